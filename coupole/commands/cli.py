@@ -16,6 +16,8 @@ from coupole.commands import benching, console, exporting, keeping, planning, ru
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
+from coupole.commands.layer import layer
+from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
@@ -54,6 +56,8 @@ for command in (
     keeping.scan,
     dose,
     render,
+    layer,
+    recipe,
     show,
     budget,
     planning.schema,

@@ -62,6 +62,8 @@ def render(
     if as_json:
         print(json.dumps({"folder": str(out), **summary}))
         return
+    for remark in summary["remarks"]:
+        console.print(remark, markup=False)
     for seen in summary["cameras"].values():
         made = seen["files"].get("film") or seen["files"]["png"]
         console.print(f"{out / made}: white {seen['white_cd_m2']:.4g} cd/m2{_noise(seen)}, simulated")

@@ -80,6 +80,8 @@ def show(
         print(json.dumps(said))
     else:
         console.print(f"{files[0]}: {size_bytes / 1e6:.1f} MB in {len(files)} files; open it in a browser")
+        for remark in look.about.get("remarks", ()):
+            console.print(remark, markup=False)
         if told := look.about.get("residual"):
             names = {name for view in told["views"] for name in view["blocks"]}
             beside = sum(file.stem in names for file in files[1:])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coupole.appearance.matter import gilding, kubelka_munk, lacquer, typical
+from coupole.appearance.matter.glossy_face import InternalReflectance, face
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.spectra import channels, light
 from coupole.appearance.spectra.grid import BANDS, Array, Complex
@@ -43,18 +44,23 @@ def rgb(spectral: ArrayLike) -> Rgb:
 def paint(
     name: str, *, thickness_mm: float = np.inf, ground: ArrayLike = 0.0, scattering_per_mm: float = 30.0
 ) -> Material:
-    """A pigment of `typical` in a glossy binder, as a layer over a ground of reflectance `ground` [81] inside it.
+    """A shape of `typical` in a glossy binder, as a layer over a ground of reflectance `ground` [81] inside it.
 
     Kubelka-Munk with Saunderson. `scattering_per_mm` is S, the same at all wavelengths: 30 hides a ground
     at about 0.1 mm (assumed).
     """
-    opaque = typical.reflectance(name)
+    opaque = typical.reflectance(name).values
     inside = opaque
     if np.isfinite(thickness_mm):
         absorption = kubelka_munk.k_over_s(opaque) * scattering_per_mm
         rho, tau = kubelka_munk.layer(absorption, scattering_per_mm, thickness_mm)
         inside = kubelka_munk.over(rho, tau, ground)
-    return Material(f"{name}", rgb(_under_binder(inside, indices.BINDER)), _normal(indices.BINDER), 0.25)
+    return Material(
+        f"{name}",
+        rgb(face(indices.BINDER).seen(InternalReflectance(inside)).values),
+        _normal(indices.BINDER),
+        0.25,
+    )
 
 
 def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12) -> Material:
@@ -90,10 +96,6 @@ def glossy(name: str, diffuse: Rgb, roughness: float) -> Material:
     f0 = _normal(indices.BINDER)
     red, green, blue = (d * (1.0 - f) for d, f in zip(diffuse, f0, strict=True))
     return Material(name, (red, green, blue), f0, roughness)
-
-
-def _under_binder(inside: Array, index: float) -> Array:
-    return kubelka_munk.saunderson(inside, _dielectric(index), fresnel.diffuse_internal(index))
 
 
 def _dielectric(index: float) -> float:

@@ -11,8 +11,9 @@ from functools import cache, partial
 
 import numpy as np
 
-from coupole.appearance.matter import brdf, four_flux, kubelka_munk, layered, makie, tabulated, typical
+from coupole.appearance.matter import brdf, four_flux, layered, makie, tabulated, typical
 from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.matter.glossy_face import Face
 from coupole.appearance.matter.hemisphere import albedo
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.spectra import light
@@ -27,12 +28,14 @@ _THREAD_PLACES, _THREAD_TURNS = 8, 6
 """Normals of the weave along each side of its cell, and turns of the cloth, of which the mean is taken."""
 _THREAD_LOBE = 0.3
 """Width of a thread's gloss, rad."""
+_RED_LACQUER = Face(np.asarray((1.0 - 0.04) * (1.0 - 0.6)), np.asarray(0.6), np.zeros(()))
+"""Its face reflects 4 % from without and 60 % from within."""
 
 
 def tabulated_finish() -> Brdf:
     """A metallic paint as seed 002 measures one: a table about the mirror direction, of Beckmann facets on a body
     of rough diffuse grains."""
-    grains = typical.reflectance("yellow ochre")
+    grains = typical.reflectance("dull_yellow_shape").values
 
     def measured(wi: Array, wo: Array) -> Array:
         body = brdf.oren_nayar(wi, wo, reflectance=0.6 * grains, roughness=0.6)
@@ -42,30 +45,30 @@ def tabulated_finish() -> Brdf:
 
 
 def layered_paint() -> Brdf:
-    """Vermilion under varnish."""
+    """A red body under varnish."""
     coat = layered.coat(layered.sheet((), indices.BINDER), 0.22)
-    return partial(layered.layered, coat=coat, body=typical.reflectance("vermilion"))
+    return partial(layered.layered, coat=coat, body=typical.reflectance("red_shape"))
 
 
 def makie_ground() -> Brdf:
     """Gold powder on red lacquer: a share of metal by its alpha, the rest diffuse (seed 002, section 4)."""
     powder = partial(brdf.cook_torrance, slope=0.32, fresnel=_gold)
-    residual = kubelka_munk.saunderson(typical.reflectance("red lead"), 0.04, 0.6)
+    residual = _RED_LACQUER.seen(typical.reflectance("orange_shape")).values
     return partial(makie.makie_brdf, alpha=0.3, residual=0.7 * residual, metallic=powder)
 
 
 def four_flux_varnish() -> Brdf:
-    """A turbid varnish on azurite under a glossy face (seed 000, section 3.4). Directional light crosses the layer
+    """A turbid varnish on blue under a glossy face (seed 000, section 3.4). Directional light crosses the layer
     at its refracted angle; what leaves has the angles of what enters, so that it is reciprocal."""
     index, rough = indices.BINDER, 0.3
-    azurite = typical.reflectance("azurite")
+    blue = typical.reflectance("blue_one_peak_shape").values
     cosines = np.linspace(0.02, 1.0, 50)
     longer = 1.0 / fresnel.cos_inside(cosines, 1.0, index).real[:, None]
     layer = four_flux.Layer(0.3, 2.0, 0.2 * longer, 6.0 * longer, 1.5 * longer, 0.08)
-    diffuse, _ = four_flux.reflectances(layer, four_flux.Background(azurite, azurite))
+    diffuse, _ = four_flux.reflectances(layer, four_flux.Background(blue, blue))
     entering = (1.0 - fresnel.reflectance(cosines, index))[:, None] * np.sqrt(diffuse)
     inner = float(fresnel.diffuse_internal(index))
-    leaving = (1.0 - inner) / (1.0 - inner * azurite)
+    leaving = (1.0 - inner) / (1.0 - inner * blue)
 
     def through(z: Array) -> Array:
         place = (np.clip(z, cosines[0], 1.0) - cosines[0]) / (cosines[1] - cosines[0])

@@ -23,7 +23,7 @@ def gilt_step_wedge(
 
 
 def paint_wedge(
-    pigment: str = "azurite",
+    pigment: str = "blue_one_peak_shape",
     thicknesses_mm: Sequence[float] = PAINT_MM,
     *,
     step_mm: float = 15.0,

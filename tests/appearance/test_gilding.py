@@ -8,17 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from coupole.appearance.matter import gilding, kubelka_munk, layered, typical
+from coupole.appearance.matter import gilding, layered, typical
+from coupole.appearance.matter.glossy_face import InternalReflectance, face
 from coupole.appearance.optics import effective_medium, fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
 
 GOLD = indices.gold()
-BOLE = kubelka_munk.saunderson(
-    typical.bole(), fresnel.reflectance(1.0, indices.EGG_WHITE), fresnel.diffuse_internal(indices.EGG_WHITE)
-)
-"""As seen from air."""
+BOLE = typical.bole()
+SEEN = face(indices.EGG_WHITE).seen(BOLE).values
+"""As an instrument sees it, gloss excluded."""
 
 
 @settings(deadline=None, max_examples=40)
@@ -94,7 +95,7 @@ def test_ten_percent_of_holes_let_more_light_through_at_every_wavelength() -> No
 def test_a_leaf_of_no_thickness_is_the_bole_as_measured() -> None:
     specular, diffuse = gilding.reflectances(gilding.gilt(GOLD, 0.0, BOLE))
 
-    assert diffuse == pytest.approx(BOLE, abs=1e-12)
+    assert diffuse == pytest.approx(SEEN, abs=1e-12)
     assert specular == pytest.approx(np.full(81, fresnel.reflectance(1.0, indices.EGG_WHITE)), abs=1e-12)
 
 
@@ -108,7 +109,17 @@ def test_a_thick_leaf_is_bulk_gold() -> None:
 def test_a_leaf_that_is_all_holes_is_the_bole_as_measured() -> None:
     _, diffuse = gilding.reflectances(gilding.gilt(GOLD, 200.0, BOLE, uncovered=1.0))
 
-    assert diffuse == pytest.approx(BOLE, abs=1e-12)
+    assert diffuse == pytest.approx(SEEN, abs=1e-12)
+
+
+@pytest.mark.parametrize(("thickness_nm", "percent"), [(0.0, 11.7), (25.0, 1.29), (50.0, 0.08)])
+def test_the_bole_under_a_leaf_is_as_bright_as_the_tables_of_the_reference_say(
+    thickness_nm: float, percent: float
+) -> None:
+    _, diffuse = gilding.reflectances(gilding.gilt(GOLD, thickness_nm, BOLE))
+
+    seen = light.tristimulus(diffuse, light.illuminant("D65"), light.observer())[1]
+    assert 100.0 * seen == pytest.approx(percent, rel=0.05)
 
 
 def test_the_step_wedge_darkens_the_bole_step_by_step() -> None:
@@ -127,7 +138,7 @@ def test_a_thin_leaf_is_green_when_light_shines_through_it() -> None:
 @settings(deadline=None, max_examples=20)
 @given(thickness_nm=st.floats(0.0, 300.0), holes=st.floats(0.0, 0.3), bare=st.floats(0.0, 1.0))
 def test_no_gilt_reflects_more_than_it_gets(thickness_nm: float, holes: float, bare: float) -> None:
-    white = np.full(81, 1.0 - fresnel.reflectance(1.0, indices.EGG_WHITE))
+    white = InternalReflectance(np.ones(81))
 
     specular, diffuse = gilding.reflectances(
         gilding.gilt(gilding.leaf_index(GOLD, holes), thickness_nm, white, uncovered=bare)

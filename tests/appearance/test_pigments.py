@@ -8,39 +8,45 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coupole.appearance.matter import kubelka_munk, pigments, typical
+from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.errors import InputError
 
-WHITE = pigments.from_opaque("white lead", typical.reflectance("white lead"), 1.0)
-RED = pigments.from_opaque("vermilion", typical.reflectance("vermilion"), 0.7)
-BLUE = pigments.from_opaque("azurite", typical.reflectance("azurite"), 0.4)
-OCHRE = pigments.from_opaque("yellow ochre", typical.reflectance("yellow ochre"), 0.5)
+WHITE = pigments.from_opaque("white", typical.reflectance("white_shape"), 1.0)
+RED = pigments.from_opaque("red", typical.reflectance("red_shape"), 0.7)
+BLUE = pigments.from_opaque("blue", typical.reflectance("blue_one_peak_shape"), 0.4)
+OCHRE = pigments.from_opaque("ochre", typical.reflectance("dull_yellow_shape"), 0.5)
 
 
 @pytest.mark.parametrize("name", typical.SHAPES)
 def test_typical_paints_reflect_a_share(name: str) -> None:
-    reflectance = typical.reflectance(name)
+    reflectance = typical.reflectance(name).values
 
     assert np.all((reflectance > 0.0) & (reflectance < 1.0))
 
 
-def test_lapis_lazuli_reflects_red_again_and_azurite_does_not() -> None:
+def test_a_blue_of_two_peaks_reflects_red_again_and_one_of_one_peak_does_not() -> None:
     blue, red = slice(12, 20), slice(70, 81)  # 440 to 475 nm, 730 to 780 nm
-    lapis, azurite = typical.reflectance("lapis-lazuli"), typical.reflectance("azurite")
+    two, one = (typical.reflectance(f"blue_{peaks}_shape").values for peaks in ("two_peaks", "one_peak"))
 
-    assert lapis[red].max() > 0.8 * lapis[blue].max()
-    assert azurite[red].max() < 0.6 * azurite[blue].max()
+    assert two[red].max() > 0.8 * two[blue].max()
+    assert one[red].max() < 0.6 * one[blue].max()
 
 
-def test_an_unknown_paint_is_refused_with_those_that_are_known() -> None:
-    with pytest.raises(InputError, match=r"vermilion.*found 'mauve'"):
+def test_an_unknown_shape_is_refused_with_those_that_are_known() -> None:
+    with pytest.raises(InputError, match=r"red_shape.*found 'mauve'"):
         typical.reflectance("mauve")
+
+
+def test_a_shape_is_understood_by_the_pigments_name_that_it_had() -> None:
+    assert set(typical.FORMER_NAMES.values()) == set(typical.SHAPES)
+    assert np.array_equal(typical.reflectance("azurite").values, typical.reflectance("blue_one_peak_shape").values)
 
 
 def test_a_pure_mixture_is_the_pigment() -> None:
     mixed = pigments.mixture([WHITE, RED], [0.0, 3.0])
 
-    assert pigments.opaque_reflectance(mixed) == pytest.approx(typical.reflectance("vermilion"))
-    assert mixed.name == "100 % vermilion"
+    assert pigments.opaque_reflectance(mixed).values == pytest.approx(typical.reflectance("red_shape").values)
+    assert mixed.name == "100 % red"
 
 
 @settings(deadline=None, max_examples=40)
@@ -68,7 +74,7 @@ def test_a_tint_that_is_darker_than_its_masstone_is_refused() -> None:
     masstone, white = (pigments.opaque_reflectance(p) for p in (BLUE, WHITE))
 
     with pytest.raises(InputError, match="between its masstone and the white"):
-        pigments.from_tint("azurite", masstone, 0.8 * masstone, white, 0.2)
+        pigments.from_tint("azurite", masstone, InternalReflectance(0.8 * masstone.values), white, 0.2)
 
 
 @settings(deadline=None, max_examples=25)
@@ -93,13 +99,13 @@ def test_a_fit_is_the_best_in_reflectance_when_a_pigment_is_missing() -> None:
     best = np.array(list(recipe.concentrations.values()))
     for _ in range(50):
         other = np.maximum(best + 0.02 * rng.standard_normal(3), 0.0)
-        missed = pigments.opaque_reflectance(pigments.mixture(palette, other)) - target
+        missed = pigments.opaque_reflectance(pigments.mixture(palette, other)).values - target.values
         assert np.sqrt(np.mean(missed**2)) >= recipe.rms - 1e-7
 
 
 def test_a_fit_with_noise_finds_the_pigments_within_two_percent() -> None:
     target = pigments.opaque_reflectance(pigments.mixture([WHITE, RED, BLUE], [0.6, 0.3, 0.1]))
-    noisy = target + 0.002 * np.random.default_rng(5).standard_normal(target.shape)
+    noisy = InternalReflectance(target.values + 0.002 * np.random.default_rng(5).standard_normal(81))
 
     found = pigments.fit(noisy, [WHITE, RED, BLUE, OCHRE]).concentrations
 

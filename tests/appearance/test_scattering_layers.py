@@ -11,7 +11,6 @@ from scipy.linalg import expm
 
 from coupole.appearance.matter import four_flux, kubelka_munk
 from coupole.appearance.matter.four_flux import Background, Layer
-from coupole.appearance.optics import fresnel
 from coupole.errors import InputError
 
 PER_MM = st.floats(0.0, 40.0)
@@ -104,22 +103,6 @@ def test_coefficients_come_back_from_two_samples(k: float, s: float, h: float, g
 def test_a_thin_sample_that_is_lighter_than_the_opaque_one_over_black_is_refused() -> None:
     with pytest.raises(InputError, match="of one paint"):
         kubelka_munk.coefficients(0.3, 0.4, 0.0, 0.05)
-
-
-@settings(deadline=None, max_examples=40)
-@given(inside=st.floats(0.0, 1.0), index=st.floats(1.01, 2.0))
-def test_saunderson_comes_back_and_never_exceeds_what_enters(inside: float, index: float) -> None:
-    k1, k2 = fresnel.reflectance(1.0, index), fresnel.diffuse_internal(index)
-
-    seen = kubelka_munk.saunderson(inside, k1, k2)
-
-    assert 0.0 <= seen <= 1.0 - k1 + 1e-12
-    assert kubelka_munk.saunderson_inverse(seen, k1, k2) == pytest.approx(inside, abs=1e-9)
-
-
-def test_a_reflectance_that_no_paint_behind_the_surface_can_have_is_refused() -> None:
-    with pytest.raises(InputError, match="inside the binder"):
-        kubelka_munk.saunderson_inverse(0.99, 0.04, 0.6)
 
 
 @settings(deadline=None, max_examples=40)

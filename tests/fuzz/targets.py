@@ -3,7 +3,7 @@
 To add a kind, add a line to `TARGETS`. `seeds` gives real files as bytes; `read` gets the path of a mutated one
 (named as `file` says, in a folder that holds a copy of `configs/`) and returns, or raises an error of
 `coupole.errors` whose message names the file. What a run keeps is in `fuzz.kept`, what other programs write in
-`fuzz.foreign`, lights are in `fuzz.lit`, wires in `fuzz.wires`.
+`fuzz.foreign`, lights are in `fuzz.lit`, paints in `fuzz.painted`, wires in `fuzz.wires`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from fuzz.foreign import FOREIGN
 from fuzz.kept import KEPT
 from fuzz.lit import LIT
+from fuzz.painted import PAINTED
 from fuzz.target import Target
 from fuzz.wires import WIRES
 from places import REPO
@@ -127,6 +128,7 @@ TARGETS = (
     Target("mesh-obj", "objects/case.obj", mesh("obj"), check_mesh),
     *FOREIGN,
     *LIT,
+    *PAINTED,
     *KEPT,
     *WIRES,
 )

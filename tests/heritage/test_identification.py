@@ -14,7 +14,7 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.errors import InputError
 from coupole.heritage.analysis import identification
 
-REFERENCES = {name: typical.reflectance(name) for name in typical.SHAPES if name != "vine black"}
+REFERENCES = {name: typical.reflectance(name).values for name in typical.SHAPES if name != "black_shape"}
 
 
 def colour_chart(name: str) -> list[Array]:
@@ -52,28 +52,30 @@ def test_dust_and_noise_do_not_hide_a_pigment(name: str, dust: float, kept: floa
 
 
 def test_a_tint_with_white_is_still_its_pigment() -> None:
-    white, blue = (pigments.from_opaque(name, REFERENCES[name]) for name in ("white lead", "azurite"))
+    white, blue = (
+        pigments.from_opaque(name, typical.reflectance(name)) for name in ("white_shape", "blue_one_peak_shape")
+    )
     tint = pigments.opaque_reflectance(pigments.mixture([white, blue], [0.7, 0.3]))
 
-    verdict = identification.identify(tint, REFERENCES)
+    verdict = identification.identify(tint.values, REFERENCES)
 
     assert verdict.finding == "match"
-    assert verdict.candidates[0].name == "azurite"
+    assert verdict.candidates[0].name == "blue_one_peak_shape"
 
 
 def test_a_pigment_that_the_references_lack_is_none_of_these() -> None:
-    others = {name: REFERENCES[name] for name in REFERENCES if name != "lapis-lazuli"}
+    others = {name: REFERENCES[name] for name in REFERENCES if name != "blue_two_peaks_shape"}
 
-    verdict = identification.identify(REFERENCES["lapis-lazuli"], others)
+    verdict = identification.identify(REFERENCES["blue_two_peaks_shape"], others)
 
     assert verdict.finding == "none"
     assert "comes nearest" in verdict.reason
 
 
 def test_two_references_that_are_alike_are_ambiguous() -> None:
-    twin = kubelka_munk.opaque(1.3 * kubelka_munk.k_over_s(REFERENCES["vermilion"]))
+    twin = kubelka_munk.opaque(1.3 * kubelka_munk.k_over_s(REFERENCES["red_shape"]))
 
-    verdict = identification.identify(REFERENCES["vermilion"], {**REFERENCES, "cinnabar": twin})
+    verdict = identification.identify(REFERENCES["red_shape"], {**REFERENCES, "cinnabar": twin})
 
     assert verdict.finding == "ambiguous"
     assert verdict.margin < 0.02
@@ -87,26 +89,26 @@ def test_a_flat_grey_is_none_of_these() -> None:
 
 
 def test_bands_that_were_not_measured_do_not_count() -> None:
-    spectrum = REFERENCES["malachite"].copy()
+    spectrum = REFERENCES["green_shape"].copy()
     spectrum[:6] = spectrum[-10:] = np.nan
 
     verdict = identification.identify(spectrum, REFERENCES)
 
     assert verdict.finding == "match"
-    assert verdict.candidates[0].name == "malachite"
+    assert verdict.candidates[0].name == "green_shape"
 
 
 def test_too_few_common_bands_are_refused() -> None:
     spectrum = np.full(81, np.nan)
-    spectrum[:20] = REFERENCES["azurite"][:20]
+    spectrum[:20] = REFERENCES["blue_one_peak_shape"][:20]
 
     with pytest.raises(InputError, match="common bands"):
-        identification.compare("azurite", spectrum, REFERENCES["azurite"])
+        identification.compare("azurite", spectrum, REFERENCES["blue_one_peak_shape"])
 
 
 def test_without_references_nothing_can_be_said() -> None:
     with pytest.raises(InputError, match="found none"):
-        identification.identify(REFERENCES["azurite"], {})
+        identification.identify(REFERENCES["blue_one_peak_shape"], {})
 
 
 def test_measured_patches_of_another_chart_are_found_again() -> None:

@@ -5,8 +5,8 @@
 f is the share of the surface not covered because of holes and cracks, R(d) the reflectance of a leaf of thickness
 d, T_in its transmittance, T_out and R_int its transmittance and reflectance for the bole's diffuse light from
 below, and R_b the bole's reflectance inside its binder. The paper's "R_gold - T_p + R_plasmon" has no definition
-of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the measured
-bole, for thick leaves bulk gold.
+of R_plasmon; a thin film includes all three (docs/decisions/0010). For thickness 0 the result is the bole
+under the face of its binder, for thick leaves bulk gold.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coupole.appearance.matter import kubelka_munk, layered
-from coupole.appearance.optics import effective_medium, fresnel, indices
+from coupole.appearance.matter import layered
+from coupole.appearance.matter.glossy_face import InternalReflectance
+from coupole.appearance.optics import effective_medium, indices
 from coupole.appearance.optics.thin_film import Film
 from coupole.appearance.spectra.grid import Array, Complex, within
 
@@ -29,8 +30,8 @@ class Gilt:
     leaf: layered.Sheet
     bare: layered.Sheet
     """Surface without leaf: the bole's binder against air."""
-    bole_inside: Array
-    """[bands], inside the binder."""
+    bole: InternalReflectance
+    """[bands]."""
     uncovered: float
     """f."""
 
@@ -54,22 +55,19 @@ def uncovered(holes: float, crack_width_um: float, crack_length_mm_per_mm2: floa
 def gilt(
     index: Complex,
     thickness_nm: float,
-    bole_seen: Array,
+    bole: InternalReflectance,
     *,
     uncovered: float = 0.0,
     binder_index: float = indices.EGG_WHITE,
 ) -> Gilt:
-    """A leaf of `index` and thickness on a bole whose reflectance in air, gloss excluded, is `bole_seen` [bands].
+    """A leaf of `index` and thickness on a bole [bands]; under the leaf there is no air.
 
-    Under the leaf there is no air: the bole's reflectance inside its binder is calculated with Saunderson.
+    Of a bole measured in air: `glossy_face.face(binder_index).inside(measured)`.
     """
-    inside = kubelka_munk.saunderson_inverse(
-        bole_seen, fresnel.reflectance(1.0, binder_index), fresnel.diffuse_internal(binder_index)
-    )
     return Gilt(
         leaf=layered.sheet([Film(index, thickness_nm)], binder_index),
         bare=layered.sheet([], binder_index),
-        bole_inside=inside,
+        bole=bole,
         uncovered=float(within("uncovered", uncovered, 0.0, 1.0)),
     )
 
@@ -79,15 +77,15 @@ def reflectances(gilded: Gilt) -> tuple[Array, Array]:
     parts = []
     for share, sheet in ((1.0 - gilded.uncovered, gilded.leaf), (gilded.uncovered, gilded.bare)):
         entering = sheet.transmittance[-1]
-        diffuse = entering * layered.emerging(sheet, gilded.bole_inside)
+        diffuse = entering * layered.emerging(sheet, gilded.bole)
         parts.append(share * np.stack([sheet.normal_reflectance, diffuse]))
     specular, diffuse = parts[0] + parts[1]
     return specular, diffuse
 
 
-def step_wedge(index: Complex, thicknesses_nm: Sequence[float], bole_seen: Array) -> Array:
+def step_wedge(index: Complex, thicknesses_nm: Sequence[float], bole: InternalReflectance) -> Array:
     """Specular and diffuse reflectance [steps, 2, bands] of leaves of several thicknesses: a gilt step wedge."""
-    return np.stack([np.stack(reflectances(gilt(index, d, bole_seen))) for d in thicknesses_nm])
+    return np.stack([np.stack(reflectances(gilt(index, d, bole))) for d in thicknesses_nm])
 
 
 @dataclass(frozen=True)
@@ -107,6 +105,6 @@ def coats(gilded: Gilt, *, leaf_roughness: float, bole_roughness: float) -> Gilt
 def gilt_brdf(wi: Array, wo: Array, *, coats: GiltCoats) -> Array:
     """BRDF of the gilt: leaf and bare bole by their shares of the surface."""
     f = coats.gilded.uncovered
-    leaf = layered.layered(wi, wo, coat=coats.leaf, body=coats.gilded.bole_inside)
-    bare = layered.layered(wi, wo, coat=coats.bare, body=coats.gilded.bole_inside)
+    leaf = layered.layered(wi, wo, coat=coats.leaf, body=coats.gilded.bole)
+    bare = layered.layered(wi, wo, coat=coats.bare, body=coats.gilded.bole)
     return (1.0 - f) * leaf + f * bare

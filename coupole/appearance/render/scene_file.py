@@ -16,7 +16,8 @@ from pydantic import AwareDatetime, BaseModel, Field, model_validator
 from coupole.appearance.render.bands import StepNm
 from coupole.appearance.render.lights import Daylight, Light, PlainLight, plain
 from coupole.appearance.render.model import Model, Positive, Vector
-from coupole.appearance.render.objects import Object
+from coupole.appearance.render.objects import Object, PaintWedge
+from coupole.appearance.render.spectra import Shape
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Pixels = Annotated[int, Field(ge=4, le=8192)]
@@ -205,3 +206,22 @@ def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str
     elif isinstance(part, tuple):
         for number, inner in enumerate(part):
             yield from files(inner, (*at, number))
+
+
+def remarks(scene: Scene) -> list[str]:
+    """What its maker must know, one sentence each."""
+    found = [shape.remark() for shape in _shapes(scene)]
+    return list(dict.fromkeys(remark for remark in found if remark))
+
+
+def _shapes(part: Any) -> Iterator[Shape]:
+    if isinstance(part, PaintWedge):
+        yield Shape(kind="shape", name=part.pigment)
+    if isinstance(part, Shape):
+        yield part
+    elif isinstance(part, BaseModel):
+        for name in type(part).model_fields:
+            yield from _shapes(getattr(part, name))
+    elif isinstance(part, tuple):
+        for inner in part:
+            yield from _shapes(inner)

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from coupole.appearance.matter import typical
+from coupole.appearance.matter.glossy_face import BARE, InternalReflectance, MeasuredReflectance, face
+from coupole.appearance.matter.paint_file import read_paint
+from coupole.appearance.matter.pigments import Pigment
 from coupole.appearance.render.model import Model, Share
 from coupole.appearance.spectra import light, measured, resampling
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
@@ -28,15 +32,25 @@ class Constant(Model):
     value: Share
 
 
-class Pigment(Model):
-    """A typical paint of `coupole.appearance.matter.typical`, opaque, inside its binder: assumed, not measured."""
+class Shape(Model):
+    """An assumed spectrum of `coupole.appearance.matter.typical`, opaque, inside its binder: no measured pigment.
 
-    kind: Literal["pigment"]
+    `kind: pigment` and pigments' names are from before version 0.2, and still read, with a remark.
+    """
+
+    kind: Literal["shape", "pigment"]
     name: str
+
+    def remark(self) -> str:
+        """What its maker must know of a former name; empty if there is none."""
+        now = typical.FORMER_NAMES.get(self.name)
+        if now is None:
+            return ""
+        return f"{self.name} is no measured pigment but an assumed shape: write {{kind: shape, name: {now}}}"
 
 
 class Bole(Model):
-    """The papers' bole, half red lead, half red ochre (seed 001, section 5)."""
+    """The papers' bole, half red lead, half red ochre (seed 001, section 5), of assumed shapes, in its binder."""
 
     kind: Literal["bole"]
 
@@ -47,9 +61,28 @@ class Measured(Model):
     kind: Literal["file"]
     path: Path
     column: int | None = None
+    sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
+    """How its face was seen; bare: it had none (matt powder), so that it holds inside a binder as it was seen."""
 
 
-Reflectance = Annotated[Constant | Pigment | Bole | Measured, Field(discriminator="kind")]
+class MeasuredPaint(Model):
+    """K and S of a paint in a file, as `coupole layer` writes it (`coupole.appearance.matter.paint_file`)."""
+
+    kind: Literal["paint_file"]
+    path: Path
+
+
+class MeasuredPower(Model):
+    """Power of a light by wavelength, measured."""
+
+    kind: Literal["file"]
+    path: Path
+    column: int | None = None
+
+
+Reflectance = Annotated[Constant | Shape | Bole | Measured, Field(discriminator="kind")]
+Colouring = Annotated[Constant | Shape | Bole | Measured | MeasuredPaint, Field(discriminator="kind")]
+"""Of a paint."""
 
 
 class Illuminant(Model):
@@ -100,18 +133,47 @@ class LowSun(Model):
 
 
 Power = Annotated[
-    Illuminant | Source | DomeLed | BlackBody | LowSun | Values | Measured, Field(discriminator="kind")
+    Illuminant | Source | DomeLed | BlackBody | LowSun | Values | MeasuredPower, Field(discriminator="kind")
 ]
 
 
-def reflectance(spectrum: Reflectance, folder: Path) -> Array:
-    """[81], 0 to 1; paths are relative to `folder`. Raises InputError."""
+def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalReflectance:
+    """[81], under a face of real index `index`, where a measured spectrum was seen through such a face.
+
+    Constants, shapes and the bole hold inside as they are. Paths are relative to `folder`. Raises InputError.
+    """
     if isinstance(spectrum, Constant):
-        return np.full(BANDS, spectrum.value)
-    if isinstance(spectrum, Pigment):
+        return InternalReflectance(np.full(BANDS, spectrum.value))
+    if isinstance(spectrum, Shape):
         return typical.reflectance(spectrum.name)
     if isinstance(spectrum, Bole):
         return typical.bole()
+    seen = _measured(spectrum, folder)
+    if spectrum.sample == "bare":
+        return BARE.inside(seen)
+    try:
+        return face(index, spectrum.sample).inside(seen)
+    except InputError as error:
+        raise InputError(f"{folder / spectrum.path}: {error}") from error
+
+
+def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigment:
+    """K and S [81], ends held. Raises InputError, also if they are not per mm where they must be."""
+    found = read_paint(folder / paint.path)
+    if needs_mm and found.unit != "per mm":
+        raise InputError(
+            f"{folder / paint.path}: is {found.unit}; a layer of a thickness needs K and S per mm: measure it "
+            "with its thickness, or leave out thickness_mm for an opaque one"
+        )
+    return found.on_grid()
+
+
+def matt(spectrum: Reflectance, folder: Path) -> MeasuredReflectance:
+    """[81], of something without a face. Raises InputError."""
+    return BARE.seen(internal(spectrum, folder, 1.0))
+
+
+def _measured(spectrum: Measured, folder: Path) -> MeasuredReflectance:
     path = folder / spectrum.path
     values = resampling.held(resampling.on_grid(measured.read_spectrum(path, column=spectrum.column)))
     if values.min() < -0.02 or values.max() > 1.02:
@@ -119,7 +181,7 @@ def reflectance(spectrum: Reflectance, folder: Path) -> Array:
             f"{path}: expected reflectances from 0 to 1, found {values.min():.3g} to {values.max():.3g}; "
             "give a sample without gloss or fluorescence"
         )
-    return np.clip(values, 0.0, 1.0)
+    return MeasuredReflectance(np.clip(values, 0.0, 1.0))
 
 
 def power(spectrum: Power, folder: Path) -> Array:

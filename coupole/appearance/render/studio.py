@@ -12,7 +12,7 @@ from typing import Any
 from coupole.appearance.render import by_gold, pictures, variant, wall
 from coupole.appearance.render.film import write_film
 from coupole.appearance.render.rendering import Renderer, Spectral, opened
-from coupole.appearance.render.scene_file import Camera, Film, Scene
+from coupole.appearance.render.scene_file import Camera, Film, Scene, remarks
 from coupole.appearance.render.spectra import power
 
 Progress = Callable[[str, int, int], None]
@@ -60,6 +60,7 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
         "depth": scene.depth,
         "seed": scene.seed,
         "observer": f"CIE {scene.observer}",
+        "remarks": remarks(scene),
         **summary,
     }
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from coupole.appearance.matter import gilding, layered
+from coupole.appearance.matter import layered
 from coupole.appearance.render import arcature, caustic, colour
 from coupole.appearance.render.lights import Distant
-from coupole.appearance.render.materials import Gilt, metal_index
+from coupole.appearance.render.materials import Gilt, gilt_of
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.objects import Arcature
 from coupole.appearance.render.pictures import SYNTHETIC, write_png
 from coupole.appearance.render.scene_file import Caustic, PlainScene
-from coupole.appearance.render.spectra import luminous, power, reflectance, scaled
+from coupole.appearance.render.spectra import luminous, power, scaled
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -103,8 +103,5 @@ def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
 
 def _leaf(gilt: Gilt, folder: Path) -> Array:
     """Specular part of the covered share, as in `layered.Sheet`."""
-    index = metal_index(gilt.gold)
-    if gilt.holes > 0.0:
-        index = gilding.leaf_index(index, gilt.holes)
-    gilded = gilding.gilt(index, gilt.thickness_nm, reflectance(gilt.bole, folder))
+    gilded, _ = gilt_of(gilt, folder)
     return np.asarray((1.0 - gilt.uncovered) * gilded.leaf.reflectance)

@@ -14,7 +14,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.render import objects
 from coupole.appearance.render.materials import Glass, Lacquer, Material, Metal
 from coupole.appearance.render.objects import Ball, MakieTile, NashijiSlab, Piece
-from coupole.appearance.render.scene_file import PlainScene, Scene, with_plain_lights
+from coupole.appearance.render.scene_file import PlainScene, Scene, remarks, with_plain_lights
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import flat_normals
@@ -144,6 +144,7 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Ma
             name: {"told": name, "xy": chromaticity(power, scene.observer)} for name, power in powers.items()
         },
         "materials": found.names,
+        "remarks": remarks(scene),
         "observer": scene.observer,
         "irradiance": float(np.pi),
         "unit": "1/sr",

@@ -14,12 +14,14 @@ from typing import assert_never
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.matter import gilding, lacquer, layered
+from coupole.appearance.matter import lacquer, layered
+from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
 from coupole.appearance.render import materials
 from coupole.appearance.render.materials import Diffuse, Films, Gilt, Glass, Lacquer, Material, Metal, Paint
-from coupole.appearance.render.spectra import reflectance
+from coupole.appearance.render.refraction import real_index
+from coupole.appearance.render.spectra import matt
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
 from coupole.errors import InputError
@@ -57,18 +59,15 @@ def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
     """One or two layers, whose sum the material is; paths are relative to `folder`. Raises InputError."""
     match material:
         case Diffuse():
-            return (_bodied(np.zeros((ANGLES, BANDS)), reflectance(material.reflectance, folder), 1.0),)
+            return (_bodied(np.zeros((ANGLES, BANDS)), matt(material.reflectance, folder).values, 1.0),)
         case Paint():
-            return (_coated(materials.paint_inside(material, folder), material.index, material.roughness),)
+            return (_coated(materials.paint_inside(material, folder), material, folder),)
         case Lacquer():
-            return (_coated(reflectance(material.body, folder), material.index, material.roughness),)
+            return (_coated(materials.lacquer_body(material, folder), material, folder),)
         case Metal():
-            return (_metal(material),)
+            return (_metal(material, folder),)
         case Films():
-            films = [Film(indices.constant(film.index), film.thickness_nm) for film in material.films]
-            base = (
-                indices.constant(material.index) if material.gold is None else materials.metal_index(material.gold)
-            )
+            films, base = materials.films_of(material, folder)
             return (_bodied(_stack(films, base), np.zeros(BANDS), material.roughness),)
         case Gilt():
             return _gilt(material, folder)
@@ -127,15 +126,19 @@ def _bodied(mirror: Array, body: Array, roughness: float) -> Layer:
     return Layer(mirror, np.ones(ANGLES), body, roughness)
 
 
-def _coated(body: Array, index: float, roughness: float) -> Layer:
+def _coated(body: InternalReflectance, material: Paint | Lacquer, folder: Path) -> Layer:
+    return _under_face(body, real_index(material.index, folder), material.roughness)
+
+
+def _under_face(body: InternalReflectance, index: Array, roughness: float) -> Layer:
     """A body under a glossy face, with all reflections between them (Saunderson), as `materials.coated` has it."""
-    face = fresnel.reflectance(COSINES, index)
-    seen = body / (index**2 * (1.0 - fresnel.diffuse_internal(index) * body))
+    face = fresnel.reflectance(COSINES, indices.at_d_line(index.astype(complex)))
+    seen = materials.under_face(body, index)
     return Layer(np.repeat(face[:, None], BANDS, axis=1), 1.0 - face, seen, roughness)
 
 
-def _metal(material: Metal) -> Layer:
-    index, factor = materials.metal_index(material.gold), np.ones(BANDS)
+def _metal(material: Metal, folder: Path) -> Layer:
+    index, factor = materials.metal_of(material, folder), np.ones(BANDS)
     if material.depth_mm is not None:
         index = index / indices.URUSHI
         inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
@@ -149,15 +152,11 @@ def _stack(films: Sequence[Film], base: Complex) -> Array:
 
 def _gilt(material: Gilt, folder: Path) -> tuple[Layer, ...]:
     """Leaf with the bole's light that comes through it, and bare bole, by their shares."""
-    index = materials.metal_index(material.gold)
-    if material.holes > 0.0:
-        index = gilding.leaf_index(index, material.holes)
-    seen = reflectance(material.bole, folder)
-    gilded = gilding.gilt(index, material.thickness_nm, seen, uncovered=material.uncovered)
-    bare = _coated(gilded.bole_inside, indices.EGG_WHITE, material.bole_roughness)
+    gilded, index = materials.gilt_of(material, folder)
+    bare = _under_face(gilded.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < materials.THINNEST_NM or material.uncovered == 1.0:
         return (bare,)
-    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole_inside)
+    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole)
     films = [Film(index, material.thickness_nm)]
     leaf = _bodied(_stack(films, indices.constant(indices.EGG_WHITE)), through, material.roughness)
     if material.uncovered == 0.0:

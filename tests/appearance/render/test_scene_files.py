@@ -12,7 +12,9 @@ import pytest
 from places import REPO
 
 from coupole.appearance.render import studio
+from coupole.appearance.render.materials import bsdf, paint_inside
 from coupole.appearance.render.rendering import opened
+from coupole.appearance.render.scene_file import remarks
 from coupole.commands.render_scene import read_scene, render, render_scene
 from coupole.errors import InputError, StorageError
 
@@ -80,6 +82,48 @@ def test_a_wrong_scene_is_refused_with_its_place(
         read_scene(written(tmp_path, SMALL.replace(*wrong)))
     assert f"small.yaml:{place}" in str(refused.value)
     assert words in str(refused.value)
+
+
+def test_pigments_names_of_old_scene_files_are_read_with_a_remark(tmp_path: Path) -> None:
+    old = SMALL.replace("{kind: constant, value: 0.5}", "{kind: pigment, name: azurite}")
+    old = old.replace("lights:", "  - {kind: paint_wedge, pigment: malachite}\nlights:")
+    _, scene = read_scene(written(tmp_path, old))
+
+    assert [remark.split(" is ")[0] for remark in remarks(scene)] == ["azurite", "malachite"]
+    assert "{kind: shape, name: blue_one_peak_shape}" in remarks(scene)[0]
+    assert not any(remarks(read_scene(path)[1]) for path in SHIPPED)
+
+
+def test_a_paint_file_has_its_own_scattering_in_a_scene(tmp_path: Path) -> None:
+    rows = "".join(f"{nm},4,12\n" for nm in range(380, 781, 20))
+    head = "# coupole: paint 1\n# name: ochre\n# unit: per mm\n# binder_index: 1.5\nwavelength_nm,K,S\n"
+    (tmp_path / "ochre.paint.csv").write_text(head + rows)
+    paint = "{kind: paint, pigment: {kind: paint_file, path: ochre.paint.csv}, thickness_mm: 0.05}"
+    path = written(tmp_path, SMALL.replace("{kind: diffuse, reflectance: {kind: constant, value: 0.5}}", paint))
+    document, scene = read_scene(path)
+
+    inside = paint_inside(scene.objects[0].material, document.path.parent).values
+
+    a, b = 16 / 12, np.sqrt((16 / 12) ** 2 - 1.0)
+    assert inside == pytest.approx(1.0 / (a + b / np.tanh(b * 12 * 0.05)))
+    (tmp_path / "ochre.paint.csv").write_text(head.replace("per mm", "relative") + rows)
+    with pytest.raises(InputError, match="is relative; a layer of a thickness needs"):
+        bsdf(scene.objects[0].material, document.path.parent)
+
+
+def test_a_metal_of_the_users_own_index_is_rendered(tmp_path: Path) -> None:
+    rows = "".join(f"{nm} 2.5 3.5\n" for nm in range(360, 820, 20))
+    (tmp_path / "iron.txt").write_text(rows)
+    own = "{kind: metal, index: {kind: file, path: iron.txt}, roughness: 0.3}"
+    path = written(tmp_path, SMALL.replace("{kind: diffuse, reflectance: {kind: constant, value: 0.5}}", own))
+    document, scene = read_scene(path)
+
+    mine = bsdf(scene.objects[0].material, document.path.parent)["material"]
+
+    assert (mine["eta"][0], mine["k"][0]) == pytest.approx((2.5, 3.5))
+    (tmp_path / "iron.txt").unlink()
+    with pytest.raises(InputError, match="no such file"):
+        read_scene(path)
 
 
 def test_an_led_that_the_dome_does_not_have_is_named(tmp_path: Path) -> None:

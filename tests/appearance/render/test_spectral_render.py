@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from spectral_scenes import camera, constant, everywhere, illuminant, plane, rendered, scene
 
 from coupole.appearance.matter import gilding, kubelka_munk, typical
+from coupole.appearance.matter.glossy_face import InternalReflectance, face
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.render import bands, colour
 from coupole.appearance.render.rendering import Spectral, degree_of_linear_polarisation
@@ -22,9 +24,9 @@ DOWNWARDS = {"kind": "distant", "direction": [0, 0, -1], "illuminance_lux": 500.
 
 
 def test_a_diffuse_plane_sends_reflectance_times_irradiance_over_pi_in_each_of_81_bands() -> None:
-    vermilion = {"kind": "diffuse", "reflectance": {"kind": "pigment", "name": "vermilion"}}
-    found = rendered(scene([plane(vermilion)], [DOWNWARDS], samples=1))
-    expected = typical.reflectance("vermilion") * scaled(light.illuminant("A"), 500.0) / np.pi
+    red = {"kind": "diffuse", "reflectance": {"kind": "shape", "name": "red_shape"}}
+    found = rendered(scene([plane(red)], [DOWNWARDS], samples=1))
+    expected = typical.reflectance("red_shape").values * scaled(light.illuminant("A"), 500.0) / np.pi
     assert found.wavelengths_nm == pytest.approx(WAVELENGTHS_NM)
     # 1e-4 of the paths fall on the ramps between quarters.
     assert found.radiance.mean(axis=(0, 1)) == pytest.approx(expected, rel=1e-3)
@@ -76,7 +78,7 @@ def test_a_gold_mirror_reflects_as_fresnel_says_of_its_index(elevation_deg: floa
 def test_paint_over_a_ground_returns_what_kubelka_munk_and_saunderson_say(scale: Scale) -> None:
     paint = {
         "kind": "paint",
-        "pigment": {"kind": "pigment", "name": "azurite"},
+        "pigment": {"kind": "shape", "name": "blue_one_peak_shape"},
         "thickness_mm": 0.05,
         "ground": constant(0.9),
         "scattering_per_mm": 8.0,
@@ -84,11 +86,20 @@ def test_paint_over_a_ground_returns_what_kubelka_munk_and_saunderson_say(scale:
     }
     one = scene([plane(paint)], [everywhere(illuminant("E"))], samples=scale(64, 1024), bands={"step_nm": 20})
     reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::4]
-    k = kubelka_munk.k_over_s(typical.reflectance("azurite")) * 8.0
+    k = kubelka_munk.k_over_s(typical.reflectance("blue_one_peak_shape").values) * 8.0
     inside = kubelka_munk.over(*kubelka_munk.layer(k, 8.0, 0.05), 0.9)
     gloss = fresnel.reflectance(1.0, 1.5)
-    seen = kubelka_munk.saunderson(inside, gloss, fresnel.diffuse_internal(1.5))
+    seen = face(1.5).seen(InternalReflectance(inside)).values
     assert reflected == pytest.approx((gloss + seen)[::4], rel=0.02)
+
+
+def test_a_measured_paint_is_shown_as_it_was_measured(scale: Scale, tmp_path: Path) -> None:
+    (tmp_path / "half.csv").write_text("nm,R\n380,0.5\n580,0.5\n780,0.5\n")
+    measured = {"kind": "file", "path": str(tmp_path / "half.csv")}
+    paint = {"kind": "paint", "pigment": measured, "roughness": 0.01}
+    one = scene([plane(paint)], [everywhere(illuminant("E"))], samples=scale(64, 1024), bands={"step_nm": 40})
+    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::8]
+    assert reflected - fresnel.reflectance(1.0, 1.5) == pytest.approx(np.full(11, 0.5), rel=0.02)
 
 
 @pytest.mark.parametrize("thickness_nm", [0.0, 25.0, 100.0])

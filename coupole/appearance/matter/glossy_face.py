@@ -1,0 +1,102 @@
+"""What an instrument sees of a paint, and what holds inside its binder: two types, and Saunderson between them.
+
+A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
+leave. Of a paint that reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5.
+The two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coupole.appearance.optics import fresnel
+from coupole.appearance.spectra.grid import Array, within
+from coupole.errors import InputError
+
+Geometry = Literal["gloss excluded", "gloss included", "45:0"]
+"""Of an instrument. Gloss excluded: diffuse light seen along the normal, or the reverse, with a gloss trap (d:8,
+SCE). Gloss included: without it (d:8, SCI). 45:0: light at 45 degrees seen along the normal."""
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredReflectance:
+    """In air, as an instrument sees it: fractions [..., bands]; noise may go below 0, gloss above 1."""
+
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class InternalReflectance:
+    """Of a layer inside its binder, for diffuse light: 0 to 1, [..., bands]. Raises InputError beyond."""
+
+    values: Array
+
+    def __post_init__(self) -> None:
+        within("R inside the binder", self.values, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Face:
+    """A binder's face against air, for one geometry of measurement; numbers or [bands].
+
+    Saunderson, J. Opt. Soc. Am. 32, 727 (1942): seen = passing R/(1 - inner R) + gloss.
+    """
+
+    passing: Array
+    """What of the incident light enters, times what of the emerging light is seen."""
+    inner: Array
+    """Reflectance for diffuse light from within (k2)."""
+    gloss: Array
+    """Light that the face itself sends to the instrument."""
+
+    def seen(self, internal: InternalReflectance) -> MeasuredReflectance:
+        """In air, of a layer under this face."""
+        r = internal.values
+        return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
+
+    def inside(self, measured: MeasuredReflectance) -> InternalReflectance:
+        """Of the layer under this face. Raises InputError where no layer can be the reason of what is seen."""
+        r = np.asarray(measured.values, dtype=float) - self.gloss
+        found = np.asarray(r / (self.passing + self.inner * r))
+        found = np.where((found > 1.0) & (found < 1.0 + _ROUNDING), 1.0, found)
+        wrong = ~((found >= 0.0) & (found <= 1.0))
+        if wrong.any():
+            low, high = (np.broadcast_to(v, found.shape)[wrong][0] for v in (self.gloss, self.brightest))
+            raise InputError(
+                f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
+                f"{np.asarray(measured.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: see "
+                "whether gloss is included, and whether the sample has a glossy face"
+            )
+        return InternalReflectance(found)
+
+    @property
+    def brightest(self) -> Array:
+        """What is seen of a layer that reflects everything."""
+        return np.asarray(self.passing / (1.0 - self.inner) + self.gloss)
+
+
+def face(index: ArrayLike, geometry: Geometry = "gloss excluded") -> Face:
+    """The face of a transparent binder of real index n >= 1, a number or [bands], for a geometry of measurement.
+
+    By diffuse light and along the normal 1 - F(0) passes inwards and 1 - k2 outwards, or the reverse: the product
+    is the same. At 45:0 the emerging radiance is seen along the normal: (1 - F(45)) (1 - F(0))/n^2.
+    """
+    if geometry not in get_args(Geometry):
+        raise InputError(f"geometry: expected one of {', '.join(get_args(Geometry))}; found {geometry!r}")
+    n = within("index of the binder", index, 1.0, 10.0)
+    inner, along = fresnel.diffuse_internal(n), fresnel.reflectance(1.0, n)
+    if geometry == "45:0":
+        passing = (1.0 - fresnel.reflectance(np.sqrt(0.5), n)) * (1.0 - along) / n**2
+    else:
+        passing = (1.0 - along) * (1.0 - inner)
+    gloss = along if geometry == "gloss included" else np.zeros_like(along)
+    return Face(np.asarray(passing), np.asarray(inner), np.asarray(gloss))
+
+
+BARE = Face(np.ones(()), np.zeros(()), np.zeros(()))
+"""No face: dry powder, matt distemper. What is seen is what holds inside."""

@@ -1,0 +1,259 @@
+"""`coupole layer`: K, S and their uncertainty from spectra of a paint's films."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError, StorageError, reason
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.heritage.analysis.layer_samples import LayerGiven
+
+
+def layer(
+    samples: Annotated[
+        Path | None,
+        typer.Argument(help="YAML that names all films; or use the options below.", show_default=False),
+    ] = None,
+    over_black: Annotated[Path | None, typer.Option(help="Spectrum of the film over black.")] = None,
+    over_white: Annotated[Path | None, typer.Option(help="Spectrum of the film over white.")] = None,
+    black: Annotated[Path | None, typer.Option(help="Spectrum of the black ground.")] = None,
+    white: Annotated[Path | None, typer.Option(help="Spectrum of the white ground.")] = None,
+    opaque: Annotated[Path | None, typer.Option(help="Spectrum of an opaque film of the same paint.")] = None,
+    thickness_um: Annotated[
+        float | None, typer.Option(min=0.01, help="Of the film; K and S are then per mm.")
+    ] = None,
+    u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Its standard uncertainty.")] = 0.0,
+    noise: Annotated[float, typer.Option(min=1e-5, max=0.1, help="Of a spectrum's value, standard.")] = 0.005,
+    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5,
+    geometry: Annotated[
+        str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")
+    ] = "gloss excluded",
+    bare_grounds: Annotated[
+        bool, typer.Option("--bare-grounds", help="The grounds were measured without a glossy face.")
+    ] = False,
+    name: Annotated[str | None, typer.Option(help="Of the paint.")] = None,
+    other_grinding: Annotated[
+        Path | None, typer.Option(help="Paint file of another grinding of the pigment: ratio of their grains.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for paint file and report.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """K and S of a paint, with 95 % intervals, from films over grounds, an opaque and a thin one, or a series.
+
+    What a film needs: two spectra of it over different grounds; or one over a ground, and one of an opaque film.
+    """
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        if samples is None:
+            films = _films(over_black, over_white, black, white, opaque, thickness_um, u_thickness_um)
+            given, folder = _given(films, name or "paint", noise, binder_index, geometry, bare_grounds), Path()
+        else:
+            if any(path is not None for path in (over_black, over_white, black, white, opaque, thickness_um)):
+                raise InputError(f"{samples}: names the films; leave out --over-black and the like")
+            given, folder = read_films(samples)
+        document = _solved(given, folder, other_grinding, out)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps(document))
+    else:
+        _say(document, console)
+
+
+def read_films(path: Path) -> tuple[LayerGiven, Path]:
+    """A YAML file of films, and the folder of its paths. Raises InputError with line and column."""
+    from coupole.heritage.analysis.layer_samples import LayerGiven
+    from coupole.plan import yamlfile
+
+    document = yamlfile.read(path)
+    return document.validate(LayerGiven), path.parent
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _films(
+    over_black: Path | None,
+    over_white: Path | None,
+    black: Path | None,
+    white: Path | None,
+    opaque: Path | None,
+    thickness_um: float | None,
+    u_thickness_um: float,
+) -> list[dict[str, Any]]:
+    films: list[dict[str, Any]] = []
+    for film, ground, kind in ((over_black, black, "black"), (over_white, white, "white")):
+        if (film is None) != (ground is None):
+            given, missing = (f"--over-{kind}", f"--{kind}") if ground is None else (f"--{kind}", f"--over-{kind}")
+            raise InputError(f"{given}: needs {missing}, too: the film and the ground that it lies on")
+        if film is not None:
+            films.append({"spectrum": film, "over": ground, "thickness_um": thickness_um})
+            films[-1]["u_thickness_um"] = u_thickness_um
+    if opaque is not None:
+        films.append({"spectrum": opaque})
+    if len(films) < 2:
+        raise InputError(
+            "expected --over-black and --over-white, or one of them and --opaque: "
+            "one spectrum cannot tell K from S"
+        )
+    return films
+
+
+def _given(
+    films: list[dict[str, Any]], name: str, noise: float, index: float, geometry: str, bare: bool
+) -> LayerGiven:
+    from typing import get_args
+
+    from coupole.appearance.matter.glossy_face import Geometry
+    from coupole.heritage.analysis.layer_samples import LayerGiven
+
+    if geometry not in get_args(Geometry):
+        raise InputError(f"--geometry: expected {', '.join(get_args(Geometry))}; found {geometry!r}")
+    return LayerGiven.model_validate(
+        {
+            "name": name,
+            "binder_index": index,
+            "geometry": geometry,
+            "grounds": "bare" if bare else "coated",
+            "noise": noise,
+            "films": films,
+        }
+    )
+
+
+def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | None) -> dict[str, Any]:
+    from coupole.heritage.analysis import four_flux_fit, layer_fit, layer_model
+    from coupole.heritage.analysis.layer_samples import paint_file, read_samples
+
+    samples = read_samples(given, folder)
+    found = layer_fit.fit(samples.films, samples.face, given.noise)
+    four = None
+    if samples.directional is None:
+        model = layer_model.deserved(found, samples.films, samples.face, given.noise)
+    else:
+        black, white = samples.films
+        four = four_flux_fit.fit(black, white, samples.directional, samples.face, given.noise)
+        light = samples.directional
+        model = layer_model.deserved_by_measurement(
+            (black.seen, white.seen), (light.over_black, light.over_white), light.transmittance, given.noise
+        )
+    paint = paint_file(given, samples, found, four)
+    document: dict[str, Any] = {
+        "name": given.name,
+        "unit": paint.unit,
+        "model": {
+            "deserved": model.model,
+            "because": model.because,
+            "difference": model.difference,
+            "unscattered": model.unscattered,
+        },
+        "coverage": 0.95,
+        "wavelength_nm": samples.wavelengths_nm.tolist(),
+        "K": found.absorption.tolist(),
+        "S": found.scattering.tolist(),
+        "half_width_K": (layer_fit.COVERAGE_FACTOR * found.u_absorption).tolist(),
+        "half_width_S": (layer_fit.COVERAGE_FACTOR * found.u_scattering).tolist(),
+        "determined": found.determined.tolist(),
+        "spectra": found.spectra,
+        "misfit": _misfit(found),
+    }
+    if four is not None:
+        document["four_fluxes"] = {
+            "k": four.direct_absorption.tolist(),
+            "s_i": four.forward.tolist(),
+            "s_j": four.backward.tolist(),
+            "u_k": four.u_direct_absorption.tolist(),
+            "u_s_i": four.u_forward.tolist(),
+            "u_s_j": four.u_backward.tolist(),
+        }
+    if other is not None:
+        document["grains"] = _grains(paint, other)
+    if out is not None:
+        from coupole.appearance.matter.paint_file import ENDING, encode
+        from coupole.viewing.layer_page import layer_page
+
+        stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in given.name)
+        files = {
+            f"{stem}{ENDING}": encode(paint),
+            f"{stem}.html": layer_page(given, samples, found, model, four),
+        }
+        document["files"] = _written(out, files)
+    return document
+
+
+def _misfit(found: Any) -> float | None:
+    """Root mean square of residuals over what noise explains; None of two spectra, which leave none."""
+    freedom = found.spectra - 2
+    return None if freedom == 0 else float((found.chi2.mean() / freedom) ** 0.5)
+
+
+def _grains(paint: Any, other: Path) -> dict[str, Any]:
+    import numpy as np
+
+    from coupole.appearance.matter.paint_file import read_paint
+    from coupole.heritage.analysis.layer_model import grain_ratio
+
+    theirs = read_paint(other)
+    if theirs.unit != "per mm" or paint.unit != "per mm":
+        raise InputError(
+            f"{other}: sizes of grains need K and S per mm of both grindings; found {theirs.unit} and "
+            f"{paint.unit}: give --thickness-um"
+        )
+    nm = theirs.wavelengths_nm
+    inside = (nm >= paint.wavelengths_nm[0]) & (nm <= paint.wavelengths_nm[-1])
+    mine = [np.interp(nm[inside], paint.wavelengths_nm, v) for v in (paint.scattering, paint.u_scattering)]
+    found = grain_ratio((mine[0], mine[1]), (theirs.scattering[inside], theirs.u_scattering[inside]))
+    return {"than": theirs.name, "ratio": found.ratio, "u_ratio": found.u_ratio, "bands": found.bands}
+
+
+def _written(folder: Path, files: dict[str, str]) -> list[str]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, words in files.items():
+            (folder / name).write_text(words, encoding="utf-8")
+    except OSError as error:
+        raise StorageError(f"{folder}: {reason(error)}. Choose another folder, or free space.") from error
+    return [str(folder / name) for name in files]
+
+
+def _say(document: dict[str, Any], console: Console) -> None:
+    from rich.table import Table
+
+    table = Table("nm", "K", "+- 95 %", "S", "+- 95 %", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    rows = list(
+        zip(
+            *(document[key] for key in ("wavelength_nm", "K", "half_width_K", "S", "half_width_S", "determined")),
+            strict=True,
+        )
+    )
+    for nm, k, wide_k, s, wide_s, sure in rows[:: max(1, len(rows) // 9)]:
+        told = [f"{value:.3g}" for value in (k, wide_k, s, wide_s)] if sure else ["hides", "", "", ""]
+        table.add_row(f"{nm:g}", *told)
+    console.print(f"{document['name']}: K and S {document['unit']}", markup=False)
+    console.print(table)
+    console.print(f"{document['model']['deserved']}: {document['model']['because']}", markup=False)
+    if document["model"]["difference"] > 0.0:
+        console.print(
+            f"directional light shows up to {document['model']['difference']:.3f} else than diffuse light"
+        )
+    if (misfit := document["misfit"]) is not None:
+        console.print(f"the films miss one K and S by {misfit:.1f} times what noise explains")
+    if grains := document.get("grains"):
+        console.print(
+            f"its grains are {grains['ratio']:.2f} +- {2 * grains['u_ratio']:.2f} times as large as those of "
+            f"{grains['than']}, if they are larger than the wavelength (S as 1/size)",
+            markup=False,
+        )
+    for path in document.get("files", ()):
+        console.print(path, markup=False)

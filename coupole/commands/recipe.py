@@ -1,0 +1,168 @@
+"""`coupole recipe TARGET`: which paints of a palette, and how much of each, are seen as a colour."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError, StorageError, reason
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from coupole.heritage.analysis.colour_match import Match
+    from coupole.heritage.analysis.recipe_search import Found, Recipe
+
+_FEWER = 3
+"""Numbers of paints shown: the chosen one, one less, two less."""
+
+
+def recipe(
+    target: Annotated[Path, typer.Argument(help="Spectrum of the colour to match.", show_default=False)],
+    palette: Annotated[
+        list[Path],
+        typer.Option(
+            "--palette",
+            help="Folder of paint files, a paint file, or a library of K and S; again for more.",
+            show_default=False,
+        ),
+    ],
+    light: Annotated[str, typer.Option("--light", help="Names, the first that of the match.")] = "D65,A",
+    at_most: Annotated[int, typer.Option("--at-most", min=1, max=8, help="Paints in a recipe.")] = 4,
+    noise: Annotated[
+        float, typer.Option("--noise", min=1e-5, max=0.1, help="Of the target's values, standard.")
+    ] = 0.005,
+    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5,
+    geometry: Annotated[
+        str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")
+    ] = "gloss excluded",
+    observer: Annotated[str, typer.Option(help="10 deg or 2 deg.")] = "10 deg",
+    out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Paints of a palette whose opaque mixture is a colour: shares, match under lights, cost of one less."""
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        names = [name.strip() for name in light.split(",") if name.strip()]
+        if not names:
+            raise InputError("--light: expected names of lights, such as D65,A; found none")
+        _refuse_unknown(geometry, observer)
+        with console.status("mixing"):
+            asked = (at_most, noise, binder_index, geometry, observer)
+            found, matches = _found(target, palette, names, *asked)
+        document = _document(found, matches)
+        if out is not None:
+            _write(out, target.stem, found, matches)
+            document["page"] = str(out)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps(document))
+    else:
+        _say(found, matches, console)
+        if out is not None:
+            console.print(str(out), markup=False)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _refuse_unknown(geometry: str, observer: str) -> None:
+    from typing import get_args
+
+    from coupole.appearance.matter.glossy_face import Geometry
+    from coupole.appearance.spectra.light import Observer
+
+    for name, given, known in (
+        ("--geometry", geometry, get_args(Geometry)),
+        ("--observer", observer, get_args(Observer)),
+    ):
+        if given not in known:
+            raise InputError(f"{name}: expected {', '.join(known)}; found {given!r}")
+
+
+def _found(
+    target: Path,
+    palette: list[Path],
+    lights: list[str],
+    at_most: int,
+    noise: float,
+    index: float,
+    geometry: Any,
+    observer: Any,
+) -> tuple[Found, list[tuple[Match, ...]]]:
+    from coupole.appearance.matter.glossy_face import face
+    from coupole.heritage.analysis.colour_match import matches
+    from coupole.heritage.analysis.layer_samples import spectrum_on_grid
+    from coupole.heritage.analysis.palette import read_palette
+    from coupole.heritage.analysis.recipe_search import find
+
+    paints = read_palette(palette)
+    try:
+        found = find(spectrum_on_grid(target), paints, face(index, geometry), noise, at_most)
+    except InputError as error:
+        raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
+    return found, [matches(found.target, one.seen, lights, observer) for one in found.recipes]
+
+
+def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:
+    return {
+        "verdict": found.verdict(),
+        "explained": found.is_explained,
+        "chosen": found.chosen + 1,
+        "noise": found.noise,
+        "bands": int(found.bands.sum()),
+        "recipes": [_told(one, under) for one, under in zip(found.recipes, matches, strict=True)],
+    }
+
+
+def _told(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
+    return {
+        "paints": len(recipe.shares),
+        "shares": recipe.shares,
+        "half_widths": recipe.half_widths,
+        "rms": recipe.rms,
+        "misfit": recipe.misfit,
+        "worst": recipe.worst,
+        "worst_nm": recipe.worst_nm,
+        "delta_e00": {m.light: m.delta_e00 for m in under},
+        "metamerism": {m.light: m.metamerism for m in under},
+    }
+
+
+def _write(path: Path, name: str, found: Found, matches: Sequence[Sequence[Match]]) -> None:
+    from coupole.viewing.recipe_page import recipe_page
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(recipe_page(name, found, matches), encoding="utf-8")
+    except OSError as error:
+        raise StorageError(f"{path}: {reason(error)}. Choose another folder, or free space.") from error
+
+
+def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> None:
+    from rich.table import Table
+
+    best = found.best
+    table = Table("paint", "share", "+- 95 %", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for name, share in sorted(best.shares.items(), key=lambda item: -item[1]):
+        table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %")
+    console.print(table)
+    for match in matches[found.chosen]:
+        left = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
+        console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{left}", markup=False)
+    console.print(f"{found.verdict()}.", markup=False)
+    for number in range(found.chosen - 1, max(-1, found.chosen - _FEWER), -1):
+        fewer = found.recipes[number]
+        told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())
+        costs = ", ".join(f"{match.delta_e00:.2f} under {match.light}" for match in matches[number])
+        console.print(f"with {number + 1}: {told}; dE00 {costs}", markup=False)

@@ -1,0 +1,115 @@
+"""Four fluxes of a film from its spectra under diffuse and under directional light (seed 000, section 3.4).
+
+K and S come from the diffuse spectra (`layer_fit`). Directional light that enters is scattered into diffuse
+light, up R_b and down T_cd, or reaches the ground as it came, Tr = exp(-mu h). Over a diffusing ground g this
+gives
+
+    R_cd(g) = R_b + tau g (T_cd + Tr)/(1 - rho g)
+
+inside the binder: two grounds give R_b and T_cd + Tr, the collimated transmittance Tr gives the rest. R_b and
+T_cd are linear in the scattering coefficients s_i and s_j at a given mu; k = mu - s_i - s_j. The paper's p and q
+are the same two numbers, and diverge where mu = b S; these equations do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.appearance.matter import four_flux, kubelka_munk
+from coupole.appearance.matter.glossy_face import Face
+from coupole.appearance.spectra.grid import Array
+from coupole.heritage.analysis import layer_fit
+from coupole.heritage.analysis.layer_fit import Coefficients, Film
+
+DRAWS = 150
+"""Of all inputs, for uncertainties (JCGM 101)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Directional:
+    """Spectra of one film under light along the normal; [n], in air, gloss excluded."""
+
+    over_black: Array
+    over_white: Array
+    transmittance: Array
+    """Collimated, of the film inside its binder: what passes without being scattered."""
+
+
+@dataclass(frozen=True, eq=False)
+class FourFlux:
+    """Coefficients for directional light, [n] per mm or of the layer, with standard uncertainties."""
+
+    direct_absorption: Array
+    """k."""
+    forward: Array
+    """s_i."""
+    backward: Array
+    """s_j."""
+    u_direct_absorption: Array
+    u_forward: Array
+    u_backward: Array
+
+
+def fit(black: Film, white: Film, directional: Directional, face: Face, noise: float, seed: int = 1) -> FourFlux:
+    """Of one film over two grounds; thickness, grounds and their uncertainties are those of the diffuse
+    `Film`s."""
+    rng = np.random.default_rng(seed)
+    n = len(black.seen)
+
+    def drawn(values: Array, u: Array | float) -> Array:
+        """[(1 + DRAWS) n]: as measured, then as it might have been."""
+        spread = np.broadcast_to(np.asarray(u, dtype=float), n)
+        noisy = values + spread * rng.standard_normal((DRAWS, n))
+        return np.concatenate([values[None], noisy]).ravel()
+
+    films = [
+        Film(drawn(film.seen, noise), drawn(_ground(film), film.u_ground), film.ground_name, 0.0, 1.0)
+        for film in (black, white)
+    ]
+    found = layer_fit.fit(films, _repeated(face, DRAWS + 1), noise)
+    light = Directional(
+        drawn(directional.over_black, noise),
+        drawn(directional.over_white, noise),
+        np.clip(drawn(directional.transmittance, noise), 1e-4, 1.0),
+    )
+    solved = _solved(found, films, light, _repeated(face, DRAWS + 1)).reshape(3, DRAWS + 1, n)
+    # Coefficients of the whole layer: those per mm follow from the thickness, the same in all bands of a draw.
+    h = black.thickness_mm * np.ones(DRAWS + 1)
+    h[1:] += black.u_thickness_mm * rng.standard_normal(DRAWS)
+    solved = solved / h[None, :, None]
+    u = 0.5 * np.subtract(*np.percentile(solved[:, 1:], [84.13, 15.87], axis=1))
+    return FourFlux(*solved[:, 0], *u)
+
+
+def _ground(film: Film) -> Array:
+    assert film.ground is not None
+    return film.ground
+
+
+def _repeated(face: Face, times: int) -> Face:
+    parts = (face.passing, face.inner, face.gloss)
+    return Face(*(np.tile(part, times) if part.ndim else part for part in parts))
+
+
+def _solved(found: Coefficients, films: list[Film], light: Directional, face: Face) -> Array:
+    """k, s_i, s_j [3, n] of the whole layer."""
+    k, s = np.maximum(found.absorption, 0.0), found.scattering
+    rho, tau = kubelka_munk.layer(k, s, 1.0)
+    seen = []
+    for film, value in zip(films, (light.over_black, light.over_white), strict=True):
+        # Light enters once as it came; what the face sends back is diffuse, as if it had come so.
+        diffuse = kubelka_munk.over(rho, tau, _ground(film))
+        seen.append((value - face.gloss) * (1.0 - face.inner * diffuse) / face.passing)
+    gains = [tau * _ground(film) / (1.0 - rho * _ground(film)) for film in films]
+    through = (seen[1] - seen[0]) / (gains[1] - gains[0])
+    up, down = seen[0] - gains[0] * through, through - light.transmittance
+    mu = -np.log(light.transmittance)
+    forwards, backwards = (
+        four_flux.response(four_flux.Layer(k, s, 0.0, mu * a, mu * (1.0 - a), 1.0)) for a in (1.0, 0.0)
+    )
+    determinant = forwards[2] * backwards[3] - forwards[3] * backwards[2]
+    s_i = mu * (up * backwards[3] - down * backwards[2]) / determinant
+    s_j = mu * (down * forwards[2] - up * forwards[3]) / determinant
+    return np.stack([mu - s_i - s_j, s_i, s_j])

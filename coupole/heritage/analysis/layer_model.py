@@ -1,0 +1,113 @@
+"""Which model a paint layer deserves, and the size of its grains (seed 000, sections 3.4 and 3.5).
+
+Two fluxes hold for light that is diffuse inside the layer: under diffuse illumination, or where the layer
+scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
+dome's LEDs, 45:0) needs four; one that hides its ground needs K/S only, from R_inf. Where spectra under
+directional light were measured, they decide. Otherwise the film is computed with four fluxes for grains that
+scatter to all sides alike, for which K = 2 k and S = 3 s/4 (Mudgett and Richards, Appl. Opt. 10, 1485, 1971): two
+fluxes suffice if what is seen of the ground by light that reached it unscattered is no more than twice the noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from coupole.appearance.matter import four_flux, kubelka_munk
+from coupole.appearance.matter.glossy_face import Face
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+from coupole.heritage.analysis.layer_fit import Coefficients, Film
+
+Model = Literal["two fluxes", "four fluxes", "K/S only"]
+
+
+@dataclass(frozen=True)
+class Deserved:
+    """The verdict, and what it rests on."""
+
+    model: Model
+    because: str
+    difference: float
+    """Largest difference over bands and grounds between what the two models show under directional light."""
+    unscattered: float
+    """Largest share over the bands of directional light that reaches the ground unscattered."""
+
+
+@dataclass(frozen=True)
+class GrainRatio:
+    """Mean size of one grinding's grains over another's."""
+
+    ratio: float
+    u_ratio: float
+    bands: int
+
+
+def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -> Deserved:
+    """From K and S alone."""
+    sure = found.determined
+    if not sure.any():
+        return Deserved(
+            "K/S only", "the films hide their grounds in every band: they tell K/S, not K and S", 0.0, 0.0
+        )
+    k, s = np.maximum(found.absorption, 0.0), found.scattering
+    total = 4.0 / 3.0 * s
+    difference, unscattered, through = 0.0, 0.0, 0.0
+    for film in films:
+        if film.ground is None:
+            continue
+        h, ground = film.thickness_mm, film.ground
+        layer = four_flux.Layer(k, s, 0.5 * k, 0.5 * total, 0.5 * total, h)
+        rho, tau, _, _, direct = four_flux.response(layer)
+        directional, _ = four_flux.reflectances(layer, four_flux.Background(ground, ground))
+        diffuse = kubelka_munk.over(rho, tau, ground)
+        leaving = face.passing / (1.0 - face.inner * diffuse)
+        difference = max(difference, float((leaving * np.abs(directional - diffuse))[sure].max()))
+        unscattered = max(unscattered, float(direct[sure].max()))
+        through = max(through, float((leaving * direct * ground * tau / (1.0 - rho * ground))[sure].max()))
+    because = (
+        f"of directional light {100.0 * unscattered:.2g} % reaches the ground unscattered, and adds up to "
+        f"{through:.3f} to what is seen; twice the noise is {2.0 * noise:.3f}"
+    )
+    model: Model = "two fluxes" if through <= 2.0 * noise else "four fluxes"
+    return Deserved(model, because, difference, unscattered)
+
+
+def deserved_by_measurement(
+    diffuse: tuple[Array, Array], directional: tuple[Array, Array], transmittance: Array, noise: float
+) -> Deserved:
+    """From spectra of one film under both kinds of light, over black and over white [n]."""
+    missed = np.stack([b - a for a, b in zip(diffuse, directional, strict=True)])
+    chi2, count = float(np.sum(missed**2) / (2.0 * noise**2)), missed.size
+    largest, unscattered = float(np.abs(missed).max()), float(transmittance.max())
+    if chi2 <= count + 3.0 * np.sqrt(2.0 * count):
+        because = f"spectra under directional light are those under diffuse light within the noise of {noise:g}"
+        return Deserved("two fluxes", because, largest, unscattered)
+    because = (
+        f"spectra under directional light differ by up to {largest:.3f} from those under diffuse light, "
+        f"{np.sqrt(chi2 / count):.1f} times the noise of their difference"
+    )
+    return Deserved("four fluxes", because, largest, unscattered)
+
+
+def grain_ratio(first: tuple[Array, Array], second: tuple[Array, Array]) -> GrainRatio:
+    """d1/d2 of two grindings of one pigment at the same concentration, from S and its uncertainty [n] of each.
+
+    Grains larger than the wavelength scatter by their cross-sections: per volume of pigment S is proportional to
+    1/d. The papers say that K and S depend on the grains and give no formula; this holds for grains above some 2
+    um. Raises InputError if no band is known well in both.
+    """
+    (s1, u1), (s2, u2) = first, second
+    relative = np.hypot(u1 / s1, u2 / s2)
+    known = np.isfinite(relative) & (relative < 0.25) & (relative > 0.0)
+    if not known.any():
+        raise InputError(
+            "grain size: expected bands in which S of both grindings is known within 25 %; found none"
+        )
+    ratios, weights = (s2 / s1)[known], relative[known] ** -2.0
+    ratio = float(np.exp(np.sum(weights * np.log(ratios)) / weights.sum()))
+    # Bands differ by more than noise where the law does not hold: their spread counts, not that over its root.
+    spread = float(np.sqrt(np.sum(weights * np.log(ratios / ratio) ** 2) / weights.sum()))
+    return GrainRatio(ratio, ratio * max(spread, float(relative[known].min())), int(known.sum()))

@@ -1,0 +1,219 @@
+"""Spectra of a paint's films and their grounds, as films for `layer_fit`; and its result as a paint file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from coupole.appearance.matter.glossy_face import Face, Geometry, face
+from coupole.appearance.matter.paint_file import PaintFile
+from coupole.appearance.spectra import measured, resampling
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+from coupole.heritage.analysis.four_flux_fit import Directional, FourFlux
+from coupole.heritage.analysis.layer_fit import Coefficients, Film
+
+_BEYOND = 5.0
+"""Standard uncertainties beyond which a contradiction is no noise."""
+_LEAST_BANDS = 3
+
+
+class _Given(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class FilmGiven(_Given):
+    """One spectrum of a film."""
+
+    spectrum: Path
+    over: Path | None = None
+    """Spectrum of the ground; none of an opaque film."""
+    thickness_um: Annotated[float, Field(gt=0)] | None = None
+    u_thickness_um: Annotated[float, Field(ge=0)] = 0.0
+    """Standard uncertainty."""
+
+
+class DirectionalGiven(_Given):
+    """The same film over the same two grounds under light along the normal."""
+
+    over_black: Path
+    over_white: Path
+    transmittance: Path
+    """Collimated, of the film without its faces."""
+
+
+class LayerGiven(_Given):
+    """What `coupole layer` works on."""
+
+    name: str = "paint"
+    binder_index: Annotated[float, Field(ge=1, le=3)] = 1.5
+    """1: the paint has no glossy face."""
+    geometry: Geometry = "gloss excluded"
+    grounds: Literal["coated", "bare"] = "coated"
+    """Whether the grounds were measured under the same glossy face, as varnished cards, or without one."""
+    noise: Annotated[float, Field(gt=0, le=0.1)] = 0.005
+    """Standard uncertainty of a spectrum's value, as a fraction."""
+    films: Annotated[tuple[FilmGiven, ...], Field(min_length=2)]
+    directional: DirectionalGiven | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Films at the bands that all spectra cover."""
+
+    wavelengths_nm: Array
+    """[n] of 380 to 780 by 5 nm."""
+    films: list[Film]
+    directional: Directional | None
+    face: Face
+    is_per_mm: bool
+
+
+def read_samples(given: LayerGiven, folder: Path) -> Samples:
+    """The spectra, their paths relative to `folder`. Raises InputError with the file for what contradicts
+    itself."""
+    films = given.films
+    known = [film.thickness_um is not None for film in films if film.over is not None]
+    if any(known) != all(known):
+        raise InputError(
+            "thickness: expected one for each film over a ground, or for none; some have one, some not"
+        )
+    one = face(given.binder_index, given.geometry)
+    paths = {film.spectrum for film in films} | {film.over for film in films if film.over is not None}
+    more = given.directional
+    if more is not None:
+        paths |= {more.over_black, more.over_white, more.transmittance}
+    spectra = {path: spectrum_on_grid(folder / path) for path in sorted(paths)}
+    bands = np.all([np.isfinite(values) for values in spectra.values()], axis=0)
+    if bands.sum() < _LEAST_BANDS:
+        raise InputError(
+            "the spectra have no common bands between 380 and 780 nm; measure them over the same range"
+        )
+    spectra = {path: values[bands] for path, values in spectra.items()}
+    nm = WAVELENGTHS_NM[bands]
+    for film in films:
+        _check_level(spectra[film.spectrum], film.spectrum, nm, one, given.noise)
+    found = [_film(film, spectra, one, given) for film in films]
+    _check_order(found, films, nm, given.noise)
+    return Samples(nm, found, _directional(given, spectra, nm, one), one, bool(known) and all(known))
+
+
+def paint_file(given: LayerGiven, samples: Samples, found: Coefficients, four: FourFlux | None) -> PaintFile:
+    """The result to keep. Where the films hide their grounds S is drawn straight between bands that tell it, with
+    an uncertainty of 100 %; if they do so in all bands, K and S are relative to a scattering of 1. K below 0 is
+    kept as 0. The head says where."""
+    nm, sure = samples.wavelengths_nm, found.determined
+    ratio = np.maximum(found.absorption, 0.0) / found.scattering
+    unit: Literal["per mm", "per layer", "relative"] = "per mm" if samples.is_per_mm else "per layer"
+    if sure.any():
+        s = np.interp(nm, nm[sure], found.scattering[sure])
+        u_k, u_s = np.where(sure, found.u_absorption, ratio * s), np.where(sure, found.u_scattering, s)
+    else:
+        unit, s, u_k, u_s = "relative", np.ones(len(nm)), np.zeros(len(nm)), np.zeros(len(nm))
+    told: dict[str, Any] = {"noise": given.noise, "geometry": given.geometry, "grounds": given.grounds}
+    told["spectra"] = [film.spectrum.name for film in given.films]
+    if len(thicknesses := sorted({film.thickness_um for film in given.films if film.thickness_um})):
+        told["thickness_um"] = thicknesses
+    if sure.any() and not sure.all():
+        told["assumed_scattering_at_nm"] = [float(value) for value in nm[~sure]]
+    if (below := found.absorption < 0.0).any():
+        told["absorption_set_to_0_at_nm"] = [float(value) for value in nm[below]]
+    other = {}
+    if four is not None:
+        other = {"k": four.direct_absorption, "s_i": four.forward, "s_j": four.backward}
+        other |= {"u_k": four.u_direct_absorption, "u_s_i": four.u_forward, "u_s_j": four.u_backward}
+    return PaintFile(given.name, unit, given.binder_index, nm, ratio * s, s, u_k, u_s, told, other)
+
+
+def spectrum_on_grid(path: Path) -> Array:
+    """[81], NaN outside the measurement. Raises InputError for gaps."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a spectrum")
+    values = resampling.on_grid(measured.read_spectrum(path)).values
+    known = np.flatnonzero(np.isfinite(values))
+    missing = known[0] + np.flatnonzero(np.isnan(values[known[0] : known[-1]]))
+    if len(missing):
+        nm = WAVELENGTHS_NM[missing]
+        raise InputError(f"{path}: has a gap of more than 20 nm about {nm[0]:g} nm; measure it there, too")
+    return np.asarray(values)
+
+
+def _film(film: FilmGiven, spectra: dict[Path, Array], one: Face, given: LayerGiven) -> Film:
+    seen = spectra[film.spectrum]
+    if film.over is None:
+        return Film(seen, None)
+    ground = spectra[film.over]
+    u_ground: Array | float = given.noise
+    if given.grounds == "coated":
+        below = ground - one.gloss
+        u_ground = given.noise * one.passing / (one.passing + one.inner * below) ** 2
+        ground = below / (one.passing + one.inner * below)
+    if ground.min() < -_BEYOND * given.noise or ground.max() > 1.0 + _BEYOND * np.max(u_ground):
+        raise InputError(
+            f"{film.over}: as a ground under a glossy face it would reflect {ground.min():.3g} to "
+            f"{ground.max():.3g} inside; expected 0 to 1: see `grounds` (bare), and whether gloss is included"
+        )
+    h, u_h = 1.0, 0.0
+    if film.thickness_um is not None:
+        h, u_h = 1e-3 * film.thickness_um, 1e-3 * film.u_thickness_um
+    return Film(seen, np.clip(ground, 0.0, 1.0), str(film.over), u_ground, h, u_h)
+
+
+def _check_level(seen: Array, path: Path, nm: Array, one: Face, noise: float) -> None:
+    low, high = np.broadcast_to(one.gloss, seen.shape), np.broadcast_to(one.brightest, seen.shape)
+    wrong = np.flatnonzero((seen < low - _BEYOND * noise) | (seen > high + _BEYOND * noise))
+    if len(wrong):
+        at = wrong[0]
+        raise InputError(
+            f"{path}: is {seen[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as {low[at]:.3g} to "
+            f"{high[at]:.3g}: see whether gloss is included, the binder's index, and percent or fractions"
+        )
+
+
+def _check_order(films: Sequence[Film], given: Sequence[FilmGiven], nm: Array, noise: float) -> None:
+    """Raises InputError for a film that is darker over the lighter of two grounds."""
+    for (a, told_a), (b, told_b) in combinations(zip(films, given, strict=True), 2):
+        if a.ground is None or b.ground is None or a.thickness_mm != b.thickness_mm:
+            continue
+        lighter = np.sign(b.ground - a.ground)
+        wrong = np.flatnonzero(
+            (lighter * (b.seen - a.seen) < -_BEYOND * np.sqrt(2.0) * noise) & (np.abs(b.ground - a.ground) > 0.05)
+        )
+        if len(wrong):
+            at = wrong[0]
+            light, dark = (told_b, told_a) if lighter[at] > 0 else (told_a, told_b)
+            raise InputError(
+                f"{light.spectrum}: is darker over the lighter ground {light.over} than {dark.spectrum} over "
+                f"{dark.over} at {nm[at]:g} nm; see which spectrum is which, and percent or fractions"
+            )
+
+
+def _directional(given: LayerGiven, spectra: dict[Path, Array], nm: Array, one: Face) -> Directional | None:
+    asked = given.directional
+    if asked is None:
+        return None
+    grounds = [film.over for film in given.films]
+    thicknesses = {film.thickness_um for film in given.films}
+    if len(given.films) != 2 or None in grounds or len(thicknesses) != 1:
+        raise InputError(
+            "directional: expected `films` to be one film over black, then over white, by diffuse light"
+        )
+    black, white = (spectra[ground] for ground in grounds if ground is not None)
+    if not np.all(white > black):
+        raise InputError(
+            "directional: expected `films` to be over black first, then over white; found white first"
+        )
+    for path in (asked.over_black, asked.over_white):
+        _check_level(spectra[path], path, nm, one, given.noise)
+    through = spectra[asked.transmittance]
+    if through.min() < -_BEYOND * given.noise or through.max() > 1.0 + _BEYOND * given.noise:
+        raise InputError(
+            f"{asked.transmittance}: expected a transmittance of 0 to 1, found up to {through.max():.3g}"
+        )
+    return Directional(spectra[asked.over_black], spectra[asked.over_white], through)

@@ -1,0 +1,120 @@
+"""Paints to mix with: paint files of `coupole layer`, and libraries of K and S."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from coupole.appearance.matter.paint_file import ENDING, read_paint
+from coupole.appearance.spectra import resampling
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.appearance.spectra.measured import Measured
+from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_library
+from coupole.errors import InputError
+
+_LIBRARIES = {".rs", ".tsv"}
+_ALIKE = 1e-3
+"""Relative difference of K and S below which two paints are one."""
+_RELATIVE = "relative"
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """One paint; [81], NaN in bands where it is not known."""
+
+    name: str
+    source: str
+    """File, with the line if there are several."""
+    unit: str
+    absorption: Array
+    scattering: Array
+    u_absorption: Array
+    u_scattering: Array
+
+
+def read_palette(sources: Sequence[Path]) -> tuple[Paint, ...]:
+    """All paints of files and folders. Raises InputError for what cannot be mixed: doublets, different units."""
+    paints: list[Paint] = []
+    for source in sources:
+        for path in _files(source):
+            paints += [_of_file(path)] if path.name.endswith(ENDING) else _of_library(path)
+    for a, b in combinations(paints, 2):
+        if a.name == b.name:
+            raise InputError(
+                f"{a.source} and {b.source}: two paints are named {a.name!r}; leave one out, or rename it"
+            )
+        if _is_same(a, b):
+            raise InputError(
+                f"{a.source} and {b.source}: {a.name!r} and {b.name!r} have the same K and S; their shares "
+                "cannot be told apart: leave one out"
+            )
+        if a.unit != b.unit:
+            raise InputError(
+                f"{a.source} is {a.unit}, {b.source} is {b.unit}: paints of different units cannot be mixed; "
+                "measure all of them with their thickness"
+            )
+    if "per layer" in {paint.unit for paint in paints} and len(paints) > 1:
+        raise InputError(
+            f"{paints[0].source}: K and S are of a layer of unknown thickness, not to be compared with others; "
+            "measure it with its thickness"
+        )
+    if not paints:
+        raise InputError(f"{', '.join(map(str, sources))}: expected paints ({ENDING}, or a library); found none")
+    return tuple(paints)
+
+
+def _files(source: Path) -> list[Path]:
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder; expected a palette")
+    if not source.is_dir():
+        return [source]
+    found = [p for p in source.iterdir() if p.name.endswith(ENDING) or p.suffix.lower() in _LIBRARIES]
+    return sorted(found)
+
+
+def _of_file(path: Path) -> Paint:
+    read = read_paint(path)
+    pigment = read.on_grid()
+    u_k, u_s = read.uncertainties_on_grid()
+    known = read.covered()
+    k, s = (np.where(known, values, np.nan) for values in (pigment.absorption, pigment.scattering))
+    return Paint(read.name, str(path), read.unit, k, s, u_k, u_s)
+
+
+def _of_library(path: Path) -> list[Paint]:
+    spectra = read_library(path)
+    if all(one.absorption is None for one in spectra):
+        raise InputError(
+            f"{path}: expected K and S of each paint, found reflectances: they do not tell how paints mix"
+        )
+    return [_of_row(one) for one in spectra]
+
+
+def _of_row(row: LibrarySpectrum) -> Paint:
+    """A paint is not known in bands where a library has K below 0 or S not above 0."""
+    place = f"{row.file}:{row.line}"
+    if row.absorption is None or row.scattering is None:
+        raise InputError(f"{place}: {row.name}: expected K and S, found a reflectance; leave the row out")
+    on_grid = []
+    known = (row.absorption >= 0.0) & (row.scattering > 0.0)
+    for values in (row.absorption, row.scattering):
+        one = resampling.on_grid(Measured(row.name, row.wavelengths_nm, values, ()))
+        near = np.interp(WAVELENGTHS_NM, row.wavelengths_nm, known.astype(float))
+        on_grid.append(np.where((near > 0.999) & (one.values >= 0.0), one.values, np.nan))
+    k, s = on_grid
+    nothing = np.zeros(len(WAVELENGTHS_NM))
+    return Paint(row.name, place, _RELATIVE, k, np.where(s > 0.0, s, np.nan), nothing, nothing)
+
+
+def _is_same(a: Paint, b: Paint) -> bool:
+    both = np.isfinite(a.absorption + b.absorption + a.scattering + b.scattering)
+    if not both.any():
+        return False
+    return all(
+        bool(np.allclose(x[both], y[both], rtol=_ALIKE, atol=_ALIKE * float(np.nanmax(y))))
+        for x, y in ((a.absorption, b.absorption), (a.scattering, b.scattering))
+    )

@@ -1,0 +1,256 @@
+"""The recipe of a colour: shares of paints whose opaque mixture is seen as a target (Duncan 1949).
+
+K and S of a mixture are sums by share. Subsets of the palette are compared by the linear problem sum c_i (K_i - Q
+S_i) = 0 with Q the target's K/S, weighted to residuals of what is seen; the best few are refined by least squares
+on what is seen itself, with shares not negative. Up to `_EXHAUSTIVE` subsets of a size all are tried, beyond that
+the best subset grows paint by paint, with exchanges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.matter import kubelka_munk
+from coupole.appearance.matter.glossy_face import Face, InternalReflectance, MeasuredReflectance
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+from coupole.heritage.analysis.layer_fit import COVERAGE_FACTOR
+from coupole.heritage.analysis.palette import Paint
+
+_EXHAUSTIVE = 5000
+_REFINED = 6
+_WORTH = 16.0
+"""Squared standard uncertainties by which one paint more must improve a recipe to be worth it."""
+_EXPLAINED = 1.5
+"""Root mean square residual over its uncertainty up to which a recipe explains the target."""
+_LEAST_BANDS = 10
+_DARKEST = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """The best mixture of a number of paints."""
+
+    shares: dict[str, float]
+    """Of the paints used; they sum to 1."""
+    half_widths: dict[str, float]
+    """Of their 95 % intervals."""
+    seen: Array
+    """[81], what the mixture shows, NaN in bands that were not compared."""
+    rms: float
+    """Root mean square of what it misses."""
+    misfit: float
+    """The same over what noise and the uncertainty of the paints' K and S explain."""
+    worst: float
+    """Largest difference, recipe less target, of the mean over five bands."""
+    worst_nm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Recipes of 1, 2, ... paints, and which of them is worth its paints."""
+
+    recipes: tuple[Recipe, ...]
+    chosen: int
+    """Index in `recipes`."""
+    target: Array
+    """[81], seen."""
+    bands: NDArray[np.bool_]
+    noise: float
+
+    @property
+    def best(self) -> Recipe:
+        """The one to mix."""
+        return self.recipes[self.chosen]
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether noise, and K and S of the paints, explain what the best recipe misses."""
+        return self.best.misfit <= _EXPLAINED
+
+    def verdict(self) -> str:
+        """In plain words."""
+        best = self.best
+        if self.is_explained:
+            return f"the palette explains the target, missed by {best.misfit:.1f} times its uncertainty"
+        kind = "lighter" if best.worst > 0.0 else "darker"
+        lacks = "absorbs" if best.worst > 0.0 else "absorbs less, or scatters more,"
+        return (
+            f"no mixture of this palette is the target: it is missed by {best.misfit:.1f} times its uncertainty, "
+            f"most about {best.worst_nm:g} nm, where the recipe is {abs(best.worst):.3f} {kind}. A paint is "
+            f"missing that {lacks} there"
+        )
+
+
+def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_most: int) -> Found:
+    """Recipes of up to `at_most` paints for `target`, [81] as seen in air, NaN where it was not measured.
+
+    Raises InputError for a target that no paint under the face can show, or without bands that all paints have.
+    """
+    bands = np.isfinite(target) & np.all(
+        [np.isfinite(paint.absorption) & np.isfinite(paint.scattering) for paint in palette], axis=0
+    )
+    if bands.sum() < _LEAST_BANDS:
+        raise InputError(
+            f"target and palette have {int(bands.sum())} common bands between 380 and 780 nm; expected "
+            f"{_LEAST_BANDS} or more: leave out the paint that is known in few"
+        )
+    problem = _Problem(target[bands], palette, bands, face, noise)
+    recipes: list[Recipe] = []
+    before: list[tuple[int, ...]] = [()]
+    for size in range(1, min(at_most, len(palette)) + 1):
+        candidates = _subsets(len(palette), size, before)
+        ranked = sorted(candidates, key=problem.roughly)[:_REFINED]
+        refined = sorted((problem.refined(subset) for subset in ranked), key=lambda found: found[0])
+        before = [subset for _, subset, _ in refined[:3]]
+        recipes.append(problem.recipe(refined[0][1], refined[0][2]))
+    return Found(tuple(recipes), _chosen(recipes, int(bands.sum())), target, bands, noise)
+
+
+def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterable[tuple[int, ...]]:
+    if comb(count, size) <= _EXHAUSTIVE:
+        return combinations(range(count), size)
+    grown = {tuple(sorted({*one, new})) for one in before for new in range(count) if new not in one}
+    if len(grown) * size * count > 10 * _EXHAUSTIVE:
+        return grown
+    others = range(count)
+    return grown | {
+        tuple(sorted({*one, new} - {old})) for one in grown for old in one for new in others if new not in one
+    }
+
+
+def _chosen(recipes: Sequence[Recipe], bands: int) -> int:
+    """The fewest to which one more paint adds nothing beyond noise, or what no palette explains."""
+    scale = max(1.0, recipes[-1].misfit)
+    for number, (one, more) in enumerate(pairwise(recipes)):
+        if bands * (one.misfit**2 - more.misfit**2) / scale**2 < _WORTH:
+            return number
+    return len(recipes) - 1
+
+
+class _Problem:
+    """The target, and what subsets of the palette make of it."""
+
+    def __init__(
+        self, target: Array, palette: Sequence[Paint], bands: NDArray[np.bool_], face: Face, noise: float
+    ) -> None:
+        self.target, self.palette, self.bands, self.noise = target, palette, bands, noise
+        self.face = Face(
+            *(np.broadcast_to(part, bands.shape)[bands] for part in (face.passing, face.inner, face.gloss))
+        )
+        self.k = np.stack([paint.absorption[bands] for paint in palette], axis=1)
+        self.s = np.stack([paint.scattering[bands] for paint in palette], axis=1)
+        clipped = np.clip(target, self.face.gloss, self.face.brightest * (1.0 - 1e-6))
+        if np.abs(clipped - target).max() > 5.0 * noise:
+            at = int(np.argmax(np.abs(clipped - target)))
+            raise InputError(
+                f"the target is {target[at]:.3g} at {WAVELENGTHS_NM[bands][at]:g} nm, which no paint under this "
+                "face shows: see whether gloss is included, and percent or fractions"
+            )
+        inside = np.maximum(self.face.inside(MeasuredReflectance(clipped)).values, _DARKEST)
+        q = kubelka_munk.k_over_s(inside)
+        # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about those of what is seen.
+        slope = inside / np.sqrt(np.maximum(q * (q + 2.0), 1e-9))
+        slope = slope * self.face.passing / (1.0 - self.face.inner * inside) ** 2
+        self.system = slope[:, None] * (self.k - q[:, None] * self.s)
+
+    def roughly(self, subset: tuple[int, ...]) -> float:
+        """Root mean square residual of the linear problem's mixture."""
+        shares = self._linear(subset)
+        return float(np.mean((self._seen(subset, shares) - self.target) ** 2))
+
+    def refined(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
+        """Squared residuals over their variances, and shares that are not negative."""
+        from scipy.optimize import least_squares
+
+        if len(subset) == 1:
+            return self._cost(subset, np.ones(1)), subset, np.ones(1)
+        start = np.maximum(self._linear(subset), 1e-6)
+        u = np.sqrt(self.noise**2 + self._of_palette(subset, start / start.sum()))
+        found = least_squares(
+            lambda c: np.append((self._seen(subset, c) - self.target) / u, c.sum() - 1.0),
+            start / start.sum(),
+            bounds=(0.0, 2.0),
+            x_scale=np.maximum(start / start.sum(), 1e-3),
+        )
+        shares = found.x / found.x.sum()
+        return 2.0 * float(found.cost), subset, shares
+
+    def _cost(self, subset: tuple[int, ...], shares: Array) -> float:
+        u2 = self.noise**2 + self._of_palette(subset, shares)
+        return float(np.sum((self._seen(subset, shares) - self.target) ** 2 / u2))
+
+    def recipe(self, subset: tuple[int, ...], shares: Array) -> Recipe:
+        seen = self._seen(subset, shares)
+        missed = seen - self.target
+        smooth = np.convolve(missed, np.ones(5) / 5.0, mode="same")
+        at = int(np.argmax(np.abs(smooth)))
+        whole = np.full(len(self.bands), np.nan)
+        whole[self.bands] = seen
+        names = [self.palette[i].name for i in subset]
+        variance = self.noise**2 + self._of_palette(subset, shares)
+        misfit = float(np.sqrt(np.mean(missed**2 / variance)))
+        widths = COVERAGE_FACTOR * self._uncertainty(subset, shares, max(1.0, misfit) ** 2 * variance)
+        return Recipe(
+            dict(zip(names, map(float, shares), strict=True)),
+            dict(zip(names, map(float, widths), strict=True)),
+            whole,
+            float(np.sqrt(np.mean(missed**2))),
+            misfit,
+            float(smooth[at]),
+            float(WAVELENGTHS_NM[self.bands][at]),
+        )
+
+    def _linear(self, subset: tuple[int, ...]) -> Array:
+        from scipy.optimize import nnls
+
+        if len(subset) == 1:
+            return np.ones(1)
+        columns = list(subset)
+        size = self.s[:, columns].mean(axis=0)
+        system = self.system[:, columns] / size
+        heavy = 10.0 * np.abs(system).max() + 1e-9
+        found, _ = nnls(np.vstack([system, np.full(len(subset), heavy)]), np.append(np.zeros(len(system)), heavy))
+        return np.asarray(found / size / (found / size).sum())
+
+    def _seen(self, subset: tuple[int, ...], shares: Array) -> Array:
+        columns = list(subset)
+        k, s = self.k[:, columns] @ shares, self.s[:, columns] @ shares
+        return self.face.seen(InternalReflectance(kubelka_munk.opaque(k / s))).values
+
+    def _uncertainty(self, subset: tuple[int, ...], shares: Array, variance: Array) -> Array:
+        """Standard uncertainty of the shares, from the variance [bands] of recipe less target."""
+        count = len(subset)
+        if count == 1:
+            return np.zeros(1)
+        step = 1e-6
+        slopes = np.stack(
+            [(self._seen(subset, shares + step * e) - self._seen(subset, shares)) / step for e in np.eye(count)],
+            axis=1,
+        )
+        # Shares sum to 1: only changes within that plane count.
+        _, _, rows = np.linalg.svd(np.ones((1, count)))
+        plane = rows[1:].T
+        weight = 1.0 / np.sqrt(variance)
+        gain = plane @ np.linalg.pinv(weight[:, None] * (slopes @ plane)) * weight
+        return np.asarray(np.sqrt(np.einsum("ib,b,ib->i", gain, variance, gain)))
+
+    def _of_palette(self, subset: tuple[int, ...], shares: Array) -> Array:
+        """Variance [bands] of what is seen from K and S of the paints."""
+        columns = list(subset)
+        k, s = self.k[:, columns] @ shares, self.s[:, columns] @ shares
+        variance = np.zeros(len(k))
+        for i, share in zip(subset, shares, strict=True):
+            paint = self.palette[i]
+            for u, at in ((paint.u_absorption, (1.0, 0.0)), (paint.u_scattering, (0.0, 1.0))):
+                step = 1e-6 * (k + s)
+                moved = kubelka_munk.opaque((k + at[0] * step) / (s + at[1] * step))
+                change = self.face.seen(InternalReflectance(moved)).values - self._seen(subset, shares)
+                variance += (change / step * share * u[self.bands]) ** 2
+        return variance

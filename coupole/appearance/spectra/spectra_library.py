@@ -1,0 +1,214 @@
+"""Libraries of spectra: tables with one spectrum a row, files with one spectrum each, and folders of either.
+
+A row is a name, then numbers, separated by tabs, semicolons or commas. The wavelengths in nm are in the first
+line, after any name, or in a file `spectra.txt` beside the table. A row with as many numbers as wavelengths is a
+reflectance, one with twice as many is absorption K, then scattering S of Kubelka and Munk. All other files are read
+as `measured` reads them. Values are percent if the highest of the file is 2.5 or more, fractions if it is 1.05 or
+less.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coupole.appearance.matter import kubelka_munk
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.measured import Unit, decoded, parse_spectrum
+from coupole.errors import InputError, Problem, reason
+
+WAVELENGTHS = "spectra.txt"
+_ENDINGS = {".rs", ".tsv", ".csv", ".txt", ".asc"}
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?")
+_NM = (150.0, 3000.0)
+_FRACTION_AT_MOST, _PERCENT_AT_LEAST = 1.05, 2.5
+_REFLECTANCE = (-0.02, 1.5)
+_LEAST_BANDS = 3
+
+
+@dataclass(frozen=True)
+class LibrarySpectrum:
+    """One spectrum with its place in a file."""
+
+    name: str
+    file: str
+    line: int
+    """0 if the file holds this spectrum only."""
+    wavelengths_nm: Array
+    """[n], rising."""
+    reflectance: Array
+    """[n], fraction. Of K and S: that of an opaque layer; NaN where K is negative or S not positive."""
+    absorption: Array | None = None
+    """K [n] in the file's unit, the same as of S; None if reflectance was measured."""
+    scattering: Array | None = None
+
+
+def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, ...]:
+    """All spectra of a table, of a file with one spectrum, or of a folder of such files (not of folders in it).
+
+    Raises InputError, with file and line, for what cannot be read without guessing, and for names that come twice.
+    """
+    if path.is_dir():
+        files = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and f.name != WAVELENGTHS)
+        if not files:
+            raise InputError(f"{path}: expected spectra, {', '.join(sorted(_ENDINGS))}; found none")
+    else:
+        files = [path]
+    found = [spectrum for file in files for spectrum in _read_file(file, unit)]
+    seen: dict[str, LibrarySpectrum] = {}
+    for spectrum in found:
+        if spectrum.name in seen:
+            before = seen[spectrum.name]
+            raise _wrong(
+                spectrum.file,
+                spectrum.line,
+                f"the name {spectrum.name!r} is that of {before.file}:{before.line} too; "
+                "give each spectrum a name of its own",
+            )
+        seen[spectrum.name] = spectrum
+    return tuple(found)
+
+
+def _read_file(path: Path, unit: Unit) -> list[LibrarySpectrum]:
+    try:
+        text = decoded(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: {reason(error)}") from error
+    lines = [(number, line.strip("\r ")) for number, line in enumerate(text.split("\n"), start=1)]
+    rows = [(number, *_named(line)) for number, line in lines if line.strip() and not line.startswith("#")]
+    if not any(_are_numbers(fields) for _, name, fields in rows if name and not _NUMBER.fullmatch(name)):
+        one = parse_spectrum(text, str(path), name=path.stem, unit=unit)
+        return [LibrarySpectrum(one.name, str(path), 0, one.wavelengths_nm, one.values)]
+    nm, rows = _wavelengths(path, rows)
+    numbers = [_numbers(path, nm, *row) for row in rows]
+    scale = _scale(path, nm, numbers, rows, unit)
+    return [
+        _spectrum(path, nm, values * scale if len(values) == len(nm) else values, number, name)
+        for values, (number, name, _) in zip(numbers, rows, strict=True)
+    ]
+
+
+def _spectrum(path: Path, nm: Array, values: Array, line: int, name: str) -> LibrarySpectrum:
+    order = np.argsort(nm)
+    if len(values) == len(nm):
+        return LibrarySpectrum(name, str(path), line, nm[order], values[order])
+    k, s = values[: len(nm)][order], values[len(nm) :][order]
+    known = (k >= 0.0) & (s > 0.0)
+    if not known.any():
+        raise _wrong(str(path), line, f"{name}: expected K and S that are positive, found none; see the export")
+    reflectance = np.full(len(nm), np.nan)
+    reflectance[known] = kubelka_munk.opaque(k[known] / s[known])
+    return LibrarySpectrum(name, str(path), line, nm[order], reflectance, k, s)
+
+
+def _named(line: str) -> tuple[str, list[str]]:
+    """Name and fields of a row. Tabs may be several, to align columns; of other separators each begins a field."""
+    quoted = re.match(r'"([^"]*)"', line)
+    rest = line[quoted.end() :] if quoted else line
+    separator = next((mark for mark in "\t;," if mark in rest), None)
+    fields = [field.strip() for field in rest.split(separator)]
+    name = quoted.group(1) if quoted else fields[0]
+    fields = fields[1:]
+    while fields and not fields[-1]:
+        fields.pop()
+    return " ".join(name.split()), [field for field in fields if field] if separator in ("\t", None) else fields
+
+
+def _are_numbers(fields: Sequence[str]) -> bool:
+    return len(fields) >= _LEAST_BANDS and all(_NUMBER.fullmatch(field) for field in fields)
+
+
+Row = tuple[int, str, list[str]]
+
+
+def _wavelengths(path: Path, rows: list[Row]) -> tuple[Array, list[Row]]:
+    """Wavelengths [n] from the first line or the file beside, and the rows of spectra."""
+    number, _, fields = rows[0]
+    beside = path.parent / WAVELENGTHS
+    first = np.array([_value(field) for field in fields]) if _are_numbers(fields) else np.zeros(0)
+    if len(first) and (np.all(first >= _NM[0]) or not beside.is_file()):
+        source, rows = str(path), rows[1:]
+    elif beside.is_file():
+        source, number = str(beside), 1
+        words = decoded(beside.read_bytes()).split()
+        if wrong := [word for word in words if not _NUMBER.fullmatch(word)]:
+            raise _wrong(source, 1, f"expected wavelengths in nm, found {wrong[0]!r}; correct the file")
+        first = np.array([_value(word) for word in words])
+    else:
+        raise _wrong(
+            str(path), number, f"expected wavelengths in nm in the first line, or in {beside}; found neither"
+        )
+    step = np.sign(np.diff(first))
+    if len(first) < _LEAST_BANDS or not (np.all(step == 1.0) or np.all(step == -1.0)):
+        raise _wrong(
+            source,
+            number,
+            f"expected {_LEAST_BANDS} or more wavelengths in nm that all rise or all fall; found "
+            f"{', '.join(f'{v:g}' for v in first[:4])}, ...: give them in the first line, or in {beside}",
+        )
+    if not np.all((first >= _NM[0]) & (first <= _NM[1])):
+        remedy = "micrometres? give them in nm" if np.all(first < 10.0) else "give them in nm"
+        raise _wrong(
+            source, number, f"expected wavelengths of {_NM[0]:g} to {_NM[1]:g} nm, found {first[0]:g} to "
+            f"{first[-1]:g}; {remedy}"
+        )  # fmt: skip
+    if not rows:
+        raise _wrong(source, number, "expected spectra below the wavelengths, found none")
+    return first, rows
+
+
+def _numbers(path: Path, nm: Array, line: int, name: str, fields: list[str]) -> Array:
+    if not name:
+        raise _wrong(str(path), line, "expected a name, then numbers; found no name")
+    for index, field in enumerate(fields):
+        if not _NUMBER.fullmatch(field):
+            what = f"{field!r}" if field else "an empty field"
+            raise _wrong(
+                str(path),
+                line,
+                f"{name}: expected a number at {nm[index % len(nm)]:g} nm, found {what}; measure it again, or "
+                "leave the spectrum out",
+            )
+    if len(fields) not in (len(nm), 2 * len(nm)):
+        raise _wrong(
+            str(path),
+            line,
+            f"{name}: expected {len(nm)} numbers (reflectance) or {2 * len(nm)} (K, then S), one for each "
+            f"wavelength; found {len(fields)}",
+        )
+    return np.array([_value(field) for field in fields])
+
+
+def _scale(path: Path, nm: Array, numbers: list[Array], rows: list[Row], unit: Unit) -> float:
+    """What turns the file's reflectances into fractions; checks them."""
+    spectra = [(values, row) for values, row in zip(numbers, rows, strict=True) if len(values) == len(nm)]
+    if not spectra:
+        return 1.0
+    highest, (line, name, _) = max(spectra, key=lambda item: float(item[0].max()))
+    peak = float(highest.max())
+    if unit == "auto" and _FRACTION_AT_MOST < peak < _PERCENT_AT_LEAST:
+        raise _wrong(str(path), line, f"{name}: {peak:g} may be percent or a fraction; say which with `unit`")
+    scale = 0.01 if unit == "percent" or (unit == "auto" and peak >= _PERCENT_AT_LEAST) else 1.0
+    low, high = _REFLECTANCE
+    for values, (at, named, _) in spectra:
+        outside = np.flatnonzero((values * scale < low) | (values * scale > high))
+        if len(outside):
+            raise _wrong(
+                str(path),
+                at,
+                f"{named}: expected a reflectance of {low:g} to {high:g}, found {values[outside[0]] * scale:g} at "
+                f"{nm[outside[0]]:g} nm; see whether it is percent or a fraction",
+            )
+    return scale
+
+
+def _value(field: str) -> float:
+    return float(field.replace(",", "."))
+
+
+def _wrong(file: str, line: int, message: str) -> InputError:
+    return InputError([Problem(file, line, 1 if line else 0, "", message)])

@@ -2,9 +2,9 @@
 
 A row is a name, then numbers, separated by tabs, semicolons or commas. The wavelengths in nm are in the first
 line, after any name, or in a file `spectra.txt` beside the table. A row with as many numbers as wavelengths is a
-reflectance, one with twice as many is absorption K, then scattering S of Kubelka and Munk. All other files are read
-as `measured` reads them. Values are percent if the highest of the file is 2.5 or more, fractions if it is 1.05 or
-less.
+reflectance, one with twice as many is absorption K, then scattering S of Kubelka and Munk. All other files are
+read as `measured` reads them. Values are percent if the highest of the file is 2.5 or more, fractions if it is
+1.05 or less.
 """
 
 from __future__ import annotations

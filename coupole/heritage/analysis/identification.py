@@ -79,6 +79,7 @@ class Finding:
     evidence: Evidence
     near_infrared: bool
     """Whether bands beyond 780 nm were compared."""
+    remarks: tuple[str, ...]
     rates: HeldOutRates
 
 
@@ -87,7 +88,7 @@ def identify(spectrum: Measured, references: References) -> Finding:
 
     Raises InputError if these are fewer than 16 bands of 10 nm.
     """
-    values = on_bands(spectrum)
+    values, left_out = references.without_stray_light(on_bands(spectrum))
     of_bands = references.of_bands(spectrum.name, values)
     seen = values[of_bands.bands]
     model = of_bands.model
@@ -120,6 +121,7 @@ def identify(spectrum: Measured, references: References) -> Finding:
         parts,
         _evidence(of_bands, seen, nearest[order[0]], nearest[order[1]]),
         bool(BANDS_NM[of_bands.bands[-1]] > NEAR_INFRARED_NM),
+        (left_out,) if left_out else (),
         of_bands.rates,
     )
 

@@ -22,6 +22,9 @@ _LEAST_CLASSES, _LEAST_SPECTRA = 2, 4
 _COVERED = 0.9
 """Share of the references that must have been measured in a band for it to count."""
 _SAME = 1e-4
+_VIOLET_NM = 460.0
+_RISE_BEYOND = 0.1
+"""Of the logarithm of reflectance over 20 nm, beyond that of the references."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,25 @@ class References:
             values = self.reflectance[np.ix_(rows, bands)]
             self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
         return self._prepared[key]
+
+    def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
+        """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if anything.
+
+        Pigments absorb more towards the ultraviolet; instruments have least light there, and stray light shows.
+        """
+        violet = np.flatnonzero(BANDS_NM < _VIOLET_NM)
+        with np.errstate(invalid="ignore"):
+            of_all = np.log(np.maximum(np.vstack([reflectance, self.reflectance]), 0.005))
+            rise = of_all[:, violet] - of_all[:, violet + 2]
+            step = reflectance[violet] - reflectance[violet + 2]
+            most = np.nanmax(rise[1:], initial=0.0) + _RISE_BEYOND
+            wrong = np.flatnonzero((rise[0] > most) & (step > 0.005))
+        if not len(wrong):
+            return reflectance, ""
+        last = violet[wrong[-1]]
+        kept = reflectance.copy()
+        kept[: last + 1] = np.nan
+        return kept, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
 
     def without_class(self, class_name: str) -> References:
         """The library as if it had never had a class."""

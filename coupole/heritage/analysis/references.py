@@ -148,7 +148,7 @@ class References:
             names = tuple(sorted({self.class_of[row] for row in rows}))
             classes = np.array([names.index(self.class_of[row]) for row in rows])
             values = self.reflectance[np.ix_(rows, bands)]
-            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
+            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, BANDS_NM[bands], classes, names))
         return self._prepared[key]
 
     def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
@@ -162,7 +162,7 @@ class References:
             rise = of_all[:, violet] - of_all[:, violet + 2]
             step = reflectance[violet] - reflectance[violet + 2]
             most = np.nanmax(rise[1:], initial=0.0) + _RISE_BEYOND
-            wrong = np.flatnonzero((rise[0] > most) & (step > 0.005))
+            wrong = np.flatnonzero((rise[0] > most) & (step > 0.002))
         if not len(wrong):
             return reflectance, ""
         last = violet[wrong[-1]]

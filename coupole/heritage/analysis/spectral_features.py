@@ -21,15 +21,17 @@ _DARKEST, _LIGHTEST = 0.008, 0.99
 _SLOPE_BANDS = 2
 _SLOPE, _REFLECTANCE, _LEVEL = 3.0, 0.5, 0.3
 _APPEARANCES = (
-    # K/S by a factor, share of light that the surface returns from within, share that it adds
-    (1.0, 0.0, 0.0),
-    (0.4, 0.0, 0.0),
-    (2.5, 0.0, 0.0),
-    (6.0, 0.0, 0.0),
-    (15.0, 0.0, 0.0),
-    (1.6, 0.45, 0.0),
-    (1.6, 0.0, 0.02),
+    # K/S by a factor, share of light that the surface returns from within, share that it adds, stray light at 380 nm
+    (1.0, 0.0, 0.0, 0.0),
+    (0.4, 0.0, 0.0, 0.0),
+    (2.5, 0.0, 0.0, 0.0),
+    (6.0, 0.0, 0.0, 0.0),
+    (15.0, 0.0, 0.0, 0.0),
+    (1.6, 0.45, 0.0, 0.0),
+    (1.6, 0.0, 0.02, 0.0),
+    (6.0, 0.0, 0.0, 0.01),
 )
+_STRAY_FALLS_NM = 60.0
 _SURFACE = 0.04
 
 
@@ -43,18 +45,20 @@ def log_k_over_s(reflectance: Array) -> Array:
     return np.log(kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST)))
 
 
-def appearances(reflectance: Array) -> Array:
-    """[a, n, bands]: spectra [n, bands] as they are, tinted, more concentrated, under a glossy binder, with stray light.
+def appearances(reflectance: Array, bands_nm: Array) -> Array:
+    """[a, n, bands]: spectra [n, bands] as they are, then tinted, in oil, under gloss, with stray light.
 
-    Binder and white change K/S by a factor; a surface acts as Saunderson described (`kubelka_munk.saunderson`).
+    Binder and white change K/S by a factor; a surface acts as Saunderson described (`kubelka_munk.saunderson`); stray
+    light falls from the violet, where instruments have least light, by 1/e in 60 nm.
     """
+    violet = np.exp(-(bands_nm - 380.0) / _STRAY_FALLS_NM)
     ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
     looks = []
-    for factor, internal, added in _APPEARANCES:
+    for factor, internal, added, stray in _APPEARANCES:
         seen = kubelka_munk.opaque(ratio * factor)
         if internal:
             seen = kubelka_munk.saunderson(seen, _SURFACE, internal)
-        looks.append(added + (1.0 - added) * seen)
+        looks.append(added + (1.0 - added) * seen + stray * violet)
     looks[0] = reflectance
     return np.stack(looks)
 

@@ -1,8 +1,8 @@
 """Rates of `coupole identify` on published libraries, with 95 % intervals.
 
-`python tools/prove_identification.py PIGMENTS` develops: `KremerHistorical.rs` in the folder PIGMENTS alone, by leaving
-out. `--test` runs the rule on `GamblinConservationColors.rs` and `oilpaint/oilpaint.rs` with Kremer as the library:
-nothing may be chosen by what it prints (docs/decisions/0042-identification.md).
+`python tools/prove_identification.py PIGMENTS` develops: `KremerHistorical.rs` in the folder PIGMENTS alone, by
+leaving out. `--test` runs the rule on `GamblinConservationColors.rs` and `oilpaint/oilpaint.rs` with Kremer as
+the library: nothing may be chosen by what it prints (docs/decisions/0042-identification.md).
 """
 
 from __future__ import annotations
@@ -49,14 +49,13 @@ def _calibration(references: References) -> None:
     stated = found.max(axis=1)[several]
     for low, high in ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.0)):
         inside = (stated >= low) & (stated < high + 1e-9)
-        print(
-            f"stated {low:.2f} to {high:.2f}: mean {stated[inside].mean():.2f}, right {Rate(int(right[inside].sum()), int(inside.sum()))}"
-        )
+        rate = Rate(int(right[inside].sum()), int(inside.sum()))
+        print(f"stated {low:.2f} to {high:.2f}: mean {stated[inside].mean():.2f}, right {rate}")
 
 
 def _mixtures(references: References) -> None:
-    """Opaque mixtures of two spectra of different classes, with noise of 0.001; and single ones, each as if the library
-    lacked it, or its class."""
+    """Opaque mixtures of two spectra of different classes, with noise of 0.001; and single ones, each as if the
+    library lacked it, or its class."""
     random = np.random.default_rng(_SEED)
     of_bands = references.of_bands("", references.reflectance[0])
     values, classes, nm = of_bands.reflectance, of_bands.classes, BANDS_NM[of_bands.bands]
@@ -102,15 +101,13 @@ def test(references: References, folder: Path) -> None:
     for title, results in (("class in the library", found), ("taken out", gone), ("not in it", never)):
         print(f"\n{title}:")
         for true, one in results:
-            print(
-                f"  {one.name:38s} {true:28s} {one.verdict:9s} {one.class_name:28s} {one.candidates[0].probability:.2f}"
-            )
+            first = one.candidates[0]
+            print(f"  {one.name:38s} {true:28s} {one.verdict:9s} {one.class_name:28s} {first.probability:.2f}")
     right = sum(one.candidates[0].class_name == true for true, one in found)
     matched = [one.class_name == true for true, one in found if one.verdict == "match"]
     print(f"\n(1) first candidate right: {Rate(right, len(found))}")
-    print(
-        f"(2) match, right: {Rate(sum(matched), len(found))}; wrong: {Rate(len(matched) - sum(matched), len(found))}"
-    )
+    wrong = Rate(len(matched) - sum(matched), len(found))
+    print(f"(2) match, right: {Rate(sum(matched), len(found))}; wrong: {wrong}")
     for number, results in ((3, gone), (4, never)):
         print(f"({number}) unknown: {Rate(sum(one.verdict == 'unknown' for _, one in results), len(results))}")
 

@@ -44,8 +44,8 @@ def identify(
         Path | None,
         typer.Option(
             "--classes",
-            help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a library "
-            "of this file's name (KremerHistorical, GamblinConservationColors, oilpaint).",
+            help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a "
+            "library of this name: KremerHistorical, GamblinConservationColors, GretagMacbethMini, oilpaint.",
         ),
     ] = None,
     unit: Annotated[
@@ -59,8 +59,8 @@ def identify(
 ) -> None:
     """Which class of pigments each spectrum shows, or that the library has none for it.
 
-    A verdict is match, mixture, ambiguous or unknown. The class and its probability stand beside the verdict, whatever
-    it is; how often the library misleads about its own spectra is printed below.
+    A verdict is match, mixture, ambiguous or unknown. The class and its probability stand beside the verdict,
+    whatever it is; how often the library misleads about its own spectra is printed below.
     """
     from coupole.viewing.terminal import make_console
 
@@ -115,8 +115,8 @@ def _references(library: Path, classes: Path | None) -> References:
     table = read_classes(classes) if classes is not None else shipped_classes(spectra)
     if not table:
         raise InputError(
-            f"{library}: no table of classes comes with Coupole for this library; name one with --classes: lines of "
-            "name and class"
+            f"{library}: no table of classes comes with Coupole for this library; name one with --classes: "
+            "lines of name and class"
         )
     return make_references(spectra, table)
 
@@ -143,8 +143,8 @@ def _show(console: Console, found: list[Finding]) -> None:
         console.print(f"{finding.name}: {'; '.join([finding.reason, *finding.remarks])}", markup=False)
     rates = found[-1].rates
     console.print(
-        f"the library's own spectra, each left out (95 %): first class right {rates.right}, match with a wrong class "
-        f"{rates.false_matches}; with the class left out unknown {rates.unknown}"
+        f"the library's own spectra, each left out (95 %): first class right {rates.right}, match with a "
+        f"wrong class {rates.false_matches}; with the class left out unknown {rates.unknown}"
     )
 
 

@@ -71,10 +71,10 @@ def _of_one(found: Finding) -> str:
         ],
     )
     return body + (
-        f"<figure>{_drawn(found.evidence, best.class_name, second)}<figcaption>Above: the spectrum (solid), the nearest "
-        f"reference of {text(best.class_name)} (long dashes) and of {text(second)} (short dashes), their K/S by the "
-        "factors that suit best. Below: what each band says, upwards for the first class, downwards for the second, "
-        "in units of the spread within classes.</figcaption></figure>"
+        f"<figure>{_drawn(found.evidence, best.class_name, second)}<figcaption>Above: the spectrum (solid), the "
+        f"nearest reference of {text(best.class_name)} (long dashes) and of {text(second)} (short dashes), their "
+        "K/S by the factors that suit best. Below: what each band says, upwards for the first class, downwards "
+        "for the second, in units of the spread within classes.</figcaption></figure>"
     )
 
 
@@ -88,8 +88,9 @@ def _percent(found: Finding) -> str:
 
 def _worth(rates: HeldOutRates) -> str:
     return (
-        "<p>Each spectrum of the library was identified as if the library lacked it, and as if it lacked its class. In "
-        "brackets are 95 % intervals (Clopper and Pearson). Another instrument, binder or ground does worse.</p>"
+        "<p>Each spectrum of the library was identified as if the library lacked it, and as if it lacked its "
+        "class. In brackets are 95 % intervals (Clopper and Pearson). Another instrument, binder or ground does "
+        "worse.</p>"
     ) + facts(
         {
             "first class right": text(rates.right),

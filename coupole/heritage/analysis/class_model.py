@@ -2,10 +2,11 @@
 
 A Gaussian process regresses the membership of each class (Rasmussen and Williams, Gaussian Processes for Machine
 Learning, 2006, section 6.5) with a Matern 3/2 kernel on the distances of `spectral_features.features`; the median
-distance is its length. Each reference is in it in several appearances. Leaving out a reference, or a class with all
-its members, has a closed form (there, Eq. 5.12). Memberships m become probabilities exp(b m_c)/Z, that of none of
-the classes exp(b (t0 + t1 v))/Z, v being the process's variance; log b, t0 and t1 are those that make the references
-most probable, each left out with the answer its class, and with its class left out with the answer none.
+distance is its length. Each reference is in it in several appearances. Leaving out a reference, or a class with
+all its members, has a closed form (there, Eq. 5.12). Memberships m become probabilities exp(b m_c)/Z, that of
+none of the classes exp(b (t0 + t1 v))/Z, v being the process's variance; log b, t0 and t1 are those that make the
+references most probable, each left out with the answer its class, and with its class left out with the answer
+none.
 """
 
 from __future__ import annotations
@@ -39,12 +40,10 @@ class HeldOut:
 
 
 class ClassModel:
-    """Classes of references `reflectance` [n, bands] without gaps at `bands_nm`; `classes` [n] are their numbers."""
+    """Classes of references `reflectance` [n, bands] without gaps; `classes` [n] are their numbers."""
 
-    def __init__(
-        self, reflectance: Array, bands_nm: Array, classes: NDArray[np.intp], class_names: tuple[str, ...]
-    ) -> None:
-        looks = appearances(reflectance, bands_nm)
+    def __init__(self, reflectance: Array, classes: NDArray[np.intp], class_names: tuple[str, ...]) -> None:
+        looks = appearances(reflectance)
         self.class_names = class_names
         self._classes, self._count = classes, len(looks)
         self._rows = features(looks.reshape(-1, looks.shape[-1]))

@@ -1,8 +1,9 @@
 """Which class of pigments a reflectance spectrum shows, or that the library has none for it.
 
-The library's classes have probabilities, and so has none of them (`class_model`). "match": the class is in the library,
-and it is this one; "ambiguous": it is one of several; "mixture": two references explain the spectrum together, and none
-alone (`unmixing`); "unknown": all else. What the verdict is worth, the library itself says: `references.HeldOutRates`.
+The library's classes have probabilities, and so has none of them (`class_model`). "match": the class is in the
+library, and it is this one; "ambiguous": it is one of several; "mixture": two references explain the spectrum
+together, and none alone (`unmixing`); "unknown": all else. What the verdict is worth, the library itself says:
+`references.HeldOutRates`.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Evidence:
     runner_up: Array
     """[n] of the second class's."""
     log_odds: Array
-    """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of the
-    spread within classes. Bands are correlated: their sum exaggerates."""
+    """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
+    the spread within classes. Bands are correlated: their sum exaggerates."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +138,13 @@ def _judged(
     flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(seen).std() < _FLAT else ""
     if mixed is not None and mixed.is_settled:
         return "mixture", (
-            f"two references leave {mixed.residual:.1%} of K/S; one alone is worse by {mixed.gain:.0f} and two of other "
-            f"classes by {mixed.lead:.0f} in Schwarz's criterion"
+            f"two references leave {mixed.residual:.1%} of K/S; one alone is worse by {mixed.gain:.0f} and two of "
+            f"other classes by {mixed.lead:.0f} in Schwarz's criterion"
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (
-            f"the library has its class with {1.0 - probabilities[0, -1]:.0%} only, {model.threshold:.0%} is needed; "
-            f"{best.class_name} comes nearest{flat}"
+            f"the library has its class with {1.0 - probabilities[0, -1]:.0%} only, {model.threshold:.0%} is "
+            f"needed; {best.class_name} comes nearest{flat}"
         )
     missing = lacking(best.class_name, model.class_names)
     if missing:

@@ -17,9 +17,9 @@ FAMILIES: tuple[frozenset[str], ...] = (
     frozenset({"carbon black", "manganese oxide", "organic brown"}),
     frozenset({"cobalt glass", "cobalt blue"}),
 )
-"""Classes whose bands are of the same kind: haematite and goethite, which heat turns into each other; black and brown
-without bands; cobalt(II) among four oxygens. One of them is known only beside the others: a library that lacks a
-class of a family cannot decide for another."""
+"""Classes whose bands are of the same kind: haematite and goethite, which heat turns into each other; black and
+brown without bands; cobalt(II) among four oxygens. One of them is known only beside the others: a library that
+lacks a class of a family cannot decide for another."""
 _COLUMNS = ("name", "class", "colour_index")
 
 
@@ -34,8 +34,8 @@ class PigmentClass:
 
 
 def read_classes(path: Path) -> dict[str, PigmentClass]:
-    """A table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs; a first line
-    with these words is not needed. Raises InputError with file and line."""
+    """A table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs; a first
+    line with these words is not needed. Raises InputError with file and line."""
     try:
         text = decoded(path.read_bytes())
     except OSError as error:

@@ -23,8 +23,8 @@ _COVERED = 0.9
 """Share of the references that must have been measured in a band for it to count."""
 _SAME = 1e-4
 _VIOLET_NM = 460.0
-_RISE_BEYOND = 0.1
-"""Of the logarithm of reflectance over 20 nm, beyond that of the references."""
+_RISE_BEYOND, _RISE_BY = 0.1, 0.005
+"""Of the logarithm of reflectance over 20 nm, beyond that of the references; of reflectance."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,8 @@ class OfBands:
                 differences.append(apart[np.argmin((apart**2).sum(axis=1))])
         if not differences:
             return np.full(self.reflectance.shape[1], 0.1)
-        return np.sqrt(np.mean(np.square(differences), axis=0)) + 0.01
+        spread: Array = np.sqrt(np.mean(np.square(differences), axis=0)) + 0.01
+        return spread
 
 
 @dataclass
@@ -139,20 +140,26 @@ class References:
             measured = BANDS_NM[np.isfinite(reflectance)]
             covered = BANDS_NM[known.mean(axis=0) >= _COVERED]
             raise InputError(
-                f"spectrum {spectrum_name}: expected {LEAST_BANDS} or more bands of 10 nm in common with the library, "
-                f"found {shared.sum()}; it covers {_range(measured)}, the library {_range(covered)}"
+                f"spectrum {spectrum_name}: expected {LEAST_BANDS} or more bands of 10 nm in common with the "
+                f"library, found {shared.sum()}; it covers {_range(measured)}, the library {_range(covered)}"
             )
         key = shared.tobytes()
         if key not in self._prepared:
             bands, rows = np.flatnonzero(shared), np.flatnonzero(known[:, shared].all(axis=1))
             names = tuple(sorted({self.class_of[row] for row in rows}))
+            if len(names) < _LEAST_CLASSES:
+                raise InputError(
+                    f"spectrum {spectrum_name}: expected references of {_LEAST_CLASSES} or more classes in its "
+                    f"bands, found {len(names)}; the library's spectra cover different wavelengths"
+                )
             classes = np.array([names.index(self.class_of[row]) for row in rows])
             values = self.reflectance[np.ix_(rows, bands)]
-            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, BANDS_NM[bands], classes, names))
+            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
         return self._prepared[key]
 
     def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
-        """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if anything.
+        """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if
+        anything.
 
         Pigments absorb more towards the ultraviolet; instruments have least light there, and stray light shows.
         """
@@ -162,7 +169,7 @@ class References:
             rise = of_all[:, violet] - of_all[:, violet + 2]
             step = reflectance[violet] - reflectance[violet + 2]
             most = np.nanmax(rise[1:], initial=0.0) + _RISE_BEYOND
-            wrong = np.flatnonzero((rise[0] > most) & (step > 0.002))
+            wrong = np.flatnonzero((rise[0] > most) & (step > _RISE_BY))
         if not len(wrong):
             return reflectance, ""
         last = violet[wrong[-1]]
@@ -182,8 +189,8 @@ class References:
 
 
 def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, PigmentClass]) -> References:
-    """The library with the classes of a table. Spectra without a class are left out; of a spectrum under two names one is
-    kept, or none if the two have different classes; `remarks` say so.
+    """The library with the classes of a table. Spectra without a class are left out; of a spectrum under two
+    names one is kept, or none if the two have different classes; `remarks` say so.
 
     Raises InputError for a library without classes, or with fewer than two.
     """
@@ -198,8 +205,8 @@ def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, Pi
     file = spectra[0].file
     if len({name for _, name in classed}) < _LEAST_CLASSES or len(classed) < _LEAST_SPECTRA:
         raise InputError(
-            f"library {file}: expected {_LEAST_SPECTRA} or more spectra of {_LEAST_CLASSES} or more classes, found "
-            f"classes for {len(classed)} of {len(spectra)}; name a table of name and class with --classes"
+            f"library {file}: expected {_LEAST_SPECTRA} or more spectra of {_LEAST_CLASSES} or more classes, "
+            f"found classes for {len(classed)} of {len(spectra)}; name a table of name and class with --classes"
         )
     remarks = []
     if len(classed) < len(spectra):

@@ -21,17 +21,15 @@ _DARKEST, _LIGHTEST = 0.008, 0.99
 _SLOPE_BANDS = 2
 _SLOPE, _REFLECTANCE, _LEVEL = 3.0, 0.5, 0.3
 _APPEARANCES = (
-    # K/S by a factor, share of light that the surface returns from within, share that it adds, stray light at 380 nm
-    (1.0, 0.0, 0.0, 0.0),
-    (0.4, 0.0, 0.0, 0.0),
-    (2.5, 0.0, 0.0, 0.0),
-    (6.0, 0.0, 0.0, 0.0),
-    (15.0, 0.0, 0.0, 0.0),
-    (1.6, 0.45, 0.0, 0.0),
-    (1.6, 0.0, 0.02, 0.0),
-    (6.0, 0.0, 0.0, 0.01),
+    # K/S by a factor, share of light that the surface returns from within, share that it adds
+    (1.0, 0.0, 0.0),
+    (0.4, 0.0, 0.0),
+    (2.5, 0.0, 0.0),
+    (6.0, 0.0, 0.0),
+    (15.0, 0.0, 0.0),
+    (1.6, 0.45, 0.0),
+    (1.6, 0.0, 0.02),
 )
-_STRAY_FALLS_NM = 60.0
 _SURFACE = 0.04
 
 
@@ -45,20 +43,19 @@ def log_k_over_s(reflectance: Array) -> Array:
     return np.log(kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST)))
 
 
-def appearances(reflectance: Array, bands_nm: Array) -> Array:
-    """[a, n, bands]: spectra [n, bands] as they are, then tinted, in oil, under gloss, with stray light.
+def appearances(reflectance: Array) -> Array:
+    """[a, n, bands]: spectra [n, bands] as they are, then tinted, in oil, under gloss, with light from the
+    surface.
 
-    Binder and white change K/S by a factor; a surface acts as Saunderson described (`kubelka_munk.saunderson`); stray
-    light falls from the violet, where instruments have least light, by 1/e in 60 nm.
+    Binder and white change K/S by a factor; a surface acts as Saunderson described (`kubelka_munk.saunderson`).
     """
-    violet = np.exp(-(bands_nm - 380.0) / _STRAY_FALLS_NM)
     ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
     looks = []
-    for factor, internal, added, stray in _APPEARANCES:
+    for factor, internal, added in _APPEARANCES:
         seen = kubelka_munk.opaque(ratio * factor)
         if internal:
             seen = kubelka_munk.saunderson(seen, _SURFACE, internal)
-        looks.append(added + (1.0 - added) * seen + stray * violet)
+        looks.append(added + (1.0 - added) * seen)
     looks[0] = reflectance
     return np.stack(looks)
 
@@ -66,9 +63,9 @@ def appearances(reflectance: Array, bands_nm: Array) -> Array:
 def features(reflectance: Array) -> Array:
     """[n, f] of spectra [n, bands], all measured in all bands, whose Euclidean distances are compared.
 
-    Deviation of log(K/S) from its mean, which a factor on K/S leaves; its slope over 20 nm times 3; reflectance and
-    its slope, each reduced to unit deviation, times 0.5; and the level (means of log(K/S), logarithm and value of the
-    highest reflectance) times 0.3 and the root of the number of bands.
+    Deviation of log(K/S) from its mean, which a factor on K/S leaves; its slope over 20 nm times 3; reflectance
+    and its slope, each reduced to unit deviation, times 0.5; and the level (means of log(K/S), logarithm and
+    value of the highest reflectance) times 0.3 and the root of the number of bands.
     """
     log_ratio = log_k_over_s(reflectance)
     slope = log_ratio[:, _SLOPE_BANDS:] - log_ratio[:, :-_SLOPE_BANDS]

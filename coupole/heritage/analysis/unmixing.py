@@ -1,9 +1,9 @@
 """Two references that explain a spectrum together better than any one of them.
 
-K/S of an opaque mixture is the weighted sum of its pigments' K/S where all scatter alike (Duncan 1949), and white only
-scales it. Weights are least squares of the relative residual; two references count against one by Schwarz's criterion
-(Ann. Stat. 6, 461, 1978), with the logarithm of the number of choices added for the search (Chen and Chen, Biometrika
-95, 759, 2008).
+K/S of an opaque mixture is the weighted sum of its pigments' K/S where all scatter alike (Duncan 1949), and white
+only scales it. Weights are least squares of the relative residual; two references count against one by Schwarz's
+criterion (Ann. Stat. 6, 461, 1978), with the logarithm of the number of choices added for the search (Chen and
+Chen, Biometrika 95, 759, 2008).
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class Unmixed:
     residual: float
     """Relative residual of K/S, rms."""
     gain: float
-    """Schwarz's criterion of the best single reference less that of the pair; above 10 is very strong evidence (Kass and Raftery 1995)."""
+    """Schwarz's criterion of the best single reference less that of the pair; above 10 is very strong evidence
+    (Kass and Raftery 1995)."""
     lead: float
     """That of the best pair of other classes less that of the pair."""
 
@@ -47,8 +48,8 @@ class Unmixed:
 
 
 def unmix(reflectance: Array, references: Array, classes: NDArray[np.intp]) -> Unmixed | None:
-    """The pair of `references` [n, bands] of different `classes` [n] that a spectrum [bands] is a mixture of; None if no
-    pair has two shares of 0.15 or more."""
+    """The pair of `references` [n, bands] of different `classes` [n] that a spectrum [bands] is a mixture of;
+    None if no pair has two shares of 0.15 or more."""
     weight = _weight(reflectance)
     relative = np.exp(log_k_over_s(references) - log_k_over_s(reflectance)) * weight
     count, bands = relative.shape

@@ -1,0 +1,119 @@
+"""`coupole identify` as a user and a program meet it."""
+
+from __future__ import annotations
+
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coupole.appearance.matter import kubelka_munk, typical
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM
+from coupole.commands.identify import identify
+from coupole.errors import InputError
+
+CLASSES = {"azurite": "copper blue", "vermilion": "cinnabar", "malachite": "copper green"}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five batches of three pigments, wavelengths in the first line; classes in a table beside it."""
+    folder = tmp_path_factory.mktemp("library")
+    lines = ["name," + ",".join(f"{nm:g}" for nm in WAVELENGTHS_NM)]
+    table = ["name;class;colour index"]
+    for shape, class_name in CLASSES.items():
+        for number in range(5):
+            values = kubelka_munk.opaque((0.6 + 0.2 * number) * kubelka_munk.k_over_s(typical.reflectance(shape)))
+            lines.append(f'"{shape}, {number}",' + ",".join(f"{value:.5f}" for value in values))
+            table.append(f"{shape}, {number};{class_name};")
+    (folder / "pigments.csv").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "classes.tsv").write_text("\n".join(table), encoding="utf-8")
+    return folder / "pigments.csv"
+
+
+def spot(folder: Path, shape: str) -> Path:
+    """An export in percent, with decimal commas."""
+    rows = zip(WAVELENGTHS_NM, 100 * typical.reflectance(shape), strict=True)
+    path = folder / f"{shape}.txt"
+    text = "nm;R %\n" + "\n".join(f"{nm:g};{value:.3f}".replace(".", ",") for nm, value in rows)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_one_spectrum_is_an_object_and_several_are_a_list(
+    library: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    classes = library.parent / "classes.tsv"
+    blue, red = spot(tmp_path, "azurite"), spot(tmp_path, "vermilion")
+
+    identify([blue], library, classes, as_json=True)
+    one = json.loads(capsys.readouterr().out)
+    identify([blue, red], library, classes, as_json=True)
+    several = json.loads(capsys.readouterr().out)
+
+    assert (one["name"], one["verdict"], one["class"]) == ("azurite", "match", "copper blue")
+    assert [found["class"] for found in several] == ["copper blue", "cinnabar"]
+    probabilities = [candidate["probability"] for candidate in one["candidates"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert set(one["candidates"][0]) == {"name", "class", "probability"}
+    assert one["candidates"][0]["name"].startswith("azurite, ")
+    assert one["held_out"]["unknown_without_the_class"]["of"] == 15
+
+
+class Page(HTMLParser):
+    """What a browser would fetch, and the words of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.outside: list[str] = []
+        self.words: list[str] = []
+        self.curves = self.bars = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.outside += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.curves += tag == "polyline"
+        self.bars += tag == "rect"
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_has_curves_and_evidence_and_fetches_nothing(library: Path, tmp_path: Path) -> None:
+    hostile = tmp_path / "<img src=x>.txt"
+    spot(tmp_path, "azurite").rename(hostile)
+
+    identify(
+        [hostile, spot(tmp_path, "vermilion")], library, library.parent / "classes.tsv", report=tmp_path / "seen"
+    )
+
+    page = Page()
+    page.feed((tmp_path / "seen" / "identification.html").read_text(encoding="utf-8"))
+    assert page.outside == ["#s0", "#s1"]
+    assert page.curves == 2 * 3
+    assert page.bars == 2 * 41
+    assert "<img src=x>" in page.words
+    assert "copper blue" in page.words
+
+
+def test_a_library_without_classes_is_refused(library: Path, tmp_path: Path) -> None:
+    other = tmp_path / "wrong.csv"
+    other.write_text("name,class\nazurite\n", encoding="utf-8")
+    twice = tmp_path / "twice.csv"
+    twice.write_text("azurite,blue\nazurite,green\n", encoding="utf-8")
+
+    with pytest.raises(InputError, match=r"no table of classes comes with Coupole .* --classes"):
+        identify([spot(tmp_path, "azurite")], library)
+    with pytest.raises(InputError, match=r"wrong.csv:2:1: expected a name and a class, found 'azurite'"):
+        identify([spot(tmp_path, "azurite")], library, other)
+    with pytest.raises(InputError, match=r"twice.csv:2:1: 'azurite' is in two classes: blue, green"):
+        identify([spot(tmp_path, "azurite")], library, twice)
+
+
+def test_a_dark_spectrum_in_percent_is_not_taken_for_a_light_one(library: Path, tmp_path: Path) -> None:
+    rows = np.column_stack([WAVELENGTHS_NM, np.full(81, 1.8)])
+    np.savetxt(tmp_path / "black.txt", rows, fmt="%.2f")
+
+    with pytest.raises(InputError, match=r"1.8 may be percent or a fraction; say which with `unit`"):
+        identify([tmp_path / "black.txt"], library, library.parent / "classes.tsv")

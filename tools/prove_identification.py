@@ -18,7 +18,7 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.spectra_library import read_library
 from coupole.heritage.analysis.identification import identify
 from coupole.heritage.analysis.pigment_classes import shipped_classes
-from coupole.heritage.analysis.references import Rate, References, make_references
+from coupole.heritage.analysis.references import Rate, References, make_references, measured
 from coupole.heritage.analysis.spectral_features import BANDS_NM
 from coupole.heritage.analysis.unmixing import unmix
 
@@ -90,14 +90,12 @@ def test(references: References, folder: Path) -> None:
         spectra = read_library(folder / name)
         table = shipped_classes(spectra)
         for spectrum in spectra:
-            known = np.isfinite(spectrum.reflectance)
-            measured = Measured(spectrum.name, spectrum.wavelengths_nm[known], spectrum.reflectance[known], ())
             class_name = table[spectrum.name].class_name
             if class_name:
-                (inside if class_name in classes else outside).append((measured, class_name))
-    found = [(true, identify(measured, references)) for measured, true in inside]
-    gone = [(true, identify(measured, references.without_class(true))) for measured, true in inside]
-    never = [(true, identify(measured, references)) for measured, true in outside]
+                (inside if class_name in classes else outside).append((measured(spectrum), class_name))
+    found = [(true, identify(one, references)) for one, true in inside]
+    gone = [(true, identify(one, references.without_class(true))) for one, true in inside]
+    never = [(true, identify(one, references)) for one, true in outside]
     for title, results in (("class in the library", found), ("taken out", gone), ("not in it", never)):
         print(f"\n{title}:")
         for true, one in results:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.export_options import LedsOption, SensorOption
+from coupole.commands.identify_spot import asked_spot, identify_spot
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -22,39 +24,58 @@ _SHOWN = 3
 _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknown": "yellow"}
 
 
+SpectraArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Spectra: an instrument's export, a table with one spectrum a row, or a folder of them.",
+        metavar="SPECTRUM",
+        show_default=False,
+    ),
+]
+LibraryOption = Annotated[
+    Path,
+    typer.Option(
+        "--library",
+        help="Spectra of known pigments: a table with one a row and its wavelengths in the first line or in "
+        "spectra.txt beside it, or a folder of exports.",
+        show_default=False,
+    ),
+]
+ClassesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--classes",
+        help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a "
+        "library of this name: KremerHistorical, GamblinConservationColors, GretagMacbethMini, oilpaint.",
+    ),
+]
+UnitOption = Annotated[
+    Literal["auto", "percent", "fraction"],
+    typer.Option("--unit", help="Of the spectra's reflectance, where their files leave it open."),
+]
+PageOption = Annotated[
+    Path | None, typer.Option("--report", help="Folder for a page with curves and what each band says.")
+]
+ResultOption = Annotated[
+    Path | None,
+    typer.Option("--result", help="In place of spectra a fitted result of runs, with --at.", show_default=False),
+]
+AtOption = Annotated[
+    str | None, typer.Option("--at", help="X,Y,Z in mm of its exported mesh.", show_default=False)
+]
+
+
 def identify(
-    spectra: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Spectra: an instrument's export, a table with one spectrum a row, or a folder of them.",
-            metavar="SPECTRUM...",
-            show_default=False,
-        ),
-    ],
-    library: Annotated[
-        Path,
-        typer.Option(
-            "--library",
-            help="Spectra of known pigments: a table with one a row and its wavelengths in the first line or in "
-            "spectra.txt beside it, or a folder of exports.",
-            show_default=False,
-        ),
-    ],
-    classes: Annotated[
-        Path | None,
-        typer.Option(
-            "--classes",
-            help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a "
-            "library of this name: KremerHistorical, GamblinConservationColors, GretagMacbethMini, oilpaint.",
-        ),
-    ] = None,
-    unit: Annotated[
-        Literal["auto", "percent", "fraction"],
-        typer.Option("--unit", help="Of the spectra's reflectance, where their files leave it open."),
-    ] = "auto",
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for a page with curves and what each band says.")
-    ] = None,
+    spectra: SpectraArgument = None,
+    *,
+    library: LibraryOption,
+    classes: ClassesOption = None,
+    unit: UnitOption = "auto",
+    report: PageOption = None,
+    result: ResultOption = None,
+    at: AtOption = None,
+    sensor_spectra: SensorOption = None,
+    led_spectrum: LedsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which class of pigments each spectrum shows, or that the library has none for it.
@@ -66,6 +87,16 @@ def identify(
 
     console = make_console(quiet=as_json)
     try:
+        spot = asked_spot(result, at, sensor_spectra, led_spectrum)
+        if (spot is None) == (not spectra):
+            raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
+        if spot is not None:
+            told = identify_spot(spot, _references(library, classes))
+            console.print(f"{told['name']}: {told['verdict']}; {told['reason']}", markup=False)
+            if as_json:
+                print(json.dumps(told))
+            return
+        assert spectra is not None
         found = _found(console, spectra, library, classes, unit)
         page = None
         if report is not None:
@@ -79,16 +110,16 @@ def identify(
     if page is not None:
         console.print(f"page: {page}", markup=False)
     if as_json:
-        told = [_told(spectrum, finding, page) for spectrum, finding in found]
-        print(json.dumps(told[0] if len(told) == 1 else told))
+        each = [_told(spectrum, finding, page) for spectrum, finding in found]
+        print(json.dumps(each[0] if len(each) == 1 else each))
 
 
 def _found(
     console: Console, paths: list[Path], library: Path, classes: Path | None, unit: Any
 ) -> list[tuple[LibrarySpectrum, Finding]]:
-    from coupole.appearance.spectra.measured import Measured
     from coupole.appearance.spectra.spectra_library import read_library
     from coupole.heritage.analysis import identification
+    from coupole.heritage.analysis.references import measured
     from coupole.viewing.terminal import step_bars
 
     spectra = [spectrum for path in paths for spectrum in read_library(path, unit=unit)]
@@ -99,9 +130,7 @@ def _found(
     with step_bars(console) as say:
         for done, spectrum in enumerate(spectra):
             say("identify", done, len(spectra))
-            known = spectrum.reflectance == spectrum.reflectance
-            measured = Measured(spectrum.name, spectrum.wavelengths_nm[known], spectrum.reflectance[known], ())
-            found.append((spectrum, identification.identify(measured, references)))
+            found.append((spectrum, identification.identify(measured(spectrum), references)))
         say("identify", len(spectra), len(spectra))
     return found
 

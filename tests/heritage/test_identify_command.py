@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from relight_cases import BASE_FROM_SUPPORT, Coat, moved, waves, write_result
 
 from coupole.appearance.matter import kubelka_munk, typical
+from coupole.appearance.spectra.channels import channel_values, channel_weights
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.commands.identify import identify
 from coupole.errors import InputError
@@ -48,9 +50,9 @@ def test_one_spectrum_is_an_object_and_several_are_a_list(
     classes = library.parent / "classes.tsv"
     blue, red = spot(tmp_path, "azurite"), spot(tmp_path, "vermilion")
 
-    identify([blue], library, classes, as_json=True)
+    identify([blue], library=library, classes=classes, as_json=True)
     one = json.loads(capsys.readouterr().out)
-    identify([blue, red], library, classes, as_json=True)
+    identify([blue, red], library=library, classes=classes, as_json=True)
     several = json.loads(capsys.readouterr().out)
 
     assert (one["name"], one["verdict"], one["class"]) == ("azurite", "match", "copper blue")
@@ -84,9 +86,8 @@ def test_the_page_has_curves_and_evidence_and_fetches_nothing(library: Path, tmp
     hostile = tmp_path / "<img src=x>.txt"
     spot(tmp_path, "azurite").rename(hostile)
 
-    identify(
-        [hostile, spot(tmp_path, "vermilion")], library, library.parent / "classes.tsv", report=tmp_path / "seen"
-    )
+    paths = [hostile, spot(tmp_path, "vermilion")]
+    identify(paths, library=library, classes=library.parent / "classes.tsv", report=tmp_path / "seen")
 
     page = Page()
     page.feed((tmp_path / "seen" / "identification.html").read_text(encoding="utf-8"))
@@ -104,11 +105,11 @@ def test_a_library_without_classes_is_refused(library: Path, tmp_path: Path) -> 
     twice.write_text("azurite,blue\nazurite,green\n", encoding="utf-8")
 
     with pytest.raises(InputError, match=r"no table of classes comes with Coupole .* --classes"):
-        identify([spot(tmp_path, "azurite")], library)
+        identify([spot(tmp_path, "azurite")], library=library)
     with pytest.raises(InputError, match=r"wrong.csv:2:1: expected a name and a class, found 'azurite'"):
-        identify([spot(tmp_path, "azurite")], library, other)
+        identify([spot(tmp_path, "azurite")], library=library, classes=other)
     with pytest.raises(InputError, match=r"twice.csv:2:1: 'azurite' is in two classes: blue, green"):
-        identify([spot(tmp_path, "azurite")], library, twice)
+        identify([spot(tmp_path, "azurite")], library=library, classes=twice)
 
 
 def test_a_dark_spectrum_in_percent_is_not_taken_for_a_light_one(library: Path, tmp_path: Path) -> None:
@@ -116,4 +117,43 @@ def test_a_dark_spectrum_in_percent_is_not_taken_for_a_light_one(library: Path, 
     np.savetxt(tmp_path / "black.txt", rows, fmt="%.2f")
 
     with pytest.raises(InputError, match=r"1.8 may be percent or a fraction; say which with `unit`"):
-        identify([tmp_path / "black.txt"], library, library.parent / "classes.tsv")
+        identify([tmp_path / "black.txt"], library=library, classes=library.parent / "classes.tsv")
+
+
+@pytest.fixture(scope="module")
+def spectra_of_cell(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Tables of a sensor with three bands, and of a white light that falls towards the red."""
+    folder = tmp_path_factory.mktemp("cell")
+    bands = [np.exp(-(((WAVELENGTHS_NM - middle) / 35.0) ** 2)) for middle in (600.0, 540.0, 460.0)]
+    np.savetxt(folder / "sensor.csv", np.column_stack([WAVELENGTHS_NM, *bands]), fmt="%.6f", delimiter=";")
+    power = np.column_stack([WAVELENGTHS_NM, 2.0 - WAVELENGTHS_NM / 800.0])
+    np.savetxt(folder / "leds.csv", power, fmt="%.6f", delimiter=";")
+    return folder / "sensor.csv", folder / "leds.csv"
+
+
+def test_three_channels_leave_classes_that_cannot_be_told_apart(
+    library: Path, spectra_of_cell: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # The object has the camera's values of a batch of azurite; its mesh has waves of 20 by 20.
+    sensor, leds = spectra_of_cell
+    weights = channel_weights(np.loadtxt(leds, delimiter=";")[:, 1], np.loadtxt(sensor, delimiter=";")[:, 1:].T)
+    red, green, blue = channel_values(typical.reflectance("azurite"), weights) / np.pi
+    result = write_result(tmp_path / "result", waves(20), Coat((red, green, blue), (0.01, 0.01, 0.01), 0.3))
+    middle = result.corners_mm[result.triangles[7]].mean(axis=0)
+    at = ",".join(f"{value:.3f}" for value in moved(np.linalg.inv(BASE_FROM_SUPPORT), middle[None])[0])
+    spot = {"result": result.folder, "sensor_spectra": sensor, "led_spectrum": leds}
+    named = {"library": library, "classes": library.parent / "classes.tsv"}
+
+    identify(**named, **spot, at=at, as_json=True)
+
+    told = json.loads(capsys.readouterr().out)
+    assert (told["verdict"], told["class"]) == ("ambiguous", "copper blue")
+    assert "copper blue" in told["not_told_apart"]
+    assert "cinnabar" not in told["not_told_apart"]
+    np.testing.assert_allclose(told["reflectance"], np.pi * np.array([red, green, blue]), rtol=1e-5)
+    with pytest.raises(InputError, match=r"nearest triangle is \d+\.\d mm away"):
+        identify(**named, **spot, at="500,500,500")
+    with pytest.raises(InputError, match="--at, --led-spectrum: a spot of a result needs"):
+        identify(**named, result=result.folder, sensor_spectra=sensor)
+    with pytest.raises(InputError, match="found both or neither"):
+        identify(**named)

@@ -143,8 +143,8 @@ def _judged(
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (
-            f"the library has its class with {1.0 - probabilities[0, -1]:.0%} only, {model.threshold:.0%} is "
-            f"needed; {best.class_name} comes nearest{flat}"
+            f"that the library has its class is probable by {1.0 - probabilities[0, -1]:.0%} only, "
+            f"{model.threshold:.0%} is needed; {best.class_name} comes nearest{flat}"
         )
     missing = lacking(best.class_name, model.class_names)
     if missing:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.spectra_library import LibrarySpectrum
-from coupole.errors import InputError
+from coupole.errors import InputError, Problem
 from coupole.heritage.analysis.class_model import ClassModel
 from coupole.heritage.analysis.pigment_classes import PigmentClass, lacking
 from coupole.heritage.analysis.spectral_features import BANDS_NM, log_k_over_s, on_bands
@@ -22,6 +22,7 @@ _LEAST_CLASSES, _LEAST_SPECTRA = 2, 4
 _COVERED = 0.9
 """Share of the references that must have been measured in a band for it to count."""
 _SAME = 1e-4
+_WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
 """Of the logarithm of reflectance over 20 nm, beyond that of the references; of reflectance."""
@@ -188,11 +189,35 @@ class References:
         )
 
 
+def measured(spectrum: LibrarySpectrum) -> Measured:
+    """A spectrum of a file for identification, without the bands that it lacks at its ends.
+
+    Raises InputError, with file and line, for gaps wider than 20 nm, which resampling leaves open.
+    """
+    known = np.isfinite(spectrum.reflectance)
+    nm = spectrum.wavelengths_nm[known]
+    wide = np.flatnonzero(np.diff(nm) > _WIDEST_GAP_NM)
+    if len(wide):
+        raise InputError(
+            [
+                Problem(
+                    spectrum.file,
+                    spectrum.line,
+                    1 if spectrum.line else 0,
+                    spectrum.name,
+                    f"expected samples every {_WIDEST_GAP_NM:g} nm or closer, found none between {nm[wide[0]]:g} "
+                    f"and {nm[wide[0] + 1]:g} nm; measure it again, or leave it out",
+                )
+            ]
+        )
+    return Measured(spectrum.name, nm, spectrum.reflectance[known], ())
+
+
 def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, PigmentClass]) -> References:
     """The library with the classes of a table. Spectra without a class are left out; of a spectrum under two
     names one is kept, or none if the two have different classes; `remarks` say so.
 
-    Raises InputError for a library without classes, or with fewer than two.
+    Raises InputError for a library without classes, or with fewer than two, and for spectra with gaps.
     """
     if not spectra:
         raise InputError("library: expected spectra, found none")
@@ -212,12 +237,7 @@ def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, Pi
     if len(classed) < len(spectra):
         without = [s.name for s in spectra if s.name not in {c.name for c, _ in classed}]
         remarks.append(f"{len(without)} spectra have no class and are left out: {_listed(without)}")
-    values = np.stack(
-        [
-            on_bands(_measured(spectrum.name, spectrum.wavelengths_nm, spectrum.reflectance))
-            for spectrum, _ in classed
-        ]
-    )
+    values = np.stack([on_bands(measured(spectrum)) for spectrum, _ in classed])
     kept, doublets = _without_doublets(values, classed)
     return References(
         tuple(classed[row][0].name for row in kept),
@@ -243,12 +263,6 @@ def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]])
                 f"{one.file}:{one.line} {one.name}, :{two.line} {two.name}: the same spectrum, which {what}"
             )
     return [row for row in range(len(values)) if row not in dropped], remarks
-
-
-def _measured(name: str, nm: Array, values: Array) -> Measured:
-    """A spectrum without its gaps, for resampling; gaps wider than 20 nm remain."""
-    known = np.isfinite(values)
-    return Measured(name, nm[known], values[known], ())
 
 
 def _listed(names: list[str]) -> str:

@@ -16,6 +16,7 @@ from coupole.commands import benching, console, exporting, keeping, planning, ru
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
+from coupole.commands.identify import identify
 from coupole.commands.layer import layer
 from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
@@ -54,6 +55,7 @@ for command in (
     keeping.archive,
     exporting.export,
     keeping.scan,
+    identify,
     dose,
     render,
     layer,

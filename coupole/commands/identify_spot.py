@@ -1,0 +1,107 @@
+"""A spot of a result of reflectance, for `coupole identify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from coupole.heritage.analysis.references import References
+
+_FARTHEST_EDGES = 3.0
+_CHANNELS = 3
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where on a result, and what its camera saw under which light."""
+
+    result: Path
+    at: str
+    """X,Y,Z in mm of the exported mesh."""
+    sensor: Path
+    """Table of nm, red, green, blue."""
+    leds: Path
+    """Table of nm, power."""
+
+
+def asked_spot(result: Path | None, at: str | None, sensor: Path | None, leds: Path | None) -> Spot | None:
+    """The spot that the options name, if they do. Raises InputError if one of them is missing."""
+    given = {"--result": result, "--at": at, "--sensor-spectra": sensor, "--led-spectrum": leds}
+    if all(value is None for value in given.values()):
+        return None
+    if missing := [name for name, value in given.items() if value is None]:
+        raise InputError(f"{', '.join(missing)}: a spot of a result needs {', '.join(given)}")
+    assert result is not None
+    assert at is not None
+    assert sensor is not None
+    assert leds is not None
+    return Spot(result, at, sensor, leds)
+
+
+def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
+    """What `--json` tells of a spot: the keys of a spectrum's, and the classes that cannot be told apart.
+
+    Three channels vouch for no class: the verdict is "ambiguous", or "unknown" if no class has the colour.
+    """
+    from coupole.appearance.spectra.measured import read_spectrum
+    from coupole.heritage.analysis.channel_classes import classes_of_channels
+
+    reflectance, u_reflectance = _channels_at(spot)
+    found = classes_of_channels(
+        reflectance,
+        u_reflectance,
+        read_spectrum(spot.leds, unit="power"),
+        [read_spectrum(spot.sensor, unit="power", column=column) for column in (1, 2, 3)],
+        references,
+    )
+    apart = found.not_told_apart
+    many = f"{len(apart)} of {len(found.candidates)} classes of the library have its colour at some concentration"
+    return {
+        "name": f"{spot.result.resolve().name} at {spot.at}",
+        "verdict": "ambiguous" if apart else "unknown",
+        "class": found.candidates[0].class_name,
+        "candidates": [
+            {"name": one.name, "class": one.class_name, "probability": one.probability} for one in found.candidates
+        ],
+        "not_told_apart": list(apart),
+        "reflectance": reflectance.tolist(),
+        "u_reflectance_relative": u_reflectance.tolist(),
+        "reason": f"three channels: {many}" + (f": {', '.join(apart)}" if apart else ""),
+    }
+
+
+def _channels_at(spot: Spot) -> tuple[np.ndarray, np.ndarray]:
+    """[3] diffuse reflectance pi kd of the nearest triangle that was fitted, and its relative uncertainty."""
+    import h5py
+
+    from coupole.reflectance.new_light.light_kinds import place_of
+    from coupole.reflectance.run_result import MATERIALS, OBJECT, RunResult
+
+    result = RunResult(spot.result)
+    name = MATERIALS[1]
+    for path in (spot.result / OBJECT, result.materials_path(name)):
+        if not path.is_file():
+            raise InputError(f"{path}: is not there; expected a fitted result of runs")
+    place = np.array([*place_of(spot.at, "--at"), 1.0])
+    corners = result.corners_mm[result.triangles].astype(float)
+    apart = np.linalg.norm(corners.mean(axis=1) - (result.base_from_support @ place)[:3], axis=1)
+    nearest = int(np.argmin(apart))
+    edge = float(np.linalg.norm(corners[nearest, 1] - corners[nearest, 0]))
+    if apart[nearest] > _FARTHEST_EDGES * edge:
+        raise InputError(
+            f"--at {spot.at}: expected a place on the object, in mm of the exported mesh; the nearest triangle is "
+            f"{apart[nearest]:.1f} mm away"
+        )
+    row = np.array([nearest])
+    kd = result.materials(name, row).kd[0]
+    if len(kd) != _CHANNELS:
+        raise InputError(f"{spot.result}: expected a colour camera's three channels, found {len(kd)}")
+    with h5py.File(result.materials_path(name), "r") as file:
+        u = np.asarray(file["u_kd"][nearest], float) if "u_kd" in file else np.zeros(_CHANNELS)
+    return np.pi * kd, np.nan_to_num(u)

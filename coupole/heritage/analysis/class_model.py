@@ -1,0 +1,155 @@
+"""Probabilities of classes, and of none of them, from a library of spectra.
+
+A Gaussian process regresses the membership of each class (Rasmussen and Williams, Gaussian Processes for Machine
+Learning, 2006, section 6.5) with a Matern 3/2 kernel on the distances of `spectral_features.features`; the median
+distance is its length. Each reference is in it in several appearances. Leaving out a reference, or a class with
+all its members, has a closed form (there, Eq. 5.12). Memberships m become probabilities exp(b m_c)/Z, that of
+none of the classes exp(b (t0 + t1 v))/Z, v being the process's variance; log b, t0 and t1 are those that make the
+references most probable, each left out with the answer its class, and with its class left out with the answer
+none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.spectra.grid import Array
+from coupole.heritage.analysis.pigment_classes import lacking
+from coupole.heritage.analysis.spectral_features import appearances, features
+
+_NOISE = 0.4
+_MOST_KNOWN = 0.05
+"""Share of the references that may seem known with their class left out."""
+_LEAST_KNOWN = 0.6
+_SURE = 0.8
+_START = (2.0, 0.55, 0.75)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Probabilities of the references, each as if the library lacked it."""
+
+    probabilities: Array
+    """[n, classes + 1], the last that of none; without the reference itself."""
+    without_class: Array
+    """[n, classes + 1]; without its whole class."""
+
+
+class ClassModel:
+    """Classes of references `reflectance` [n, bands] without gaps; `classes` [n] are their numbers."""
+
+    def __init__(self, reflectance: Array, classes: NDArray[np.intp], class_names: tuple[str, ...]) -> None:
+        looks = appearances(reflectance)
+        self.class_names = class_names
+        self._classes, self._count = classes, len(looks)
+        self._rows = features(looks.reshape(-1, looks.shape[-1]))
+        squared = _squared_distances(self._rows, self._rows)
+        self._length2 = float(np.median(squared[squared > 0.0])) if np.any(squared > 0.0) else 1.0
+        self._members = np.eye(len(class_names))[np.tile(classes, self._count)]
+        self._precision = np.linalg.inv(self._kernel(squared) + _NOISE * np.eye(len(squared)))
+        self._weights = self._precision @ self._members
+
+    def probabilities(self, reflectance: Array) -> Array:
+        """[q, classes + 1] of spectra [q, bands]; the last is that of none of the classes."""
+        near = self._kernel(_squared_distances(features(reflectance), self._rows))
+        variance = 1.0 - np.einsum("qr,rs,qs->q", near, self._precision, near)
+        return _probabilities(np.column_stack([near @ self._weights, variance]), self._scale)
+
+    def nearest(self, reflectance: Array) -> Array:
+        """[q, n] distance of spectra [q, bands] to each reference in its most similar appearance."""
+        squared = _squared_distances(features(reflectance), self._rows)
+        nearest: Array = np.sqrt(squared.reshape(len(squared), self._count, -1).min(axis=1))
+        return nearest
+
+    def is_known(self, probabilities: Array) -> NDArray[np.bool_]:
+        """Whether the library has the class, of rows [q, classes + 1]."""
+        known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
+        return known
+
+    def is_sure(self, probabilities: Array) -> NDArray[np.bool_]:
+        """Whether the first class is probable enough if the library has the class."""
+        sure: NDArray[np.bool_] = probabilities[:, :-1].max(axis=1) >= _SURE * (1.0 - probabilities[:, -1])
+        return sure
+
+    @cached_property
+    def held_out(self) -> HeldOut:
+        """Of the references as they were measured."""
+        one, all_of_class = (_probabilities(found[: len(self._classes)], self._scale) for found in self._left_out)
+        return HeldOut(one, all_of_class)
+
+    @cached_property
+    def threshold(self) -> float:
+        """Probability that the class is in the library, from which it counts as known: only a share of 0.05 of the
+        references whose class is left out, and that no family (`pigment_classes`) speaks against, reach it."""
+        found = self.held_out.without_class
+        known = 1.0 - found[:, -1]
+        for row, number in enumerate(self._classes):
+            left = set(self.class_names) - {self.class_names[number]}
+            if lacking(self.class_names[found[row, :-1].argmax()], left):
+                known[row] = 0.0
+        return max(_LEAST_KNOWN, float(np.quantile(known, 1.0 - _MOST_KNOWN)))
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        """Memberships and variance [appearances x n, classes + 1], without the reference, or without its class."""
+        numbers = np.arange(len(self._classes))
+        return self._without(np.tile(numbers, self._count)), self._without(np.tile(self._classes, self._count))
+
+    def _without(self, group: NDArray[np.intp]) -> Array:
+        found = np.empty((len(group), len(self.class_names) + 1))
+        for number in np.unique(group):
+            rows = np.flatnonzero(group == number)
+            covariance = np.linalg.inv(self._precision[np.ix_(rows, rows)])
+            found[rows, :-1] = self._members[rows] - covariance @ self._weights[rows]
+            found[rows, -1] = np.diag(covariance) - _NOISE
+        return found
+
+    @cached_property
+    def _scale(self) -> Array:
+        """log b, t0 and t1; a reference alone in its class can only be left out with it."""
+        from scipy.optimize import minimize
+
+        one, all_of_class = self._left_out
+        classes = np.tile(self._classes, self._count)
+        sizes = np.bincount(self._classes)[classes]
+        weight = sizes**-0.5
+        several = sizes > 1
+
+        def missed(scale: Array) -> float:
+            none = np.log(_probabilities(all_of_class, scale)[:, -1] + 1e-12)
+            total = -float(weight @ none / weight.sum()) + 1e-3 * float(scale @ scale)
+            if several.any():
+                right = _probabilities(one[several], scale)[np.arange(several.sum()), classes[several]]
+                total -= float(weight[several] @ np.log(right + 1e-12) / weight[several].sum())
+            return total
+
+        found = minimize(
+            missed, _START, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-4}
+        )
+        return np.asarray(found.x)
+
+    def _kernel(self, squared: Array) -> Array:
+        distance = np.sqrt(3.0 * squared / self._length2)
+        kernel: Array = (1.0 + distance) * np.exp(-distance)
+        return kernel
+
+
+def _probabilities(found: Array, scale: Array) -> Array:
+    sharpness = np.exp(scale[0])
+    exponents = sharpness * np.column_stack([found[:, :-1], scale[1] + scale[2] * found[:, -1]])
+    exponents -= exponents.max(axis=1, keepdims=True)
+    powers = np.exp(exponents)
+    probabilities: Array = powers / powers.sum(axis=1, keepdims=True)
+    return probabilities
+
+
+def _squared_distances(a: Array, b: Array) -> Array:
+    squared: Array = np.maximum(
+        (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)[None] - 2.0 * a @ b.T,
+        0.0,
+    )
+    return squared

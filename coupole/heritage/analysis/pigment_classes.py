@@ -1,0 +1,94 @@
+"""Classes of pigments by colouring matter: tables that name them, and classes that have one colouring matter."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+from coupole.appearance.spectra.measured import decoded
+from coupole.appearance.spectra.spectra_library import LibrarySpectrum
+from coupole.errors import InputError, Problem, reason
+
+FAMILIES: tuple[frozenset[str], ...] = (
+    frozenset({"iron red", "iron yellow and brown earths"}),
+    frozenset({"carbon black", "manganese oxide", "organic brown"}),
+    frozenset({"cobalt glass", "cobalt blue"}),
+)
+"""Classes whose bands are of the same kind: haematite and goethite, which heat turns into each other; black and
+brown without bands; cobalt(II) among four oxygens. One of them is known only beside the others: a library that
+lacks a class of a family cannot decide for another."""
+_COLUMNS = ("name", "class", "colour_index")
+
+
+@dataclass(frozen=True)
+class PigmentClass:
+    """What a table says of one spectrum."""
+
+    class_name: str
+    """Empty for mixtures and products of unknown composition."""
+    colour_index: str
+    """Generic name without dots and blanks (PR101), or empty."""
+
+
+def read_classes(path: Path) -> dict[str, PigmentClass]:
+    """A table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs; a first
+    line with these words is not needed. Raises InputError with file and line."""
+    try:
+        text = decoded(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: {reason(error)}") from error
+    return _parsed(text, str(path))
+
+
+def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClass]:
+    """The tables that come with Coupole for the files of these spectra, found by the files' names."""
+    folder = resources.files(__package__).joinpath("classes")
+    found: dict[str, PigmentClass] = {}
+    for stem in {Path(spectrum.file).stem for spectrum in spectra}:
+        table = folder.joinpath(f"{stem}.csv")
+        if table.is_file():
+            found |= _parsed(table.read_text(encoding="utf-8"), f"{stem}.csv")
+    return found
+
+
+def lacking(class_name: str, known: Collection[str]) -> list[str]:
+    """Classes of the same family that `known` lacks."""
+    return sorted(
+        other for family in FAMILIES if class_name in family for other in family if other not in set(known)
+    )
+
+
+def _parsed(text: str, file: str) -> dict[str, PigmentClass]:
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise InputError(f"{file}: expected lines of name and class, found none")
+    mark = max("\t;,", key=lines[0].count)
+    found: dict[str, PigmentClass] = {}
+    reader = csv.reader(text.splitlines(), delimiter=mark)
+    columns = {name: index for index, name in enumerate(_COLUMNS)}
+    for row in reader:
+        if not any(field.strip() for field in row) or row[0].startswith("#"):
+            continue
+        fields = [" ".join(field.split()) for field in row]
+        words = [field.lower().replace(" ", "_") for field in fields]
+        if not found and "name" in words and "class" in words:
+            columns = {name: words.index(name) for name in _COLUMNS if name in words}
+            continue
+        if len(fields) <= max(columns["name"], columns["class"]) or not fields[columns["name"]]:
+            raise _wrong(file, reader.line_num, f"expected a name and a class, found {mark.join(row)!r}")
+        name, class_name = fields[columns["name"]], fields[columns["class"]]
+        index = columns.get("colour_index", len(fields))
+        said = PigmentClass(class_name, fields[index] if index < len(fields) else "")
+        if found.get(name, said) != said:
+            raise _wrong(
+                file, reader.line_num, f"{name!r} is in two classes: {found[name].class_name}, {class_name}"
+            )
+        found[name] = said
+    return found
+
+
+def _wrong(file: str, line: int, message: str) -> InputError:
+    return InputError([Problem(file, line, 1, "", message)])

@@ -1,0 +1,273 @@
+"""A library with its classes, made ready for comparison, and how often it misleads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.measured import Measured
+from coupole.appearance.spectra.spectra_library import LibrarySpectrum
+from coupole.errors import InputError, Problem
+from coupole.heritage.analysis.class_model import ClassModel
+from coupole.heritage.analysis.pigment_classes import PigmentClass, lacking
+from coupole.heritage.analysis.spectral_features import BANDS_NM, log_k_over_s, on_bands
+
+LEAST_BANDS = 16
+_LEAST_CLASSES, _LEAST_SPECTRA = 2, 4
+_COVERED = 0.9
+"""Share of the references that must have been measured in a band for it to count."""
+_SAME = 1e-4
+_WIDEST_GAP_NM = 20.0
+_VIOLET_NM = 460.0
+_RISE_BEYOND, _RISE_BY = 0.1, 0.005
+"""Of the logarithm of reflectance over 20 nm, beyond that of the references; of reflectance."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """`count` of `of`, with its interval of 95 % (Clopper and Pearson, Biometrika 26, 404, 1934)."""
+
+    count: int
+    of: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lowest and highest rate."""
+        from scipy.stats import beta
+
+        low = float(beta.ppf(0.025, self.count, self.of - self.count + 1)) if self.count else 0.0
+        high = float(beta.ppf(0.975, self.count + 1, self.of - self.count)) if self.count < self.of else 1.0
+        return low, high
+
+    def __str__(self) -> str:
+        if not self.of:
+            return "0 of 0"
+        low, high = self.interval
+        return f"{self.count} of {self.of} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+@dataclass(frozen=True)
+class HeldOutRates:
+    """What comes of the library's own spectra, each identified as if the library lacked it."""
+
+    right: Rate
+    """First candidate of the right class; of those with others of their class."""
+    matches: Rate
+    """Verdict `match`, right class; of the same."""
+    false_matches: Rate
+    """Verdict `match`, wrong class; of the same."""
+    unknown: Rate
+    """Verdict `unknown` with the whole class left out; of all."""
+
+
+@dataclass
+class OfBands:
+    """The references that were measured in certain bands."""
+
+    bands: NDArray[np.intp]
+    rows: NDArray[np.intp]
+    """[n] numbers of the references."""
+    reflectance: Array
+    """[n, bands]"""
+    classes: NDArray[np.intp]
+    """[n] numbers of classes."""
+    model: ClassModel
+
+    @cached_property
+    def rates(self) -> HeldOutRates:
+        """By leaving out each spectrum, and each class; mixtures are not looked for."""
+        model, classes = self.model, self.classes
+        several = np.bincount(classes)[classes] > 1
+        one, none = model.held_out.probabilities, model.held_out.without_class
+        right = one[:, :-1].argmax(axis=1) == classes
+        names = model.class_names
+        match = model.is_known(one) & model.is_sure(one)
+        match &= [not lacking(names[best], names) for best in one[:, :-1].argmax(axis=1)]
+        known = model.is_known(none)
+        for row, number in enumerate(classes):
+            left = [name for name in names if name != names[number]]
+            known[row] &= not lacking(names[none[row, :-1].argmax()], left)
+        of = int(several.sum())
+        return HeldOutRates(
+            Rate(int((right & several).sum()), of),
+            Rate(int((match & right & several).sum()), of),
+            Rate(int((match & ~right & several).sum()), of),
+            Rate(int((~known).sum()), len(classes)),
+        )
+
+    @cached_property
+    def spread(self) -> Array:
+        """[bands] rms difference of log(K/S), less its mean, between references of a class that are most alike."""
+        log_ratio = log_k_over_s(self.reflectance)
+        shape = log_ratio - log_ratio.mean(axis=1, keepdims=True)
+        differences = []
+        for row, number in enumerate(self.classes):
+            others = np.flatnonzero((self.classes == number) & (np.arange(len(self.classes)) != row))
+            if len(others):
+                apart = shape[others] - shape[row]
+                differences.append(apart[np.argmin((apart**2).sum(axis=1))])
+        if not differences:
+            return np.full(self.reflectance.shape[1], 0.1)
+        spread: Array = np.sqrt(np.mean(np.square(differences), axis=0)) + 0.01
+        return spread
+
+
+@dataclass
+class References:
+    """Spectra of known class."""
+
+    names: tuple[str, ...]
+    class_of: tuple[str, ...]
+    """[n] class of each."""
+    reflectance: Array
+    """[n, 221] at `BANDS_NM`; NaN where it was not measured."""
+    remarks: tuple[str, ...]
+    """What was left out, and why."""
+    _prepared: dict[bytes, OfBands] = field(default_factory=dict)
+
+    def of_bands(self, spectrum_name: str, reflectance: Array) -> OfBands:
+        """The references in the bands in which a spectrum [221] and nine of ten references were measured.
+
+        Raises InputError if the bands are fewer than 16.
+        """
+        known = np.isfinite(self.reflectance)
+        shared = np.isfinite(reflectance) & (known.mean(axis=0) >= _COVERED)
+        if shared.sum() < LEAST_BANDS:
+            measured = BANDS_NM[np.isfinite(reflectance)]
+            covered = BANDS_NM[known.mean(axis=0) >= _COVERED]
+            raise InputError(
+                f"spectrum {spectrum_name}: expected {LEAST_BANDS} or more bands of 10 nm in common with the "
+                f"library, found {shared.sum()}; it covers {_range(measured)}, the library {_range(covered)}"
+            )
+        key = shared.tobytes()
+        if key not in self._prepared:
+            bands, rows = np.flatnonzero(shared), np.flatnonzero(known[:, shared].all(axis=1))
+            names = tuple(sorted({self.class_of[row] for row in rows}))
+            if len(names) < _LEAST_CLASSES:
+                raise InputError(
+                    f"spectrum {spectrum_name}: expected references of {_LEAST_CLASSES} or more classes in its "
+                    f"bands, found {len(names)}; the library's spectra cover different wavelengths"
+                )
+            classes = np.array([names.index(self.class_of[row]) for row in rows])
+            values = self.reflectance[np.ix_(rows, bands)]
+            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
+        return self._prepared[key]
+
+    def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
+        """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if
+        anything.
+
+        Pigments absorb more towards the ultraviolet; instruments have least light there, and stray light shows.
+        """
+        violet = np.flatnonzero(BANDS_NM < _VIOLET_NM)
+        with np.errstate(invalid="ignore"):
+            of_all = np.log(np.maximum(np.vstack([reflectance, self.reflectance]), 0.005))
+            rise = of_all[:, violet] - of_all[:, violet + 2]
+            step = reflectance[violet] - reflectance[violet + 2]
+            most = np.nanmax(rise[1:], initial=0.0) + _RISE_BEYOND
+            wrong = np.flatnonzero((rise[0] > most) & (step > _RISE_BY))
+        if not len(wrong):
+            return reflectance, ""
+        last = violet[wrong[-1]]
+        kept = reflectance.copy()
+        kept[: last + 1] = np.nan
+        return kept, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
+
+    def without_class(self, class_name: str) -> References:
+        """The library as if it had never had a class."""
+        kept = [row for row, name in enumerate(self.class_of) if name != class_name]
+        return References(
+            tuple(self.names[row] for row in kept),
+            tuple(self.class_of[row] for row in kept),
+            self.reflectance[kept],
+            self.remarks,
+        )
+
+
+def measured(spectrum: LibrarySpectrum) -> Measured:
+    """A spectrum of a file for identification, without the bands that it lacks at its ends.
+
+    Raises InputError, with file and line, for gaps wider than 20 nm, which resampling leaves open.
+    """
+    known = np.isfinite(spectrum.reflectance)
+    nm = spectrum.wavelengths_nm[known]
+    wide = np.flatnonzero(np.diff(nm) > _WIDEST_GAP_NM)
+    if len(wide):
+        raise InputError(
+            [
+                Problem(
+                    spectrum.file,
+                    spectrum.line,
+                    1 if spectrum.line else 0,
+                    spectrum.name,
+                    f"expected samples every {_WIDEST_GAP_NM:g} nm or closer, found none between {nm[wide[0]]:g} "
+                    f"and {nm[wide[0] + 1]:g} nm; measure it again, or leave it out",
+                )
+            ]
+        )
+    return Measured(spectrum.name, nm, spectrum.reflectance[known], ())
+
+
+def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, PigmentClass]) -> References:
+    """The library with the classes of a table. Spectra without a class are left out; of a spectrum under two
+    names one is kept, or none if the two have different classes; `remarks` say so.
+
+    Raises InputError for a library without classes, or with fewer than two, and for spectra with gaps.
+    """
+    if not spectra:
+        raise InputError("library: expected spectra, found none")
+    table = {name.casefold(): said for name, said in classes.items()}
+    classed = [
+        (spectrum, table[spectrum.name.casefold()].class_name)
+        for spectrum in spectra
+        if spectrum.name.casefold() in table and table[spectrum.name.casefold()].class_name
+    ]
+    file = spectra[0].file
+    if len({name for _, name in classed}) < _LEAST_CLASSES or len(classed) < _LEAST_SPECTRA:
+        raise InputError(
+            f"library {file}: expected {_LEAST_SPECTRA} or more spectra of {_LEAST_CLASSES} or more classes, "
+            f"found classes for {len(classed)} of {len(spectra)}; name a table of name and class with --classes"
+        )
+    remarks = []
+    if len(classed) < len(spectra):
+        without = [s.name for s in spectra if s.name not in {c.name for c, _ in classed}]
+        remarks.append(f"{len(without)} spectra have no class and are left out: {_listed(without)}")
+    values = np.stack([on_bands(measured(spectrum)) for spectrum, _ in classed])
+    kept, doublets = _without_doublets(values, classed)
+    return References(
+        tuple(classed[row][0].name for row in kept),
+        tuple(classed[row][1] for row in kept),
+        values[kept],
+        (*remarks, *doublets),
+    )
+
+
+def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]]) -> tuple[list[int], list[str]]:
+    dropped: set[int] = set()
+    remarks = []
+    for row in range(len(values)):
+        apart = np.abs(values[:row] - values[row])
+        both = np.isfinite(apart)
+        same = np.where(both, apart, 0.0).max(axis=1, initial=0.0) < _SAME
+        for before in np.flatnonzero(same & both.any(axis=1)):
+            (one, of_one), (two, of_two) = classed[before], classed[row]
+            agree = of_one == of_two
+            dropped |= {row} if agree else {int(before), row}
+            what = "counts once" if agree else f"is left out: {of_one}, {of_two}"
+            remarks.append(
+                f"{one.file}:{one.line} {one.name}, :{two.line} {two.name}: the same spectrum, which {what}"
+            )
+    return [row for row in range(len(values)) if row not in dropped], remarks
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+
+
+def _range(nm: Array) -> str:
+    return f"{nm[0]:g} to {nm[-1]:g} nm" if len(nm) else "none"

@@ -1,0 +1,86 @@
+"""What is compared of reflectance spectra, and how the same paint may look to another instrument.
+
+Bands are every 10 nm, ultraviolet to near infrared; those that were not measured are NaN.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coupole.appearance.matter import kubelka_munk
+from coupole.appearance.matter.glossy_face import Face, InternalReflectance
+from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.measured import Measured
+from coupole.appearance.spectra.resampling import resampled
+
+STEP_NM = 10.0
+BANDS_NM: Array = np.arange(300.0, 2500.0 + STEP_NM / 2, STEP_NM)
+BANDS_NM.setflags(write=False)
+NEAR_INFRARED_NM = 780.0
+_DARKEST, _LIGHTEST = 0.008, 0.99
+"""K/S beyond them is mostly the instrument's stray light, or its white."""
+_SLOPE_BANDS = 2
+_SLOPE, _REFLECTANCE, _LEVEL = 3.0, 0.5, 0.3
+_APPEARANCES = (
+    # K/S by a factor, share of light that the surface returns from within, share that it adds
+    (1.0, 0.0, 0.0),
+    (0.4, 0.0, 0.0),
+    (2.5, 0.0, 0.0),
+    (6.0, 0.0, 0.0),
+    (15.0, 0.0, 0.0),
+    (1.6, 0.45, 0.0),
+    (1.6, 0.0, 0.02),
+)
+_SURFACE = 0.04
+
+
+def on_bands(spectrum: Measured) -> Array:
+    """[221] reflectance at `BANDS_NM`."""
+    return resampled(spectrum, BANDS_NM, STEP_NM)[0]
+
+
+def log_k_over_s(reflectance: Array) -> Array:
+    """log(K/S) of an opaque layer, any shape; reflectances are limited to 0.008 and 0.99."""
+    return np.log(kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST)))
+
+
+def appearances(reflectance: Array) -> Array:
+    """[a, n, bands]: spectra [n, bands] as they are, then tinted, in oil, under gloss, with light from the
+    surface.
+
+    Binder and white change K/S by a factor; a surface acts as Saunderson described (`glossy_face.Face`).
+    """
+    ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
+    looks = []
+    for factor, internal, added in _APPEARANCES:
+        seen = kubelka_munk.opaque(ratio * factor)
+        if internal:
+            face = Face(np.array((1.0 - _SURFACE) * (1.0 - internal)), np.array(internal), np.zeros(()))
+            seen = face.seen(InternalReflectance(seen)).values
+        looks.append(added + (1.0 - added) * seen)
+    looks[0] = reflectance
+    return np.stack(looks)
+
+
+def features(reflectance: Array) -> Array:
+    """[n, f] of spectra [n, bands], all measured in all bands, whose Euclidean distances are compared.
+
+    Deviation of log(K/S) from its mean, which a factor on K/S leaves; its slope over 20 nm times 3; reflectance
+    and its slope, each reduced to unit deviation, times 0.5; and the level (means of log(K/S), logarithm and
+    value of the highest reflectance) times 0.3 and the root of the number of bands.
+    """
+    log_ratio = log_k_over_s(reflectance)
+    slope = log_ratio[:, _SLOPE_BANDS:] - log_ratio[:, :-_SLOPE_BANDS]
+    rise = reflectance[:, _SLOPE_BANDS:] - reflectance[:, :-_SLOPE_BANDS]
+    highest = reflectance.max(axis=1, keepdims=True)
+    level = np.hstack([log_ratio.mean(axis=1, keepdims=True), np.log(np.maximum(highest, 0.0) + 0.02), highest])
+    shape = reflectance - reflectance.mean(axis=1, keepdims=True)
+    return np.hstack(
+        [
+            log_ratio - log_ratio.mean(axis=1, keepdims=True),
+            _SLOPE * slope,
+            _REFLECTANCE * shape / (reflectance.std(axis=1, keepdims=True) + 0.02),
+            _REFLECTANCE * rise / (np.sqrt(np.mean(rise**2, axis=1, keepdims=True)) + 0.004),
+            _LEVEL * np.sqrt(reflectance.shape[1]) * level,
+        ]
+    )

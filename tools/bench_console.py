@@ -60,6 +60,7 @@ class Console:
 class Seen:
     """What a watcher got."""
 
+    connections: int = 0
     updates: int = 0
     pictures: int = 0
     bytes: int = 0
@@ -91,10 +92,15 @@ async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, seen: 
                         seen.bytes += len(await picture.read())
                         seen.pictures += picture.status == 200
 
+        async def connected() -> None:
+            seen.connections += 1
+            assert await client.call("handshake", query), "the screen did not take the watcher"
+            query["next_message_id"] = None  # of a connection that was lost: go on with what is next
+
         client.on("update", update)
+        client.on("connect", connected)
         headers = {"Origin": url, "Cookie": "; ".join(f"{name}={value}" for name, value in cookies.items())}
         await client.connect(url, headers, transports=["websocket"], socketio_path="/_nicegui_ws/socket.io")
-        assert await client.call("handshake", query), "the screen did not take the watcher"
         await until.wait()
         await client.disconnect()
 
@@ -120,7 +126,7 @@ def _watchers(url: str) -> None:
                 reply.raise_for_status()
                 cookies = {cookie.key: cookie.value for cookie in http.cookie_jar}
         await asyncio.gather(*(_watch(url, cookies, until, seen) for seen in all_seen))
-        print(json.dumps([[seen.updates, seen.pictures, seen.bytes] for seen in all_seen]))
+        print(json.dumps([[seen.updates, seen.pictures, seen.bytes, seen.connections] for seen in all_seen]))
 
     asyncio.run(work())
 
@@ -130,7 +136,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         folder = Path(name)
         rig, plan = _cell(root, folder)
         console = _serve(root, rig, folder)
-        without, watched, seen = [], [], [[0, 0, 0]]
+        without, watched, seen = [], [], [[0, 0, 0, 0]]
         try:
             console.ask("POST", "/api/v1/accounts", {"name": "Eve", "password": _PASSWORD, "role": "observer"})
             for _ in range(rounds):
@@ -153,6 +159,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         "ratio": value / peer,
         "updates": min(one[0] for one in seen),
         "pictures": min(one[1] for one in seen),
+        "connections": max(one[3] for one in seen),
         "mb": round(sum(one[2] for one in seen) / 1e6, 1),
     }
 

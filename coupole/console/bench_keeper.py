@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +32,16 @@ Phase = Literal["closed", "opening", "open", "closing"]
 class Bench:
     """The bench of one cell, as its console sees it."""
 
-    def __init__(self, cell: Cell, acquisitions: Acquisitions, plans: PlanFiles, folder: Path) -> None:
+    def __init__(
+        self,
+        cell: Cell,
+        acquisitions: Acquisitions,
+        plans: PlanFiles,
+        folder: Path,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         """`folder`: for what its process prints."""
-        self._cell, self._acquisitions, self._plans = cell, acquisitions, plans
+        self._cell, self._acquisitions, self._plans, self._now_s = cell, acquisitions, plans, now_s
         self._tasks = Tasks(folder)
         self._task: Task | None = None
         self._lock, self._ended = threading.Lock(), threading.Event()
@@ -90,7 +98,7 @@ class Bench:
 
     def looked_at(self) -> None:
         """Somebody looks at it: its state is kept fresh for a while."""
-        self._looked_s = time.monotonic()
+        self._looked_s = self._now_s()
 
     def open(self, who: str, plan: str) -> None:
         """Begin it; the object of a plan lies on the support, or nothing. Raises InputError: something has the
@@ -106,7 +114,7 @@ class Bench:
             except InputError:
                 task.stop()
                 raise
-            self._acted_s = time.monotonic()
+            self._acted_s = self._now_s()
             self._task, self.plan, self.closed_because = task, plan, ""
 
     def close(self, why: str = "") -> list[str]:
@@ -134,7 +142,7 @@ class Bench:
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """What it answers. Raises InputError with its words where it did not obey."""
-        self._acted_s = time.monotonic()
+        self._acted_s = self._now_s()
         return obeyed(ask_bench(self._cell, command, **fields))
 
     def views(self) -> list[str]:
@@ -181,7 +189,7 @@ class Bench:
                 self._look()
 
     def _look(self) -> None:
-        now_s = time.monotonic()
+        now_s = self._now_s()
         looked_at = now_s - self._looked_s < _LOOKED_AT_S
         pause_s = {"open": 0.0 if looked_at else _LOOKED_AT_S, "opening": 0.0}.get(self.phase, _FOREIGN_EVERY_S)
         if now_s - self._asked_s < pause_s or (self.phase == "closed" and not looked_at):

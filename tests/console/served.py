@@ -16,6 +16,17 @@ from urllib.parse import urlsplit
 import cells
 from cells import CellFolder
 
+BORROWER = """
+import sys, time
+from pathlib import Path
+from coupole.console.client import borrowed
+from coupole.plan.cell import read_cell
+with borrowed(read_cell(Path(sys.argv[1])), "look at the focus"):
+    print("mine", flush=True)
+    time.sleep(600)
+"""
+"""A process that borrows the cell of a rig until it is ended."""
+
 
 @dataclass
 class Reply:

@@ -16,23 +16,13 @@ from typing import Any
 import cells
 import pytest
 from cells import CellFolder
-from served import Browser, Served, served
+from served import BORROWER, Browser, Served, served
 
 from coupole.acquisition import runtime_folder
 from coupole.console.client import borrowed, call, is_served
 from coupole.errors import InputError
 from coupole.plan.cell import read_cell
 from sim.world.client import World
-
-BORROWER = """
-import sys, time
-from pathlib import Path
-from coupole.console.client import borrowed
-from coupole.plan.cell import read_cell
-with borrowed(read_cell(Path(sys.argv[1])), "look at the focus"):
-    print("mine", flush=True)
-    time.sleep(600)
-"""
 
 
 class Standing:

@@ -10,6 +10,10 @@ from pathlib import Path
 
 import cells
 import pytest
+from cells import CellFolder
+
+from coupole.acquisition.cell_bench.bench_client import ask_bench, bench_socket
+from coupole.plan.cell import read_cell
 
 _CONSOLE = """
 import sys, threading, time
@@ -61,3 +65,43 @@ def _ended(process: int) -> bool:
     except ProcessLookupError:
         return True
     return False
+
+
+_OPENS_DEVICES = """
+import sys, time
+from pathlib import Path
+from coupole.console.acquisitions import Acquisitions
+from coupole.console.bench_keeper import Bench
+from coupole.console.plan_files import PlanFiles
+from coupole.console.plan_queue import PlanQueue
+from coupole.plan.cell import read_cell
+folder = Path(sys.argv[1])
+cell = read_cell(folder / "rig.yaml")
+acquisitions = Acquisitions(PlanQueue(folder / "queue.json"), cell, folder / "output")
+plans = PlanFiles(folder, folder / "rig.yaml", folder / "drawings")
+with Bench(cell, acquisitions, plans, folder / "bench") as bench:
+    bench.open("Ada", "")
+    while bench.phase != "open":
+        bench.looked_at()
+        time.sleep(0.1)
+    print(bench._running.process.pid, flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.full  # of anything that a console has begun: above
+def test_the_devices_of_a_killed_console_are_made_safe_and_closed(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    cell.join()
+    with cell.world() as world:
+        command = [sys.executable, "-c", _OPENS_DEVICES, tmp_path]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            bench = os.pidfd_open(int(process.stdout.readline()))
+            asked = ask_bench(read_cell(cell.rig), "state")
+            assert asked["devices"]
+            process.kill()
+            cells.wait_until(lambda: _ended(bench), "the end of the bench")
+            os.close(bench)
+        assert cells.safe(world)
+        assert not bench_socket(read_cell(cell.rig)).exists()

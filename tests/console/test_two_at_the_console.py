@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +18,7 @@ import pytest
 from at_the_console import Visitor, assert_usable
 from browser import Browser, needs_chromium
 from cells import CellFolder
-from served import Served, served
+from served import BORROWER, Served, served
 
 from sim.world.client import World
 
@@ -171,6 +173,34 @@ def test_a_stop_by_who_watches_puts_the_light_out_at_once(two: Two) -> None:
     two.max.sees("[data-name=alarm]", "stopped")
 
 
+def test_whatever_the_cell_is_lent_for_is_interrupted_by_the_headers_stop(two: Two) -> None:
+    command = [sys.executable, "-c", BORROWER, str(two.cell.rig)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=cells.REPO
+    ) as borrower:
+        assert borrower.stdout is not None
+        assert borrower.stdout.readline() == "mine\n"
+        cells.wait_until(lambda: two.state()["lent_to"], "the loan")
+        two.max.clicks("[data-name=stop]")
+        assert borrower.wait(cells.PATIENCE_S) == -signal.SIGINT
+    cells.wait_until(lambda: not two.state()["lent_to"], "the end of the loan")
+
+
+def test_a_run_that_does_not_answer_is_said_to_be_silent_and_stopped(two: Two) -> None:
+    _empty(two)
+    now = two.begins()
+    running = next(entry for entry in now["queue"] if entry["state"] == "running")
+    os.kill(running["pid"], signal.SIGSTOP)
+    try:
+        two.max.sees("[data-name=state]", "the run does not answer")
+        cells.wait_until(lambda: _is_dark(two.world), "the devices' own watchdogs")
+        two.max.clicks("[data-name=stop]")
+        two.max.sees(".q-notification", "not sure: the run does not answer")
+    finally:
+        os.kill(running["pid"], signal.SIGCONT)
+    cells.wait_until(lambda: two.state()["state"] == "halted", "the end of its process")
+
+
 @pytest.mark.full  # over HTTP: tests/console/test_command_line.py
 def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(two: Two) -> None:
     _empty(two)
@@ -185,6 +215,11 @@ def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(tw
     two.ada.sees("[data-name=state]", "running")
     two.ada.clicks("[data-name=stop]")
     two.ada.sees("[data-name=alarm]", "stopped")
+
+
+def _is_dark(world: World) -> bool:
+    state = world.ask("state")
+    return not (state["shining"] or state["panels"] or state["arm_moving"])
 
 
 def _empty(two: Two) -> None:

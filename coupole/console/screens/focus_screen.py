@@ -19,7 +19,7 @@ from coupole.console.screens.sharpness import Sharpness
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
-_LIVE_S = 60.0
+LIVE_S = 60.0
 """Live pictures end when nobody has touched the page for so long: each is light on the object."""
 _EVERY_S = 0.1
 
@@ -161,14 +161,13 @@ class _Screen:
     async def _tick(self) -> None:
         if not self._live or self._asking:
             return
-        if self._ending:
-            self._end_live(self._ending)
-        elif not self._visit.is_watched:
-            self._end_live("the page was closed")
-        elif time.monotonic() - self._touched_s > _LIVE_S:
-            self._end_live(f"nobody has touched this page for {_LIVE_S:g} s")
-        elif self._was_stopped:
-            self._end_live("stopped")
+        why = self._ending or why_live_ends(
+            watched=self._visit.is_watched,
+            untouched_s=time.monotonic() - self._touched_s,
+            stopped=self._was_stopped,
+        )
+        if why:
+            self._end_live(why)
         else:
             await self._expose(live=True)
 
@@ -255,6 +254,15 @@ class _Screen:
         if dose["warning"]:
             rows["warning"] = dose["warning"]
         self._dose.set_content(facts_html(rows))
+
+
+def why_live_ends(*, watched: bool, untouched_s: float, stopped: bool) -> str:
+    """Why no further picture is taken by itself; empty if one is."""
+    if not watched:
+        return "the page was closed"
+    if untouched_s > LIVE_S:
+        return f"nobody has touched this page for {LIVE_S:g} s"
+    return "stopped" if stopped else ""
 
 
 def _white_words(gains: list[float], region: dict[str, Any] | None, white: list[float] | None) -> str:

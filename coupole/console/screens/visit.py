@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 from fastapi import Request
-from nicegui import Client, ui
+from nicegui import Client, app, background_tasks, ui
 
 from coupole.console.accounts import Account, Role
 from coupole.console.guard import account_here, address_of, is_of_this_machine
@@ -66,7 +66,8 @@ class Visit:
         self._followers.append(show)
 
     def watch(self) -> None:
-        """Begin to tell the followers; called once the screen is built."""
+        """Begin to tell the followers; called once the screen is built. By a loop of its own: the library's timers
+        stand still if the machine's clock is set back, and who looks must not take old news for new."""
         before, over = "", False
 
         def tell() -> None:
@@ -84,9 +85,19 @@ class Visit:
                 return
             before = known
             for show in self._followers:
-                show(now)
+                try:
+                    show(now)
+                except Exception as error:  # noqa: BLE001  the others are told all the same
+                    app.handle_exception(error)
 
-        ui.timer(NEWS_EVERY_S, tell)
+        async def tell_always() -> None:
+            await self._client.connected()
+            while not self._client.is_deleted:
+                with self._client:
+                    tell()
+                await asyncio.sleep(NEWS_EVERY_S)
+
+        background_tasks.create(tell_always(), name="news for a screen")
 
     async def act(
         self,

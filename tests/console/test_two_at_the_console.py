@@ -201,7 +201,7 @@ def test_a_run_that_does_not_answer_is_said_to_be_silent_and_stopped(two: Two) -
     cells.wait_until(lambda: two.state()["state"] == "halted", "the end of its process")
 
 
-@pytest.mark.full  # over HTTP: tests/console/test_command_line.py
+@pytest.mark.full  # over HTTP: tests/console/command_line/test_command_line.py
 def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(two: Two) -> None:
     _empty(two)
     now = two.begins()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ import cells
 import pytest
 from cells import CellFolder
 
-from coupole.acquisition.runtime_folder import named_after
+from coupole.acquisition.runtime_folder import in_use, named_after
 from coupole.console.cell import acquisitions as module
 from coupole.console.cell.acquisitions import Acquisitions
 from coupole.console.cell.state_now import _entries_now
@@ -104,18 +105,32 @@ def test_what_cannot_be_begun_is_told_and_the_watch_goes_on(
     assert running._thread.is_alive()
 
 
-def test_a_plan_waits_while_somebody_else_has_the_devices(
-    queue: PlanQueue, begun: list[list[str]], running: Acquisitions, tmp_path: Path
-) -> None:
-    live = cells.start("live", tmp_path / "rig.yaml", "--yes")
+@contextmanager
+def live(rig: Path) -> Iterator[None]:
+    """A live view of a cell."""
+    process = cells.start("live", rig, "--yes")
     try:
-        cells.wait_until(lambda: module.is_in_use(tmp_path / "storage/state"), "the live view")
+        cells.wait_until(lambda: module.is_in_use(rig.parent / "storage/state"), "the live view")
+        yield
+    finally:
+        process.terminate()
+        cells.finish(process)
+
+
+@pytest.mark.parametrize(
+    "had", [lambda rig: in_use(rig.parent / "storage/state"), pytest.param(live, marks=pytest.mark.full)]
+)
+def test_a_plan_waits_while_somebody_else_has_the_devices(
+    queue: PlanQueue,
+    begun: list[list[str]],
+    running: Acquisitions,
+    tmp_path: Path,
+    had: Callable[[Path], AbstractContextManager[None]],
+) -> None:
+    with had(tmp_path / "rig.yaml"):
         queue.add("Ada", plan="one.yaml")
         time.sleep(1.0)
         assert begun == []
-    finally:
-        live.terminate()
-        cells.finish(live)
     cells.wait_until(lambda: begun, "the plan")
 
 

@@ -130,7 +130,7 @@ def test_no_request_that_the_schema_allows_or_forbids_makes_it_fail(
         operation = found.ok()
         if operation.path in ENDLESS_OR_OVER:
             continue
-        examples = 2 if operation.path in HASHES else scale(8, 100)
+        examples = 2 if operation.path in HASHES else scale(4, 100)
 
         @settings(
             max_examples=examples, deadline=None, database=None, derandomize=True, phases=[Phase.generate],

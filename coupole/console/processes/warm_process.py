@@ -21,8 +21,9 @@ from coupole.errors import InputError
 P = ParamSpec("P")
 T = TypeVar("T")
 _IMPORTED = [
-    "coupole.preflight.files",
+    "coupole.preflight.checking",
     "coupole.viewing.preflight_table",
+    "coupole.viewing.terminal",
     "coupole.scan.mesh",
     "scipy.spatial",
 ]

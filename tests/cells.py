@@ -23,6 +23,7 @@ import h5py
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
+from nursery import NURSERY
 from places import REPO
 from ruamel.yaml import YAML
 
@@ -196,8 +197,9 @@ def here(*arguments: str | Path, typed: str = "") -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
-def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
-    """Run a command as a process; nobody types at it."""
+def start(*arguments: str | Path, anew: bool = False, **popen: Any) -> subprocess.Popen[str]:
+    """Run a command as a process; nobody types at it. It and its world are forked where all modules are, unless it
+    is a console, or asked for `anew` or with options of a process beyond its streams."""
     options: dict[str, Any] = {
         "stdin": subprocess.DEVNULL,
         "stdout": subprocess.PIPE,
@@ -206,7 +208,10 @@ def start(*arguments: str | Path, **popen: Any) -> subprocess.Popen[str]:
         "cwd": REPO,
         **popen,
     }
-    return subprocess.Popen([sys.executable, "-m", "coupole.commands.cli", *map(str, arguments)], **options)
+    words = [*map(str, arguments)]
+    if not anew and popen.keys() <= {"stdin", "stdout", "stderr"} and words[0] != "serve":
+        return NURSERY.command(words, **options)
+    return subprocess.Popen([sys.executable, "-m", "coupole.commands.cli", *words], **options)
 
 
 def finish(process: subprocess.Popen[str]) -> Ended:

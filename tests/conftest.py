@@ -13,13 +13,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy comes: the te
 import pytest
 from cells import CellFolder
 from hypothesis import settings
-from nursery import Nursery
+from nursery import NURSERY
 from skip_budget import over_budget
 from xdist.scheduler.loadscope import LoadScopeScheduling
 
 from sim.world import client
 
-client._launch = Nursery().start  # type: ignore[assignment] # for what runs in the tests' own process
+client._launch = NURSERY.start  # type: ignore[assignment] # for what runs in the tests' own process
 
 settings.register_profile("coupole", deadline=None, max_examples=50)  # no test asserts wall-clock speed
 settings.register_profile("coupole at full scale", deadline=None, max_examples=500)

@@ -1,14 +1,17 @@
-"""Gives birth to simulated worlds: a process that has imported all that a world wants, and forks.
+"""Gives birth to simulated worlds and commands: a process that has imported all that they want, and forks.
 
-A world of its own for each of hundreds of tests is a second of imports each; a fork of one that has them is none.
-What is forked runs `sim.world.world.main` as `python -m sim.world.world` does, in a session of its own, with the
-same pipes.
+A world of its own for each of hundreds of tests is a second of imports each, a command two or three; a fork of one
+that has them is none. What is forked runs `sim.world.world.main` as `python -m sim.world.world` does, or
+`coupole.commands.cli.main`, in a session of its own, with the same pipes. A
+command's own worlds are forked here, too.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
+import gc
 import importlib
 import os
 import pickle
@@ -17,21 +20,27 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from typing import IO, Any
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NoReturn
 
 from numba.core.dispatcher import Dispatcher
 from numba.np.ufunc import parallel
 from places import REPO
 
 FDS = 4
+OURS = ("coupole.", "drivers.", "sim.")
+MOST_BYTES = 1 << 16
 
 
 class Nursery:
-    """A process that forks worlds; ends with this one."""
+    """A process that forks worlds and commands; ends with the one that opened it. `line` leads to it already."""
 
-    def __init__(self) -> None:
-        self._line: socket.socket | None = None
+    def __init__(self, line: socket.socket | None = None) -> None:
+        self._line = line
+        self._asking = threading.Lock()
 
     def _open(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -41,82 +50,152 @@ class Nursery:
             )
         return ours
 
+    def ask(self, wanted: tuple[Any, ...], fds: list[int]) -> int:
+        """The pid of what is forked with these standard streams and pipe for its exit code."""
+        with self._asking:
+            self._line = self._line or self._open()
+            socket.send_fds(self._line, [pickle.dumps(wanted)], fds)
+            return int.from_bytes(self._line.recv(8), "little")
+
     def start(self) -> Born:
         """A new world that waits for its configuration."""
-        self._line = self._line or self._open()
-        config, stdin = os.pipe()
-        stdout, endpoints = os.pipe()
-        code, status = os.pipe()
-        socket.send_fds(self._line, [b"world"], [config, endpoints, 2, status])
-        for theirs in (config, endpoints, status):
-            os.close(theirs)
-        pid = int.from_bytes(self._line.recv(8), "little")
-        return Born(pid, os.fdopen(stdin, "w"), os.fdopen(stdout), code)
+        return Born(self, [], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def command(self, arguments: list[str], **streams: Any) -> Born:
+        """`coupole` with these arguments, here and with this environment."""
+        return Born(self, ["coupole", *arguments], **streams)
 
 
-class Born:
-    """What of `subprocess.Popen` a world's client uses."""
+class Born(subprocess.Popen[str]):
+    """A process that the nursery forked: no child of this one, which hears of its end through a pipe."""
 
-    def __init__(self, pid: int, stdin: IO[str], stdout: IO[str], code: int) -> None:
-        self.pid, self.stdin, self.stdout, self._code = pid, stdin, stdout, code
-        self.returncode: int | None = None
+    def __init__(self, nursery: Nursery, arguments: list[str], **streams: Any) -> None:
+        self._nursery = nursery
+        super().__init__(arguments, **streams)
 
-    def wait(self, timeout: float | None = None) -> int:
-        """The exit code; -9 of one that could not tell it."""
-        if self.returncode is None:
-            if not select.select([self._code], [], [], timeout)[0]:
-                raise subprocess.TimeoutExpired("world", timeout or 0.0)
-            self.returncode = (os.read(self._code, 1) or b"\xf7")[0]
-            self.returncode -= 256 * (self.returncode > 127)
-            os.close(self._code)
+    def _execute_child(self, args: list[str], *options: Any) -> None:  # type: ignore[override]
+        cwd, ends = options[4], options[9:15]
+        streams = [ends[index] if ends[index] != -1 else number for number, index in enumerate((0, 3, 5))]
+        self._code, code = os.pipe()
+        self.pid = self._nursery.ask((args, str(cwd or Path.cwd()), dict(os.environ)), [*streams, code])
+        self._child_created = True
+        os.close(code)
+        self._close_pipe_fds(*ends)  # type: ignore[attr-defined]
+
+    def _try_wait(self, wait_flags: int) -> tuple[int, int]:
+        """As `os.waitpid`; of whoever could not tell its exit code, that it was killed."""
+        if wait_flags & os.WNOHANG and not select.select([self._code], [], [], 0)[0]:
+            return 0, 0
+        told = os.read(self._code, 1)
+        os.close(self._code)
+        return self.pid, told[0] << 8 if told else signal.SIGKILL
+
+    def _internal_poll(self, *_: Any, **__: Any) -> int | None:
+        with self._waitpid_lock:  # type: ignore[attr-defined]
+            if self.returncode is None and (found := self._try_wait(os.WNOHANG))[0]:
+                self._handle_exitstatus(found[1])  # type: ignore[attr-defined]
         return self.returncode
 
-    def kill(self) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
+
+NURSERY = Nursery()
+"""That of the tests' process."""
 
 
 def serve(line: socket.socket) -> None:
-    """Fork a world for each message, until the line is closed."""
-    from sim.world import world
-
-    importlib.import_module("trimesh")  # a third of a second, which a world with an object's mesh takes later
-
+    """Fork a world or a command for each message, until the line is closed."""
+    for module in ("sim.world.world", "trimesh"):  # which takes a third of a second, where there is a mesh
+        importlib.import_module(module)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    lines = [line]
     while True:
-        message, fds, _, _ = socket.recv_fds(line, 16, FDS)
-        if not message:
-            return
-        learn(lessons)
-        if pid := os.fork():
-            line.send(pid.to_bytes(8, "little"))
-            for fd in fds:
-                os.close(fd)
-            continue
-        line.close()
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        os.setsid()
-        start_threads()
-        for theirs, number in zip(fds, range(3), strict=False):
-            os.dup2(theirs, number)
-        code = 1
-        try:
-            known = signatures()
-            code = world.main()
-            if new := signatures() - known:
-                learnt.send(pickle.dumps(new))
-        finally:
-            os.write(fds[3], bytes([code]))
-            os._exit(code)
+        for asking in select.select(lines, [], [])[0]:
+            message, fds, _, _ = socket.recv_fds(asking, MOST_BYTES, FDS)
+            if not message and asking is line:
+                return
+            if not message:
+                lines.remove(asking)
+                asking.close()
+                continue
+            arguments, folder, environment = pickle.loads(message)
+            learn(lessons)
+            if arguments:
+                importlib.import_module("coupole.commands.cli")
+            gc.freeze()  # a fork that went through all of this would have to copy it
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            if pid := os.fork():
+                asking.send(pid.to_bytes(8, "little"))
+                for end in (*fds, theirs.detach()):
+                    os.close(end)
+                lines.append(ours)
+                continue
+            for other in (*lines, ours):
+                other.close()
+            live(arguments, folder, environment, fds, Nursery(theirs), learnt)
+
+
+def live(
+    arguments: list[str],
+    folder: str,
+    environment: dict[str, str],
+    fds: list[int],
+    nursery: Nursery,
+    learnt: socket.socket,
+) -> NoReturn:
+    """In a fork: be the world, or the command with these arguments, and tell the exit code."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    os.setsid()
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    start_threads()
+    *streams, told = fds
+    for theirs, number in zip(streams, range(3), strict=True):
+        os.dup2(theirs, number)
+        os.close(theirs)
+    sys.stdin, sys.stdout = os.fdopen(0, closefd=False), os.fdopen(1, "w", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+    from sim.world import world
+
+    known = signatures()
+    code = exit_code(commanded(arguments, nursery) if arguments else world.main)
+    if new := signatures() - known:
+        learnt.send(pickle.dumps(new))
+    os.write(told, bytes([code]))
+    os._exit(code)
+
+
+def commanded(arguments: list[str], nursery: Nursery) -> Callable[[], None]:
+    """The command line, whose worlds are of this nursery."""
+    from coupole.commands import cli
+    from sim.world import client
+
+    client._launch = nursery.start
+    sys.argv = arguments
+    return cli.main
+
+
+def exit_code(run: Callable[[], int | None]) -> int:
+    """Run it and do what an interpreter does at its end."""
+    code = 1
+    try:
+        code = run() or 0
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    except BaseException:  # noqa: BLE001  as an interpreter: tell, and end
+        traceback.print_exc()
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    return code
 
 
 def signatures() -> set[tuple[str, str, Any]]:
-    """Module, name and types of the arguments of all kernels of the simulator that are compiled here."""
+    """Module, name and types of the arguments of all our kernels that are compiled here."""
     return {
         (module, name, signature)
         for module, content in list(sys.modules.items())
-        if module.startswith("sim.")
+        if module.startswith(OURS)
         for name, kernel in vars(content).items()
         if isinstance(kernel, Dispatcher)
         for signature in kernel.signatures

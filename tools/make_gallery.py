@@ -114,7 +114,8 @@ _RENDERINGS = """
 ## Spectral renderings
 
 By `coupole render` (Mitsuba; `tools/make_renderings.py`), from the scenes in `configs/scenes/`. These
-pictures have 11 bands and few samples; the scene files ask for 81. *All are simulated.*
+pictures have 11 or 21 bands and few samples; the scene files ask for 81, and for 21 in the film. Those of the
+sun are denoised; the sunset is [a film](pictures/renderings/sunset-film-main.mp4) too. *All are simulated.*
 
 """
 _RENDERED = (
@@ -124,11 +125,12 @@ _RENDERED = (
     ("urushi-makie-main", "Sprinkled gold on black urushi (seed 002)"),
     ("nashiji-stereo-left", "Nashiji for the left eye (seed 002)"),
     ("nashiji-stereo-right", "Nashiji for the right eye"),
-    ("sunset-gilding-main", "Gilding under a low sun"),
+    ("sunset-gilding-main", "Gilding in the evening sun of 15 July 2009 at Paris, 21:09, 5 degrees high"),
     (
-        "arcature-main",
-        "A gilded niche in the sun, by path tracing: grainy, because paths hit the sun after gold only by chance",
+        "sunset-film-main",
+        "The same until 21:33, when the sun is 1.7 degrees high; one exposure",
     ),
+    ("arcature-main", "A gilded niche at 21:33: what gold sends onto the stone behind a king's head, by photons"),
     ("arcature-caustic", "The sun's light on the niche's ground and back wall, by photons (seed 001)"),
 )
 

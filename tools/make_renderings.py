@@ -10,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
+
 from coupole.appearance.render import studio
 from coupole.commands.render_scene import read_scene, render_scene
 
@@ -20,8 +22,9 @@ QUICK = {
     "gilt-step-wedge-a": (40, 480, 40),
     "paint-wedge": (40, 480, 40),
     "urushi-makie": (48, 360, 40),
-    "sunset-gilding": (48, 360, 40),
-    "arcature": (256, 360, 40),
+    "sunset-gilding": (48, 480, 20),
+    "sunset-film": (24, 360, 20),
+    "arcature": (96, 420, 20),
     "nashiji-stereo": (48, 280, 40),
 }
 """Samples, width in pixels, nm between bands."""
@@ -35,9 +38,22 @@ def main() -> None:
         quick = studio.reduced(scene, samples=samples, width_px=width_px, step_nm=step_nm)
         with tempfile.TemporaryDirectory() as folder:
             render_scene(document, quick, Path(folder), lambda camera, done, total: None)
-            for png in sorted(Path(folder).glob("*.png")):
-                shutil.copy(png, PICTURES)
-                print(f"{png.name}: {png.stat().st_size / 1000:.0f} kB")
+            for film in sorted(Path(folder).glob("*.mp4")):
+                _strip(Path(folder) / f"{film.stem}-frames", Path(folder) / f"{film.stem}.png")
+            for made in sorted([*Path(folder).glob("*.png"), *Path(folder).glob("*.mp4")]):
+                shutil.copy(made, PICTURES)
+                print(f"{made.name}: {made.stat().st_size / 1000:.0f} kB")
+
+
+def _strip(frames: Path, path: Path) -> None:
+    """Four pictures of a film beside each other, from its first to its last."""
+    pngs = sorted(frames.glob("*.png"))
+    pictures = [Image.open(pngs[round(part * (len(pngs) - 1) / 3)]) for part in range(4)]
+    width, height = pictures[0].size
+    strip = Image.new("RGB", (4 * width, height))
+    for number, picture in enumerate(pictures):
+        strip.paste(picture, (number * width, 0))
+    strip.save(path, optimize=True)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,11 @@ def render(
     width: Annotated[
         int | None, typer.Option("--width", min=4, help="Of the pictures, if less than the scene's.")
     ] = None,
-    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20 or 40.")] = None,
+    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20, 40.")] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option("--noise", min=1e-4, max=0.9, help="Stop at this noise: relative, in half of the pixels."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Render a scene in spectral bands: an EXR of all bands and a PNG for each camera, and a summary."""
@@ -41,7 +45,7 @@ def render(
         if step not in {None, 5, 10, 20, 40}:
             raise InputError(f"--step: expected 5, 10, 20 or 40, found {step}; choose one of them")
         document, wanted = read_scene(scene)
-        wanted = studio.reduced(wanted, samples=samples, width_px=width, step_nm=step)
+        wanted = studio.reduced(wanted, samples=samples, width_px=width, step_nm=step, noise=noise)
         console.print(f"{wanted.name}: Mitsuba, {studio.variant_of(wanted)}")
         with Progress(console=console, disable=not console.is_terminal) as bars:
             tasks: dict[str, TaskID] = {}
@@ -59,7 +63,13 @@ def render(
         print(json.dumps({"folder": str(out), **summary}))
         return
     for seen in summary["cameras"].values():
-        console.print(f"{out / seen['files']['png']}: white {seen['white_cd_m2']:.4g} cd/m2, simulated")
+        made = seen["files"].get("film") or seen["files"]["png"]
+        console.print(f"{out / made}: white {seen['white_cd_m2']:.4g} cd/m2{_noise(seen)}, simulated")
+
+
+def _noise(seen: dict[str, Any]) -> str:
+    noise = seen.get("noise")
+    return "" if noise is None else f", noise {noise:.2g} with {seen['samples']} paths a pixel"
 
 
 def read_scene(path: Path) -> tuple[Document, Scene]:

@@ -74,7 +74,7 @@ def read_led_table(path: Path) -> LedTable:
         except (ValueError, csv.Error) as error:
             wrong(line, str(error))
             continue
-        if len(values) != len(COLUMNS) or not np.all(np.isfinite(values)):
+        if len(values) != len(COLUMNS) or not all(map(math.isfinite, values)):
             wrong(line, f"expected {len(COLUMNS)} finite numbers, found {len(values)} fields")
             continue
         led = int(values[0])

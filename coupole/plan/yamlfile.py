@@ -17,7 +17,7 @@ import math
 import pickle
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -133,13 +133,17 @@ def read(path: Path) -> Document:
 
 def parse(path: Path, text: str) -> Document:
     """The same of a file's text; `path` is where it is, or was."""
-    return Document(path, *pickle.loads(_parsed(path, text)))
+    try:
+        return Document(path, *pickle.loads(_parsed(text)))
+    except InputError as error:
+        raise InputError([replace(problem, file=str(path)) for problem in error.problems]) from error
 
 
 @functools.lru_cache(maxsize=64)
-def _parsed(path: Path, text: str) -> bytes:
+def _parsed(text: str) -> bytes:
     """Data and places of values and keys, pickled: one command reads some files several times, a record of a
-    calibration for a second each, and whoever reads one may change what he was given."""
+    calibration for a second each, and whoever reads one may change what he was given. Problems name no file."""
+    path = Path()
     tabs = [
         Problem(str(path), number, len(line) - len(line.lstrip(" ")) + 1, "", "a tab; indent with spaces")
         for number, line in enumerate(text.split("\n"), start=1)
@@ -182,10 +186,8 @@ def text_of(path: Path) -> str:
 
 def compose(path: Path, text: str) -> Node | None:
     """The graph of YAML nodes, None when the file has no content."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
     try:
-        root: Node | None = yaml.compose(text)
+        return _graph(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place: Place = (mark.line + 1, mark.column + 1) if mark else (0, 0)
@@ -199,6 +201,14 @@ def compose(path: Path, text: str) -> Node | None:
         raise InputError([_problem_after(path, before, f"not valid YAML: {reason}")]) from error
     except RecursionError as error:
         raise InputError([Problem(str(path), 0, 0, "", f"nested deeper than {MAX_DEPTH} levels")]) from error
+
+
+@functools.lru_cache(maxsize=4)
+def _graph(text: str) -> Node | None:
+    """A text is composed once to be read and once to be rewritten; nobody changes the nodes."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
+    root: Node | None = yaml.compose(text)
     return root
 
 

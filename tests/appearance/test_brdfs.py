@@ -12,7 +12,6 @@ from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.spectra.grid import BANDS, Array
 
-GOLD = indices.gold()
 COSINES = np.array([0.05, 0.2, 0.5, 0.8, 1.0])
 
 
@@ -21,9 +20,17 @@ def mirror_all(cosines: Array) -> Array:
     return np.ones((*np.shape(cosines), 1))
 
 
+def of_gold(cosines: Array) -> Array:
+    """The share that gold reflects, in five bands."""
+    reflected: Array = fresnel.of_index(indices.gold()[::20])(cosines)
+    return reflected
+
+
 def gilt_brdf() -> Brdf:
     bole = np.full(BANDS, 0.9)
-    coats = gilding.coats(gilding.gilt(GOLD, 30.0, bole, uncovered=0.2), leaf_roughness=0.15, bole_roughness=0.4)
+    coats = gilding.coats(
+        gilding.gilt(indices.gold(), 30.0, bole, uncovered=0.2), leaf_roughness=0.15, bole_roughness=0.4
+    )
     return partial(gilding.gilt_brdf, coats=coats)
 
 
@@ -37,7 +44,7 @@ BRDFS: dict[str, Brdf] = {
     "oren-nayar": partial(brdf.oren_nayar, reflectance=1.0, roughness=0.7),
     "smooth ggx": partial(brdf.ggx, roughness=0.05, fresnel=mirror_all),
     "rough ggx": partial(brdf.ggx, roughness=0.8, fresnel=mirror_all),
-    "golden ggx": partial(brdf.ggx, roughness=0.2, fresnel=fresnel.of_index(GOLD[::20])),
+    "golden ggx": partial(brdf.ggx, roughness=0.2, fresnel=of_gold),
     "smooth cook-torrance": partial(brdf.cook_torrance, slope=0.1, fresnel=mirror_all),
     "rough cook-torrance": partial(brdf.cook_torrance, slope=0.6, fresnel=mirror_all),
     "lacquered white": partial(
@@ -106,11 +113,11 @@ def test_ggx_of_roughness_one_has_a_closed_form_along_the_normal() -> None:
 
 
 def test_a_smooth_metals_lobe_holds_its_fresnel_reflectance() -> None:
-    f = partial(brdf.ggx, roughness=0.02, fresnel=fresnel.of_index(GOLD))
+    f = partial(brdf.ggx, roughness=0.02, fresnel=fresnel.of_index(indices.gold()))
 
     reflected = hemisphere.albedo(f, np.array([0.7]))[0]
 
-    assert reflected == pytest.approx(fresnel.reflectance(0.7, GOLD), abs=5e-3)
+    assert reflected == pytest.approx(fresnel.reflectance(0.7, indices.gold()), abs=5e-3)
 
 
 def test_cook_torrance_in_the_papers_norm_would_create_light() -> None:
@@ -154,7 +161,7 @@ def test_paint_under_smooth_lacquer_is_what_saunderson_says() -> None:
 
 
 def test_a_gilts_lobes_hold_what_the_smooth_gilt_reflects() -> None:
-    gilded = gilding.gilt(GOLD, 20.0, np.full(BANDS, 0.5))
+    gilded = gilding.gilt(indices.gold(), 20.0, np.full(BANDS, 0.5))
     specular, diffuse = gilding.reflectances(gilded)
     f = partial(gilding.gilt_brdf, coats=gilding.coats(gilded, leaf_roughness=0.02, bole_roughness=0.02))
 

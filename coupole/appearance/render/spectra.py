@@ -77,8 +77,17 @@ class BlackBody(Model):
     kelvin: Annotated[float, Field(ge=800, le=30000)]
 
 
+class Values(Model):
+    """81 values, 380 to 780 nm by 5 nm."""
+
+    kind: Literal["values"]
+    name: str = "given"
+    """As pictures and pages name it."""
+    values: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=BANDS, max_length=BANDS)]
+
+
 class LowSun(Model):
-    """The sun at an elevation, through clear air: computed, not measured.
+    """The sun at a refracted elevation, through clear air: computed, not measured.
 
     A black body of 5778 K behind Rayleigh scattering 0.008735 um^-4.08 and haze beta um^-1.3 (Leckner 1978), over
     the air mass of Kasten and Young 1989. Ozone is neglected.
@@ -90,7 +99,9 @@ class LowSun(Model):
     """Angstrom's beta: 0.02 is clear, 0.2 is turbid."""
 
 
-Power = Annotated[Illuminant | Source | DomeLed | BlackBody | LowSun | Measured, Field(discriminator="kind")]
+Power = Annotated[
+    Illuminant | Source | DomeLed | BlackBody | LowSun | Values | Measured, Field(discriminator="kind")
+]
 
 
 def reflectance(spectrum: Reflectance, folder: Path) -> Array:
@@ -123,6 +134,8 @@ def power(spectrum: Power, folder: Path) -> Array:
         return _planck(spectrum.kelvin)
     if isinstance(spectrum, LowSun):
         return _low_sun(spectrum)
+    if isinstance(spectrum, Values):
+        return np.array(spectrum.values)
     read = measured.read_spectrum(folder / spectrum.path, unit="power", column=spectrum.column)
     return np.maximum(resampling.held(resampling.on_grid(read)), 0.0)
 

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from coupole.appearance.render import pictures, variant, wall
-from coupole.appearance.render.rendering import opened
-from coupole.appearance.render.scene_file import Scene
+from coupole.appearance.render import by_gold, pictures, variant, wall
+from coupole.appearance.render.film import write_film
+from coupole.appearance.render.rendering import Renderer, Spectral, opened
+from coupole.appearance.render.scene_file import Camera, Film, Scene
+from coupole.appearance.render.spectra import power
 
 Progress = Callable[[str, int, int], None]
 """Camera, passes done, passes in all."""
 
 
-def reduced(scene: Scene, *, samples: int | None, width_px: int | None, step_nm: int | None) -> Scene:
+def reduced(
+    scene: Scene,
+    *,
+    samples: int | None = None,
+    width_px: int | None = None,
+    step_nm: int | None = None,
+    noise: float | None = None,
+) -> Scene:
     """The scene with fewer samples, narrower pictures or coarser bands, for a quick look."""
     cameras = [camera.narrowed(width_px) if width_px else camera for camera in scene.cameras]
     changed = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
     if samples:
         changed["samples"] = samples
+    if noise:
+        changed["noise"] = noise
     if step_nm:
         changed["bands"] = {"step_nm": step_nm}
     return Scene.model_validate(changed)
@@ -36,23 +49,12 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
 
     Raises InputError for an inconsistent scene or a missing library, OSError for files.
     """
-    with opened(scene, folder) as renderer:
-        white = pictures.white_of(scene, folder)
-        written_by = f"Mitsuba {renderer.version}, {renderer.variant_name}"
-        seen = {}
-        for camera in scene.cameras:
-            name = camera.name
-            found = renderer.render(camera, partial(progress, name))
-            stem = out / f"{scene.name}-{name}"
-            seen[name] = pictures.write(scene, found, stem, white=white, written_by=written_by)
-        summary: dict[str, Any] = {"cameras": seen}
-        if scene.caustic is not None:
-            stem = out / f"{scene.name}-caustic"
-            summary["caustic"] = wall.write_wall(scene, folder, stem, white, partial(progress, "caustic"))
+    summary = (
+        _film(scene, scene.film, folder, out, progress) if scene.film else _still(scene, folder, out, progress)
+    )
     return {
         "scene": scene.name,
         "synthetic": True,
-        "renderer": written_by,
         "bands": len(range(380, 781, scene.bands.step_nm)),
         "samples": scene.samples,
         "depth": scene.depth,
@@ -60,3 +62,85 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
         "observer": f"CIE {scene.observer}",
         **summary,
     }
+
+
+def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
+    with opened(scene, folder) as renderer:
+        eye = pictures.eye_of(renderer.scene, folder)
+        written_by = _written_by(renderer)
+        seen = {}
+        for camera in scene.cameras:
+            found = _seen(renderer, camera, folder, partial(progress, camera.name))
+            stem = out / f"{scene.name}-{camera.name}"
+            seen[camera.name] = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by)
+        summary: dict[str, Any] = {"renderer": written_by, "cameras": seen}
+        if scene.caustic is not None:
+            stem = out / f"{scene.name}-caustic"
+            white_power = power(renderer.scene.lights[0].spectrum, folder)
+            summary["caustic"] = wall.write_wall(
+                renderer.scene, folder, stem, white_power, partial(progress, "caustic")
+            )
+    return summary
+
+
+def _film(scene: Scene, film: Film, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
+    """A PNG and its summary for each camera and time, then the film; pictures of the same scene stay as they are.
+
+    All have the scene's `white_cd_m2`, or the level that the first of each camera has by itself.
+    """
+    times, seen, written_by = film.times(), {}, ""
+    for camera in scene.cameras:
+        frames = out / f"{scene.name}-{camera.name}-frames"
+        frames.mkdir(parents=True, exist_ok=True)
+        fixed = scene.model_copy(update={"cameras": (camera,), "film": None, "caustic": None})
+        made: list[dict[str, Any]] = []
+        for number, when in enumerate(times):
+            progress(camera.name, number, len(times))
+            made.append(_frame(fixed.at(when), folder, frames / f"{number:04d}"))
+            written_by = made[-1]["renderer"]
+            if number == 0:
+                display = fixed.display.model_copy(update={"white_cd_m2": made[0]["white_cd_m2"]})
+                fixed = fixed.model_copy(update={"display": display})
+        progress(camera.name, len(times), len(times))
+        path = out / f"{scene.name}-{camera.name}.mp4"
+        told = (
+            f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {times[0].isoformat()} to {times[-1].isoformat()}"
+        )
+        write_film([frames / one["files"]["png"] for one in made], path, film.frames_per_s, told)
+        seen[camera.name] = {
+            "files": {"film": path.name, "frames": frames.name},
+            "frames": len(made),
+            "white_cd_m2": made[0]["white_cd_m2"],
+            "mean_cd_m2": [one["mean_cd_m2"] for one in made],
+        }
+    return {"renderer": written_by, "cameras": seen}
+
+
+def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
+    """One picture of a film, unless it is there; a film that was interrupted goes on where it was."""
+    summary_path = stem.with_suffix(".json")
+    digest = sha256(f"{scene.model_dump_json()} {variant_of(scene)}".encode()).hexdigest()
+    if summary_path.exists():
+        known: dict[str, Any] = json.loads(summary_path.read_text())
+        if known["of"] == digest:
+            return known
+    with opened(scene, folder) as renderer:
+        found = _seen(renderer, scene.cameras[0], folder, lambda done, total: None)
+        eye = pictures.eye_of(renderer.scene, folder)
+        written_by = _written_by(renderer)
+        seen = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by, with_spectra=False)
+    made = {"of": digest, "renderer": written_by, **seen}
+    summary_path.write_text(json.dumps(made) + "\n")
+    return made
+
+
+def _seen(renderer: Renderer, camera: Camera, folder: Path, progress: Callable[[int, int], None]) -> Spectral:
+    gathered = renderer.scene.gathered
+    if gathered is None:
+        return renderer.render(camera, progress)
+    return by_gold.render(renderer.scene, gathered, camera, folder, progress)
+
+
+def _written_by(renderer: Renderer) -> str:
+    photons = "" if renderer.scene.gathered is None else ", and photons gathered by the eye"
+    return f"Mitsuba {renderer.version}, {renderer.variant_name}{photons}"

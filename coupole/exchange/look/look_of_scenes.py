@@ -14,7 +14,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.render import objects
 from coupole.appearance.render.materials import Glass, Lacquer, Material, Metal
 from coupole.appearance.render.objects import Ball, MakieTile, NashijiSlab, Piece
-from coupole.appearance.render.scene_file import Scene
+from coupole.appearance.render.scene_file import PlainScene, Scene, with_plain_lights
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import flat_normals
@@ -78,6 +78,7 @@ class _Materials:
 
 def look_of_scene(scene: Scene, folder: Path) -> Look:
     """Of a scene whose paths are relative to `folder`. Raises InputError, with what can be shown."""
+    scene = with_plain_lights(scene, folder)
     found, face = _Materials(folder), None
     parts: list[_Part] = []
     for thing in scene.objects:
@@ -129,7 +130,7 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def _about(scene: Scene, folder: Path, powers: dict[str, Array], found: _Materials) -> dict[str, Any]:
+def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Materials) -> dict[str, Any]:
     start = start_of(scene, folder)
     lamps = [light.kind for light in scene.lights if light.kind in {"area", "leds"}]
     return {

@@ -11,9 +11,9 @@ from typing import Any, assert_never
 import numpy as np
 
 from coupole.appearance.render.led_squares import read_leds
-from coupole.appearance.render.lights import Area, Distant, Environment, Leds, Light
-from coupole.appearance.render.scene_file import Camera, Scene
-from coupole.appearance.render.spectra import BlackBody, DomeLed, Illuminant, LowSun, Power, Source, power
+from coupole.appearance.render.lights import Area, Distant, Environment, Leds, PlainLight
+from coupole.appearance.render.scene_file import Camera, PlainScene
+from coupole.appearance.render.spectra import BlackBody, DomeLed, Illuminant, LowSun, Power, Source, Values, power
 from coupole.appearance.spectra import light as known_light
 from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.white_led import LedSpectrum, spectral_power
@@ -35,7 +35,7 @@ class _Lamp:
     spectrum: Power
 
 
-def illuminants(scene: Scene, folder: Path) -> dict[str, Array]:
+def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
     """Spectral power [81] by name: the scene's own first, then those that a page always offers."""
     found = {named(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
     offered = {name: known_light.illuminant(name) for name in ("D65", "A")}
@@ -47,7 +47,7 @@ def illuminants(scene: Scene, folder: Path) -> dict[str, Array]:
 def named(spectrum: Power) -> str:
     """As the page names it."""
     match spectrum:
-        case Illuminant() | Source():
+        case Illuminant() | Source() | Values():
             return spectrum.name
         case DomeLed():
             return "LED of the dome"
@@ -60,7 +60,7 @@ def named(spectrum: Power) -> str:
             return f"{spectrum.path.name}{column}"
 
 
-def start_of(scene: Scene, folder: Path) -> dict[str, Any]:
+def start_of(scene: PlainScene, folder: Path) -> dict[str, Any]:
     """The page's first state. Raises InputError for more lamps than the page has."""
     target = np.asarray(scene.cameras[0].target_mm)
     lamps = [lamp for light in scene.lights for lamp in _lamps(light, folder, target)]
@@ -83,7 +83,7 @@ def start_of(scene: Scene, folder: Path) -> dict[str, Any]:
     }
 
 
-def _lamps(light: Light, folder: Path, target: Array) -> Iterator[_Lamp]:
+def _lamps(light: PlainLight, folder: Path, target: Array) -> Iterator[_Lamp]:
     match light:
         case Environment():
             return

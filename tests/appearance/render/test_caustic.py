@@ -6,17 +6,20 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from spectral_scenes import constant, illuminant, rendered, scene
+from spectral_scenes import HERE, constant, everywhere, illuminant, rendered, scene
 
 from coupole.appearance.matter import layered
 from coupole.appearance.optics import indices
 from coupole.appearance.optics.thin_film import Film
+from coupole.appearance.render import by_gold
 from coupole.appearance.render.arcature import arcature, nephroid
 from coupole.appearance.render.caustic import Niche, Sun, irradiance, photons
+from coupole.appearance.render.scene_file import Gathered, with_plain_lights
 from coupole.appearance.render.spectra import scaled
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import BANDS, Array
+from coupole.errors import InputError
 
 Scale = Callable[[int, int], int]
 RADIUS_MM, HEIGHT_MM, DEPTH_MM = 400.0, 600.0, 300.0
@@ -87,6 +90,7 @@ def test_rough_gold_spreads_light_but_does_not_make_any() -> None:
     assert np.all(returned > 0.9 * found.started)  # what facets hide from each other is lost
 
 
+@pytest.mark.full
 def test_photons_and_the_path_tracer_see_the_same_light_on_the_wall(scale: Scale) -> None:
     width_deg, lux, grey = 20.0, 1000.0, 1e-4
     way = np.array([0.9, 0.43, -0.03])
@@ -119,3 +123,54 @@ def test_photons_and_the_path_tracer_see_the_same_light_on_the_wall(scale: Scale
     found = photons(lined, source, (-400.0, 400.0, 700.0), scale(300_000, 4_000_000), seed=5)
     lit = irradiance(found, (x - side_mm / 2, x + side_mm / 2), 300.0, side_mm, 350.0)[0, 0, ::8]
     assert lit == pytest.approx(traced, rel=0.06)  # 0.015 with four times the samples
+
+
+def test_photons_gathered_by_the_eye_and_paths_alone_make_the_same_picture(scale: Scale) -> None:
+    """Of a niche of stone that reflects, with wide sun and rough gold, which paths find too."""
+    stone = {"kind": "diffuse", "reflectance": constant(0.5)}
+    thing = {"kind": "arcature", "height_mm": 300, "depth_mm": 350, "gilt": {"kind": "gilt", "roughness": 0.4}}
+    sunlight = {"kind": "distant", "direction": [0.9, 0.43, -0.03], "illuminance_lux": 1000.0, "width_deg": 45.0}
+    outside = {
+        "name": "main",
+        "position_mm": [-100, -1200, 420],
+        "target_mm": [0, 100, 380],
+        "optics": {"kind": "field", "degrees": 34},
+        "width_px": 16,
+        "height_px": 16,
+    }
+    one = scene(
+        [{**thing, "stone": stone}],
+        [{**sunlight, "spectrum": illuminant("E")}, everywhere(illuminant("D65"), 2.0)],
+        cameras=[outside],
+        samples=scale(256, 8000),
+        depth=10,
+        bands={"step_nm": 40},
+    )
+    plain = with_plain_lights(one, HERE)
+    wanted = Gathered(photons=scale(60_000, 2_000_000), radius_mm=8.0)
+    gathered = by_gold.render(plain, wanted, plain.cameras[0], HERE, lambda done, total: None).radiance
+    traced = rendered(one).radiance
+    inside = (slice(2, 15), slice(4, 12))  # where the niche is seen
+    assert gathered[inside].sum(axis=(0, 1)) == pytest.approx(
+        traced[inside].sum(axis=(0, 1)), rel=scale(6, 2) / 100
+    )
+    without = by_gold.render(
+        plain, Gathered(photons=1000, radius_mm=0.01), plain.cameras[0], HERE, lambda done, total: None
+    ).radiance
+    assert without[inside].sum() < 0.97 * traced[inside].sum()  # what photons add can be seen
+
+
+def test_what_photons_do_not_know_is_refused() -> None:
+    wanted = with_plain_lights(
+        scene(
+            [{"kind": "sphere", "radius_mm": 20, "material": {"kind": "lacquer"}}],
+            [{"kind": "distant", "direction": [0, 0, -1], "illuminance_lux": 10.0, "spectrum": illuminant("E")}],
+            gathered={},
+        ),
+        HERE,
+    )
+    assert wanted.gathered is not None
+    with pytest.raises(
+        InputError, match="`gathered` expected materials `diffuse`, `gilt` and bare `metal`, found `lac"
+    ):
+        by_gold.render(wanted, wanted.gathered, wanted.cameras[0], HERE, lambda done, total: None)

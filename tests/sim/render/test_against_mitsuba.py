@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import pytest
+from lazily import lazily
 from numpy.typing import NDArray
 from scenes import camera_above, quad, relief, scene_of, sphere
 
@@ -24,6 +24,8 @@ from sim.render.lens import Lens
 from sim.render.radiance import led_radiance
 from sim.render.shadows import Shadows
 from sim.scene.surface import Material
+
+mi: Any = lazily("mitsuba")
 
 LED_MM, TOWARDS, FLUX_LM = np.array([350.0, -200.0, 700.0]), np.array([-0.4, 0.3, -0.87]), 1800.0
 LOW_LED_MM = np.array([450.0, -200.0, 250.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,14 @@ from sim.scene.surface import Material
 from sim.world.config import MeasuredConfig
 
 LENS, TILTED = Lens(40, 30, 40.0), camera_above(330.0, 35.0)
-WEIGHTS = camera_weights(LedModel(), light.camera())
 SLOW = {"tabulated", "four-flux"}
 GLOSSY = ExportedMaterial("glossy", np.array([0.2, 0.15, 0.1]), np.array([0.05, 0.04, 0.03]), 0.3)
+
+
+@cache
+def weights() -> np.ndarray:
+    """Of the simulated camera under a white LED."""
+    return camera_weights(LedModel(), light.camera())
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -63,7 +69,7 @@ def test_a_specimen_is_shown_as_it_reflects(name: str) -> None:
     scene = scene_of(quad((0.0, 0.0, 0.0), 400.0), specimen(name))
     for shown, lit, lights, eyes in seen_under_leds(scene):
         spectral = SPECIMENS[name]()(lights, eyes)
-        expected = spectral @ WEIGHTS.T * lit
+        expected = spectral @ weights().T * lit
         off = np.abs(shown / expected - 1.0)
         assert np.median(off) < 3e-3
         assert np.quantile(off, 0.95) < 0.02
@@ -148,7 +154,7 @@ def test_spectra_are_seen_by_the_camera_and_threads_from_all_sides(tmp_path: Pat
     cosine = np.cos(0.25 * np.pi)  # light and eye at theta_h 0, theta_d 45 degrees; the table is f cos
     theta_d = np.linspace(0, 0.5 * np.pi, table.shape[1])
     found = np.array([np.interp(0.25 * np.pi, theta_d, table[0, :, 3, channel]) for channel in range(3)])
-    red = WEIGHTS @ np.interp(WAVELENGTHS_NM, nm, nm > 600)
+    red = weights() @ np.interp(WAVELENGTHS_NM, nm, nm > 600)
     np.testing.assert_allclose(found, red / cosine, rtol=1e-3)
     assert found[0] > 5 * found[2]
 

@@ -36,7 +36,7 @@ class Console:
 
     def ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> Any:
         sys.path.insert(0, str(self.root))
-        from coupole.console.client import call
+        from coupole.console.command_line.client import call
         from coupole.plan.cell import read_cell
 
         return call(read_cell(self.rig), method, path, body)

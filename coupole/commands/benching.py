@@ -39,7 +39,7 @@ def bench(
     or when a client asks for it; the cell is then safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import Cell, read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
@@ -74,7 +74,7 @@ def arm(
     from coupole.acquisition.cell_bench.bench_service import bench_of
     from coupole.acquisition.observer import Control
     from coupole.acquisition.runtime_folder import is_in_use
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console

@@ -44,7 +44,7 @@ def calibrate_all(
     For a real cell it prints what must be on the support, and waits; a simulated one has its own object and
     scanner.
     """
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.viewing.terminal import make_console

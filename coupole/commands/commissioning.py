@@ -36,7 +36,7 @@ def commission(
     """
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.preflight.commissioned import STEPS, record_path

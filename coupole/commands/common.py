@@ -55,7 +55,7 @@ def plan_of(resumed: Path | None) -> Path:
 
 def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cell | None:
     """The cell of a plan, or of a run that is resumed, if a console owns it; None if none does."""
-    from coupole.console.client import is_served
+    from coupole.console.command_line.client import is_served
     from coupole.plan.cell import read_cell
     from coupole.plan.reading import read_plan
     from coupole.storage.run import Run

@@ -83,8 +83,8 @@ def serve(
 
 def _test_notifications(rig: Path, *, as_json: bool) -> None:
     """Raises InputError: nothing is set up, or something could not be sent."""
-    from coupole.console.notifications import NAME, console_folder, read_settings
-    from coupole.console.notifier import send_test
+    from coupole.console.upkeep.notifications import NAME, console_folder, read_settings
+    from coupole.console.upkeep.notifier import send_test
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
@@ -136,7 +136,7 @@ def queue(
 
     Preflight is made of each as it is entered, counted with what runs and waits before it.
     """
-    from coupole.console.client import PREFLIGHT_S, call
+    from coupole.console.command_line.client import PREFLIGHT_S, call
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 

@@ -52,7 +52,7 @@ def acquire(
     try:
         served = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
         if served is not None:
-            from coupole.console.following import acquire_by_console
+            from coupole.console.command_line.following import acquire_by_console
 
             named = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
             asked = {key: str(path.resolve()) for key, path in named.items() if path is not None}
@@ -82,7 +82,7 @@ def devices(
     from rich.table import Table
 
     from coupole.acquisition.opened_cell import open_cell
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
@@ -123,7 +123,7 @@ def meter(
 ) -> None:
     """Advise on a plan's exposure, by a few pictures of each view under a few lights, which are not stored."""
     from coupole.acquisition.looking import meter as meter_plan
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.preflight.exposure_advice import Request, write_plan
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console, show_advice
@@ -159,7 +159,7 @@ def live(
     entered in the ledger) the camera is opened; the arm is not moved.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
-    from coupole.console.client import borrowed
+    from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import Cell, read_cell
     from coupole.plan.yamlfile import read
     from coupole.preflight.job import read_job

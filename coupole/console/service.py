@@ -12,31 +12,31 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from coupole.console.accounts import Account, Accounts, Role
-from coupole.console.acquisitions import Acquisitions
-from coupole.console.api import make_app
-from coupole.console.audit import Audit
-from coupole.console.bench_keeper import Bench
-from coupole.console.calibration_status import CalibrationStatus
-from coupole.console.client import service_socket
-from coupole.console.drafts import Desk
-from coupole.console.entering import Entering
-from coupole.console.frame_sheets import FrameSheets
-from coupole.console.messages import StateNow
-from coupole.console.notifications import console_folder, read_settings
-from coupole.console.notifier import Notifier, Occurrences
-from coupole.console.object_files import ObjectFiles
-from coupole.console.plan_files import PlanFiles
-from coupole.console.plan_queue import PlanQueue
-from coupole.console.run_files import RunFiles
-from coupole.console.run_watch import RunWatch
+from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.cell.bench_keeper import Bench
+from coupole.console.cell.calibration_status import CalibrationStatus
+from coupole.console.cell.state_now import Newest, state_of
+from coupole.console.command_line.client import service_socket
+from coupole.console.people.accounts import Account, Accounts, Role
+from coupole.console.people.audit import Audit
+from coupole.console.people.sessions import Control, Session, Sessions
+from coupole.console.plans.drafts import Desk
+from coupole.console.plans.entering import Entering
+from coupole.console.plans.object_files import ObjectFiles
+from coupole.console.plans.plan_files import PlanFiles
+from coupole.console.plans.plan_queue import PlanQueue
+from coupole.console.processes.tasks import Tasks
+from coupole.console.routes.api import make_app
+from coupole.console.routes.messages import StateNow
+from coupole.console.routes.sockets import in_url, is_here, listen, origins_of, run_servers, tls_context
+from coupole.console.runs.frame_sheets import FrameSheets
+from coupole.console.runs.run_files import RunFiles
+from coupole.console.runs.run_watch import RunWatch
 from coupole.console.screens.all_screens import add_screens
 from coupole.console.service_parts import Service
-from coupole.console.sessions import Control, Session, Sessions
-from coupole.console.sockets import in_url, is_here, listen, origins_of, run_servers, tls_context
-from coupole.console.state_now import Newest, state_of
-from coupole.console.support_bundle import SupportBundles
-from coupole.console.tasks import Tasks
+from coupole.console.upkeep.notifications import console_folder, read_settings
+from coupole.console.upkeep.notifier import Notifier, Occurrences
+from coupole.console.upkeep.support_bundle import SupportBundles
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.storage.durable import make_folder

@@ -6,23 +6,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from coupole.console.accounts import Accounts
-from coupole.console.acquisitions import Acquisitions
-from coupole.console.audit import Audit
-from coupole.console.bench_keeper import Bench
-from coupole.console.calibration_status import CalibrationStatus
-from coupole.console.drafts import Desk
-from coupole.console.entering import Entering
-from coupole.console.frame_sheets import FrameSheets
-from coupole.console.messages import StateNow
-from coupole.console.object_files import ObjectFiles
-from coupole.console.plan_files import PlanFiles
-from coupole.console.plan_queue import PlanQueue
-from coupole.console.run_files import RunFiles
-from coupole.console.run_watch import RunWatch
-from coupole.console.sessions import Control, Session, Sessions
-from coupole.console.support_bundle import SupportBundles
-from coupole.console.tasks import Tasks
+from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.cell.bench_keeper import Bench
+from coupole.console.cell.calibration_status import CalibrationStatus
+from coupole.console.people.accounts import Accounts
+from coupole.console.people.audit import Audit
+from coupole.console.people.sessions import Control, Session, Sessions
+from coupole.console.plans.drafts import Desk
+from coupole.console.plans.entering import Entering
+from coupole.console.plans.object_files import ObjectFiles
+from coupole.console.plans.plan_files import PlanFiles
+from coupole.console.plans.plan_queue import PlanQueue
+from coupole.console.processes.tasks import Tasks
+from coupole.console.routes.messages import StateNow
+from coupole.console.runs.frame_sheets import FrameSheets
+from coupole.console.runs.run_files import RunFiles
+from coupole.console.runs.run_watch import RunWatch
+from coupole.console.upkeep.support_bundle import SupportBundles
 from coupole.plan.cell import Cell
 
 

@@ -140,6 +140,19 @@ def test_one_acts_the_other_watches_until_control_is_handed_over(two: Two) -> No
     cells.wait_until(lambda: two.state()["in_control"] == "", "nobody in control")
 
 
+def test_whatever_the_cell_is_lent_for_is_interrupted_by_the_headers_stop(two: Two) -> None:
+    command = [sys.executable, "-c", BORROWER, str(two.cell.rig)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=cells.REPO
+    ) as borrower:
+        assert borrower.stdout is not None
+        assert borrower.stdout.readline() == "mine\n"
+        cells.wait_until(lambda: two.state()["lent_to"], "the loan")
+        two.max.clicks("[data-name=stop]")
+        assert borrower.wait(cells.PATIENCE_S) == -signal.SIGINT
+    cells.wait_until(lambda: not two.state()["lent_to"], "the end of the loan")
+
+
 SCREENS = (("/run", "No run"), ("/queue", "coffee"), ("/plan", "can be run"), ("/object", "lux h"))
 
 
@@ -173,19 +186,7 @@ def test_a_stop_by_who_watches_puts_the_light_out_at_once(two: Two) -> None:
     two.max.sees("[data-name=alarm]", "stopped")
 
 
-def test_whatever_the_cell_is_lent_for_is_interrupted_by_the_headers_stop(two: Two) -> None:
-    command = [sys.executable, "-c", BORROWER, str(two.cell.rig)]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, cwd=cells.REPO
-    ) as borrower:
-        assert borrower.stdout is not None
-        assert borrower.stdout.readline() == "mine\n"
-        cells.wait_until(lambda: two.state()["lent_to"], "the loan")
-        two.max.clicks("[data-name=stop]")
-        assert borrower.wait(cells.PATIENCE_S) == -signal.SIGINT
-    cells.wait_until(lambda: not two.state()["lent_to"], "the end of the loan")
-
-
+@pytest.mark.full  # without a browser: tests/console/plans/test_plan_queue.py
 def test_a_run_that_does_not_answer_is_said_to_be_silent_and_stopped(two: Two) -> None:
     _empty(two)
     now = two.begins()
@@ -201,7 +202,7 @@ def test_a_run_that_does_not_answer_is_said_to_be_silent_and_stopped(two: Two) -
     cells.wait_until(lambda: two.state()["state"] == "halted", "the end of its process")
 
 
-@pytest.mark.full  # over HTTP: tests/console/test_command_line.py
+@pytest.mark.full  # over HTTP: tests/console/command_line/test_command_line.py
 def test_a_killed_acquisition_leaves_a_dark_cell_and_is_offered_to_be_resumed(two: Two) -> None:
     _empty(two)
     now = two.begins()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.accounts import Role
-from coupole.console.calibration_status import PlanRow, RecordRow, StepNow
+from coupole.console.cell.calibration_status import PlanRow, RecordRow, StepNow
+from coupole.console.people.accounts import Role
 from coupole.console.screens.calibration_pictures import placed
 from coupole.console.screens.parts import button, count, moment, named, panel, sure, table_html
 from coupole.console.screens.task_list import TaskList

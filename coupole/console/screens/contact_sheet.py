@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from nicegui import events, ui
 
-from coupole.console.frame_sheets import SheetFrame
+from coupole.console.runs.frame_sheets import SheetFrame
 from coupole.console.screens.parts import button, picture_address
 
 PER_PAGE, _WIDTH_PX = 60, 160

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from nicegui import events, ui
 
-from coupole.console.frame_sheets import LedPlace, SheetFrame
+from coupole.console.runs.frame_sheets import LedPlace, SheetFrame
 from coupole.viewing.view_colours import css, of_share
 
 _LARGEST, _EDGE = 0.05, 1.12

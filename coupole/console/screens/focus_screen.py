@@ -7,9 +7,9 @@ from typing import Any
 
 from nicegui import ui
 
-from coupole.console.accounts import Role
-from coupole.console.permission import NotAllowed, allow
-from coupole.console.plan_fields import fields_of
+from coupole.console.people.accounts import Role
+from coupole.console.people.permission import NotAllowed, allow
+from coupole.console.plans.plan_fields import fields_of
 from coupole.console.screens.bench_bar import BenchBar
 from coupole.console.screens.look_picture import LookPicture
 from coupole.console.screens.meter_panel import MeterPanel

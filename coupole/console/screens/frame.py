@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from nicegui import ui
 
-from coupole.console.messages import StateNow
+from coupole.console.routes.messages import StateNow
 from coupole.console.screens.parts import button
 from coupole.console.screens.visit import Visit
 from coupole.viewing.terminal import duration_text

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from nicegui import ui
 
-from coupole.console.run_files import Frame
+from coupole.console.runs.run_files import Frame
 from coupole.console.screens.parts import (
     button,
     clipping_words,

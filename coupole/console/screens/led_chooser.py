@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from nicegui import events, ui
 
-from coupole.console.frame_sheets import LedPlace
+from coupole.console.runs.frame_sheets import LedPlace
 from coupole.console.screens.parts import named
 from coupole.errors import InputError
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
-from coupole.console.plan_fields import fields_of, text_with
+from coupole.console.plans.plan_fields import fields_of, text_with
 from coupole.console.screens.parts import button, facts_html, named, panel, sure
 from coupole.console.screens.visit import Visit
 

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from nicegui import ui
 
-from coupole.console.drafts import Draft
+from coupole.console.plans.drafts import Draft
 from coupole.console.screens.parts import Choice, button, facts_html, named, panel, table_html
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError, InputError

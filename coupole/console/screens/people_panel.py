@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from coupole.console.accounts import SHORTEST_PASSWORD, Account, Role
+from coupole.console.people.accounts import SHORTEST_PASSWORD, Account, Role
 from coupole.console.screens.parts import Choice, button, labelled, panel, sure
 from coupole.console.screens.visit import Visit
 

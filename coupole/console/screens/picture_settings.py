@@ -7,7 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
-from coupole.console.frame_sheets import places_in
+from coupole.console.runs.frame_sheets import places_in
 from coupole.console.screens.led_chooser import LedChooser, numbers
 from coupole.console.screens.parts import button, named, panel
 from coupole.errors import InputError

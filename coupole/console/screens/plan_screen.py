@@ -11,9 +11,9 @@ from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.drafts import Checked, Draft
-from coupole.console.messages import NewEntry, StateNow
-from coupole.console.plan_fields import PlanFields, fields_of, text_with
+from coupole.console.plans.drafts import Checked, Draft
+from coupole.console.plans.plan_fields import PlanFields, fields_of, text_with
+from coupole.console.routes.messages import NewEntry, StateNow
 from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel
 from coupole.console.screens.plan_verdict import figures_of, view_table
 from coupole.console.screens.visit import Visit, enter, in_background, in_thread

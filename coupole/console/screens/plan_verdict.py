@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from coupole.console.drafts import Checked
+from coupole.console.plans.drafts import Checked
 from coupole.console.screens.parts import table_html
 from coupole.viewing.terminal import bytes_text, duration_text
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.messages import EntryNow, NewEntry, StateNow
+from coupole.console.routes.messages import EntryNow, NewEntry, StateNow
 from coupole.console.screens.parts import Choice, button, labelled, named, panel
 from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.viewing.terminal import bytes_text, duration_text

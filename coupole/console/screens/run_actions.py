@@ -8,12 +8,12 @@ from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.messages import NewEntry
-from coupole.console.run_results import export_folder, look_page, reflectance_folder, stands_alone
+from coupole.console.processes.tasks import Task
+from coupole.console.routes.messages import NewEntry
+from coupole.console.runs.run_results import export_folder, look_page, reflectance_folder, stands_alone
 from coupole.console.screens.export_dialog import ExportDialog
 from coupole.console.screens.parts import button, link, sure
 from coupole.console.screens.visit import Visit, enter, in_background, in_thread
-from coupole.console.tasks import Task
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 

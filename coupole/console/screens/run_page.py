@@ -7,10 +7,10 @@ from typing import Any
 
 from nicegui import events, ui
 
-from coupole.console.event_words import words_of
-from coupole.console.frame_sheets import LedPlace, SheetFrame, led_places
-from coupole.console.messages import NewEntry
-from coupole.console.run_files import RunRow
+from coupole.console.routes.messages import NewEntry
+from coupole.console.runs.event_words import words_of
+from coupole.console.runs.frame_sheets import LedPlace, SheetFrame, led_places
+from coupole.console.runs.run_files import RunRow
 from coupole.console.screens.contact_sheet import ContactSheet
 from coupole.console.screens.dome_picture import DomePicture
 from coupole.console.screens.frame_viewer import FrameViewer

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from nicegui import ui
 
-from coupole.console.messages import EntryNow, NewEntry, StateNow
-from coupole.console.run_files import Frame
-from coupole.console.run_watch import Watched
+from coupole.console.routes.messages import EntryNow, NewEntry, StateNow
+from coupole.console.runs.run_files import Frame
+from coupole.console.runs.run_watch import Watched
 from coupole.console.screens.fault_of_arm import FaultOfArm
 from coupole.console.screens.parts import (
     button,

@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from nicegui import events, ui
 
-from coupole.console.run_files import RunRow
+from coupole.console.runs.run_files import RunRow
 from coupole.console.screens.parts import button, heading, labelled, link, moment, panel, picture_address
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.task_list import TaskList

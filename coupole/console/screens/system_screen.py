@@ -6,13 +6,13 @@ from typing import Any
 
 from nicegui import ui
 
-from coupole.console.accounts import Role
+from coupole.console.people.accounts import Role
 from coupole.console.screens.parts import button, facts, moment, named, panel, table_html
 from coupole.console.screens.people_panel import PeoplePanel
 from coupole.console.screens.task_list import TaskList
 from coupole.console.screens.visit import Visit, in_thread
-from coupole.console.support_bundle import versions
-from coupole.console.system_facts import NOTIFICATIONS, Disk, disk_of, log_lines, notifications, to_measure
+from coupole.console.upkeep.support_bundle import versions
+from coupole.console.upkeep.system_facts import NOTIFICATIONS, Disk, disk_of, log_lines, notifications, to_measure
 from coupole.viewing.terminal import bytes_text
 
 _LOG_SHOWN, _LOOK_EVERY_S = 100, 3.0

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 from nicegui import ui
 
-from coupole.console.accounts import Role
+from coupole.console.people.accounts import Role
+from coupole.console.processes.tasks import Task
 from coupole.console.screens.parts import button, moment
 from coupole.console.screens.visit import Visit
-from coupole.console.tasks import Task
 from coupole.viewing.terminal import duration_text
 
 _LOOK_EVERY_S = 1.0

@@ -11,11 +11,11 @@ from typing import Any, ParamSpec, TypeVar
 from fastapi import Request
 from nicegui import Client, app, background_tasks, ui
 
-from coupole.console.accounts import Account, Role
-from coupole.console.guard import account_here, address_of, is_of_this_machine
-from coupole.console.messages import NewEntry, StateNow
-from coupole.console.permission import NotAllowed, allow
-from coupole.console.plan_queue import Entry
+from coupole.console.people.accounts import Account, Role
+from coupole.console.people.guard import account_here, address_of, is_of_this_machine
+from coupole.console.people.permission import NotAllowed, allow
+from coupole.console.plans.plan_queue import Entry
+from coupole.console.routes.messages import NewEntry, StateNow
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
 

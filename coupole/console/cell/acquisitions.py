@@ -1,0 +1,248 @@
+"""Runs the queue: each plan in a process of its own, `coupole acquire`, which no fault of the service touches.
+
+The process is asked and told by its run's socket (`acquisition.run_control`), as by any other client; before it
+has one it can be interrupted, as by Ctrl-C. It goes on if the service dies, and a new service finds it by the
+number of its process in the queue.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from coupole.acquisition.run_control import Command, State, ask, running
+from coupole.acquisition.runtime_folder import is_in_use, named_after
+from coupole.console.cell.lending import Lending
+from coupole.console.plans.plan_queue import Entry, PlanQueue
+from coupole.console.processes.growing_file import end_of_file
+from coupole.errors import CoupoleError, InputError
+from coupole.plan.cell import Cell
+from coupole.storage.line_file import utc_now
+
+_LOOK_EVERY_S = 0.2
+_STOPPED = (129, 130, 143)
+"""Exit codes of a session that somebody stopped."""
+_MOST_SAID_BYTES = 65536
+
+
+class Acquisitions:
+    """The thread that begins what waits in a queue, and watches what runs."""
+
+    def __init__(self, queue: PlanQueue, cell: Cell, folder: Path) -> None:
+        """`folder`: for what processes print."""
+        self._queue, self._cell, self._folder = queue, cell, folder
+        self._rig = str(cell.document.path.resolve())
+        self._ended = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self.state: State | None = None
+        """Of the run at work, as its process tells it; None if there is none."""
+        self.lending = Lending()
+        self.give_way: Callable[[str], object] = lambda _: None
+        """Called, again and again, when something is to begin and something else has the cell, with its name."""
+        self._beginning = threading.Lock()
+        self._thread = threading.Thread(target=self._watch, name="acquisitions", daemon=True)
+
+    def __enter__(self) -> Acquisitions:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._forget_old()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """What runs goes on without us."""
+        self._ended.set()
+        self._thread.join()
+
+    def tell(self, run: str, command: Command) -> State:
+        """`pause`, `go-on` or `stop` to the run with this name; one that the queue has begun and that does not
+        answer is stopped as by Ctrl-C. Raises InputError: it is not being acquired, or does not answer."""
+        for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
+            if Path(state["run"]).name == run and self._is_ours(state):
+                return self._told(state, command)
+        raise InputError(f"{run}: is not being acquired in this cell")
+
+    def _told(self, state: State, command: Command) -> State:
+        try:
+            return ask(Path(state["run"]), command)
+        except InputError:
+            entry = self._queue.running
+            if command != "stop" or entry is None or entry.pid != state["pid"]:
+                raise
+            self.stop(entry)
+            return {**state, "trouble": ["not sure: the run does not answer; its process was told to end"]}
+
+    def stop(self, entry: Entry) -> None:
+        """Stop what an entry has begun, also before its run has a name: as Ctrl-C does. Raises InputError."""
+        if entry.state != "running" or not entry.pid or not self._is_alive(entry):
+            raise InputError(f"queue: {entry.id} is not running")
+        os.kill(entry.pid, signal.SIGINT)
+
+    def begin_at_once(self, by: str, **fields: Any) -> Entry:
+        """A new entry that begins now. Raises InputError: something has the cell or waits for it; StorageError."""
+        with self._beginning:
+            if why := self._had_by():
+                raise InputError(why)
+            return self._queue.add(by, at_once=True, **fields)
+
+    def lend(self, pid: int, who: str, what: str) -> None:
+        """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile. One
+        that has it keeps it. Raises InputError: something else has the cell."""
+        with self._beginning:
+            if self.lending.has(pid):
+                return
+            if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
+                raise InputError(why)
+            self.lending.lend(pid, who, what)
+
+    def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
+        """What an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`, once they
+        are there."""
+        said, figures = self._files(entry)
+        return end_of_file(said, _MOST_SAID_BYTES), _last_document(figures)
+
+    def _had_by(self) -> str:
+        """Who has the cell; empty if nobody."""
+        if self._queue.running is not None:
+            return f"{self._queue.running.words} is being acquired"
+        if self.state is not None:
+            return f"{Path(self.state['run']).name} is being acquired"
+        if self.lending.lent_to:
+            return f"the cell is lent to {self.lending.lent_to}"
+        return "another process of this user has its devices open" if is_in_use(self._cell.state_folder) else ""
+
+    def _is_ours(self, state: State) -> bool:
+        """Whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names its
+        own copy of the rig)."""
+        entry = self._queue.running
+        return state["rig"] == self._rig or (entry is not None and bool(entry.pid) and state["pid"] == entry.pid)
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_LOOK_EVERY_S):
+            try:
+                self._look()
+            except Exception as error:  # noqa: BLE001  it must go on to watch, and tell what it cannot
+                self.state = None
+                with contextlib.suppress(CoupoleError):
+                    self._queue.halt(f"{type(error).__name__}: {error}")
+
+    def _look(self) -> None:
+        entry = self._queue.running
+        self.state = self._at_work()
+        if entry is not None:
+            self._look_after(entry)
+            return
+        with self._beginning:
+            following = self._queue.following
+            if following is None:
+                return
+            if self._had_by():
+                self.give_way(following.words)
+                return
+            if following.hold:
+                now = utc_now()
+                self._queue.conclude(following.id, halt=following.words, state="done", begun=now, ended=now)
+            else:
+                self._begin(following)
+
+    def _at_work(self) -> State | None:
+        """The state of this cell's run; `silent`, and else as last known, while its process does not answer."""
+        found, entry = running(), self._queue.running
+        last = self.state
+        if last is None and entry is not None and entry.run:  # begun by a service before this one
+            last = {"run": entry.run, "rig": self._rig, "pid": entry.pid, "light_after_lux_h": {}}
+        if last is not None:
+            socket = named_after(Path(last["run"]), "sock").name
+            if any(state["state"] == "silent" and state["socket"] == socket for state in found):
+                return {**last, "state": "silent"}
+        return next((state for state in found if self._is_ours(state)), None)
+
+    def _begin(self, entry: Entry) -> None:
+        self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice
+        said, figures = self._files(entry)
+        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *self._arguments(entry)]
+        try:
+            with said.open("wb") as errors, figures.open("wb") as found:
+                self._process = subprocess.Popen(
+                    [*command, "--yes", "--json", "--begun-by-console"],
+                    stdin=subprocess.DEVNULL,
+                    stdout=found,
+                    stderr=errors,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            self._queue.conclude(
+                entry.id, halt=f"{entry.words}: {error}", state="failed", ended=utc_now(), said=str(error)
+            )
+            return
+        self._queue.change(entry.id, pid=self._process.pid)
+
+    def _arguments(self, entry: Entry) -> list[str]:
+        plan = [entry.plan, "--rig", self._rig] if entry.plan else []
+        resume = ["--resume", entry.resume] if entry.resume else []
+        output = ["--output", entry.output] if entry.output else []
+        return [*plan, *resume, *output, *(["--with-mesh"] if entry.with_mesh else [])]
+
+    def _look_after(self, entry: Entry) -> None:
+        if self.state is not None and self.state["pid"] == entry.pid and not entry.run:
+            self._queue.change(entry.id, run=self.state["run"])
+        if not self._is_alive(entry):
+            self._conclude(self._queue.entry(entry.id))
+
+    def _is_alive(self, entry: Entry) -> bool:
+        if self._process is not None and self._process.pid == entry.pid:
+            return self._process.poll() is None
+        try:  # of a service before this one
+            words = Path(f"/proc/{entry.pid}/cmdline").read_bytes().split(b"\0")
+        except OSError:
+            return False
+        return b"acquire" in words and (entry.plan or entry.resume).encode() in words
+
+    def _conclude(self, entry: Entry) -> None:
+        said, figures = self._files(entry)
+        found = _last_document(figures)
+        code = found.get("exit_code", 0 if "proven" in found else None)
+        if self._process is not None and self._process.pid == entry.pid:
+            code = self._process.returncode
+            if code < 0:  # by a signal: those that end a session may come before the process obeys them
+                code = 128 - code if 128 - code in _STOPPED else None
+        self._process = None
+        state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
+        last = _last_line(said) if code is not None else ""
+        why = "" if code == 0 else found.get("error") or last or "its process was killed"
+        halt = "" if code == 0 else f"{entry.words}: {why}"
+        run = str(found.get("run", entry.run))
+        self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
+        self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Take away what processes printed whose entries the queue has no longer."""
+        known = {entry.id for entry in self._queue.entries}
+        for path in self._folder.iterdir():
+            if path.suffix in (".log", ".json") and path.stem not in known:
+                with contextlib.suppress(OSError):
+                    path.unlink()
+
+    def _files(self, entry: Entry) -> tuple[Path, Path]:
+        return self._folder / f"{entry.id}.log", self._folder / f"{entry.id}.json"
+
+
+def _last_document(path: Path) -> dict[str, Any]:
+    """The last line of JSON; empty if there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])
+    except (OSError, ValueError, IndexError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _last_line(path: Path) -> str:
+    lines = end_of_file(path, _MOST_SAID_BYTES).strip().splitlines()
+    return lines[-1] if lines else ""

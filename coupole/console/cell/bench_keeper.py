@@ -1,0 +1,207 @@
+"""The bench that people at a console have begun: a process that holds the cell's devices while no run is at work.
+
+The console only asks it (docs/reference/bench.md). It is closed by a person, when nobody has used it for a while,
+before the queue begins something, and with the console.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from coupole.acquisition.cell_bench.bench_client import ask_bench, bench_socket, obeyed
+from coupole.acquisition.runtime_folder import named_after
+from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.plans.plan_files import PlanFiles
+from coupole.console.processes.tasks import Task, Tasks
+from coupole.errors import CoupoleError, InputError
+from coupole.plan.cell import Cell
+from coupole.plan.reading import read_plan
+from coupole.plan.schedule import expand_view
+
+IDLE_S = 600.0
+"""It is closed when nobody has used it for so long."""
+_LOOK_EVERY_S, _FOREIGN_EVERY_S, _LOOKED_AT_S = 0.1, 1.0, 2.0
+_CLOSES_WITHIN_S = 20.0
+Phase = Literal["closed", "opening", "open", "closing"]
+
+
+class Bench:
+    """The bench of one cell, as its console sees it."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        acquisitions: Acquisitions,
+        plans: PlanFiles,
+        folder: Path,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`folder`: for what its process prints."""
+        self._cell, self._acquisitions, self._plans, self._now_s = cell, acquisitions, plans, now_s
+        self._tasks = Tasks(folder)
+        self._task: Task | None = None
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._closing = ""
+        self._acted_s = self._looked_s = self._asked_s = -_FOREIGN_EVERY_S
+        self.plan = ""
+        """The plan whose object lies on the support; empty: nothing does, or this console has not begun it."""
+        self.state: dict[str, Any] | None = None
+        """As the bench told it last; None if there is none."""
+        self.closed_because = ""
+        """Why the last one has ended; empty if somebody closed it."""
+        self._thread = threading.Thread(target=self._watch, name="bench", daemon=True)
+        acquisitions.give_way = self.give_way
+
+    def __enter__(self) -> Bench:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """With the console nobody can see what is open: it ends."""
+        self._ended.set()
+        self._thread.join()
+        if self._running is not None:
+            self._close("the console has ended")
+
+    @property
+    def phase(self) -> Phase:
+        if self._closing:
+            return "closing"
+        if self.state is not None:
+            return "open"
+        return "opening" if self._running is not None else "closed"
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this console has begun it."""
+        return self._running is not None
+
+    @property
+    def work(self) -> dict[str, Any]:
+        """The last work; empty if there was none."""
+        return (self.state or {}).get("work") or {}
+
+    @property
+    def identities(self) -> dict[str, Any]:
+        """Of the devices that it holds, by kind."""
+        devices = (self.state or {}).get("devices", {})
+        return {kind: device["identity"] for kind, device in devices.items()}
+
+    @property
+    def pictures(self) -> Path:
+        """Folder of its last pictures."""
+        return named_after(self._cell.state_folder, "frames")
+
+    def looked_at(self) -> None:
+        """Somebody looks at it: its state is kept fresh for a while."""
+        self._looked_s = self._now_s()
+
+    def open(self, who: str, plan: str) -> None:
+        """Begin it; the object of a plan lies on the support, or nothing. Raises InputError: something has the
+        cell, or there is no such plan."""
+        with self._lock:
+            if self.phase != "closed":
+                raise InputError(f"the devices are {self.phase}")
+            lies = ["--object", str(self._plans.path(plan))] if plan else []
+            rig = str(self._cell.document.path.resolve())
+            task = self._tasks.begin("open the devices", ["bench", rig, "--yes", *lies], who)
+            try:
+                self._acquisitions.lend(task.process.pid, who, "the devices are open")
+            except InputError:
+                task.stop()
+                raise
+            self._acted_s = self._now_s()
+            self._task, self.plan, self.closed_because = task, plan, ""
+
+    def close(self, why: str = "") -> list[str]:
+        """End it, with the cell safe; what is not sure then. Raises InputError: there is none."""
+        if self.phase not in ("open", "opening"):
+            raise InputError(f"the devices are {self.phase}")
+        return self._close(why)
+
+    def give_way(self, what: str) -> None:
+        """Something is about to begin: close it, as soon as the arm has ended what it does."""
+        if self.is_own and self.phase in ("open", "opening") and self.work.get("state") != "running":
+            self._closing = f"closed, because {what} begins"
+            threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
+
+    def stop(self) -> list[str]:
+        """Stop what it does; what is not sure then. One that does not obey (it is being opened or closed) is
+        ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
+        try:
+            return list(self.ask("stop")["trouble"])
+        except InputError:
+            if (task := self._running) is None:
+                raise
+            task.stop()
+            return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
+
+    def ask(self, command: str, **fields: Any) -> dict[str, Any]:
+        """What it answers. Raises InputError with its words where it did not obey."""
+        self._acted_s = self._now_s()
+        return obeyed(ask_bench(self._cell, command, **fields))
+
+    def views(self) -> list[str]:
+        """Names of the plan's views. Raises InputError."""
+        if not self.plan:
+            return []
+        plan = read_plan(self._plans.path(self.plan), self._cell.document.path).plan
+        return [pose.name for view in plan.views for pose in expand_view(view)]
+
+    def plan_path(self) -> str:
+        """The plan's file. Raises InputError: the bench was begun without a plan."""
+        if not self.plan:
+            raise InputError("no plan: close the devices, and open them with the plan whose object lies there")
+        return str(self._plans.path(self.plan))
+
+    # -- watching -----------------------------------------------------------------------------------------------
+
+    @property
+    def _running(self) -> Task | None:
+        return self._task if self._task is not None and self._task.running else None
+
+    def _close(self, why: str) -> list[str]:
+        task, trouble = self._running, []
+        self._closing = why or "closed"
+        try:
+            trouble = list(obeyed(ask_bench(self._cell, "close"))["trouble"])
+        except InputError:
+            if task is not None:
+                task.stop()
+        end_s = time.monotonic() + _CLOSES_WITHIN_S
+        while (task.running if task else bench_socket(self._cell).exists()) and time.monotonic() < end_s:
+            time.sleep(_LOOK_EVERY_S)
+        self.state, self._task, self._closing, self.closed_because = None, None, "", why
+        return trouble
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_LOOK_EVERY_S):
+            if self._closing:
+                continue
+            if self._task is not None and not self._task.running:
+                self.closed_because = self._task.why or "it has ended by itself"
+                self._task = self.state = None
+            else:
+                self._look()
+
+    def _look(self) -> None:
+        now_s = self._now_s()
+        looked_at = now_s - self._looked_s < _LOOKED_AT_S
+        pause_s = {"open": 0.0 if looked_at else _LOOKED_AT_S, "opening": 0.0}.get(self.phase, _FOREIGN_EVERY_S)
+        if now_s - self._asked_s < pause_s or (self.phase == "closed" and not looked_at):
+            return
+        self._asked_s = now_s
+        try:
+            found = obeyed(ask_bench(self._cell, "state")) if bench_socket(self._cell).exists() else None
+        except CoupoleError:
+            found = None
+        if not self._closing and (found is not None or self._running is None):
+            self.state = found
+        if self.work.get("state") == "running":
+            self._acted_s = now_s
+        if self.is_own and found is not None and now_s - self._acted_s > IDLE_S:
+            self._close(f"nobody has used them for {IDLE_S / 60:g} minutes")

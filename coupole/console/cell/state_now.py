@@ -1,0 +1,151 @@
+"""The cell at this moment, as the console tells it."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.cell.bench_keeper import Bench
+from coupole.console.people.sessions import Control
+from coupole.console.plans.outlook import expected_times
+from coupole.console.plans.plan_queue import PlanQueue
+from coupole.console.routes.messages import EntryNow, StateNow
+from coupole.errors import CoupoleError
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import in_world
+from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.ledger import History, Ledger
+from coupole.storage.line_file import utc_now, utc_text
+from coupole.storage.run import Run
+
+_NEWEST_S = 0.1
+_ENDED_TOLD = 20
+
+
+class Newest:
+    """A state that is made anew by a thread of its own, however many ask for it."""
+
+    def __init__(self, make: Callable[[], StateNow]) -> None:
+        self._make, self._state = make, make()
+        threading.Thread(target=self._renew, name="newest state", daemon=True).start()
+
+    def __call__(self) -> StateNow:
+        return self._state
+
+    def _renew(self) -> None:
+        while True:
+            time.sleep(_NEWEST_S)
+            try:
+                self._state = self._make()
+            except Exception as error:  # noqa: BLE001  the old one must not be taken for what is so
+                self._state = self._state.model_copy(update={"trouble": str(error), "t": utc_now()})
+
+
+def state_of(
+    cell: Cell,
+    queue: PlanQueue,
+    acquisitions: Acquisitions,
+    bench: Bench,
+    control: Control,
+    *,
+    checking: str,
+    trouble: str,
+) -> StateNow:
+    """The cell at this moment; `checking` is what preflight is being made of."""
+    at_work, entry = acquisitions.state or {}, queue.running
+    if not at_work:
+        _forget_runs()
+    begun = "halted" if queue.halted else "idle"
+    if entry is not None:
+        begun = "concluding" if entry.run else "starting"
+    faults = ArmFaults(cell.state_folder).standing()
+    return StateNow(
+        state=at_work.get("state", begun),
+        rig=cell.rig.name,
+        simulated=in_world(cell.rig, dry_run=False),
+        run=Path(at_work["run"]).name if at_work else None,
+        view=at_work.get("view"),
+        proven=at_work.get("proven", 0),
+        frames=at_work.get("frames", 0),
+        dose=at_work.get("dose_lux_h", 0.0),
+        **(_object_of(cell, at_work["run"]) if at_work else _NO_OBJECT),
+        left_s=at_work.get("left_s"),
+        halted=queue.halted,
+        arm_fault=faults[-1].message if faults else "",
+        devices=_devices(at_work["run"]) if at_work else bench.identities,
+        lent_to=acquisitions.lending.lent_to,
+        queue=_entries_now(queue, at_work.get("left_s")),
+        checking=checking,
+        in_control=control.now.name,
+        asked_by=control.now.asked_by,
+        trouble=trouble,
+        t=utc_now(),
+    )
+
+
+def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
+    times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
+    ended = [entry.id for entry in queue.entries if entry.ended]
+    found = []
+    for entry in queue.entries:
+        if entry.id in ended[:-_ENDED_TOLD]:
+            continue
+        begin, end = (utc_text(_rounded(time)) if time else None for time in times.get(entry.id, (None, None)))
+        found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
+    return found
+
+
+def _rounded(time: datetime) -> datetime:
+    """To 10 s: what is expected does not change with every look."""
+    return datetime.fromtimestamp(round(time.timestamp(), -1), UTC)
+
+
+def _devices(run: str) -> dict[str, Any]:
+    """Identities of a run's devices; none if they cannot be read."""
+    try:
+        return _devices_when(run)
+    except (CoupoleError, KeyError):
+        return {}
+
+
+@functools.lru_cache(4)
+def _devices_when(run: str) -> dict[str, Any]:
+    """Identities of a run's devices, which do not change while it runs. Raises InputError, KeyError."""
+    return dict(Run(Path(run)).about["devices"])
+
+
+_NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
+
+
+def _object_of(cell: Cell, run: str) -> dict[str, Any]:
+    """Of a run that is being acquired; nothing if it cannot be read."""
+    try:
+        return _object_when(cell.ledger_folder, cell.former_ledger_folder, run)
+    except CoupoleError:
+        return _NO_OBJECT
+
+
+@functools.lru_cache(4)
+def _object_when(ledgers: Path, former: Path, run: str) -> dict[str, Any]:
+    """A run's object, the light on it that is not this run's, and its budget; they do not change while it runs.
+    Raises InputError, StorageError."""
+    opened = Run(Path(run))
+    named = opened.about.get("object") or ""
+    plan = yamlfile.read(opened.plan_path).data
+    history = Ledger(ledgers, named, former).read() if named else History()
+    before = sum(entry.dose_lux_h for entry in history.entries if entry.run != opened.folder.name)
+    budget = (plan.get("object") or {}).get("dose_budget_lux_h")
+    return {"object": named, "dose_before": before, "dose_budget": budget}
+
+
+def _forget_runs() -> None:
+    """A run that goes on later is read anew: its object may have received other light meanwhile."""
+    _devices_when.cache_clear()
+    _object_when.cache_clear()

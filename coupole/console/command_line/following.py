@@ -1,0 +1,208 @@
+"""`coupole acquire` where a console owns the cell: the plan is entered in its queue, and followed in the terminal.
+
+The process that acquires is the console's. Signals and keys here are passed on to it, its words and progress are
+shown here, and how it ended is how this ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from coupole import errors
+from coupole.acquisition.observer import Control
+from coupole.acquisition.operator import ask_to_begin, refuse
+from coupole.acquisition.run_control import State, ask
+from coupole.acquisition.signals import obeyed_by
+from coupole.console.command_line.client import NotServed, call
+from coupole.errors import CoupoleError, DeviceError, InputError, Interrupted
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import in_world
+from coupole.preflight.checking import preflight_of
+from coupole.preflight.job import read_job, without_hidden
+from coupole.storage.run import Run
+from coupole.viewing.keys import obeyed
+from coupole.viewing.preflight_table import show_preflight
+from coupole.viewing.progress import Progress
+from coupole.viewing.terminal import RunObserver
+
+_LOOK_EVERY_S, _TRIALS = 0.3, 50
+_PROGRESS_LINE = re.compile(r"view \S+ \(\d+/\d+\) .* frames proven, ")
+_FIELDS = tuple(Progress.__dataclass_fields__)
+
+
+def acquire_by_console(
+    cell: Cell,
+    console: Console,
+    asked: dict[str, Any],
+    *,
+    confirm: bool,
+    found: dict[str, Any],
+) -> None:
+    """Enter a plan or a run to be resumed (`asked`: as of `POST /api/v1/queue`), which begins at once, and follow
+    it to its end; `found` is filled with the figures of `--json`.
+
+    Raises InputError: the queue is at work, or somebody else is in control; and what the acquisition raised.
+    """
+    if confirm and not in_world(cell.rig, dry_run=False):
+        _confirm(cell, console, asked)
+    control = Control()
+    followed = _Followed(cell, console, control)
+    with obeyed_by(control, followed.stop):
+        followed.enter(asked)
+        followed.to_its_end(found)
+
+
+def _confirm(cell: Cell, console: Console, asked: dict[str, Any]) -> None:
+    """Show what a real cell is about to do, and ask. Raises PreflightRefused, Interrupted."""
+    run = Run(Path(asked["resume"])) if asked.get("resume") else None
+    plan = Path(asked["plan"]) if asked.get("plan") else run.plan_path if run else Path()
+    job = without_hidden(read_job(plan, cell.document.path), run.hidden_leds if run else None)
+    folder = run.folder if run else Path(asked.get("output") or cell.storage_folder)
+    job, preflight = preflight_of(
+        job, folder, allocated_bytes=run.allocated_bytes() if run else 0, proven=run.proven() if run else ()
+    )
+    show_preflight(console, preflight, name=job.plan.name, rig=cell.rig.name)
+    refuse(preflight)
+    ask_to_begin(cell, confirm=True)
+
+
+class _Followed:
+    """An entry of the queue that this terminal has begun."""
+
+    def __init__(self, cell: Cell, console: Console, control: Control) -> None:
+        self._cell, self._console, self._control = cell, console, control
+        self._entry: dict[str, Any] = {}
+        self._printed = ""
+        self._observer = RunObserver(console, cell.rig.frame_bytes, 0)
+        self._bars = contextlib.ExitStack()
+        self._has_bars = False
+
+    def enter(self, asked: dict[str, Any]) -> None:
+        try:
+            self._entry = call(self._cell, "POST", "/api/v1/queue", {**asked, "now": True})
+        except InputError as error:
+            rig, plan = self._cell.document.path, asked.get("plan") or f"--resume {asked['resume']}"
+            raise InputError(
+                f"not begun: {error}\nA console owns this cell: `coupole queue {rig} {plan}` enters it in its "
+                "queue, and shows that."
+            ) from error
+        if self._control.stop.is_set():
+            self.stop()
+
+    def stop(self) -> None:
+        """Stop what was entered, whether or not it has begun; from any thread."""
+        number = self._entry.get("id")
+        for _ in range(_TRIALS if number else 0):
+            for method, path in (("POST", f"/api/v1/queue/{number}/stop"), ("DELETE", f"/api/v1/queue/{number}")):
+                with contextlib.suppress(InputError):
+                    call(self._cell, method, path)
+                    return
+            if self._ended:
+                return
+            time.sleep(_LOOK_EVERY_S)
+
+    @property
+    def _ended(self) -> bool:
+        return bool(self._entry.get("ended"))
+
+    def to_its_end(self, found: dict[str, Any]) -> None:
+        """Show what the process says and does; raises what it raised."""
+        keys = {"p": self._pause_or_go_on, "q": self.stop}
+        with obeyed(keys) as read, self._bars:
+            if read:
+                self._console.print("keys: p pauses after the burst, and goes on; q stops")
+            for output in self._outputs():
+                self._entry = output["entry"]
+                self._say(output["said"])
+                self._show_progress()
+                figures = output["figures"]
+        self._conclude(figures, found)
+
+    def _outputs(self) -> Iterator[dict[str, Any]]:
+        """Until the entry has ended. Raises Interrupted: it was taken out before it began; InputError: the console
+        has ended, and after it what it had begun."""
+        while not self._ended:
+            try:
+                yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
+            except NotServed as error:
+                if self._state() is None:
+                    run = self._entry["run"] or "RUN"
+                    raise InputError(
+                        f"the console has ended: `coupole status {run}` says what became of the run"
+                    ) from error
+                self._show_progress()
+            except InputError:
+                if self._control.stop.is_set():
+                    raise self._control.interrupted() from None
+                raise
+            time.sleep(_LOOK_EVERY_S)
+
+    def _state(self) -> State | None:
+        try:
+            return ask(Path(self._entry["run"]), "state") if self._entry["run"] else None
+        except InputError:
+            return None
+
+    def _pause_or_go_on(self) -> None:
+        state = self._state()
+        if state is not None:
+            with contextlib.suppress(InputError):
+                paused = state["state"] in ("paused", "pausing")
+                ask(Path(self._entry["run"]), "go-on" if paused else "pause")
+
+    def _say(self, said: str) -> None:
+        """What is new of it, in whole lines."""
+        whole = said[: said.rfind("\n") + 1]
+        new = whole[len(self._printed) :] if whole.startswith(self._printed) else whole
+        self._printed = whole
+        for line in new.splitlines():
+            if not (self._has_bars and _PROGRESS_LINE.match(line)):
+                self._console.print(line, markup=False)
+
+    def _show_progress(self) -> None:
+        """Bars on a terminal; elsewhere the process's own lines say it."""
+        state = self._state() if self._console.is_terminal else None
+        if state is None or "view" not in state or self._ended:
+            return
+        progress = Progress(**{name: state[name] for name in _FIELDS})
+        if not self._has_bars:
+            self._has_bars = True
+            self._observer = RunObserver(self._console, self._cell.rig.frame_bytes, progress.proven)
+            self._bars.enter_context(self._observer.showing(progress.frames, progress.views))
+        self._observer.progress(progress)
+
+    def _conclude(self, figures: dict[str, Any], found: dict[str, Any]) -> None:
+        found.update(
+            {name: value for name, value in figures.items() if name not in ("error", "kind", "exit_code")}
+        )
+        if self._entry["exit_code"] == 0:
+            return
+        if self._entry["state"] == "stopped":
+            number = self._control.signal_number
+            raise Interrupted(figures.get("error") or "stopped before it began", number)
+        if "error" in figures:
+            raise _as_raised(figures)
+        run = self._entry["run"]
+        raise DeviceError(
+            "cell",
+            expected="the process that acquires to end by itself",
+            happened=self._entry["said"] or "it was killed",
+            remedy="Look at the cell: without it lights and arm stop by their own watchdogs"
+            + (f"; go on with `coupole acquire --resume {run}`." if run else "."),
+        )
+
+
+def _as_raised(figures: dict[str, Any]) -> CoupoleError:
+    """The error that the figures of a process's `--json` tell."""
+    kind = getattr(errors, figures["kind"], CoupoleError)
+    told: CoupoleError = kind.__new__(kind)
+    Exception.__init__(told, figures["error"])
+    told.exit_code = figures["exit_code"]
+    return told

@@ -1,0 +1,1 @@
+"""Who may do what at a console: accounts, sessions, control, the guard before all requests, the log."""

@@ -1,0 +1,24 @@
+"""What routes ask of a request: who sends it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+
+from coupole.console.people.accounts import Account
+from coupole.console.people.guard import account_here, is_of_this_machine
+from coupole.console.people.sessions import Session
+
+
+def _account(request: Request) -> Account:
+    """Whose session it is."""
+    session: Session = request.state.session
+    return account_here(session.account, of_this_machine=is_of_this_machine(request))
+
+
+Who = Annotated[Account, Depends(_account)]
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    403: {"description": "Not for this role, or without a fresh token."},
+    409: {"description": "Somebody else is in control, or the cell cannot."},
+}

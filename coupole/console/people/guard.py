@@ -1,0 +1,168 @@
+"""Who asks: nothing but the sign-in page is served to who is not signed in; nothing is changed for another site's
+page, or twice; what was asked and would change something is logged, with its answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from anyio import to_thread
+from fastapi import FastAPI, Request, Response, WebSocket
+from fastapi.responses import HTMLResponse, JSONResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from coupole.console.people.accounts import Account, Role
+from coupole.console.people.permission import NotAllowed
+from coupole.console.people.sessions import Session
+from coupole.console.service_parts import Service
+from coupole.errors import CoupoleError, InputError
+
+_READING, _MOST_BYTES = ("GET", "HEAD"), 65536
+_MOST_BYTES_OF_A_PICTURE = 20_000_000
+_LOOPBACK = ("127.0.0.1", "::1")
+_SIGN_IN = Path(__file__).parent / "sign_in.html"
+_STATIC = "/_nicegui/"
+"""Files of the screens' library: the same for everybody, with their version in the name."""
+_SIGN_IN_POLICY = "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:"
+_SCREEN_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; worker-src 'self' blob:; frame-src 'self'; "
+    "object-src 'none'; base-uri 'self'; form-action 'self'"
+)
+"""The screens' library compiles its templates in the browser; nothing comes from, or goes, elsewhere."""
+
+
+def guard(app: FastAPI, service: Service) -> None:
+    """Put the guard in front of an app."""
+
+    @app.middleware("http")
+    async def logged(request: Request, call_next: Callable[[Request], Any]) -> Response:
+        response: Response = await check(request, call_next)
+        if request.method not in _READING:
+            session = getattr(request.state, "session", None)
+            name = session.account.name if session else ""
+            asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
+            log = (name, asked, response.status_code, address_of(request), about)
+            await to_thread.run_sync(service.audit.note, *log)
+        return response
+
+    async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
+        most = _MOST_BYTES_OF_A_PICTURE if request.url.path.endswith("/photograph") else _MOST_BYTES
+        if int(request.headers.get("content-length", "0") or 0) > most:
+            return _no(413, f"expected at most {most} bytes")
+        if "transfer-encoding" in request.headers:
+            return _no(411, "expected a body with its length")
+        if why := _foreign(request, service):
+            return why
+        session = session_of(request, service)
+        request.state.session = session
+        public = request.url.path in ("/", "/api/v1/sign-in")
+        if session is None and not public:
+            return sign_in_page(401) if _wants_page(request) else _no(401, "sign in first")
+        if request.method not in _READING and session is not None and not public:
+            ambient = not is_command_line(request) and not bearer_of(request)
+            if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
+                return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
+        response: Response = await call_next(request)
+        if not request.url.path.startswith(_STATIC) and "Cache-Control" not in response.headers:
+            response.headers["Cache-Control"] = "no-store"
+        response.headers.setdefault("Content-Security-Policy", _SCREEN_POLICY)
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers["Referrer-Policy"] = "no-referrer"
+        response.headers.setdefault("X-Frame-Options", "DENY")
+        return response
+
+    app.add_middleware(_WebSocketGuard, service=service)
+
+    @app.exception_handler(InputError)
+    async def wrong(_: Request, error: InputError) -> Response:
+        return JSONResponse({"detail": str(error), "problems": [asdict(one) for one in error.problems]}, 422)
+
+    @app.exception_handler(CoupoleError)
+    async def failed(_: Request, error: CoupoleError) -> Response:
+        return _no(409, str(error))
+
+    @app.exception_handler(NotAllowed)
+    async def not_allowed(_: Request, refusal: NotAllowed) -> Response:
+        return _no(refusal.status, str(refusal))
+
+
+class _WebSocketGuard:
+    """The same for the connections by which screens work."""
+
+    def __init__(self, app: ASGIApp, service: Service) -> None:
+        self._app, self._service = app, service
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "websocket":
+            socket = WebSocket(scope, receive, send)
+            own = socket.headers.get("origin") in self._service.origins
+            if not own or session_of(socket, self._service) is None:
+                await socket.close(1008)
+                return
+        await self._app(scope, receive, send)
+
+
+def sign_in_page(status: int = 200) -> Response:
+    page = _SIGN_IN.read_text(encoding="utf-8")
+    return HTMLResponse(
+        page, status, headers={"Content-Security-Policy": _SIGN_IN_POLICY, "Cache-Control": "no-store"}
+    )
+
+
+def _wants_page(request: Request) -> bool:
+    return request.method == "GET" and "text/html" in request.headers.get("accept", "")
+
+
+def _foreign(request: Request, service: Service) -> Response | None:
+    """A refusal, if another site's page asks, or another host's name was used."""
+    hosts = {origin.partition("://")[2] for origin in service.origins}
+    if not is_command_line(request) and request.headers.get("host", "") not in hosts:
+        return _no(400, "expected this console's own address as host")
+    origin = request.headers.get("origin")
+    if origin is not None and origin not in service.origins:
+        return _no(403, "asked by the page of another site")
+    return None
+
+
+def _no(code: int, why: str) -> Response:
+    return JSONResponse({"detail": why}, code)
+
+
+def is_command_line(request: Request | WebSocket) -> bool:
+    """By the service's Unix socket, at which only processes of its own user are heard."""
+    server = request.scope.get("server")
+    return server is not None and server[1] is None
+
+
+def bearer_of(request: Request | WebSocket) -> str:
+    kind, _, secret = request.headers.get("authorization", "").partition(" ")
+    return secret if kind == "Bearer" else ""
+
+
+def address_of(request: Request | WebSocket) -> str:
+    """Where somebody is who asks."""
+    return request.client.host if request.client else "command line"
+
+
+def session_of(request: Request | WebSocket, service: Service, *, used: bool = True) -> Session | None:
+    """Of who asks; None without one. Looking on does not count as using it."""
+    if is_command_line(request):
+        return service.command_line
+    if bearer := bearer_of(request):
+        return service.sessions.of(bearer, script=True, used=used)
+    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False, used=used)
+
+
+def is_of_this_machine(request: Request | WebSocket) -> bool:
+    """A connection from an address of this machine itself: nobody else can have one."""
+    if is_command_line(request) or request.client is None:
+        return is_command_line(request)
+    return request.client.host in _LOOPBACK or request.client.host == request.scope["server"][0]
+
+
+def account_here(account: Account, *, of_this_machine: bool) -> Account:
+    """Who somebody is where they sit: from another machine everybody is an observer."""
+    return account if of_this_machine else replace(account, role=min(account.role, Role.OBSERVER))

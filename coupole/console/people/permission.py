@@ -1,0 +1,24 @@
+"""Whether somebody may do something: by role, and by who is in control."""
+
+from __future__ import annotations
+
+from coupole.console.people.accounts import Account, Role
+from coupole.console.service_parts import Service
+
+
+class NotAllowed(Exception):
+    """With the HTTP status and the words for whoever asked."""
+
+    def __init__(self, status: int, words: str) -> None:
+        super().__init__(words)
+        self.status = status
+
+
+def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+    """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
+    if who.role < role:
+        raise NotAllowed(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
+    of_command_line = who is service.command_line.account
+    if acts and not service.control.act(who, keep=not of_command_line):
+        how = "`coupole queue RIG --take-control` takes it" if of_command_line else "ask for it first"
+        raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; {how}")

@@ -1,0 +1,142 @@
+"""Who is signed in, and who of them is in control."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from coupole.console.people.accounts import Account, Role
+from coupole.errors import InputError
+
+IDLE_S = 12 * 3600.0
+"""After which a session that was not used is over."""
+ABSENT_S = 300.0
+"""After which somebody in control who did nothing may be relieved by any operator."""
+_MOST_TOKENS = 64
+
+
+@dataclass
+class Session:
+    """One browser or script of a person."""
+
+    account: Account
+    seen_s: float
+    script: bool
+    """Its secret comes as a bearer, which no browser adds by itself."""
+    tokens: set[str] = field(default_factory=set)
+    """For one request that changes something each."""
+
+
+class Sessions:
+    """All sessions, in memory: after a restart everybody signs in anew."""
+
+    def __init__(
+        self,
+        now_s: Callable[[], float] = time.monotonic,
+        holds: Callable[[Account], bool] = lambda _: True,
+    ) -> None:
+        """`holds` tells whether somebody still is who signed in; a session is over as soon as that is not so."""
+        self._now_s, self._holds, self._lock = now_s, holds, threading.Lock()
+        self._by_hash: dict[str, Session] = {}
+
+    def begin(self, account: Account, *, script: bool) -> str:
+        """A new session's secret, which only its browser or script keeps."""
+        secret = secrets.token_urlsafe(32)
+        now_s = self._now_s()
+        with self._lock:
+            self._by_hash = {key: one for key, one in self._by_hash.items() if now_s - one.seen_s <= IDLE_S}
+            self._by_hash[_hash(secret)] = Session(account, now_s, script)
+        return secret
+
+    def of(self, secret: str, *, script: bool, used: bool = True) -> Session | None:
+        """The session of this kind with this secret, if it is not over; from now on it counts as just `used`."""
+        with self._lock:
+            session = self._by_hash.get(_hash(secret))
+            if session is None or session.script is not script:
+                return None
+            if self._now_s() - session.seen_s > IDLE_S or not self._holds(session.account):
+                self._by_hash.pop(_hash(secret), None)
+                return None
+            if used:
+                session.seen_s = self._now_s()
+            return session
+
+    def end(self, secret: str) -> None:
+        with self._lock:
+            self._by_hash.pop(_hash(secret), None)
+
+    def token(self, session: Session) -> str:
+        """For one request of this session."""
+        token = secrets.token_urlsafe(16)
+        with self._lock:
+            while len(session.tokens) >= _MOST_TOKENS:
+                session.tokens.pop()
+            session.tokens.add(token)
+        return token
+
+    def spend(self, session: Session, token: str) -> bool:
+        """True once for each of the session's tokens."""
+        with self._lock:
+            known = token in session.tokens
+            session.tokens.discard(token)
+            return known
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class InControl:
+    """Who is in control, and who asks to be."""
+
+    name: str = ""
+    asked_by: str = ""
+
+
+class Control:
+    """One person at a time is in control: others look, until it is handed over, given up or left alone."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s, self._lock = now_s, threading.Lock()
+        self._now, self._acted_s = InControl(), 0.0
+
+    @property
+    def now(self) -> InControl:
+        return self._now
+
+    def take(self, account: Account) -> InControl:
+        """Take it if nobody has it, who has it does nothing, or one is an engineer; else ask for it."""
+        with self._lock:
+            holder = self._now.name
+            absent = self._now_s() - self._acted_s > ABSENT_S
+            if holder in ("", account.name) or absent or account.role is Role.ENGINEER:
+                self._now, self._acted_s = InControl(account.name), self._now_s()
+            else:
+                self._now = replace(self._now, asked_by=account.name)
+            return self._now
+
+    def give(self, account: Account, to: str) -> InControl:
+        """Hand it over to who asked for it, or give it up (`to` is empty). Raises InputError."""
+        with self._lock:
+            if self._now.name != account.name:
+                raise InputError(f"{account.name} is not in control")
+            if to and to != self._now.asked_by:
+                raise InputError(f"{to} has not asked for control")
+            self._now, self._acted_s = InControl(to), self._now_s()
+            return self._now
+
+    def act(self, account: Account, *, keep: bool = True) -> bool:
+        """Whether somebody may act now: who is in control, or an operator where nobody is, who then has it, unless
+        he does not `keep` it."""
+        with self._lock:
+            if self._now.name not in ("", account.name):
+                return False
+            if not keep and not self._now.name:
+                return True
+            self._now, self._acted_s = replace(self._now, name=account.name), self._now_s()
+            return True

@@ -1,0 +1,171 @@
+"""Reads and checks what is to be acquired, and enters it in the queue.
+
+Preflight is made by a process of its own (`entry_preflight`). While something is acquired it does not measure the
+disk's speed, as that takes all of it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from anyio import CapacityLimiter
+
+from coupole.console.cell.acquisitions import Acquisitions
+from coupole.console.plans.entry_preflight import EntryPreflight
+from coupole.console.plans.outlook import at_work_of, too_little_disk, too_much_light
+from coupole.console.plans.plan_queue import Entry, Needs, PlanQueue
+from coupole.console.routes.messages import NewEntry
+from coupole.errors import InputError, Problem
+from coupole.plan.cell import Cell, read_cell
+from coupole.plan.plan import possible_path
+from coupole.plan.reading import PlanFiles, read_plan
+from coupole.plan.yamlfile import read
+from coupole.preflight.files import Files
+from coupole.storage.ledger import ledger_of
+from coupole.storage.run import Run
+
+
+class Entering:
+    """What may enter one cell's queue."""
+
+    def __init__(self, cell: Cell, plans: Path, queue: PlanQueue, acquisitions: Acquisitions) -> None:
+        self._cell, self._plans, self._queue, self._acquisitions = cell, plans, queue, acquisitions
+        self._rig = cell.document.path.resolve()
+        self.preflight = EntryPreflight()
+        self.one_at_a_time = CapacityLimiter(1)
+        """For threads that call `enter` and `move`: each counts what the ones before have entered."""
+
+    def close(self) -> None:
+        """End what is being checked."""
+        self.preflight.close()
+
+    def enter(
+        self, asked: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
+    ) -> Entry:
+        """A new entry. The command line may name files anywhere, other people only plans and runs of this cell's
+        folders. `may_still` raises if whoever asked may not any more, after preflight. Raises InputError: it
+        cannot be run, with all problems; StorageError."""
+        if bool(asked.plan or asked.resume) == bool(asked.hold):
+            raise InputError("expected either `plan` or `hold`, or `resume`")
+        if asked.hold:
+            if asked.now:
+                raise InputError("`now`: a hold does not begin")
+            return self._queue.add(by, before=asked.before, hold=asked.hold)
+        if not by_command_line and (asked.output or asked.with_mesh or (asked.plan and asked.resume)):
+            raise InputError("`output`, `with_mesh` and `plan` with `resume` are for the command line")
+        run = self._run(asked.resume, anywhere=by_command_line) if asked.resume else None
+        plan = self._plan(asked.plan, anywhere=by_command_line) if asked.plan else None
+        fields: dict[str, Any] = {
+            "plan": str(plan.document.path.resolve()) if plan else "",
+            "resume": str(run.folder) if run else "",
+            "output": str(Path(asked.output).resolve()) if asked.output else "",
+            "with_mesh": asked.with_mesh,
+        }
+        if asked.now:
+            return self._acquisitions.begin_at_once(by, **fields)
+        files = plan or (read_plan(run.plan_path) if run else None)
+        assert files is not None
+        fields["needs"] = self._needs(files, fields, by)
+        self._refuse(Entry(id="new", by=by, entered="", **fields), asked.before)
+        may_still()
+        return self._queue.add(by, before=asked.before, **fields)
+
+    def move(self, number: str, before: str) -> None:
+        """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
+        moved = self._queue.order_after(number, before)
+        if more := self._more_light(moved):
+            raise InputError([_problem(entry.words, more[entry.id]) for entry in moved if entry.id in more])
+        self._queue.move(number, before)
+
+    def _plan(self, name: str, *, anywhere: bool) -> PlanFiles:
+        path = _place("plan", self._plans, name, anywhere=anywhere)
+        if "views" not in read(path).data:
+            raise InputError(f"{path}: expected a plan, with `views`")
+        files = read_plan(path, self._rig if anywhere else None)
+        if files.cell.document.path.resolve() != self._rig:
+            raise InputError(f"{path}: its rig is {files.cell.document.path}; this console's is {self._rig}")
+        return files
+
+    def _run(self, name: str, *, anywhere: bool) -> Run:
+        path = _place("resume", self._cell.storage_folder, name, anywhere=anywhere)
+        run = Run(path)
+        begun_on = read_cell(run.rig_path)
+        if begun_on.state_folder.resolve() != self._cell.state_folder.resolve():
+            raise InputError(f"{path}: was begun in another cell, {begun_on.rig.name}")
+        return run
+
+    # -- preflight --------------------------------------------------------------------------------------------
+
+    def _needs(self, files: PlanFiles, fields: dict[str, Any], by: str) -> Needs:
+        """Raises InputError: preflight refuses it, with all refusals."""
+        run = Path(fields["resume"]) if fields["resume"] else None
+        plan, rig = (Path(fields["plan"]), self._rig) if fields["plan"] else (files.document.path, None)
+        asked = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
+        begun_s = time.monotonic()
+        told = self.preflight.of(asked, by, beside_a_run=self._acquisitions.state is not None)
+        if told.problems:
+            raise InputError(told.problems)
+        found = told.document
+        thing = files.plan.object
+        return Needs(
+            duration_s=found["duration_s"],
+            preparation_s=time.monotonic() - begun_s,
+            dose_lux_h=found["dose_lux_h"],
+            bytes=found["bytes"],
+            frames=found["frames"],
+            object=thing.id if thing else None,
+            dose_budget_lux_h=thing.dose_budget_lux_h if thing else None,
+            folder=fields["resume"] or fields["output"] or str(self._cell.storage_folder.resolve()),
+            warnings=tuple(found["warnings"]),
+        )
+
+    # -- with what runs and waits before ------------------------------------------------------------------------
+
+    def _refuse(self, new: Entry, before: str) -> None:
+        named = new.plan or new.resume
+        waiting = list(self._queue.waiting)
+        place = waiting.index(self._queue.waiting_entry(before)) if before else len(waiting)
+        entries = [*waiting[:place], new, *waiting[place:]]
+        problems = [_problem(named, refusal) for refusal in self._more_light(entries).values()]
+        rig = self._cell.rig
+        problems += [
+            _problem(named, refusal)
+            for refusal in too_little_disk(
+                entries,
+                at_work_of(self._acquisitions.state, rig.frame_bytes),
+                free_bytes=lambda folder: shutil.disk_usage(folder).free,
+                reserve_bytes=rig.storage.reserve_bytes,
+            )
+        ]
+        if problems:
+            raise InputError(problems)
+
+    def _more_light(self, entries: tuple[Entry, ...] | list[Entry]) -> dict[str, str]:
+        """Refusals of light that these entries have in this order, and have not as they are."""
+        at_work = at_work_of(self._acquisitions.state, self._cell.rig.frame_bytes)
+
+        def received_lux_h(name: str) -> float:
+            return ledger_of(self._cell, name).read().total_lux_h
+
+        now = too_much_light(self._queue.waiting, received_lux_h, at_work)
+        found = too_much_light(entries, received_lux_h, at_work)
+        return {number: refusal for number, refusal in found.items() if number not in now}
+
+
+def _place(key: str, folder: Path, name: str, *, anywhere: bool) -> Path:
+    """Raises InputError: no path, or not below the folder."""
+    try:
+        path = (folder / possible_path(Path(name))).resolve()
+    except ValueError as error:
+        raise InputError(f"{key}: expected {error}") from error
+    if not anywhere and not path.is_relative_to(folder.resolve()):
+        raise InputError(f"{key}: expected a place below {folder}; found {name!r}")
+    return path
+
+
+def _problem(named: str, refusal: str) -> Problem:
+    return Problem(named, 0, 0, "", refusal)

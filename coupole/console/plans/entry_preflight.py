@@ -1,0 +1,82 @@
+"""Preflight of what is entered in the queue, by a process of its own, with words for those who wait for it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from coupole.console.processes.warm_process import WarmProcess, say
+from coupole.errors import CoupoleError, InputError, Problem
+from coupole.preflight.files import Files, check_files
+from coupole.storage.line_file import utc_now
+
+AT_MOST_S = 1500.0
+"""Less than the command line waits (`client.PREFLIGHT_S`)."""
+BESIDE_A_RUN = 5
+"""Niceness while a run is at work: a third of the time of a core that both want. More would starve it on a machine
+that is busy; a burst does not wait for it, as the box fires by itself."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What preflight says."""
+
+    problems: tuple[Problem, ...] = ()
+    """Mistakes in the files, or refusals; with any nothing can be run."""
+    document: dict[str, Any] = field(default_factory=dict)
+    """As of `coupole check --json`."""
+
+
+def check_entry(files: Files, *, measure: bool) -> Found:
+    """Preflight of files; what is wrong with them is in `problems`."""
+    from coupole.viewing.preflight_table import document_of
+
+    named = str(files.resume or files.plan)
+    try:
+        report = check_files(files, measure=measure, say=say)[1]
+    except InputError as error:
+        return Found(problems=tuple(error.problems) or (Problem(named, 0, 0, "", str(error)),))
+    except CoupoleError as error:
+        return Found(problems=(Problem(named, 0, 0, "", str(error)),))
+    return Found(tuple(Problem(named, 0, 0, "", one) for one in report.refusals), document_of(report))
+
+
+class EntryPreflight:
+    """The process that makes it, and what it is at work on."""
+
+    def __init__(self) -> None:
+        self._process = WarmProcess("makes preflight")
+        self._for = ""
+
+    @property
+    def words(self) -> str:
+        """What is being checked, for whom, since when, and how far it is; empty if nothing is."""
+        if not (known := self._for):
+            return ""
+        return f"{known}: {self._process.step or 'it begins'}"
+
+    def of(self, files: Files, by: str, *, beside_a_run: bool) -> Found:
+        """What preflight says of files. Raises InputError: it takes too long, is given up, or its process died."""
+        with self._told(f"{(files.resume or files.plan).name}, entered by {by} at {utc_now()[11:19]} UTC"):
+            niceness = BESIDE_A_RUN if beside_a_run else 0
+            return self._process.run(check_entry, AT_MOST_S, niceness, files, measure=not beside_a_run)
+
+    @contextlib.contextmanager
+    def _told(self, words: str) -> Iterator[None]:
+        self._for = words
+        try:
+            yield
+        finally:
+            self._for = ""
+
+    def give_up(self) -> None:
+        """End what is being checked: it is not entered. Raises InputError: nothing is."""
+        if not self._for:
+            raise InputError("no preflight is being made")
+        self._process.end()
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.end()

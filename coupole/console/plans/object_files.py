@@ -1,0 +1,108 @@
+"""What a console knows of objects: their ledgers, their photographs, and the plans and runs that name them."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from coupole.console.plans.plan_files import PlanFiles
+from coupole.console.runs.run_files import RunFiles, RunRow
+from coupole.errors import CoupoleError, InputError, StorageError
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell
+from coupole.plan.plan import NAME_PATTERN
+from coupole.storage.durable import make_folder, write_synced
+from coupole.storage.ledger import History, ledger_of, similar_ids
+
+_PHOTOGRAPH_PX = 1600
+
+
+@dataclass(frozen=True)
+class NamedBy:
+    """A plan that names an object."""
+
+    plan: str
+    mesh: bool
+    budget_lux_h: float | None
+
+
+class ObjectFiles:
+    """Objects by their ids: accession numbers."""
+
+    def __init__(self, cell: Cell, plans: PlanFiles, runs: RunFiles, folder: Path) -> None:
+        """`folder`: for photographs."""
+        self._cell, self._plans, self._runs, self._folder = cell, plans, runs, folder
+
+    def ids(self) -> list[str]:
+        """Of all objects that a plan, a run or a ledger names."""
+        ledgers = [*self._cell.ledger_folder.glob("*.jsonl"), *self._cell.former_ledger_folder.glob("*.jsonl")]
+        found = {path.stem for path in ledgers}
+        found |= {row.object for row in self._runs.rows() if row.object}
+        found |= set(self._named())
+        return sorted(found)
+
+    def plans_of(self, object_id: str) -> list[NamedBy]:
+        return self._named().get(object_id, [])
+
+    def runs_of(self, object_id: str) -> list[RunRow]:
+        """The newest first."""
+        return [row for row in self._runs.rows() if row.object == object_id]
+
+    def history(self, object_id: str) -> History:
+        """All light on it. Raises InputError, StorageError."""
+        return ledger_of(self._cell, object_id).read()
+
+    def similar(self, object_id: str) -> list[str]:
+        """Others whose ids are nearly the same."""
+        return similar_ids(self._cell.ledger_folder, object_id)
+
+    def enter_light(self, object_id: str, dose_lux_h: float, note: str) -> None:
+        """Light that was given elsewhere. Raises InputError, StorageError."""
+        if not note.strip() or not 0 < dose_lux_h < 1e9:
+            raise InputError("expected how many lux hours, above 0, and what that light was")
+        ledger_of(self._cell, object_id).enter(dose_lux_h, note.strip())
+
+    def photograph(self, object_id: str) -> Path | None:
+        path = self._photograph_path(object_id)
+        return path if path.is_file() else None
+
+    def keep_photograph(self, object_id: str, data: bytes) -> None:
+        """Keep a picture in place of the one before. Raises InputError: not a picture."""
+        from PIL import Image, ImageOps, UnidentifiedImageError
+
+        try:
+            with Image.open(io.BytesIO(data)) as read:
+                picture = ImageOps.exif_transpose(read).convert("RGB")
+        except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
+            raise InputError("expected a picture: JPEG, PNG or TIFF") from error
+        picture.thumbnail((_PHOTOGRAPH_PX, _PHOTOGRAPH_PX))
+        out = io.BytesIO()
+        picture.save(out, "JPEG", quality=88)
+        path = self._photograph_path(object_id)
+        try:
+            make_folder(path.parent)
+            write_synced(path, out.getvalue())
+        except OSError as error:
+            raise StorageError(f"{path}: {error.strerror}") from error
+
+    def _photograph_path(self, object_id: str) -> Path:
+        if not re.fullmatch(NAME_PATTERN, object_id):
+            raise InputError(f"object: expected an id as in a plan; found {object_id!r}")
+        return self._folder / f"{object_id}.jpg"
+
+    def _named(self) -> dict[str, list[NamedBy]]:
+        found: dict[str, list[NamedBy]] = {}
+        for name in self._plans.names():
+            try:
+                measured = yamlfile.parse(self._plans.path(name), self._plans.read(name)).data.get("object")
+            except CoupoleError:
+                continue
+            if isinstance(measured, dict) and isinstance(measured.get("id"), str):
+                budget = measured.get("dose_budget_lux_h")
+                named = NamedBy(
+                    name, bool(measured.get("mesh")), budget if isinstance(budget, int | float) else None
+                )
+                found.setdefault(measured["id"], []).append(named)
+        return found

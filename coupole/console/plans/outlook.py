@@ -1,0 +1,109 @@
+"""What a queue will need: when each entry begins and ends, and whether light and disk suffice for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from coupole.console.plans.plan_queue import Entry
+
+
+@dataclass(frozen=True)
+class AtWork:
+    """What the run at work still takes."""
+
+    folder: str = ""
+    bytes_left: int = 0
+    light_after_lux_h: Mapping[str, float] = field(default_factory=dict)
+    """All light on its object, by id, when the run is complete."""
+
+
+def expected_times(
+    entries: Sequence[Entry], now: datetime, *, left_s: float | None, halted: bool
+) -> dict[str, tuple[datetime | None, datetime | None]]:
+    """Begin and end of each entry that runs or waits, by its id; None where a person decides on it (a hold, a
+    queue that is halted), or where it is not known. `left_s` of the run at work."""
+    found: dict[str, tuple[datetime | None, datetime | None]] = {}
+    free_at: datetime | None = None if halted else now
+    for entry in entries:
+        if entry.state == "running":
+            begun = datetime.fromisoformat(entry.begun)
+            free_at = _end_of_running(entry, begun, now, left_s)
+            found[entry.id] = begun, free_at
+            free_at = None if halted else free_at
+    for entry in entries:
+        if entry.state == "waiting":
+            begins = free_at
+            ends = begins + timedelta(seconds=_whole_s(entry)) if begins and entry.needs else None
+            found[entry.id] = begins, ends
+            free_at = ends
+    return found
+
+
+def _end_of_running(entry: Entry, begun: datetime, now: datetime, left_s: float | None) -> datetime | None:
+    if left_s is not None:
+        return now + timedelta(seconds=left_s)
+    return max(now, begun + timedelta(seconds=_whole_s(entry))) if entry.needs else None
+
+
+def _whole_s(entry: Entry) -> float:
+    return entry.needs.preparation_s + entry.needs.duration_s if entry.needs else 0.0
+
+
+def too_much_light(
+    entries: Sequence[Entry], received_lux_h: Callable[[str], float], at_work: AtWork
+) -> dict[str, str]:
+    """Refusals of the entries that wait whose object's budget is exceeded when all before them are done, by id.
+
+    `received_lux_h` tells what an object has received by its ledger.
+    """
+    light: dict[str, float] = {}
+    refused: dict[str, str] = {}
+    for entry in entries:
+        needs = entry.needs
+        if entry.state != "waiting" or needs is None or needs.object is None:
+            continue
+        name = needs.object
+        if name not in light:
+            light[name] = max(received_lux_h(name), at_work.light_after_lux_h.get(name, 0.0))
+        before, light[name] = light[name], light[name] + needs.dose_lux_h
+        if needs.dose_budget_lux_h is not None and light[name] > needs.dose_budget_lux_h:
+            refused[entry.id] = (
+                f"object {name}: {needs.dose_lux_h:.2f} lux.h after {before:.2f} lux.h with what runs and waits "
+                f"before it; its budget is {needs.dose_budget_lux_h:g} lux.h"
+            )
+    return refused
+
+
+def too_little_disk(
+    entries: Sequence[Entry],
+    at_work: AtWork,
+    *,
+    free_bytes: Callable[[Path], int],
+    reserve_bytes: int,
+) -> list[str]:
+    """Refusals of the disks that cannot take all that runs and waits; `reserve_bytes` must stay free."""
+    wanted: dict[int, tuple[Path, int]] = {}
+    folders: list[tuple[str, int]] = [(at_work.folder, at_work.bytes_left)] if at_work.folder else []
+    folders += [(e.needs.folder, e.needs.bytes) for e in entries if e.state == "waiting" and e.needs]
+    for folder, size in folders:
+        existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
+        disk = existing.stat().st_dev
+        wanted[disk] = existing, wanted.get(disk, (existing, 0))[1] + size
+    return [
+        f"storage {folder}: all that runs and waits needs {size / 1e9:.2f} GB and {reserve_bytes / 1e9:.2f} GB "
+        f"must stay free; {free_bytes(folder) / 1e9:.2f} GB are free"
+        for folder, size in wanted.values()
+        if size + reserve_bytes > free_bytes(folder)
+    ]
+
+
+def at_work_of(state: Mapping[str, Any] | None, frame_bytes: int) -> AtWork:
+    """Of a run's state as its process tells it; nothing if there is none."""
+    if state is None:
+        return AtWork()
+    left = max(0, state.get("frames", 0) - state.get("proven", 0))
+    return AtWork(state["run"], left * frame_bytes, state["light_after_lux_h"])

@@ -1,0 +1,1 @@
+"""Processes that compute for a console, and what they print."""

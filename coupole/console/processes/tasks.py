@@ -1,0 +1,174 @@
+"""What people begin at the console beside the queue: commands of the command line (`verify`, `archive`, ...), each
+in a process of its own, whose output is kept while the service lives."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from coupole.console.processes.growing_file import GrowingFile
+from coupole.console.processes.keeping_newest import keep_newest
+from coupole.errors import InputError
+from coupole.storage.durable import make_folder
+from coupole.storage.line_file import utc_now
+
+MOST_AT_ONCE, _MOST_KEPT, _MOST_SAID = 4, 100, 20_000
+_PATIENCE_S = 20.0
+"""A cell is made safe before its process ends."""
+_COUPOLE = (sys.executable, "-m", "coupole.commands.cli")
+_BOUND = Path(__file__).with_name("bound_process.py")
+_FORMER_KEPT = 50
+
+
+@dataclass
+class Task:
+    """One command, under way or ended."""
+
+    id: str
+    words: str
+    """What it does, for people."""
+    command: tuple[str, ...]
+    """Arguments of `coupole`."""
+    by: str
+    begun: str
+    process: subprocess.Popen[bytes] = field(repr=False)
+    folder: Path = field(repr=False)
+    begun_s: float = field(default_factory=time.monotonic)
+    ended_s: float | None = None
+    _found: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        self._log = GrowingFile(self.folder / f"{self.id}.log", _MOST_SAID)
+
+    @property
+    def running(self) -> bool:
+        if self.ended_s is None and self.process.poll() is not None:
+            self.ended_s = time.monotonic()
+        return self.ended_s is None
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs; below 0 if a signal ended it."""
+        return self.process.poll()
+
+    @property
+    def duration_s(self) -> float:
+        return (self.ended_s if not self.running and self.ended_s else time.monotonic()) - self.begun_s
+
+    @property
+    def said(self) -> str:
+        """The end of what it printed for people."""
+        return self._log.text
+
+    @property
+    def found(self) -> dict[str, Any]:
+        """Its `--json`; empty until it has ended, and if there is none."""
+        if self.running:
+            return {}
+        if self._found is None:
+            try:
+                found = json.loads((self.folder / f"{self.id}.json").read_text(encoding="utf-8").splitlines()[-1])
+            except (OSError, ValueError, IndexError):
+                found = {}
+            self._found = found if isinstance(found, dict) else {}
+        return self._found
+
+    @property
+    def why(self) -> str:
+        """Why it failed, in a line; empty if it did not."""
+        if self.running or self.exit_code == 0:
+            return ""
+        lines = [line.strip() for line in self.said.splitlines() if line.strip()]
+        return str(self.found.get("error") or (lines[-1] if lines else "it was stopped"))
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Until it has ended. Raises subprocess.TimeoutExpired."""
+        self.process.wait(timeout_s)
+
+    def stop(self) -> None:
+        """As Ctrl-C does."""
+        if self.running:
+            os.kill(self.process.pid, signal.SIGINT)
+
+
+class Tasks:
+    """All tasks of a service's life, the newest last. They end with the service, also if it is killed."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder`: for what processes print; of former lives the newest stay, for whoever looks for a fault."""
+        self._folder, self._lock = folder, threading.Lock()
+        self._tasks: OrderedDict[str, Task] = OrderedDict()
+        self._beginner = ThreadPoolExecutor(1, "tasks")
+        """The kernel interrupts a bound process when the thread ends that has begun it: this one lives as long."""
+        keep_newest(folder, _FORMER_KEPT)
+
+    def begin(self, words: str, command: Sequence[str], by: str) -> Task:
+        """Begin `coupole COMMAND... --json`. Raises InputError: too many are under way."""
+        make_folder(self._folder)
+        with self._lock:
+            if sum(task.running for task in self._tasks.values()) >= MOST_AT_ONCE:
+                raise InputError(f"{words}: {MOST_AT_ONCE} commands are under way; wait for one to end")
+            number = secrets.token_hex(6)
+            said, found = self._folder / f"{number}.log", self._folder / f"{number}.json"
+            with said.open("wb") as errors, found.open("wb") as figures:
+                process = self._beginner.submit(_begun, [*_COUPOLE, *command, "--json"], figures, errors).result()
+            task = Task(number, words, tuple(command), by, utc_now(), process, self._folder)
+            self._tasks[number] = task
+            self._forget_old()
+        return task
+
+    def task(self, number: str) -> Task:
+        """Raises InputError: there is none with this id."""
+        if (found := self._tasks.get(number)) is None:
+            raise InputError(f"no command {number!r}")
+        return found
+
+    @property
+    def listed(self) -> list[Task]:
+        """The newest first."""
+        return list(reversed(self._tasks.values()))
+
+    def close(self) -> None:
+        """Stop what is under way; what has not ended after 20 s is killed."""
+        running = [task for task in self._tasks.values() if task.running]
+        for task in running:
+            task.stop()
+        end_s = time.monotonic() + _PATIENCE_S
+        for task in running:
+            try:
+                task.wait(max(0.0, end_s - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                task.process.kill()
+        self._beginner.shutdown()
+
+    def _forget_old(self) -> None:
+        for number, task in list(self._tasks.items()):
+            if len(self._tasks) <= _MOST_KEPT:
+                return
+            if not task.running:
+                del self._tasks[number]
+                for kind in ("log", "json"):
+                    (self._folder / f"{number}.{kind}").unlink(missing_ok=True)
+
+
+def _begun(command: Sequence[str], figures: BinaryIO, errors: BinaryIO) -> subprocess.Popen[bytes]:
+    """A process that ends with the thread that calls this."""
+    return subprocess.Popen(
+        [sys.executable, "-I", "-S", _BOUND, str(os.getpid()), *command],
+        stdin=subprocess.DEVNULL,
+        stdout=figures,
+        stderr=errors,
+        start_new_session=True,
+    )

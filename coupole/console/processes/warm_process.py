@@ -1,0 +1,113 @@
+"""A process of its own for what computes, forked from one that has imported what plans want.
+
+It stays for the next job, with the kernels that it has loaded, and ends with the console, also if that is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.sharedctypes import RawArray
+from typing import Any, ParamSpec, TypeVar
+
+from coupole.errors import InputError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+_IMPORTED = [
+    "coupole.preflight.checking",
+    "coupole.viewing.preflight_table",
+    "coupole.viewing.terminal",
+    "coupole.scan.mesh",
+    "scipy.spatial",
+]
+_LONGEST_STEP = 200
+_steps: list[Any] = []
+"""In a worker: where it says what it does."""
+
+
+def say(step: str) -> None:
+    """Tell whoever waits what is being done; nothing outside a worker."""
+    for place in _steps:
+        place.value = step.encode()[: _LONGEST_STEP - 1]
+
+
+def _begin(step: Any, niceness: int) -> None:
+    """In a worker: it ends with the console, to which Ctrl-C is left."""
+    threading.Thread(target=_end_with_console, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(niceness)
+    _steps.append(step)
+
+
+def _end_with_console() -> None:
+    console = multiprocessing.parent_process()
+    assert console is not None
+    console.join()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class WarmProcess:
+    """One process, that does one thing after the other; a new one after it died or was ended."""
+
+    def __init__(self, what: str) -> None:
+        """`what` it does, for people: `reads plans`."""
+        self._what, self._lock = what, threading.Lock()
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(_IMPORTED)
+        self._step = RawArray("c", _LONGEST_STEP)
+        self._pool: ProcessPoolExecutor | None = None
+        self._niceness = 0
+
+    @property
+    def step(self) -> str:
+        """What it does now, as it said last."""
+        return bytes(self._step.value).decode(errors="replace")
+
+    def run(
+        self, work: Callable[P, T], within_s: float, niceness: int = 0, *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """What work gives. Raises InputError: it takes too long, or the process died of it or was ended; and what
+        work raises."""
+        self._step.value = b""
+        pool, future = self._submit(niceness, work, *args, **kwargs)
+        try:
+            return future.result(within_s)
+        except TimeoutError as error:
+            if future.done():
+                raise
+            self.end()
+            raise InputError(f"the process that {self._what} was ended: not done within {within_s:g} s") from error
+        except (BrokenProcessPool, CancelledError) as error:
+            if self._pool is not pool:
+                raise InputError(f"the process that {self._what} was ended") from error
+            self.end()
+            raise InputError(f"the process that {self._what} died of this one: is its mesh too large?") from error
+
+    def _submit(
+        self, niceness: int, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs
+    ) -> tuple[ProcessPoolExecutor, Future[T]]:
+        if self._niceness != niceness:  # nobody but root can take it back
+            self.end()
+        with self._lock:
+            if self._pool is not None:
+                with contextlib.suppress(BrokenProcessPool):  # it died while it had nothing to do
+                    return self._pool, self._pool.submit(work, *args, **kwargs)
+            self._niceness = niceness
+            self._pool = ProcessPoolExecutor(1, self._context, initializer=_begin, initargs=(self._step, niceness))
+            return self._pool, self._pool.submit(work, *args, **kwargs)
+
+    def end(self) -> None:
+        """End the process, and what it does."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            for process in list((pool._processes or {}).values()):
+                process.kill()
+            pool.shutdown(wait=False, cancel_futures=True)

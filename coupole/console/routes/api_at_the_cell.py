@@ -1,0 +1,106 @@
+"""Routes of the HTTP interface for what is done with the cell besides runs: its loan, light by hand, the queue's
+order, its preflight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from anyio import to_thread
+from fastapi import FastAPI, Request
+
+from coupole.console.cell.lending import begun_here
+from coupole.console.people.accounts import Role
+from coupole.console.people.asking import REFUSALS, Who
+from coupole.console.people.guard import is_command_line
+from coupole.console.people.permission import NotAllowed, allow
+from coupole.console.routes.messages import Lease, Light, Move, Output, StateNow, Text, Warn
+from coupole.console.service_parts import Service
+from coupole.errors import InputError
+from coupole.plan.cell import Cell
+from coupole.storage.ledger import Ledger, ledger_of, similar_ids
+from coupole.viewing import dose_table
+
+
+def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
+    _add_loan(app, service)
+    _add_light(app, service, service.cell)
+
+    @app.post("/api/v1/queue/{entry}/move", responses=REFUSALS)
+    async def move(entry: Text, asked: Move, who: Who) -> StateNow:
+        """Put an entry that waits before another one, or at the end."""
+        allow(service, who, Role.OPERATOR, "move", acts=True)
+        limiter = service.entering.one_at_a_time
+        await to_thread.run_sync(service.entering.move, entry, asked.before, limiter=limiter)
+        return service.state()
+
+    @app.delete("/api/v1/preflight", responses=REFUSALS)
+    def give_up(who: Who) -> dict[str, str]:
+        """Give up the preflight that is being made: what it is of is not entered."""
+        allow(service, who, Role.OPERATOR, "give up a preflight")
+        words = service.entering.preflight.words
+        service.entering.preflight.give_up()
+        return {"given_up": words}
+
+    @app.get("/api/v1/queue/{entry}/output", responses=REFUSALS)
+    def output(entry: Text) -> Output:
+        """What the process of an entry has told."""
+        found = service.queue.entry(entry)
+        said, figures = service.acquisitions.output(found)
+        return Output(entry=found, said=said, figures=figures)
+
+
+def _add_loan(app: FastAPI, service: Service) -> None:
+    def borrower(request: Request) -> int:
+        if not is_command_line(request) or request.client is None:
+            raise NotAllowed(403, "the cell is lent to commands on this machine, by the console's own socket")
+        return request.client.port
+
+    @app.post("/api/v1/cell/lease", responses=REFUSALS)
+    def lend(asked: Lease, who: Who, request: Request) -> dict[str, str]:
+        """Lend the cell to the process that asks, by the Unix socket, until it gives it back or ends. The queue
+        waits meanwhile. A process that the console itself has begun acts for whoever asked for it there."""
+        allow(service, who, Role.OPERATOR, asked.what)
+        pid = borrower(request)
+        if not begun_here(pid):
+            allow(service, who, Role.OPERATOR, asked.what, acts=True)
+        request.state.about = asked.what
+        try:
+            service.acquisitions.lend(pid, who.name, asked.what)
+        except InputError as error:
+            raise NotAllowed(409, f"{asked.what}: {error}") from error
+        return {"lent_to": service.acquisitions.lending.lent_to}
+
+    @app.delete("/api/v1/cell/lease", responses=REFUSALS)
+    def give_back(who: Who, request: Request) -> dict[str, str]:
+        """Give the cell back."""
+        allow(service, who, Role.OPERATOR, "give back")
+        service.acquisitions.lending.give_back(borrower(request))
+        return {"lent_to": service.acquisitions.lending.lent_to}
+
+
+def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
+    def document(ledger: Ledger) -> dict[str, Any]:
+        return dose_table.document(ledger, ledger.read(), similar_ids(ledger.folder, ledger.object_id))
+
+    @app.get("/api/v1/objects/{thing}/light", responses=REFUSALS)
+    def light(thing: Text) -> dict[str, Any]:
+        """All light that an object has received by its ledger, as of `coupole dose --json`."""
+        return document(ledger_of(cell, thing))
+
+    @app.post("/api/v1/objects/{thing}/light", responses=REFUSALS)
+    def enter(thing: Text, asked: Light, who: Who, request: Request) -> dict[str, Any]:
+        """Enter light that was given elsewhere in an object's ledger."""
+        allow(service, who, Role.OPERATOR, "enter light")
+        request.state.about = f"{asked.dose_lux_h:g} lux.h: {asked.note}"
+        ledger = ledger_of(cell, thing)
+        ledger.enter(asked.dose_lux_h, asked.note)
+        return document(ledger)
+
+    @app.post("/api/v1/objects/{thing}/warning", responses=REFUSALS)
+    def warn(thing: Text, asked: Warn, who: Who, request: Request) -> dict[str, Any]:
+        """Have an object's ledger warn of more light than this."""
+        allow(service, who, Role.OPERATOR, "warn")
+        request.state.about = f"above {asked.above_lux_h} lux.h"
+        ledger = ledger_of(cell, thing)
+        ledger.warn_above(asked.above_lux_h)
+        return document(ledger)

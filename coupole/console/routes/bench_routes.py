@@ -1,0 +1,121 @@
+"""The bench's pictures, and the connection by which a button at the console holds the arm in motion."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from typing import Any
+
+from anyio import to_thread
+from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import FileResponse
+
+from coupole.console.people.accounts import Account, Role
+from coupole.console.people.guard import account_here, address_of, is_of_this_machine, session_of
+from coupole.console.people.permission import NotAllowed, allow
+from coupole.console.routes.messages import Text
+from coupole.console.service_parts import Service
+from coupole.errors import CoupoleError, InputError
+
+HOLD = "/api/v1/bench/hold"
+_RENEWED = {"axis", "direction", "share"}
+
+
+def add_bench_routes(app: FastAPI, service: Service) -> None:
+    """Add them to a console's app."""
+
+    @app.get("/api/v1/bench")
+    def bench() -> dict[str, Any]:
+        """`phase` (closed, opening, open, closing), `plan`, `closed_because`; `state` as the bench tells it."""
+        found = service.bench
+        found.looked_at()
+        return {
+            "phase": found.phase,
+            "plan": found.plan,
+            "closed_because": found.closed_because,
+            "state": found.state,
+        }
+
+    @app.get("/api/v1/bench/pictures/{name}", response_class=Response)
+    def picture(name: Text) -> FileResponse:
+        """One of the last pictures as JPEG (`7.jpg`), or `loupe.png`."""
+        if not re.fullmatch(r"[0-9]{1,9}\.jpg|loupe\.png", name):
+            raise InputError("expected a number and .jpg, or loupe.png")
+        path = service.bench.pictures / name
+        if not path.is_file():
+            raise InputError(f"{name}: this picture is gone")
+        return FileResponse(path)
+
+    @app.websocket(HOLD)
+    async def hold(socket: WebSocket) -> None:
+        """While a button is held the page sends `{axis, direction, share}`, the next one only when the answer to
+        the last has come; when it is let go, or lost, the connection ends, and so does the motion."""
+        await socket.accept()
+        await _Hold(service, socket).serve()
+
+
+class _Hold:
+    """One button, from its press to its release."""
+
+    def __init__(self, service: Service, socket: WebSocket) -> None:
+        self._service, self._socket = service, socket
+        self._number: int | None = None
+        self._asked: dict[str, Any] = {}
+
+    async def serve(self) -> None:
+        ended, begun = "the button was let go", False
+        try:
+            while True:
+                asked = await self._socket.receive_json()
+                work = await to_thread.run_sync(self._renewed, asked)
+                if not begun:
+                    begun = True
+                    self._note(f"begins to move {_words(asked)}", 200)
+                await self._socket.send_json({"state": work["state"]})
+                if work["state"] != "running":
+                    ended = str(work.get("ended") or work["why"] or work["state"])
+                    break
+        except (WebSocketDisconnect, ValueError, KeyError):
+            ended = await to_thread.run_sync(self._let_go)
+        except (NotAllowed, CoupoleError) as error:
+            ended = str(error)
+            await to_thread.run_sync(self._let_go)
+        self._note(f"ends: {ended}" if begun else f"is refused: {ended}", 200 if begun else 409)
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+            await self._socket.send_json({"ended": ended})
+            await self._socket.close()
+
+    def _renewed(self, asked: Any) -> dict[str, Any]:
+        """Press or renew. Raises NotAllowed, InputError."""
+        if not isinstance(asked, dict) or set(asked) != _RENEWED:
+            raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
+        allow(self._service, self._who(), Role.OPERATOR, "move by hand", acts=True)
+        goes_on = {"hold": self._number} if self._number is not None else {}
+        self._asked = {**asked, "from": address_of(self._socket)}
+        work = self._service.bench.ask("jog", **self._asked, **goes_on)
+        self._number = int(work["hold"])
+        return work
+
+    def _let_go(self) -> str:
+        """At once: a renewal the other way ends a hold."""
+        if self._number is None:
+            return "the button was let go"
+        other = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}
+        with contextlib.suppress(CoupoleError):
+            self._service.bench.ask("jog", **other)
+        return "the button was let go, or the connection was lost"
+
+    def _who(self) -> Account:
+        session = session_of(self._socket, self._service)
+        if session is None:
+            raise NotAllowed(401, "the session is over: sign in again")
+        return account_here(session.account, of_this_machine=is_of_this_machine(self._socket))
+
+    def _note(self, words: str, status: int) -> None:
+        session = session_of(self._socket, self._service)
+        name = session.account.name if session else ""
+        self._service.audit.note(name, f"hold {words}", status, address_of(self._socket))
+
+
+def _words(asked: dict[str, Any]) -> str:
+    return f"{asked['axis']} {'+' if asked['direction'] > 0 else '-'}"

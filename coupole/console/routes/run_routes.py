@@ -1,0 +1,78 @@
+"""The console's HTTP interface to files: runs, their pictures and pages, and support bundles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import FastAPI, Query, Request, Response
+from fastapi.responses import FileResponse
+
+from coupole.console.people.accounts import Role
+from coupole.console.people.guard import account_here, is_of_this_machine
+from coupole.console.people.permission import NotAllowed
+from coupole.console.people.sessions import Session
+from coupole.console.routes.messages import Text
+from coupole.console.runs.run_files import RunRow
+from coupole.console.runs.run_results import look_page
+from coupole.console.service_parts import Service
+from coupole.errors import InputError
+
+_STILL = (
+    "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self'"
+)
+"""Of a page that only shows: no script, nothing from elsewhere, nothing of this console's origin."""
+_LIVELY = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval'; "
+    "style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self'"
+)
+"""Of a page with scripts of its own, which reach nothing but the page itself."""
+
+
+def add_run_routes(app: FastAPI, service: Service) -> None:
+    """Add them to a console's app."""
+
+    @app.get("/api/v1/runs")
+    def runs() -> list[RunRow]:
+        """The cell's runs, the newest first."""
+        return service.runs.rows()
+
+    @app.get("/api/v1/runs/{run}/picture", response_class=Response)
+    def picture(
+        run: Text, shot: Text, width: Annotated[int, Query(ge=1, le=2048)] = 640, saturation: bool = False
+    ) -> Response:
+        """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
+        jpeg = service.runs.picture(run, shot, width, saturation=saturation)
+        return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+
+    @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
+    def report_page(run: Text) -> FileResponse:
+        """The run's report, without the right to run scripts."""
+        return _file(service.runs.run(run).report_path, "text/html", _STILL)
+
+    @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
+    def readme(run: Text) -> FileResponse:
+        """What the run's folder says of itself."""
+        return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
+
+    @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)
+    def support_bundle(name: Text, request: Request) -> FileResponse:
+        """One that was made at the console; for engineers."""
+        session: Session = request.state.session
+        if account_here(session.account, of_this_machine=is_of_this_machine(request)).role < Role.ENGINEER:
+            raise NotAllowed(403, "support bundles: only for engineers")
+        return FileResponse(service.bundles.path(name), media_type="application/zip", filename=name)
+
+    @app.get("/api/v1/runs/{run}/look", response_class=FileResponse)
+    def look(run: Text) -> FileResponse:
+        """The page that `coupole show` made of the run, if it stands alone."""
+        return _file(look_page(service.cell, service.runs.run(run)), "text/html", _LIVELY)
+
+
+def _file(path: Path, kind: str, policy: str) -> FileResponse:
+    """A file of ours with a policy of its own. Raises InputError."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file yet")
+    return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": policy})

@@ -1,0 +1,159 @@
+"""What contact sheets and pictures of the dome show of a run: its frames by view, light and exposure, how bright
+each is, and where each LED stands."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.console.runs.run_files import RunFiles
+from coupole.errors import CoupoleError, InputError
+from coupole.plan.cell import Cell, read_cell
+from coupole.plan.shot_id import Dark, Led, ShotId
+from coupole.storage.durable import make_folder
+from coupole.storage.view_reader import View
+
+_MOST_PAIRS = 256
+"""Of rows of a frame that its mean is taken of."""
+_KEPT_EVERY = 100
+
+
+@dataclass(frozen=True)
+class SheetFrame:
+    """A proven frame on a contact sheet."""
+
+    shot: str
+    light: str
+    """For people: `LED 417`, `dark 3`."""
+    led: int | None
+    """Its id in the dome's table; None for a panel, and without light."""
+    exposure: int
+    """Index into the plan's exposures."""
+    exposure_us: int
+
+
+@dataclass(frozen=True)
+class LedPlace:
+    """Where an LED stands, seen from the support's centre."""
+
+    azimuth_deg: float
+    """About the support's z axis, from its x axis."""
+    elevation_deg: float
+    """Above the support's plane."""
+
+
+class FrameSheets:
+    """For all runs of a cell; means are read once and kept."""
+
+    def __init__(self, runs: RunFiles, folder: Path) -> None:
+        """`folder`: for the means."""
+        self._runs, self._folder = runs, folder
+        self._reading = threading.Lock()
+        self._places: dict[str, dict[int, LedPlace]] = {}
+
+    def frames(self, name: str, view: str) -> list[SheetFrame]:
+        """The proven frames of a view: by LED, then panels, then without light. Raises InputError,
+        StorageError."""
+        proven = {shot: event for shot, event in self._runs.proven(name).items() if shot.view == view}
+        if not proven:
+            return []
+        exposures = self._runs.view(name, list(proven.values())).records["exposure_us"]
+        return [
+            SheetFrame(
+                str(shot),
+                _words(shot),
+                shot.light.id if isinstance(shot.light, Led) else None,
+                shot.label.exposure,
+                int(exposures[event.index]),
+            )
+            for shot, event in sorted(proven.items(), key=lambda one: _order(one[0]))
+        ]
+
+    def places(self, name: str) -> dict[int, LedPlace]:
+        """Of all LEDs of the run's own table, by id. Raises InputError."""
+        if name not in self._places:
+            self._places[name] = places_in(read_cell(self._runs.run(name).rig_path))
+        return self._places[name]
+
+    def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
+        """Those of `means` that were read before. Raises InputError, StorageError."""
+        kept, proven = self._kept(name), self._runs.proven(name)
+        found = {shot: kept.get(proven[one].xxh3) for shot in shots if (one := ShotId.parse(shot)) in proven}
+        return {shot: mean for shot, mean in found.items() if mean is not None}
+
+    def means(self, name: str, shots: Sequence[str], tell: Callable[[int, int], object]) -> dict[str, float]:
+        """The mean above black of each of these proven frames of one view, as a share of full scale, by at most
+        256 pairs of rows; `tell` is told how many of how many are read. Raises InputError, StorageError."""
+        with self._reading:
+            kept, proven = self._kept(name), self._runs.proven(name)
+            events = [proven[ShotId.parse(shot)] for shot in shots]
+            missing = [event for event in events if event.xxh3 not in kept]
+            view = self._runs.view(name, missing) if missing else None
+            for done, event in enumerate(missing, 1):
+                assert view is not None
+                kept[event.xxh3] = _mean(view.pixels(event.index), view)
+                tell(done, len(missing))
+                if done % _KEPT_EVERY == 0 or done == len(missing):
+                    self._keep(name, kept)
+        return {shot: kept[event.xxh3] for shot, event in zip(shots, events, strict=True)}
+
+    def _kept(self, name: str) -> dict[str, float]:
+        """Means by the frames' checksums."""
+        self._runs.run(name)
+        try:
+            found: dict[str, float] = json.loads((self._folder / f"{name}.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return found
+
+    def _keep(self, name: str, kept: dict[str, float]) -> None:
+        make_folder(self._folder)
+        partial = self._folder / f".{name}.part"
+        partial.write_text(json.dumps(kept), encoding="utf-8")
+        partial.replace(self._folder / f"{name}.json")
+
+
+def places_in(cell: Cell) -> dict[int, LedPlace]:
+    """Of all LEDs of a cell, by id."""
+    support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
+    x, y, z = support_from_base[:3, :3] @ cell.leds.positions_mm.T + support_from_base[:3, 3:]
+    azimuths, elevations = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    return {
+        int(led): LedPlace(float(azimuth), float(elevation))
+        for led, azimuth, elevation in zip(cell.leds.ids, azimuths, elevations, strict=True)
+    }
+
+
+def led_places(sheets: FrameSheets, name: str) -> dict[int, LedPlace]:
+    """As `FrameSheets.places`; empty for a run whose rig cannot be read any more."""
+    try:
+        return sheets.places(name)
+    except (InputError, CoupoleError):
+        return {}
+
+
+def _mean(pixels: NDArray[np.uint16], view: View) -> float:
+    pairs = pixels[: pixels.shape[0] // 2 * 2].reshape(-1, 2, pixels.shape[1])
+    some = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
+    return float((some.mean() - view.black_dn) / (view.white_dn - view.black_dn))
+
+
+def _words(shot: ShotId) -> str:
+    repeat = f", {shot.label.repeat + 1}th time" if shot.label.repeat else ""
+    if isinstance(shot.light, Led):
+        return f"LED {shot.light.id}{repeat}"
+    if isinstance(shot.light, Dark):
+        return f"dark {shot.light.number}{repeat}"
+    return f"{str(shot.light).replace('panel', 'panel ').replace('-mark', ', mark ')}{repeat}"
+
+
+def _order(shot: ShotId) -> tuple[int, int, str, int, int]:
+    led = shot.light.id if isinstance(shot.light, Led) else 0
+    kind = 0 if isinstance(shot.light, Led) else 2 if shot.is_dark else 1
+    return kind, led, "" if kind == 0 else str(shot.light), shot.label.exposure, shot.label.repeat

@@ -1,0 +1,96 @@
+"""The run at work, followed by its journal: what is proven of each view, what happened, its newest frame."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+from coupole.console.runs.event_words import words_of
+from coupole.console.runs.run_files import RunFiles
+from coupole.plan.shot_id import Led
+from coupole.storage.journal import Follower
+from coupole.storage.journal_events import BurstEnded, FrameProven, ReshootBegun
+from coupole.storage.run import Run
+
+_NO_OFTENER_S = 0.4
+_EVENTS_KEPT = 200
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A run as far as it has come."""
+
+    run: str
+    views: tuple[tuple[str, int, int], ...]
+    """Name, proven and expected frames of each, in the plan's order."""
+    newest: FrameProven | None
+    """Under an LED."""
+    reshot: int
+    hottest_board_c: float | None
+    events: tuple[tuple[str, str], ...]
+    """Time (UTC) and words, the newest first."""
+
+
+@dataclass
+class _Followed:
+    run: Run
+    follower: Follower
+    expected: Counter[str]
+    proven: Counter[str] = field(default_factory=Counter)
+    newest: FrameProven | None = None
+    reshot: int = 0
+    hottest_board_c: float | None = None
+    events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS_KEPT))
+
+    def read(self) -> None:
+        for event in self.follower.news():
+            match event:
+                case FrameProven():
+                    self.proven[event.shot.view] += 1
+                    if isinstance(event.shot.light, Led):
+                        self.newest = event
+                case ReshootBegun():
+                    self.reshot += len(event.shots)
+                case BurstEnded():
+                    self.hottest_board_c = event.hottest_board_c
+                case _:
+                    pass
+            if words := words_of(event):
+                self.events.appendleft((event.t, words))
+
+
+class RunWatch:
+    """One reader for however many screens: only the first that asks after a moment waits for it."""
+
+    def __init__(self, runs: RunFiles) -> None:
+        self._runs, self._lock = runs, threading.Lock()
+        self._followed: _Followed | None = None
+        self._known: Watched | None = None
+        self._read_s = 0.0
+
+    def of(self, name: str) -> Watched:
+        """A run of this cell. Raises InputError, StorageError."""
+        with self._lock:
+            followed = self._followed
+            if followed is None or followed.run.folder.name != name:
+                run = self._runs.run(name)
+                expected = Counter(shot.view for shot in run.expected_shots())
+                followed = self._followed = _Followed(run, Follower(run.journal_path), expected)
+                self._read_s = 0.0
+            if self._known is None or self._known.run != name or time.monotonic() - self._read_s > _NO_OFTENER_S:
+                followed.read()
+                self._known, self._read_s = _watched(followed), time.monotonic()
+            return self._known
+
+
+def _watched(followed: _Followed) -> Watched:
+    return Watched(
+        run=followed.run.folder.name,
+        views=tuple((view, followed.proven[view], count) for view, count in followed.expected.items()),
+        newest=followed.newest,
+        reshot=followed.reshot,
+        hottest_board_c=followed.hottest_board_c,
+        events=tuple(followed.events),
+    )

@@ -1,0 +1,165 @@
+"""Sees what happens at a cell and tells people of it, in threads of its own: nothing else waits for them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from coupole.console.plans.plan_queue import Entry, PlanQueue
+from coupole.console.upkeep.notifications import Message, Settings, ways
+from coupole.errors import CoupoleError, InputError, StorageError
+from coupole.plan.cell import Cell
+from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.line_file import LineFile, utc_now
+
+_LOOK_EVERY_S, _TRIALS, _AGAIN_AFTER_S, _MOST_WAITING = 1.0, 3, 5.0, 100
+_RELIEF = 1.1
+"""How many times the limit must be free again before a disk counts as low once more."""
+
+
+class Occurrences:
+    """What has happened at a cell since it was last asked."""
+
+    def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
+        self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
+        self._faults = ArmFaults(cell.state_folder)
+        self._ended = {entry.id for entry in plans.entries if entry.ended}
+        self._halted = plans.halted
+        self._known_fault = self._newest_fault()
+        self._disk_was_low = False
+
+    def since(self) -> Iterator[Message]:
+        """Raises StorageError: the arm's faults cannot be read."""
+        for entry in self._queue.entries:
+            if entry.ended and entry.id not in self._ended:
+                self._ended.add(entry.id)
+                yield self._ending(entry)
+        if (halted := self._queue.halted) != self._halted:
+            self._halted = halted
+            ended = [entry.words for entry in self._queue.entries if entry.ended]
+            if halted and not halted.startswith(tuple(ended)):
+                yield self._message("fault", "the queue has stopped", halted)
+        if (fault := self._newest_fault()) != self._known_fault:
+            self._known_fault = fault
+            if fault:
+                words = (
+                    f"{fault}\nUntil somebody has been there and says `coupole confirm`, the arm does not move."
+                )
+                yield self._message("arm-fault", "the arm is in a fault", words)
+        yield from self._disk()
+
+    def _ending(self, entry: Entry) -> Message:
+        if entry.hold:
+            return self._message("hold", entry.words, f"The queue waits for a person: {entry.hold}")
+        waiting = f"{len(self._queue.waiting)} entries wait." if self._queue.waiting else "Nothing waits."
+        text = f"{entry.words} of {entry.by}: {entry.said or 'complete'}\n{entry.run}\n{waiting}"
+        if entry.state == "failed":
+            return self._message("fault", f"{entry.words} failed", text)
+        return self._message("plan-ended", f"{entry.words} is {entry.state}", text)
+
+    def _newest_fault(self) -> str:
+        standing = self._faults.standing()
+        return f"{standing[-1].t}: {standing[-1].message}" if standing else ""
+
+    def _disk(self) -> Iterator[Message]:
+        folder = next(
+            path for path in (self._cell.storage_folder, *self._cell.storage_folder.parents) if path.exists()
+        )
+        free_bytes = shutil.disk_usage(folder).free
+        if free_bytes < self._low_bytes and not self._disk_was_low:
+            self._disk_was_low = True
+            words = f"{free_bytes / 1e9:.1f} GB are free; it is said below {self._low_bytes / 1e9:g} GB."
+            yield self._message("disk-low", f"little room left in {folder}", words)
+        elif free_bytes > _RELIEF * self._low_bytes:
+            self._disk_was_low = False
+
+    def _message(self, event: object, subject: str, text: str) -> Message:
+        return Message.now(self._cell.rig.name, event, subject, text)  # type: ignore[arg-type]
+
+
+class Notifier:
+    """Sends what has happened, while a context lasts. `trouble` says what the last message met; each delivery has
+    a line in `notifications.jsonl`."""
+
+    def __init__(self, settings: Settings | None, occurrences: Occurrences, folder: Path) -> None:
+        self._settings, self._occurrences = settings, occurrences
+        self._log = folder / "notifications.jsonl"
+        self._messages: queue.Queue[Message | None] = queue.Queue(_MOST_WAITING)
+        self._ending = threading.Event()
+        self.trouble = ""
+
+    def __enter__(self) -> Notifier:
+        if self._settings is not None:
+            for work in (self._watch, self._deliver):
+                threading.Thread(target=work, name=f"notifications, {work.__name__}", daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """What is still to be sent is given up."""
+        self._ending.set()
+        with contextlib.suppress(queue.Full):
+            self._messages.put_nowait(None)
+
+    def _watch(self) -> None:
+        assert self._settings is not None
+        while not self._ending.wait(_LOOK_EVERY_S):
+            try:
+                for message in self._occurrences.since():
+                    if message.event in self._settings.events:
+                        self._messages.put_nowait(message)
+            except (CoupoleError, OSError, queue.Full) as error:
+                self.trouble = f"notifications: {error or 'too many wait to be sent'}"
+
+    def _deliver(self) -> None:
+        assert self._settings is not None
+        while (message := self._messages.get()) is not None:
+            troubles = [words for words in self._sent(message).values() if words]
+            self.trouble = "; ".join(f"notification not sent: {words}" for words in troubles)
+
+    def _sent(self, message: Message) -> dict[str, str]:
+        assert self._settings is not None
+        found = {}
+        for way, send in ways(self._settings).items():
+            for trial in range(_TRIALS):
+                try:
+                    send(message)
+                except (OSError, ValueError) as error:
+                    found[way] = f"{way}: {error or type(error).__name__}"
+                    if trial + 1 == _TRIALS or self._ending.wait(_AGAIN_AFTER_S):
+                        break
+                else:
+                    found[way] = ""
+                    break
+            self._note(message, way, found[way])
+        return found
+
+    def _note(self, message: Message, way: str, trouble: str) -> None:
+        line = {"t": utc_now(), "event": message.event, "subject": message.subject, "by": way, "trouble": trouble}
+        with contextlib.suppress(StorageError):
+            file = LineFile(self._log)
+            try:
+                file.append([json.dumps(line, ensure_ascii=False) + "\n"])
+            finally:
+                file.close()
+
+
+def send_test(settings: Settings, cell: str) -> dict[str, str]:
+    """A message by each way, once; what each met, empty if it was sent."""
+    message = Message.now(cell, "test", "a test of its notifications", "If you read this, they reach you.")
+    found = {}
+    for way, send in ways(settings).items():
+        begun_s = time.monotonic()
+        try:
+            send(message)
+            found[way] = ""
+        except (OSError, ValueError) as error:
+            found[way] = f"{error or type(error).__name__} (after {time.monotonic() - begun_s:.0f} s)"
+    if not found:
+        raise InputError("the settings name no way: expected `email`, `webhooks` or `desktop: true`")
+    return found

@@ -1,0 +1,110 @@
+"""What the console tells of the machine and the rig: room on the disk, what is still to be measured, the log."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from coupole.console.runs.run_files import RunRow
+from coupole.errors import CoupoleError
+from coupole.plan import yamlfile
+from coupole.plan.cell import Cell
+
+_MEASURE = re.compile(r"\s*#\s*measure\b:?\s*(.*)", re.IGNORECASE)
+_LOG_BYTES = 2_000_000
+NOTIFICATIONS = "notifications.yaml"
+
+
+@dataclass(frozen=True)
+class Disk:
+    """Where the runs are; in bytes."""
+
+    total: int
+    free: int
+    runs: int
+    """That the cell's runs take."""
+    reserve: int
+    """That a run leaves free."""
+    frame: int
+    """Of this rig."""
+
+    @property
+    def frames_left(self) -> int:
+        """Room for frames of this rig, as they come from the camera."""
+        return max(0, self.free - self.reserve) // self.frame
+
+
+@dataclass(frozen=True)
+class ToMeasure:
+    """A line of the rig whose comment says that it is to be measured."""
+
+    line: int
+    key: str
+    why: str
+
+
+def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
+    """Of the cell's storage folder, with these runs."""
+    folder = cell.storage_folder
+    while not folder.exists():
+        folder = folder.parent
+    usage = shutil.disk_usage(folder)
+    reserve = cell.rig.storage.reserve_bytes
+    return Disk(usage.total, usage.free, sum(row.bytes for row in rows), reserve, cell.rig.frame_bytes)
+
+
+def to_measure(rig: Path) -> list[ToMeasure]:
+    """What comments `# Measure: ...` in a rig's file are written above."""
+    lines = rig.read_text(encoding="utf-8").splitlines()
+    found = []
+    for number, line in enumerate(lines, 1):
+        if why := _MEASURE.fullmatch(line):
+            key = next((text.split(":")[0].strip(" -{") for text in lines[number:] if _is_entry(text)), "")
+            found.append(ToMeasure(number, key, why[1]))
+    return found
+
+
+def _is_entry(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def log_lines(path: Path) -> list[dict[str, Any]]:
+    """The newest lines of the console's log, the newest first."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _LOG_BYTES))
+            lines = file.read().split(b"\n")
+    except OSError:
+        return []
+    found = []
+    for line in reversed(lines):
+        try:
+            found.append(dict(json.loads(line)))
+        except (ValueError, TypeError):
+            continue
+    return found
+
+
+def notifications(folder: Path) -> dict[str, str]:
+    """Who is told what, by `notifications.yaml` in the console's folder, without its passwords; empty if there is
+    no such file."""
+    path = folder / NOTIFICATIONS
+    if not path.is_file():
+        return {}
+    try:
+        data: dict[str, Any] = yamlfile.read(path).data
+        email, hooks = data.get("email") or {}, data.get("webhooks") or ()
+        return {
+            "of": ", ".join(map(str, data.get("events") or ())) or "everything",
+            "by e-mail to": ", ".join(map(str, email.get("to") or ())) or "nobody",
+            "to addresses at": ", ".join(urlsplit(str(hook["url"])).hostname or "" for hook in hooks) or "none",
+            "on this desktop": "yes" if data.get("desktop") else "no",
+        }
+    except (CoupoleError, AttributeError, KeyError, TypeError) as error:
+        return {"trouble": f"{path}: cannot be read: {error}"}

@@ -1,0 +1,178 @@
+"""The command line where a console owns the cell: it acquires by it, borrows the cell, and tells it of light."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cells
+import pytest
+from cells import CellFolder
+from served import BORROWER, Browser, Served, served
+
+from coupole.acquisition import runtime_folder
+from coupole.console.command_line.client import borrowed, call, is_served
+from coupole.errors import InputError
+from coupole.plan.cell import read_cell
+from sim.world.client import World
+
+
+class Standing:
+    """A cell whose world outlives its controllers, its console, and an engineer at its page."""
+
+    def __init__(self, cell: CellFolder, world: World, service: Served) -> None:
+        self.cell, self.world, self.service = cell, world, service
+        self.engineer: Browser = service.browser(token=service.token)
+
+    def state(self) -> dict[str, Any]:
+        return self.engineer.state()
+
+    @contextmanager
+    def when_frames_are_proven(self, act: Callable[[], None]) -> Iterator[None]:
+        """Do something in another thread as soon as this session has proven frames."""
+        before = self.state()["proven"]
+        done: list[bool] = []
+
+        def wait() -> None:
+            cells.wait_until(lambda: self.state()["proven"] > before, "proven frames")
+            act()
+            done.append(True)
+
+        thread = threading.Thread(target=wait)
+        thread.start()
+        try:
+            yield
+        finally:
+            thread.join()
+        assert done
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Standing]:
+    cell = CellFolder(tmp_path_factory.mktemp("standing"), speed=2.0)
+    cell.join()
+    cell.write(lights=cells.SOME_LIGHTS, repeats=20)
+    with cell.world() as world, served(cell) as service:
+        yield Standing(cell, world, service)
+
+
+@pytest.fixture(autouse=True)
+def nobody_in_control(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    if "standing" in request.fixturenames:
+        engineer: Browser = request.getfixturevalue("standing").engineer
+        engineer.post("/api/v1/control/take")
+        assert engineer.post("/api/v1/control/give", {}).status == 200
+
+
+def test_a_run_of_a_terminal_is_the_consoles_and_is_stopped_resumed_killed_and_offered_again(
+    standing: Standing,
+) -> None:
+    cell, world = standing.cell, standing.world
+    with standing.when_frames_are_proven(lambda: os.kill(os.getpid(), signal.SIGTERM)):
+        stopped = cells.here("acquire", cell.plan, "--json", "--yes")
+    run = cell.run_folder
+    assert (stopped.code, stopped.document["kind"], stopped.document["run"]) == (143, "Interrupted", str(run))
+    assert cells.safe(world)
+    entry = standing.state()["queue"][-1]
+    assert (entry["exit_code"], entry["by"].endswith("(command line)")) == (130, True)
+    said: list[str] = []
+    served_cell = read_cell(cell.rig)
+
+    def refused_then_killed() -> None:
+        for path, asked in (("queue", {"plan": str(cell.plan), "now": True}), ("cell/lease", {"what": "live"})):
+            with pytest.raises(InputError) as refused:
+                call(served_cell, "POST", f"/api/v1/{path}", asked)
+            said.append(str(refused.value))
+        os.kill(standing.state()["queue"][-1]["pid"], signal.SIGKILL)
+
+    with standing.when_frames_are_proven(refused_then_killed):
+        killed = cells.here("acquire", "--resume", run, "--yes")
+    assert killed.code == 4, killed.err
+    assert "view top (1/1)" in killed.err
+    assert f"--resume {run}" in killed.err
+    assert said == [f"{run.name} is being acquired", f"live: {run.name} is being acquired"]
+    cells.wait_until(lambda: cells.safe(world), "the devices' own watchdogs")
+    state = standing.state()
+    assert (state["state"], state["run"], state["queue"][-1]["state"]) == ("halted", None, "failed")
+    assert "its process was killed" in state["halted"]
+
+    again = standing.engineer.post("/api/v1/queue", {"resume": run.name}).document
+    left = cells.here("status", run, "--json").document
+    assert left["go_on"]
+    whole = cells.about(run)["expected"]["frames"]
+    assert whole - cells.frame_lines(run) <= again["needs"]["frames"] < whole
+    assert standing.engineer.post(f"/api/v1/queue/{again['id']}", method="DELETE").status == 200
+
+
+def test_the_cell_is_lent_to_a_process_until_that_ends(standing: Standing) -> None:
+    command = [sys.executable, "-c", BORROWER, str(standing.cell.rig)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=cells.REPO) as borrower:
+        assert borrower.stdout is not None
+        assert borrower.stdout.readline() == "mine\n"
+        lent_to = standing.state()["lent_to"]
+        assert lent_to.endswith("(command line): look at the focus")
+        for what, *named in (
+            ("live", standing.cell.rig),
+            ("meter", standing.cell.plan),
+            ("devices", "--rig", standing.cell.rig),
+            ("commission", standing.cell.rig, "--name", "Ada", "--yes"),
+            ("calibrate", "all", "--rig", standing.cell.rig, "--out", standing.cell.folder / "calibrations"),
+        ):
+            refused = cells.here(what, *named)
+            assert (refused.code, f": the cell is lent to {lent_to}" in refused.err) == (2, True), what
+        asked = {"plan": str(standing.cell.plan), "now": True}
+        assert lent_to in standing.engineer.post("/api/v1/queue", asked | {"plan": "plan.yaml"}).document["detail"]
+        with pytest.raises(InputError, match="not lent to this process"):
+            call(read_cell(standing.cell.rig), "DELETE", "/api/v1/cell/lease")
+        borrower.kill()
+    assert standing.state()["lent_to"] == ""
+    assert standing.engineer.post("/api/v1/cell/lease", {"what": "mine"}).status == 403
+
+
+def test_who_is_in_control_at_the_page_is_not_overruled_unasked(standing: Standing) -> None:
+    rig = standing.cell.rig
+    standing.engineer.post("/api/v1/control/take")
+    refused = cells.here("acquire", standing.cell.plan)
+    assert (refused.code, "first engineer is in control" in refused.err) == (2, True)
+    assert cells.here("queue", rig, "--take-control", "--hold", "lunch", "--give-control").code == 0
+    assert standing.state()["in_control"] == ""
+    assert cells.here("queue", rig, "--go-on").code == 0
+    assert standing.state()["in_control"] == "", "a command is over when it is answered"
+
+
+def test_light_by_hand_goes_through_the_console_whose_log_says_who_and_what(standing: Standing) -> None:
+    entered = cells.here(
+        "dose", "relief", "--rig", standing.cell.rig, "--add", "0.5", "--note", "studio", "--json"
+    )
+    assert entered.document["dose_lux_h"] == pytest.approx(0.5)
+    light = standing.engineer.get("/api/v1/objects/relief/light").document
+    assert light == entered.document
+    lines = (standing.cell.folder / "storage/state/console/audit.jsonl").read_text().splitlines()
+    (line,) = [line for line in map(json.loads, lines) if line["asked"] == "POST /api/v1/objects/relief/light"]
+    assert (line["name"].endswith("(command line)"), line["about"]) == (True, "0.5 lux.h: studio")
+
+
+def test_where_no_console_is_served_commands_work_by_themselves(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    assert cells.here("dose", "relief", "--rig", cell.rig, "--add", "0.5", "--note", "studio").code == 0
+    assert (cell.folder / "ledger/relief.jsonl").is_file()
+    asked = cells.here("queue", cell.rig)
+    assert (asked.code, "`coupole serve" in asked.err) == (2, True)
+
+
+def test_a_machine_without_a_place_for_sockets_keeps_nobody_from_working(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = read_cell(CellFolder(tmp_path).rig)
+    monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / "nowhere")
+    with borrowed(cell, "live"):
+        assert not is_served(cell)

@@ -12,7 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy comes: the te
 
 import pytest
 from cells import CellFolder
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from nursery import NURSERY
 from skip_budget import over_budget
 from xdist.scheduler.loadscope import LoadScopeScheduling
@@ -21,8 +21,12 @@ from sim.world import client
 
 client._launch = NURSERY.start  # type: ignore[assignment] # for what runs in the tests' own process
 
-settings.register_profile("coupole", deadline=None, max_examples=50)  # no test asserts wall-clock speed
-settings.register_profile("coupole at full scale", deadline=None, max_examples=500)
+unhurried: Any = {
+    "deadline": None,
+    "suppress_health_check": [HealthCheck.too_slow],
+}  # no test asserts wall-clock speed
+settings.register_profile("coupole", max_examples=30, **unhurried)
+settings.register_profile("coupole at full scale", max_examples=500, **unhurried)
 settings.load_profile("coupole")
 
 

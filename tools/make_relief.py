@@ -87,9 +87,9 @@ def relief(columns: int = COLUMNS, rows: int = ROWS) -> tuple[NDArray[np.float32
     return np.concatenate([top, bottom]).astype("<f4"), np.concatenate(faces).astype("<i4")
 
 
-def relief_ply() -> bytes:
+def relief_ply(columns: int = COLUMNS, rows: int = ROWS) -> bytes:
     """The mesh as binary little-endian PLY."""
-    vertices, triangles = relief()
+    vertices, triangles = relief(columns, rows)
     header = (
         "ply\nformat binary_little_endian 1.0\ncomment relief tile, mm, z up, bottom at z = 0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"

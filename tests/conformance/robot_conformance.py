@@ -71,8 +71,16 @@ class RobotCell(ABC):
             assert time.monotonic() < give_up
             time.sleep(0.001)
 
+    def under_way(self) -> bool:
+        """True if a motion from home has begun in earnest."""
+        return bool(np.max(np.abs(self.joints_deg() - HOME_DEG)) > 8.0)
+
     def wait_until_under_way(self) -> None:
-        self.wait_until(lambda: bool(np.max(np.abs(self.joints_deg() - HOME_DEG)) > 8.0))
+        self.wait_until(self.under_way)
+
+    def stop_under_way(self, robot: Robot) -> None:
+        self.wait_until_under_way()
+        robot.stop()
 
     def close(self) -> None:
         self._drivers.close()
@@ -206,8 +214,7 @@ class RobotConformance:
 
     def test_stop_in_mid_motion_brings_it_to_rest_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)
-        cell.wait_until_under_way()
-        robot.stop()
+        cell.stop_under_way(robot)
         assert not robot.measured().moving
         cell.assert_stands()
         assert np.max(np.abs(cell.joints_deg() - AWAY_DEG)) > 1.0

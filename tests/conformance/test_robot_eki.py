@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
 
-from coupole.devices import ArmCondition
+from coupole.devices import ArmCondition, Robot
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import move_duration_s
 from drivers.kuka.eki.driver import KukaEki, Settings
@@ -77,18 +77,33 @@ class EkiCell(RobotCell):
     def open(self, **settings: object) -> KukaEki:
         return self._drivers.enter_context(closing(KukaEki(self.settings.model_copy(update=settings), self.clock)))
 
-    def hold_until_commanded(self, command: Callable[[], None]) -> NDArray[np.float64]:
-        """Where the axes [6] are when `command` is begun; the world stands still until it has come."""
+    def hold_until_commanded(
+        self, command: Callable[[], None], *, once: Callable[[], bool] = lambda: True
+    ) -> NDArray[np.float64]:
+        """Where the axes [6] are when `command` is begun, `once` this is so; the world stands still until it has
+        come."""
         called_deg = []
+        come = threading.Event()
 
         def hold() -> None:
+            if not once():
+                self.reactor.after(SAMPLE_MS / 1e3, hold)
+                return
             called_deg.append(self.joints_deg())
             command()
             assert self.controller._client is not None
             self.reactor.hold_for(self.controller._client, 20.0)
+            come.set()
 
         self.in_world(hold)
+        assert come.wait(30.0)
         return called_deg[0]
+
+    def stop_under_way(self, robot: Robot) -> None:
+        """At a place of the world, not of a busy machine's: at this speed the way is soon at its end."""
+        stopper = threading.Thread(target=robot.stop)
+        self.hold_until_commanded(stopper.start, once=self.under_way)
+        stopper.join()
 
 
 class TestKukaEki(RobotConformance):

@@ -62,7 +62,7 @@ def _total(run: Path, counter: str) -> int:
     [
         pytest.param(0, id="first"),
         pytest.param(7, id="first-light", marks=pytest.mark.full),
-        pytest.param(30, id="middle"),
+        pytest.param(30, id="middle", marks=pytest.mark.full),
         pytest.param(60, id="last-light", marks=pytest.mark.full),
         pytest.param(65, id="last"),
     ],
@@ -72,7 +72,7 @@ def test_a_dropped_trigger_has_its_shot_taken_again(joining: CellFolder, edge: i
     _assert_made_good(joining, ended, [edge])
 
 
-@pytest.mark.parametrize("frame", [0, 65], ids=["first", "last"])
+@pytest.mark.parametrize("frame", [pytest.param(0, marks=pytest.mark.full), 65], ids=["first", "last"])
 def test_a_frame_lost_in_transfer_is_taken_again(joining: CellFolder, frame: int) -> None:
     ended = _acquire_with(joining, {"kind": "lost_transfer", "frame": frame})
     _assert_made_good(joining, ended, [frame])
@@ -86,7 +86,7 @@ def test_a_gap_in_the_frame_ids_is_called_a_lost_transfer(joining: CellFolder) -
     assert (gap["missing"], gap["lost_in_transfer"]) == (2, 1)
 
 
-@pytest.mark.parametrize("delay_us", [300, 9_500])
+@pytest.mark.parametrize("delay_us", [300, pytest.param(9_500, marks=pytest.mark.full)])
 def test_a_bounce_that_the_camera_ignores_costs_nothing(joining: CellFolder, delay_us: int) -> None:
     """While it exposes or reads out, the camera counts a second pulse and makes no frame."""
     ended = _acquire_with(joining, {"kind": "double_trigger", "edge": 30, "delay_us": delay_us})

@@ -18,24 +18,36 @@ from coupole.motion.itinerary import arm_of, base_from_flange, bodies_of
 from coupole.motion.ordering import shortest_tour
 from coupole.motion.path_planner import PathPlanner
 from coupole.motion.singularities import margin
+from coupole.plan.rig import Rig
 from coupole.plan.schedule import ViewPose
-from coupole.preflight.job import read_job
+from coupole.preflight.job import Job, read_job
 
 Floats = NDArray[np.float64]
 ROOT = REPO
-JOB = read_job(ROOT / "configs/plans/demo.yaml")
-RIG = JOB.cell.rig
-HOME = np.array(RIG.motion.home_joints_deg)
+
+
+@cache
+def job() -> Job:
+    """The demo."""
+    return read_job(ROOT / "configs/plans/demo.yaml")
+
+
+def rig() -> Rig:
+    return job().cell.rig
+
+
+def home() -> Floats:
+    return np.array(rig().motion.home_joints_deg)
 
 
 @cache
 def cell() -> CellBodies:
     """The simulated cell with the demo's relief."""
-    return bodies_of(RIG, JOB.cell.leds, JOB.shape.corners_mm)
+    return bodies_of(rig(), job().cell.leds, job().shape.corners_mm)
 
 
 def planner() -> PathPlanner:
-    return PathPlanner(arm_of(RIG), cell(), [RIG.motion.home_joints_deg])
+    return PathPlanner(arm_of(rig()), cell(), [rig().motion.home_joints_deg])
 
 
 def random_views(count: int, seed: int) -> list[Floats]:
@@ -44,8 +56,8 @@ def random_views(count: int, seed: int) -> list[Floats]:
     views: list[Floats] = []
     while len(views) < count:
         pose = look_at((0, 0, 30), random.uniform(280, 400), random.uniform(-180, 180), random.uniform(40, 85))
-        arm = arm_of(RIG)
-        postures = inverse(arm, base_from_flange(ViewPose("v", pose, None, (0, 0, 30)), RIG))
+        arm = arm_of(rig())
+        postures = inverse(arm, base_from_flange(ViewPose("v", pose, None, (0, 0, 30)), rig()))
         if len(postures):
             postures = postures[(cell().tightest_mm(postures) >= 0) & (margin(arm, postures) >= 1.0)]
         if len(postures):
@@ -54,7 +66,7 @@ def random_views(count: int, seed: int) -> list[Floats]:
 
 
 def seconds_of(found: PathPlanner, views: list[Floats]) -> float:
-    tour = shortest_tour(found, HOME, views, [np.zeros(len(view)) for view in views])
+    tour = shortest_tour(found, home(), views, [np.zeros(len(view)) for view in views])
     return sum(leg.duration_s for leg in tour.legs)
 
 
@@ -64,7 +76,7 @@ class Search:
 
     def __init__(self, views: list[Floats]) -> None:
         self.planner = planner()
-        self.places = np.concatenate([HOME[None], *views])
+        self.places = np.concatenate([home()[None], *views])
         self.groups = np.split(np.arange(1, len(self.places)), np.cumsum([len(view) for view in views])[:-1])
         self.seconds = self.planner.straight_s(self.places)
         self.known = np.eye(len(self.places), dtype=bool)
@@ -182,31 +194,31 @@ def test_many_views_take_at_most_a_quarter_more_than_a_long_search_finds(
 def test_the_same_views_give_the_same_tour() -> None:
     views = random_views(8, 3)
     posture_cost_s = [np.zeros(len(view)) for view in views]
-    first, second = (shortest_tour(planner(), HOME, views, posture_cost_s) for _ in range(2))
+    first, second = (shortest_tour(planner(), home(), views, posture_cost_s) for _ in range(2))
     assert first.order == second.order
     assert np.array_equal(first.places, second.places)
 
 
 def test_each_view_is_visited_once_at_one_of_its_places() -> None:
     views = random_views(8, 4)
-    tour = shortest_tour(planner(), HOME, views, [np.zeros(len(view)) for view in views])
+    tour = shortest_tour(planner(), home(), views, [np.zeros(len(view)) for view in views])
     assert sorted(tour.order) == list(range(8))
     for group, place in zip(tour.order, tour.places, strict=True):
         assert (views[group] == place).all(axis=1).any()
 
 
 def test_of_nearly_equal_ways_the_easier_is_taken() -> None:
-    near, easy = HOME + np.array((5, 0, 0, 0, 0, 0)), HOME - np.array((5.5, 0, 0, 0, 0, 0))
-    free = PathPlanner(arm_of(RIG), None, [])
+    near, easy = home() + np.array((5, 0, 0, 0, 0, 0)), home() - np.array((5.5, 0, 0, 0, 0, 0))
+    free = PathPlanner(arm_of(rig()), None, [])
     for uneasy_s, expected in ((0.0, near), (0.3, easy)):
-        tour = shortest_tour(free, HOME, [np.array([near, easy])], [np.array([uneasy_s, 0.0])])
+        tour = shortest_tour(free, home(), [np.array([near, easy])], [np.array([uneasy_s, 0.0])])
         assert np.array_equal(tour.places[0], expected)
 
 
 def test_without_views_there_is_no_tour() -> None:
-    assert shortest_tour(planner(), HOME, [], []).order == ()
+    assert shortest_tour(planner(), home(), [], []).order == ()
 
 
 def test_a_view_where_the_arm_stands_already_takes_no_time() -> None:
-    tour = shortest_tour(PathPlanner(arm_of(RIG), None, []), HOME, [HOME[None]], [np.zeros(1)])
+    tour = shortest_tour(PathPlanner(arm_of(rig()), None, []), home(), [home()[None]], [np.zeros(1)])
     assert tour.legs[0].duration_s == 0.0

@@ -290,7 +290,8 @@ def blocks(picture: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("kind", "alpha", "most"), [("area", 0.05, 0.1), ("area", 0.3, 0.015), ("environment", 0.3, 0.025)]
+    ("kind", "alpha", "most"),
+    [("area", 0.05, 0.1), pytest.param("area", 0.3, 0.015, marks=pytest.mark.full), ("environment", 0.3, 0.025)],
 )
 def test_highlights_of_large_lights_are_those_of_an_independent_renderer(
     tmp_path: Path, kind: str, alpha: float, most: float

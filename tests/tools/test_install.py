@@ -38,8 +38,8 @@ def run(home: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
     ("words", "completed"),
     [
         (["st"], "stop status"),
-        (["export", "somewhere", "--to", "pt"], "ptm"),
-        (["plan", "new", "ch"], "charuco"),
+        pytest.param(["export", "somewhere", "--to", "pt"], "ptm", marks=pytest.mark.full),
+        pytest.param(["plan", "new", "ch"], "charuco", marks=pytest.mark.full),
         (["acquire", "configs/plans/dem"], "configs/plans/demo.yaml"),
         (["acquire", "configs/rigs/sim-ur5"], ""),
     ],

@@ -54,6 +54,7 @@ def test_the_committed_small_dome_is_what_the_tool_writes(tmp_path: Path) -> Non
 def test_the_committed_relief_is_what_the_tool_writes(tmp_path: Path) -> None:
     tool("make_relief.py")["main"](["--output", str(tmp_path / "relief.ply")])
     assert (tmp_path / "relief.ply").read_bytes() == RELIEF.read_bytes()
+    assert tool("make_relief.py")["relief_ply"](28, 21) == (ROOT / "tests/data/relief.ply").read_bytes()
 
 
 def test_the_dome_has_1080_leds_on_boards_of_6(table: NDArray[np.float64]) -> None:

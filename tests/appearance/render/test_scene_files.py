@@ -20,6 +20,7 @@ from coupole.errors import InputError, StorageError
 
 ROOT = REPO
 SHIPPED = sorted((ROOT / "configs" / "scenes").glob("*.yaml"))
+SLOW = {"sunset-gilding"}
 SMALL = """\
 schema_version: 1
 name: small
@@ -49,7 +50,10 @@ def written(folder: Path, text: str = SMALL) -> Path:
     return path
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=pytest.mark.full if path.stem in SLOW else ()) for path in SHIPPED],
+)
 def test_every_shipped_scene_renders(path: Path, tmp_path: Path) -> None:
     document, scene = read_scene(path)
     small = studio.reduced(scene, samples=1, width_px=16, step_nm=40)

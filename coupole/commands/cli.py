@@ -17,6 +17,7 @@ from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.dose_ledger import dose
 from coupole.commands.reflectance import reflectance_app
+from coupole.commands.register_scans import register
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
@@ -52,6 +53,7 @@ for command in (
     keeping.archive,
     exporting.export,
     keeping.scan,
+    register,
     dose,
     render,
     show,

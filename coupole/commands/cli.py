@@ -15,6 +15,7 @@ from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
+from coupole.commands.compare_states import compare
 from coupole.commands.dose_ledger import dose
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.register_scans import register
@@ -54,6 +55,7 @@ for command in (
     exporting.export,
     keeping.scan,
     register,
+    compare,
     dose,
     render,
     show,

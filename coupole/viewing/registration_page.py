@@ -64,15 +64,16 @@ def scans_drawn(found: Registered) -> Any:
     if len(points) > _DRAWN_POINTS:
         some = np.random.default_rng(0).choice(len(points), _DRAWN_POINTS, replace=False)
         points, colour = points[some], colour[some]
-    return _drawn(points, lambda canvas: canvas.dots(points, colour, 1.5))
+    return drawn(points, lambda canvas: canvas.dots(points, colour, 1.5))
 
 
 def solid_drawn(solid: Solid, colours: Any) -> Any:
     """A solid in one colour, or one for each face, from three sides."""
-    return _drawn(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], outlined=False))
+    return drawn(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], outlined=False))
 
 
-def _drawn(points: Points, draw: Any) -> Any:
+def drawn(points: Points, draw: Any) -> Any:
+    """A PIL image from three sides; `draw` draws on a canvas."""
     from PIL import Image, ImageDraw
 
     low, high = points.min(axis=0), points.max(axis=0)

@@ -4,9 +4,9 @@
 
 167 scans of 570 x 570 rays are 54 million, about as many points as were taken of Notre-Dame's west front (seed
 001). Surfaces hide each other, a third of the material is dark and loses rays, ranges have noise of 0.5 mm.
-Reading, registration and merging are timed, and memory is measured. Exits with 1 if a scan is placed wrongly or not
-at all, if fewer than 90 % of the poses lie in their 95 % regions, if it took more than 30 minutes, or if a process
-took more than 8 GB.
+Reading, registration and merging are timed, and memory is measured. Exits with 1 if a scan is placed wrongly or
+not at all, if fewer than 90 % of the poses lie in their 95 % regions, if it took more than 30 minutes, or if a
+process took more than 8 GB.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def main() -> int:
     off_mm, covered = compared(found, truth)
     loops = [loop.error_mm for loop in found.loops] or [np.inf]
     print(
-        f"{len(found.placed)} placed, {len(found.unplaced)} not; {found.pairs} pairs, {len(found.rejected)} rejected; "
+        f"{len(found.placed)} placed, {len(found.unplaced)} not; {found.pairs} pairs, "
+        f"{len(found.rejected)} rejected, "
         f"{len(loops)} loops: median {np.median(loops):.3f} mm, worst {max(loops):.3f} mm; factor "
         f"{found.loop_factor:.2f}, inflation {found.fit.inflation:.2f}, noise {found.fit.noise_mm:.3f} mm"
     )

@@ -53,7 +53,7 @@ def remarks(found: Comparison) -> Iterator[str]:
     else:
         yield (
             f"colour: {int(found.recoloured.sum()):,} points changed significantly, in "
-            f"{len(found.colour_regions)} regions; dE00 {np.nanmedian(found.de00):.2f} in the median, noise included"
+            f"{len(found.colour_regions)} regions; dE00 {np.nanmedian(found.de00):.2f} in the median, with noise"
         )
     if (~known).any():
         yield f"{int((~known).sum()):,} points have no surface of the other state near them: not compared"

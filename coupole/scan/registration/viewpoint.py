@@ -22,6 +22,8 @@ STANDS: tuple[Stand, ...] = ("origin", "+x", "-x", "+y", "-y", "+z", "-z", "none
 _MOST_FOLDED = 0.05
 """Share of the picture's cells with two surfaces in them, of a scan that was seen from there."""
 _AS_GOOD = 0.005
+_LEAST_FORWARD = 0.1
+"""Length of the mean of all directions below which a scan looks all around."""
 _MOST_CELLS = 4_000_000
 
 
@@ -60,7 +62,8 @@ class DepthPicture:
 
     def __init__(self, viewpoint: Viewpoint, points_mm: Floats, spacing_mm: float) -> None:
         self._viewpoint = viewpoint
-        places, depths = viewpoint.seen(points_mm)
+        self._level = _level(points_mm) if viewpoint.stand == "origin" else np.eye(3)
+        places, depths = viewpoint.seen(points_mm @ self._level)
         self._turn = _gap(places[:, 0]) if viewpoint.stand == "origin" else 0.0
         places = self._turned(places)
         self._low = places.min(axis=0)
@@ -88,7 +91,7 @@ class DepthPicture:
     def in_front(self, points_mm: Floats, least_mm: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Of points [n, 3] in this scan's frame: which lie in rays that ended at a surface, and which of these by
         `least_mm` or more before it, in space that the scanner saw through."""
-        places, depths = self._viewpoint.seen(points_mm)
+        places, depths = self._viewpoint.seen(points_mm @ self._level)
         flat, inside = self._cells(self._turned(places))
         nearest = np.where(inside, self._nearest[flat], -np.inf)
         seen = np.isfinite(nearest)
@@ -104,6 +107,17 @@ class DepthPicture:
         inside = np.all((cells >= 0) & (cells < np.array(self._shape)), axis=1)
         clipped = np.clip(cells, 0, np.array(self._shape) - 1)
         return clipped[:, 0] * self._shape[1] + clipped[:, 1], inside
+
+
+def _level(points_mm: Floats) -> Floats:
+    """[3, 3] axes in which the middle of what was seen lies on the horizon: near the poles a picture by azimuth and
+    elevation is distorted."""
+    ways = points_mm / np.maximum(np.linalg.norm(points_mm, axis=1, keepdims=True), 1e-12)
+    forward = ways.mean(axis=0)
+    if np.linalg.norm(forward) < _LEAST_FORWARD:
+        return np.eye(3)
+    axes, _ = np.linalg.qr(np.column_stack([forward, np.eye(3)[np.argsort(np.abs(forward))[:2]].T]))
+    return np.asarray(axes)
 
 
 def _gap(azimuths: Floats) -> float:

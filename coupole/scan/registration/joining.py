@@ -12,14 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from coupole.scan.registration.pair_matching import MOST_CONTRADICTED, PairMotion, fit_of
+from coupole.scan.registration.pair_matching import MOST_CONTRADICTED, PairMotion, contradiction
 from coupole.scan.registration.prepared_scan import PreparedScan
 from coupole.scan.registration.small_motions import applied, displacement_mm, inverse_of
 from coupole.scan.registration.viewpoint import Floats
 
 AGREEMENT_PITCHES = 3.0
 """Two motions agree if they bring a scan's points to places within so many cells of the coarse grid."""
-_MOST_CROSS_CHECKS = 300
+_MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
+"""Pairs of scans of two groups that are looked at; from how many on only each fifth point of them."""
 
 
 @dataclass
@@ -123,24 +124,20 @@ def _contradict(
     if len(pairs) > _MOST_CROSS_CHECKS:
         chosen = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
         pairs = [pairs[k] for k in chosen]
+    every = 1 if len(pairs) < _FEW_CHECKS else _EVERY
     slack = 1.0 + len(pairs) ** 0.25  # poses of groups that were not adjusted yet have drifted
     for a, b in pairs:
         first_from_second = inverse_of(groups.group_from_scan[a]) @ one_from_other @ groups.group_from_scan[b]
         near_mm = 0.7 * scans[a].coarse.pitch_mm * slack
-        if fit_of(scans[a], scans[b], first_from_second, near_mm).contradicted > 2 * MOST_CONTRADICTED:
+        if not spheres_meet(scans[a], scans[b], first_from_second):
+            continue
+        if contradiction(scans[a], scans[b], first_from_second, near_mm, every) > 2 * MOST_CONTRADICTED:
             return True
     return False
 
 
 def spheres_meet(one: PreparedScan, other: PreparedScan, one_from_other: Floats) -> bool:
     """Whether two scans' bounding spheres meet: only then they may overlap."""
-    middle_one, radius_one = _sphere(one)
-    middle_other, radius_other = _sphere(other)
+    (middle_one, radius_one), (middle_other, radius_other) = one.coarse.sphere, other.coarse.sphere
     apart = np.linalg.norm(applied(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)
-
-
-def _sphere(scan: PreparedScan) -> tuple[Floats, float]:
-    points = scan.coarse.points_mm
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return middle, float(np.linalg.norm(points - middle, axis=1).max())

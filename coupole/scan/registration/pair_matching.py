@@ -123,11 +123,17 @@ def fit_of(first: PreparedScan, second: PreparedScan, first_from_second: Floats,
     places = int(on.sum())
     smaller = min(len(first.coarse.points_mm), len(second.coarse.points_mm))
     rms_mm = float(np.sqrt(np.mean(off_mm[on] ** 2))) if places else float("inf")
-    contradicted = max(
-        _contradicted(first, moved, near_mm),
-        _contradicted(second, _moved_back(first.coarse.points_mm, first_from_second), near_mm),
-    )
-    return Fit(places / smaller, contradicted, rms_mm, places)
+    return Fit(places / smaller, contradiction(first, second, first_from_second, near_mm), rms_mm, places)
+
+
+def contradiction(
+    first: PreparedScan, second: PreparedScan, first_from_second: Floats, near_mm: float, every: int = 1
+) -> float:
+    """Share of points that the other scanner sees by its rays, and that lie before the surface where these ended:
+    the larger of both scans'. Only each `every`-th point is looked at."""
+    there = second.coarse.points_mm[::every] @ first_from_second[:3, :3].T + first_from_second[:3, 3]
+    back = (first.coarse.points_mm[::every] - first_from_second[:3, 3]) @ first_from_second[:3, :3]
+    return max(_contradicted(first, there, near_mm), _contradicted(second, back, near_mm))
 
 
 def _contradicted(seer: PreparedScan, points_mm: Floats, near_mm: float) -> float:
@@ -135,10 +141,6 @@ def _contradicted(seer: PreparedScan, points_mm: Floats, near_mm: float) -> floa
         return 0.0
     seen, before = seer.picture.in_front(points_mm, 2.0 * near_mm)
     return float(before.sum() / max(1, seen.sum()))
-
-
-def _moved_back(points_mm: Floats, motion: Floats) -> Floats:
-    return np.asarray((points_mm - motion[:3, 3]) @ motion[:3, :3])
 
 
 def match(number_first: int, number_second: int, first: PreparedScan, second: PreparedScan) -> PairMotion | None:

@@ -56,6 +56,12 @@ class Cloud:
     def tree(self) -> cKDTree:
         return cKDTree(self.points_mm)
 
+    @cached_property
+    def sphere(self) -> tuple[Floats, float]:
+        """Middle [3] and radius of a sphere around all points, mm."""
+        middle = (self.points_mm.min(axis=0) + self.points_mm.max(axis=0)) / 2
+        return middle, float(np.linalg.norm(self.points_mm - middle, axis=1).max())
+
     def __getstate__(self) -> dict[str, Any]:
         """Without trees and the libraries' own clouds, which every process makes for itself."""
         return {name: self.__dict__[name] for name in ("points_mm", "normals", "incidence", "pitch_mm")}

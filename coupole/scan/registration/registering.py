@@ -177,7 +177,9 @@ def _grow(scans: Sequence[PreparedScan], search: Search, groups: Groups, placed:
     """Motions of the pairs that overlap by the poses found, and were not matched yet."""
     matched = {(m.first, m.second) for m in groups.accepted}
     tasks = []
-    for pair in combinations(placed, 2):
+    every = list(combinations(placed, 2))
+    for done, pair in enumerate(every):
+        say("looking for neighbours", done + 1, len(every))
         predicted = groups.predicted(*pair)
         if predicted is not None and pair not in matched and _may_overlap(scans, pair, predicted):
             tasks.append((*pair, predicted))

@@ -110,8 +110,8 @@ class DepthPicture:
 
 
 def _level(points_mm: Floats) -> Floats:
-    """[3, 3] axes in which the middle of what was seen lies on the horizon: near the poles a picture by azimuth and
-    elevation is distorted."""
+    """[3, 3] axes in which the middle of what was seen lies on the horizon: near the poles a picture by azimuth
+    and elevation is distorted."""
     ways = points_mm / np.maximum(np.linalg.norm(points_mm, axis=1, keepdims=True), 1e-12)
     forward = ways.mean(axis=0)
     if np.linalg.norm(forward) < _LEAST_FORWARD:

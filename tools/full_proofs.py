@@ -53,6 +53,11 @@ PROOFS = (
     Proof("paper-table", "intervals with the paper's uncertainties hold the truth", "tools/prove_paper_table.py"),
     Proof("clusters", "1,000 materials for an object that varies everywhere", "tools/prove_clusters.py"),
     Proof("clusters-400k", "the same for 400,000 triangles", "tools/prove_clusters.py --triangles 400000"),
+    Proof(
+        "registration",
+        "167 scans of a tower, 54 million rays: found as they are, with true uncertainties",
+        "tools/prove_registration.py",
+    ),
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
     Proof("layers", "intervals of K and S hold, by matrix exponentials and photons", "tools/prove_layers.py"),
     Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),

@@ -15,11 +15,13 @@ from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
+from coupole.commands.compare_states import compare
 from coupole.commands.dose_ledger import dose
 from coupole.commands.identify import identify
 from coupole.commands.layer import layer
 from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
+from coupole.commands.register_scans import register
 from coupole.commands.render_scene import render
 from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
@@ -56,6 +58,8 @@ for command in (
     exporting.export,
     keeping.scan,
     identify,
+    register,
+    compare,
     dose,
     render,
     layer,

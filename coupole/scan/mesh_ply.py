@@ -184,10 +184,18 @@ def _read_ascii_ply(path: Path, elements: list[_Element], at: int, line: int) ->
             state, at, line = _fill_faces(data, at, line, triangles, len(vertices))
             expect_text(path, state, line, f"3 and three vertices of 0 to {len(vertices) - 1}")
         else:
-            for number in range(element.count):
-                expect_records(path, element.name, element.count, number if at >= len(data) else element.count)
-                at, line = mesh_text.line_end(data, at) + 1, line + 1
+            at, line = _after_lines(path, data, at, element), line + element.count
     return Mesh(vertices, triangles)
+
+
+def _after_lines(path: Path, data: NDArray[np.uint8], at: int, element: _Element) -> int:
+    """Where the lines of an element end that is skipped."""
+    if element.count == 0:
+        return at
+    begins = np.concatenate([[at], at + 1 + np.flatnonzero(data[at:] == ord("\n"))])
+    there = int(np.sum(begins < len(data)))
+    expect_records(path, element.name, element.count, min(there, element.count))
+    return int(begins[element.count]) if len(begins) > element.count else len(data)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,0 +1,67 @@
+"""The command `coupole compare`: what changed between two states of an object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+
+def compare(
+    before: Annotated[Path, typer.Argument(help="A mesh or cloud: PLY, STL, OBJ.", show_default=False)],
+    after: Annotated[Path, typer.Argument(help="Another one of the same object.", show_default=False)],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="A new folder for report and maps.", show_default=False)
+    ] = None,
+    unit: Annotated[str, typer.Option("--unit", help="Of both: mm, cm, m, um or in.")] = "mm",
+    noise_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--noise-mm",
+            help="Standard deviation of a point of either state; by its scatter without it.",
+            show_default=False,
+        ),
+    ] = None,
+    aligned: Annotated[
+        bool, typer.Option("--aligned", help="Both are in one frame already: do not align them.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two states: align them by what did not change, then mark significant changes of shape and colour."""
+    from coupole.heritage.comparison.state_comparison import about
+    from coupole.heritage.comparison.state_comparison import compare as compared
+    from coupole.scan.scan import UNITS, new_scan_folder
+    from coupole.viewing import comparison_page
+    from coupole.viewing.terminal import make_console, step_bars
+
+    console = make_console(quiet=as_json)
+    try:
+        if unit not in UNITS:
+            raise InputError(f"--unit {unit}: expected one of {', '.join(UNITS)}")
+        if noise_mm is not None and not 0 < noise_mm < 1e3:
+            raise InputError(f"--noise-mm {noise_mm:g}: expected a standard deviation above 0 mm")
+        if out is not None and out.exists():
+            raise InputError(f"--out {out}: exists already; name a new folder")
+        with step_bars(console) as say:
+            found = compared(before, after, unit, noise_mm, aligned=aligned, say=say)
+            told = about(found)
+            if out is not None:
+                say("drawing", 0, 1)
+                with new_scan_folder(out) as folder:
+                    (folder / "comparison.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+                    comparison_page.write(found, folder)
+                say("drawing", 1, 1)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    for remark in comparison_page.remarks(found):
+        console.print(remark)
+    if out is not None:
+        console.print(f"[bold]{out}[/]: report.html, maps.ply, comparison.json")
+    if as_json:
+        print(json.dumps(told))

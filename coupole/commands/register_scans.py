@@ -1,0 +1,111 @@
+"""The command `coupole register`: scans with unknown poses, brought together and merged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from coupole.scan.registration.merging import Merged
+    from coupole.scan.registration.registering import Registered, Say
+    from coupole.scan.registration.viewpoint import Stand
+
+
+def _option(name: str, help_text: str) -> typer.models.OptionInfo:
+    return typer.Option(name, help=help_text, show_default=False)  # type: ignore[no-any-return]
+
+
+def register(
+    scans: Annotated[
+        list[Path],
+        typer.Argument(help="Two or more, in any order: PLY, STL, OBJ, or text with x y z.", show_default=False),
+    ],
+    out: Annotated[Path, _option("--out", "A new folder for poses, mesh and report.")],
+    unit: Annotated[str, typer.Option("--unit", help="Of the scans and tables: mm, cm, m, um or in.")] = "mm",
+    targets: Annotated[
+        Path | None, _option("--targets", "Table of targets in the scans: scan, name, x, y, z, u_mm.")
+    ] = None,
+    control: Annotated[
+        Path | None, _option("--control", "Table of targets whose places are known: name, x, y, z, u_mm.")
+    ] = None,
+    seen_from: Annotated[
+        str | None,
+        _option(
+            "--seen-from",
+            "Where the scanner stood in each scan's frame: origin, or far away along +x, -x, +y, -y, +z or -z, or "
+            "none; found by the scans themselves without it.",
+        ),
+    ] = None,
+    mesh_mm: Annotated[
+        float | None, _option("--mesh-mm", "Cells of the merged mesh; 1.5 times the points' spacing without it.")
+    ] = None,
+    no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Poses only.")] = False,
+    levels: Annotated[str, typer.Option("--levels", help="Pitches of thinner clouds, mm.")] = "5,10,50,250",
+    as_json: JsonOption = False,
+) -> None:
+    """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""
+    from coupole.scan.registration.registering import register as registered
+    from coupole.scan.registration.summary import about, remarks
+    from coupole.scan.scan import UNITS, new_scan_folder
+    from coupole.viewing import registration_page
+    from coupole.viewing.terminal import make_console, step_bars
+
+    console = make_console(quiet=as_json)
+    try:
+        if unit not in UNITS:
+            raise InputError(f"--unit {unit}: expected one of {', '.join(UNITS)}")
+        stand = _stand(seen_from)
+        if mesh_mm is not None and not mesh_mm > 0:
+            raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
+        levels_mm = _levels(levels)
+        with new_scan_folder(out) as folder, step_bars(console) as say:
+            found = registered(scans, unit, stand=stand, targets=targets, control=control, say=say)
+            merged = None if no_mesh else _merged(found, unit, mesh_mm, levels_mm, folder, say)
+            told = about(found, merged)
+            (folder / "registration.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+            say("drawing", 0, 1)
+            registration_page.write(found, merged, folder)
+            say("drawing", 1, 1)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    for remark in remarks(found):
+        console.print(remark)
+    console.print(f"[bold]{out}[/]: report.html, registration.json" + ("" if no_mesh else ", mesh.ply"))
+    if as_json:
+        print(json.dumps(told))
+
+
+def _stand(seen_from: str | None) -> Stand | None:
+    from coupole.scan.registration.viewpoint import STANDS
+
+    found = next((known for known in STANDS if known == seen_from), None)
+    if seen_from is not None and found is None:
+        raise InputError(f"--seen-from {seen_from}: expected one of {', '.join(STANDS)}")
+    return found
+
+
+def _merged(
+    found: Registered, unit: str, mesh_mm: float | None, levels_mm: list[float], folder: Path, say: Say
+) -> Merged:
+    from coupole.scan.registration.merging import default_cell_mm, merge
+
+    placed = [found.scans[k] for k in found.placed]
+    poses = [found.first_from_scan[k] for k in found.placed]
+    return merge(placed, poses, unit, mesh_mm or default_cell_mm(placed), levels_mm, folder, say)
+
+
+def _levels(text: str) -> list[float]:
+    try:
+        found = [float(word) for word in text.split(",") if word.strip()]
+    except ValueError:
+        found = [-1.0]
+    if any(not 0 < level < 1e6 for level in found):
+        raise InputError(f"--levels {text}: expected pitches in mm, separated by commas, such as 5,10,50,250")
+    return found

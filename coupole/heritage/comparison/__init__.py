@@ -1,0 +1,1 @@
+"""Two states of an object compared: what changed in shape and colour, and how surely."""

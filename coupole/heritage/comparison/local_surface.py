@@ -1,0 +1,116 @@
+"""The surface of a state near given places: a quadric through its nearest points, and how well it is known there.
+
+The idea is that of M3C2 (Lague, Brodu, Leroux, ISPRS J. 82, 2013): distances between local surfaces along the
+local normal, with an uncertainty from the scatter of the points about each; here the surfaces may be curved, and
+colours are fitted with the shape.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from coupole.heritage.comparison.state_files import Floats
+
+NEIGHBOURS = 24
+_TERMS, _PLANE_TERMS = 6, 3
+_FREEDOM_ALONE = NEIGHBOURS - _TERMS
+FREEDOM = 3 * _FREEDOM_ALONE
+"""Degrees of freedom of a scatter: fits next to each other share most of their points."""
+_BATCH = 50_000
+_MOST_BESIDE = 0.6
+"""Middle of the neighbours beside the place, over their extent: more is a rim, where the surface ends."""
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class LocalFits:
+    """Values of a state's surface at places."""
+
+    values: Floats
+    """[n, c] height along the normal in mm, by a quadric, then the points' own, by a plane; NaN where there is no
+    surface."""
+    scatter: Floats
+    """[n, c, c] covariance of a point's values about the quadric, the mean of that here and next to here."""
+    leverage: Floats
+    """[n, c] variance of a value over that of one point."""
+
+    @property
+    def covariance(self) -> Floats:
+        """[n, c, c] of the values."""
+        spread = np.sqrt(self.leverage)
+        return np.asarray(self.scatter * spread[:, :, None] * spread[:, None, :])
+
+
+def fit_locally(
+    tree: cKDTree, values: Floats | None, places_mm: Floats, normals: Floats, reach_mm: float
+) -> LocalFits:
+    """Fit the points of a tree, with values [m, c - 1] of their own, near places [n, 3] with normals [n, 3]."""
+    count = 1 + (0 if values is None else values.shape[1])
+    found = LocalFits(
+        np.full((len(places_mm), count), np.nan),
+        np.full((len(places_mm), count, count), np.nan),
+        np.full((len(places_mm), count), np.nan),
+    )
+    for first in range(0, len(places_mm), _BATCH):
+        part = slice(first, first + _BATCH)
+        _fit_batch(tree, values, places_mm[part], normals[part], reach_mm, part, found)
+    around = cKDTree(places_mm)
+    alone = found.scatter.copy()
+    for first in range(0, len(places_mm), _BATCH):
+        part = slice(first, first + _BATCH)
+        near = around.query(places_mm[part], min(NEIGHBOURS, len(places_mm)))[1]
+        known = np.isfinite(alone[near, 0, 0])
+        total = np.sum(np.where(known[:, :, None, None], alone[near], 0.0), axis=1)
+        found.scatter[part] = total / np.maximum(known.sum(axis=1), 1)[:, None, None]
+    return found
+
+
+def _fit_batch(
+    tree: cKDTree,
+    values: Floats | None,
+    places: Floats,
+    normals: Floats,
+    reach_mm: float,
+    part: slice,
+    found: LocalFits,
+) -> None:
+    away, near = tree.query(places, NEIGHBOURS)
+    offsets = np.asarray(tree.data)[near] - places[:, None]
+    one, two = _tangents(normals)
+    x, y = np.einsum("nka,na->nk", offsets, one), np.einsum("nka,na->nk", offsets, two)
+    extent = np.sqrt(np.mean(x**2 + y**2, axis=1))
+    there = (away[:, 0] < reach_mm) & (extent > 0)
+    beside = np.hypot(x.mean(axis=1), y.mean(axis=1)) / np.where(extent > 0, extent, 1.0)
+    there &= beside < _MOST_BESIDE
+    scale = np.where(extent > 0, extent, 1.0)[:, None]
+    x, y = x / scale, y / scale
+    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
+    height = np.einsum("nka,na->nk", offsets, normals)[:, :, None]
+    fits = [_least_squares(design, height)]
+    if values is not None:
+        fits.append(_least_squares(design[:, :, :_PLANE_TERMS], values[near]))
+    there_values, left = (np.concatenate([fit[k] for fit in fits], axis=-1) for k in (0, 1))
+    found.values[part] = np.where(there[:, None], there_values, np.nan)
+    scatter = np.einsum("nkc,nkd->ncd", left, left) / _FREEDOM_ALONE
+    found.scatter[part] = np.where(there[:, None, None], scatter, np.nan)
+    found.leverage[part, 0] = np.where(there, fits[0][2], np.nan)
+    found.leverage[part, 1:] = np.where(there, fits[-1][2], np.nan)[:, None]
+
+
+def _least_squares(design: Floats, seen: Floats) -> tuple[Floats, Floats, Floats]:
+    """Values [n, c] at the middle, what is left [n, k, c], and leverage [n], of designs [n, k, t] and values
+    [n, k, c]."""
+    normal = np.einsum("nki,nkj->nij", design, design) + _RIDGE * NEIGHBOURS * np.eye(design.shape[2])
+    inverse = np.linalg.inv(normal)
+    terms = inverse @ np.einsum("nki,nkc->nic", design, seen)
+    return terms[:, 0], seen - design @ terms, inverse[:, 0, 0]
+
+
+def _tangents(normals: Floats) -> tuple[Floats, Floats]:
+    least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    one = np.cross(normals, least)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    return one, np.cross(normals, one)

@@ -1,0 +1,56 @@
+"""Which of many differences are real: p-values with a noise that the data themselves confirm, and false
+discoveries.
+
+If noise is correlated from point to point, or surfaces are sampled unevenly, differences scatter more than local
+fits say. Most of an object does not change, so the bulk of all differences shows their true scatter (an
+empirical null: Efron, J. American Statistical Association 99, 2004); uncertainties are enlarged to it, never
+reduced. Of the points marked at most 5 % are expected to be unchanged (Benjamini, Hochberg, J. Royal Statistical
+Society B 57(1), 1995).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtr
+from scipy.stats import f, t
+
+from coupole.heritage.comparison.state_files import Floats
+
+FALSE_SHARE = 0.05
+_BULK = 0.5
+"""Quantile of the differences by which their scatter is judged: changes beyond half of an object mislead it."""
+
+
+def of_lengths(differences: Floats, u: Floats, freedom: float) -> tuple[Floats, float]:
+    """Two-sided p-values of differences [n] with standard uncertainties [n]; and the factor that enlarges
+    these."""
+    ratio = np.abs(differences) / u
+    factor = max(1.0, float(np.nanquantile(ratio, _BULK) / t.ppf((1 + _BULK) / 2, freedom)))
+    return np.asarray(2 * stdtr(freedom, -ratio / factor)), factor
+
+
+def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tuple[Floats, float]:
+    """p-values of differences [n, c] with covariances [n, c, c] (Hotelling's T2), and the factor that enlarges
+    uncertainties."""
+    dimensions = differences.shape[1]
+    squared = np.full(len(differences), np.nan)
+    known = np.isfinite(differences).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    chosen = differences[known][:, :, None]
+    squared[known] = np.squeeze(np.swapaxes(chosen, 1, 2) @ np.linalg.solve(covariances[known], chosen), (1, 2))
+    left = freedom - dimensions + 1
+    squared *= left / (freedom * dimensions)
+    bulk = np.nanquantile(squared, _BULK) if known.any() else 0.0
+    factor = max(1.0, float(np.sqrt(bulk / f.ppf(_BULK, dimensions, left))))
+    return np.asarray(f.sf(squared / factor**2, dimensions, left)), factor
+
+
+def discoveries(p: Floats, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
+    """Which of p-values [n] are marked, so that at most this share of them is expected to be false; NaN is not."""
+    known = np.flatnonzero(np.isfinite(p))
+    order = known[np.argsort(p[known])]
+    under = p[order] <= false_share * np.arange(1, len(order) + 1) / max(1, len(order))
+    marked = np.zeros(len(p), bool)
+    if under.any():
+        marked[order[: int(np.flatnonzero(under)[-1]) + 1]] = True
+    return marked

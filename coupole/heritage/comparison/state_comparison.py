@@ -1,0 +1,227 @@
+"""Compares two states of an object: aligned by what did not change, then point by point in shape and colour."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from coupole.errors import InputError
+from coupole.heritage.comparison.local_surface import FREEDOM, fit_locally
+from coupole.heritage.comparison.significance import discoveries, of_lengths, of_vectors
+from coupole.heritage.comparison.state_files import Floats, State, read_state
+from coupole.heritage.comparison.unchanged_alignment import Alignment, align
+from coupole.scan.registration.prepared_scan import ExtraMissing, thinned
+from coupole.scan.registration.small_motions import applied, inverse_of
+from coupole.scan.registration.viewpoint import Viewpoint
+
+Say = Callable[[str, int, int], None]
+_REACH_SHARE, _REACH_SPACINGS = 0.02, 6.0
+"""How far apart surfaces may lie to be compared: the larger of this share of the size, and so many spacings."""
+_LEAST_REGION = 3
+_SMALLEST_SPREAD = 1e-4
+"""Of Lab values: finer than 8 bits tell, so that equal colours have an uncertainty too."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Marked points that hang together."""
+
+    points: int
+    middle_mm: Floats
+    across_mm: float
+    """Largest extent."""
+    distance_mm: float
+    """Mean of the surface's distances; positive: outwards, material was added."""
+    de00: float
+    """Mean colour difference; NaN without colours."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What changed from a state to another, at the points of the first."""
+
+    before: State
+    after: State
+    alignment: Alignment
+    normals: Floats
+    distance_mm: Floats
+    """[n] along the normals, outwards positive; NaN where the other state has no surface."""
+    u_mm: Floats
+    """[n] standard uncertainty."""
+    moved: NDArray[np.bool_]
+    """[n] significantly."""
+    noise_factor: float
+    de00: Floats | None
+    """[n] CIEDE2000 of the sRGB colours under D65."""
+    recoloured: NDArray[np.bool_] | None
+    colour_factor: float
+    shape_regions: tuple[Region, ...]
+    colour_regions: tuple[Region, ...]
+
+
+def compare(
+    before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, aligned: bool, say: Say
+) -> Comparison:
+    """Compare two files. `noise_mm` is the standard deviation of a point, else found by the scatter; `aligned`
+    takes the files' frame as common. Raises InputError."""
+    say("reading", 0, 2)
+    before = read_state(before_path, unit)
+    say("reading", 1, 2)
+    after = read_state(after_path, unit)
+    say("reading", 2, 2)
+    if not 0.2 < before.size_mm / after.size_mm < 5:
+        raise InputError(
+            f"{after_path}: {after.size_mm:.3g} mm in size, {before_path.name} is {before.size_mm:.3g} mm: "
+            "another unit, another object, or a part of it only?"
+        )
+    say("aligning", 0, 1)
+    alignment = align(before, after)
+    if aligned:
+        alignment = Alignment(np.eye(4), np.zeros((6, 6)), np.zeros(3), alignment.noise_mm, True)
+    say("aligning", 1, 1)
+    return _compared(before, after, alignment, noise_mm, say)
+
+
+def _compared(before: State, after: State, alignment: Alignment, noise_mm: float | None, say: Say) -> Comparison:
+    spacing_mm = max(before.spacing_mm, after.spacing_mm)
+    reach_mm = max(_REACH_SHARE * before.size_mm, _REACH_SPACINGS * spacing_mm)
+    normals = _normals(before)
+    after_mm = applied(alignment.before_from_after, after.points_mm)
+    labs = None
+    if before.srgb is not None and after.srgb is not None:
+        labs = lab_of(before.srgb), lab_of(after.srgb)
+    say("fitting surfaces", 0, 2)
+    one = fit_locally(
+        cKDTree(before.points_mm), None if labs is None else labs[0], before.points_mm, normals, reach_mm
+    )
+    say("fitting surfaces", 1, 2)
+    two = fit_locally(cKDTree(after_mm), None if labs is None else labs[1], before.points_mm, normals, reach_mm)
+    say("fitting surfaces", 2, 2)
+    differences = two.values - one.values
+    covariance = one.covariance + two.covariance
+    variance = covariance[:, 0, 0] if noise_mm is None else noise_mm**2 * (one.leverage + two.leverage)[:, 0]
+    least_mm = 1e-6 * before.size_mm  # what float32 coordinates tell
+    u_mm = np.sqrt(variance + alignment.uncertainty_mm(before.points_mm, normals) ** 2 + least_mm**2)
+    p, factor = of_lengths(differences[:, 0], u_mm, 2 * FREEDOM if noise_mm is None else 1e9)
+    moved = discoveries(p)
+    de00, recoloured, colour_factor = None, None, 1.0
+    if labs is not None:
+        known = covariance[:, 1:, 1:] + np.eye(3) * _SMALLEST_SPREAD
+        p, colour_factor = of_vectors(differences[:, 1:], known, 2 * FREEDOM)
+        recoloured = discoveries(p)
+        de00 = de00_of(one.values[:, 1:], two.values[:, 1:])
+    found = Comparison(
+        before, after, alignment, normals, differences[:, 0], u_mm * factor, moved, factor, de00, recoloured,
+        colour_factor, (), (),
+    )  # fmt: skip
+    shape = _regions(found, moved)
+    colour = () if recoloured is None else _regions(found, recoloured)
+    return Comparison(**{**found.__dict__, "shape_regions": shape, "colour_regions": colour})
+
+
+def _normals(state: State) -> Floats:
+    """[n, 3]: by triangles, else by neighbours, and then which side is out is not known."""
+    if state.outward is not None and np.linalg.norm(state.outward, axis=1).min() > 0:
+        return state.outward
+    cloud = thinned(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)
+    return np.asarray(cloud.normals[cloud.tree.query(state.points_mm)[1]])
+
+
+def lab_of(srgb: NDArray[np.uint8]) -> Floats:
+    """[n, 3] CIELAB under D65, 2 degrees, of sRGB colours. Raises ExtraMissing."""
+    return np.asarray(_colour_library().rgb2lab(srgb[None].astype(np.float64) / 255.0)[0], np.float64)
+
+
+def de00_of(lab: Floats, other: Floats) -> Floats:
+    """[n] CIEDE2000 between CIELAB values [n, 3] (Luo, Cui, Rigg, Color Res. Appl. 26(5), 2001). Raises
+    ExtraMissing."""
+    return np.asarray(_colour_library().deltaE_ciede2000(lab, other), np.float64)
+
+
+def _colour_library() -> Any:
+    try:
+        from skimage import color
+    except ImportError as error:
+        raise ExtraMissing(
+            f"comparing needs scikit-image: pip install 'coupole[registration]' ({error})"
+        ) from error
+    return color
+
+
+def _regions(found: Comparison, marked: NDArray[np.bool_]) -> tuple[Region, ...]:
+    """The largest first; a few single points are left out."""
+    numbers = np.flatnonzero(marked)
+    if not len(numbers):
+        return ()
+    points = found.before.points_mm[numbers]
+    pairs = cKDTree(points).query_pairs(3 * found.before.spacing_mm, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), (len(numbers), len(numbers)))
+    count, of_point = connected_components(graph, directed=False)
+    regions = []
+    for number in range(count):
+        mine = of_point == number
+        if mine.sum() < _LEAST_REGION:
+            continue
+        own = numbers[mine]
+        regions.append(
+            Region(
+                len(own),
+                points[mine].mean(axis=0),
+                float(np.ptp(points[mine], axis=0).max()),
+                float(np.nanmean(found.distance_mm[own])),
+                float("nan") if found.de00 is None else float(np.nanmean(found.de00[own])),
+            )
+        )
+    return tuple(sorted(regions, key=lambda region: -region.points))
+
+
+def about(found: Comparison) -> dict[str, Any]:
+    """The content of `comparison.json`."""
+
+    def told(regions: tuple[Region, ...]) -> list[dict[str, Any]]:
+        return [
+            {
+                "points": one.points,
+                "middle_mm": one.middle_mm.tolist(),
+                "across_mm": one.across_mm,
+                "distance_mm": one.distance_mm,
+                "de00": None if np.isnan(one.de00) else one.de00,
+            }
+            for one in regions
+        ]
+
+    known = np.isfinite(found.distance_mm)
+    colours = None
+    if found.de00 is not None and found.recoloured is not None:
+        colours = {
+            "changed": int(found.recoloured.sum()),
+            "median_de00": float(np.nanmedian(found.de00)),
+            "largest_de00": float(np.nanmax(found.de00)),
+            "factor_by_scatter": found.colour_factor,
+            "regions": told(found.colour_regions),
+        }
+    return {
+        "before": found.before.name,
+        "after": found.after.name,
+        "before_from_after": found.alignment.before_from_after.tolist(),
+        "after_from_before": inverse_of(found.alignment.before_from_after).tolist(),
+        "points": len(known),
+        "not_comparable": int((~known).sum()),
+        "shape": {
+            "changed": int(found.moved.sum()),
+            "median_mm": float(np.median(np.abs(found.distance_mm[known]))),
+            "largest_mm": float(np.abs(found.distance_mm[known]).max()),
+            "median_u_mm": float(np.nanmedian(found.u_mm)),
+            "factor_by_scatter": found.noise_factor,
+            "regions": told(found.shape_regions),
+        },
+        "colour": colours,
+    }

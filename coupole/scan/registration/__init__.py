@@ -1,0 +1,1 @@
+"""Many scans of one object with unknown poses: matched, checked, adjusted together, merged."""

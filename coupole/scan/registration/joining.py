@@ -1,0 +1,143 @@
+"""Scans joined to groups by the motions between pairs; a motion that others contradict is rejected.
+
+As Kruskal's spanning tree, the strongest motion first, but with a vote: all motions between two groups are
+compared, those that agree stand together, and the best supported place of one group in the other counts. It is
+taken only if no scan of one group then lies in the space that a scanner of the other saw through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from coupole.scan.registration.pair_matching import MOST_CONTRADICTED, PairMotion, contradiction
+from coupole.scan.registration.prepared_scan import PreparedScan
+from coupole.scan.registration.small_motions import applied, displacement_mm, inverse_of
+from coupole.scan.registration.viewpoint import Floats
+
+AGREEMENT_PITCHES = 3.0
+"""Two motions agree if they bring a scan's points to places within so many cells of the coarse grid."""
+_MOST_CROSS_CHECKS, _FEW_CHECKS, _EVERY = 300, 30, 5
+"""Pairs of scans of two groups that are looked at; from how many on only each fifth point of them."""
+
+
+@dataclass
+class Groups:
+    """Groups of scans with known places in each other, and which motions they rest on."""
+
+    group_from_scan: list[Floats]
+    """Of each scan, 4x4 mm, into the frame of its group's first scan."""
+    members: dict[int, list[int]]
+    group_of: list[int]
+    accepted: list[PairMotion] = field(default_factory=list)
+    rejected: list[PairMotion] = field(default_factory=list)
+
+    def predicted(self, first: int, second: int) -> Floats | None:
+        """`first_from_second` of two scans of the same group."""
+        if self.group_of[first] != self.group_of[second]:
+            return None
+        return np.asarray(inverse_of(self.group_from_scan[first]) @ self.group_from_scan[second])
+
+    def agrees(self, scans: Sequence[PreparedScan], motion: PairMotion) -> bool:
+        """Whether a motion between two scans of one group says where they lie already."""
+        predicted = self.predicted(motion.first, motion.second)
+        return predicted is not None and _agree(scans, motion, predicted)
+
+
+def join(scans: Sequence[PreparedScan], motions: Sequence[PairMotion]) -> Groups:
+    """Groups by motions in any order."""
+    count = len(scans)
+    groups = Groups([np.eye(4) for _ in scans], {k: [k] for k in range(count)}, list(range(count)))
+    waiting = sorted(motions, key=lambda motion: -motion.fit.places * motion.fit.overlap)
+    while waiting:
+        strongest = waiting[0]
+        one, other = groups.group_of[strongest.first], groups.group_of[strongest.second]
+        pair = {one, other}
+        between = [m for m in waiting if {groups.group_of[m.first], groups.group_of[m.second]} == pair]
+        waiting = [m for m in waiting if {groups.group_of[m.first], groups.group_of[m.second]} != pair]
+        if one == other:
+            _sort_within(scans, groups, between)
+        else:
+            _merge(scans, groups, one, other, between)
+    return groups
+
+
+def _sort_within(scans: Sequence[PreparedScan], groups: Groups, motions: Sequence[PairMotion]) -> None:
+    for motion in motions:
+        (groups.accepted if groups.agrees(scans, motion) else groups.rejected).append(motion)
+
+
+def _agree(scans: Sequence[PreparedScan], motion: PairMotion, predicted: Floats) -> bool:
+    coarse = scans[motion.second].coarse
+    apart_mm = displacement_mm(motion.first_from_second, predicted, coarse.points_mm)
+    return apart_mm <= AGREEMENT_PITCHES * coarse.pitch_mm
+
+
+def _merge(
+    scans: Sequence[PreparedScan], groups: Groups, one: int, other: int, motions: Sequence[PairMotion]
+) -> None:
+    """Place a group in another as most of the motions between them say, or reject these."""
+    places = [_place(groups, one, motion) for motion in motions]
+    supporters = [
+        [m for m in motions if _agree(scans, m, _between(groups, one, m, one_from_other))]
+        for one_from_other in places
+    ]
+    order = sorted(range(len(motions)), key=lambda k: -sum(m.fit.places for m in supporters[k]))
+    for best in order:
+        if not _contradict(scans, groups, one, other, places[best]):
+            break
+    else:
+        groups.rejected += motions
+        return
+    agreeing = {id(m) for m in supporters[best]}
+    groups.accepted += [m for m in motions if id(m) in agreeing]
+    groups.rejected += [m for m in motions if id(m) not in agreeing]
+    for scan in groups.members.pop(other):
+        groups.group_from_scan[scan] = places[best] @ groups.group_from_scan[scan]
+        groups.group_of[scan] = one
+        groups.members[one].append(scan)
+
+
+def _place(groups: Groups, one: int, motion: PairMotion) -> Floats:
+    """The place of the other group in group `one` by a motion between scans of both."""
+    first, second, first_from_second = motion.first, motion.second, motion.first_from_second
+    if groups.group_of[first] != one:
+        first, second, first_from_second = second, first, inverse_of(first_from_second)
+    placed = groups.group_from_scan[first] @ first_from_second @ inverse_of(groups.group_from_scan[second])
+    return np.asarray(placed)
+
+
+def _between(groups: Groups, one: int, motion: PairMotion, one_from_other: Floats) -> Floats:
+    """`first_from_second` of a motion's scans, if the other group is placed so in group `one`."""
+    whole = one_from_other if groups.group_of[motion.first] == one else inverse_of(one_from_other)
+    first, second = groups.group_from_scan[motion.first], groups.group_from_scan[motion.second]
+    return np.asarray(inverse_of(first) @ whole @ second)
+
+
+def _contradict(
+    scans: Sequence[PreparedScan], groups: Groups, one: int, other: int, one_from_other: Floats
+) -> bool:
+    """True if a scan of one group lies in the space that a scan of the other saw through."""
+    pairs = [(a, b) for a in groups.members[one] for b in groups.members[other]]
+    if len(pairs) > _MOST_CROSS_CHECKS:
+        chosen = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
+        pairs = [pairs[k] for k in chosen]
+    every = 1 if len(pairs) < _FEW_CHECKS else _EVERY
+    slack = 1.0 + len(pairs) ** 0.25  # poses of groups that were not adjusted yet have drifted
+    for a, b in pairs:
+        first_from_second = inverse_of(groups.group_from_scan[a]) @ one_from_other @ groups.group_from_scan[b]
+        near_mm = 0.7 * scans[a].coarse.pitch_mm * slack
+        if not spheres_meet(scans[a], scans[b], first_from_second):
+            continue
+        if contradiction(scans[a], scans[b], first_from_second, near_mm, every) > 2 * MOST_CONTRADICTED:
+            return True
+    return False
+
+
+def spheres_meet(one: PreparedScan, other: PreparedScan, one_from_other: Floats) -> bool:
+    """Whether two scans' bounding spheres meet: only then they may overlap."""
+    (middle_one, radius_one), (middle_other, radius_other) = one.coarse.sphere, other.coarse.sphere
+    apart = np.linalg.norm(applied(one_from_other, middle_other[None])[0] - middle_one)
+    return bool(apart < radius_one + radius_other)

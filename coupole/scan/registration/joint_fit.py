@@ -1,0 +1,305 @@
+"""All scans adjusted together: every overlap, targets and control points in one least squares, with covariances.
+
+Points of one scan are compared with the surface of another along its normals (Chen, Medioni, 1992), for all
+pairs that overlap at once, so that errors do not add up along chains (Bergevin et al., PAMI 18(5), 1996).
+Neighbouring points have errors in common, and a point counts in every pair of its scan; so the covariance is
+that of sums over cells of space, not over points (a sandwich, clustered: Liang, Zeger, Biometrika 73(1), 1986).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+
+from coupole.errors import InputError
+from coupole.scan.registration.control import Sighting, Sightings
+from coupole.scan.registration.prepared_scan import Cloud, PreparedScan
+from coupole.scan.registration.small_motions import applied, inverse_of, stepped
+from coupole.scan.registration.viewpoint import Floats
+
+Say = Callable[[str, int, int], None]
+Columns = NDArray[np.intp]
+
+_MOST_ROUNDS, _LEAST_ROUNDS = 20, 2
+_SETTLED_PITCHES = 3e-3
+_SAME_SIDE = 0.7
+_BESIDE_PITCHES = 0.7
+"""Farther beside the nearest point, over the pitch, lies no surface: a rim."""
+_STEEP = 0.5
+"""Cosine of incidence: flatter than 60 degrees to a scanner's rays its errors grow."""
+_HUBER = 2.0
+_CELLS_ACROSS = 12
+"""Cells of space along the size of a scan, over each of which errors may have something in common."""
+_LEAST_PAIRS = 30
+_LEAST_CELLS = 8.0
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Points of the second scan that lie on the first, in the common frame."""
+
+    first: int
+    second: int
+    derivatives: Floats
+    """[n, 12] of the distances, by steps of the first and of the second scan."""
+    off_mm: Floats
+    """[n] distances along the normals of the first."""
+    points_mm: Floats
+    """[n, 3]"""
+    nearest_mm: Floats
+    """[n] from point to point."""
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Poses of scans that hang together, and how well they are known."""
+
+    common_from_scan: list[Floats]
+    """4x4 mm; the common frame is that of the fixed scan, or of the control points."""
+    covariance: Floats
+    """[6 n, 6 n] of steps (mm, rad) about the pivots, in the common frame; zero for the fixed scan."""
+    pivots_mm: Floats
+    """[n, 3] middle of each scan in the common frame."""
+    noise_mm: float
+    """Of one distance between two surfaces: robust standard deviation."""
+    rms_mm: float
+    """Of the distances along normals, over all overlaps."""
+    median_nearest_mm: float
+    """From points to the nearest ones of other scans, over all overlaps."""
+    inflation: float
+    """Standard uncertainties over those that independent errors of all points would give."""
+    sightings: tuple[Sighting, ...]
+    """Targets, with what is left of them."""
+
+
+def adjust(
+    scans: Sequence[PreparedScan],
+    pairs: Sequence[tuple[int, int]],
+    common_from_scan: Sequence[Floats],
+    fixed: int,
+    sightings: Sightings,
+    say: Say,
+) -> JointFit:
+    """Poses of scans from poses that are about right; `pairs` are numbers of scans that overlap. The scan `fixed`
+    stays where it is, unless there are control points. Raises InputError if nothing overlaps."""
+    poses = [np.array(pose) for pose in common_from_scan]
+    if sightings.anchored:
+        onto = sightings.site_from_common(poses)
+        poses = [onto @ pose for pose in poses]
+    inflation = 1.0
+    poses, state = _settled(scans, pairs, poses, fixed, sightings, inflation, say)
+    if sightings.seen and state.overlaps:  # what a point weighs against a target is known only now
+        inflation = state.inflation()
+        poses, state = _settled(scans, pairs, poses, fixed, sightings, inflation, say)
+    every = np.concatenate([o.off_mm for o in state.overlaps] or [np.zeros(1)])
+    nearest = np.concatenate([o.nearest_mm for o in state.overlaps] or [np.zeros(1)])
+    return JointFit(
+        poses,
+        state.covariance(),
+        state.pivots,
+        state.noise_mm,
+        float(np.sqrt(np.mean(every**2))),
+        float(np.median(nearest)),
+        state.inflation(),
+        sightings.left(poses),
+    )
+
+
+@dataclass(frozen=True)
+class _State:
+    """The linear problem at some poses."""
+
+    scans: Sequence[PreparedScan]
+    overlaps: list[Overlap]
+    pivots: Floats
+    noise_mm: float
+    targets_normal: Floats
+    normal: Floats
+    """With targets, and with what is known before: no scan is farther off than its own size."""
+    gradient: Floats
+    prior: Floats
+    """[6 n]"""
+    free: Columns
+    inflation_used: float
+
+    def step(self) -> Floats:
+        found = np.zeros(len(self.gradient))
+        found[self.free] = -cho_solve(
+            cho_factor(self.normal[np.ix_(self.free, self.free)]), self.gradient[self.free]
+        )
+        return found
+
+    def inflation(self) -> float:
+        """Root mean ratio of variances of the poses, of sums over cells to those of independent points."""
+        if not self.overlaps:
+            return 1.0
+        points = self.normal - self.targets_normal
+        bread = np.linalg.inv(points[np.ix_(self.free, self.free)] * self.inflation_used**2)
+        meat = self._meat(1.0) + np.diag(self.prior)
+        honest = bread @ meat[np.ix_(self.free, self.free)] @ bread
+        return max(1.0, float(np.sqrt(np.median(np.diag(honest) / np.diag(bread)))))
+
+    def covariance(self) -> Floats:
+        bread = np.linalg.inv(self.normal[np.ix_(self.free, self.free)])
+        meat = self._meat(self.inflation_used) + self.targets_normal + np.diag(self.prior)
+        whole = np.zeros_like(self.normal)
+        whole[np.ix_(self.free, self.free)] = bread @ meat[np.ix_(self.free, self.free)] @ bread
+        return whole
+
+    def _meat(self, inflation: float) -> Floats:
+        """[6 n, 6 n] sum over cells of space of the squared sums of weighted distances times derivatives."""
+        if not self.overlaps:
+            return np.zeros_like(self.normal)
+        size_mm = float(np.median([scan.survey.size_mm for scan in self.scans])) / _CELLS_ACROSS
+        keys = [np.floor(o.points_mm / size_mm).astype(np.int64) for o in self.overlaps]
+        low = np.min([k.min(axis=0) for k in keys], axis=0)
+        span = np.max([k.max(axis=0) for k in keys], axis=0) - low + 1
+        flat = [((k - low) @ np.array([span[1] * span[2], span[2], 1])) for k in keys]
+        cells, number = np.unique(np.concatenate(flat), return_inverse=True)
+        rows, columns, values, at = [], [], [], 0
+        for overlap in self.overlaps:
+            mine = number[at : at + len(overlap.off_mm)]
+            at += len(overlap.off_mm)
+            pulls = overlap.derivatives * (_weights(overlap.off_mm, self.noise_mm) * overlap.off_mm)[:, None]
+            own, place = np.unique(mine, return_inverse=True)
+            sums = np.stack([np.bincount(place, column, len(own)) for column in pulls.T], axis=1)
+            rows.append(np.repeat(own, 12))
+            columns.append(np.tile(_columns(overlap), len(own)))
+            values.append(sums.reshape(-1))
+        shape = (len(cells), len(self.gradient))
+        pull = sparse.coo_matrix(
+            (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
+        ).tocsr()
+        few = len(cells) / max(len(cells) - _LEAST_CELLS, 1.0)  # sums of few cells are too small by chance
+        return np.asarray((pull.T @ pull).toarray() * few / inflation**4)
+
+
+def _settled(
+    scans: Sequence[PreparedScan],
+    pairs: Sequence[tuple[int, int]],
+    poses: list[Floats],
+    fixed: int,
+    sightings: Sightings,
+    inflation: float,
+    say: Say,
+) -> tuple[list[Floats], _State]:
+    pitch_mm = scans[0].fine.pitch_mm
+    reach_mm = 3.0 * pitch_mm
+    for turn in range(_MOST_ROUNDS):
+        say("adjusting all scans together", turn, _MOST_ROUNDS)
+        state = _state(scans, pairs, poses, fixed, sightings, inflation, reach_mm)
+        reach_mm = max(1.5 * pitch_mm, 5.0 * state.noise_mm)
+        step = state.step().reshape(-1, 6)
+        poses = [stepped(pose, step[k], state.pivots[k]) for k, pose in enumerate(poses)]
+        if turn >= _LEAST_ROUNDS and np.abs(step[:, :3]).max() < _SETTLED_PITCHES * pitch_mm:
+            break
+    say("adjusting all scans together", _MOST_ROUNDS, _MOST_ROUNDS)
+    return poses, state
+
+
+def _state(
+    scans: Sequence[PreparedScan],
+    pairs: Sequence[tuple[int, int]],
+    poses: Sequence[Floats],
+    fixed: int,
+    sightings: Sightings,
+    inflation: float,
+    reach_mm: float,
+) -> _State:
+    count = len(scans)
+    pivots = np.array([applied(p, s.coarse.points_mm).mean(axis=0) for s, p in zip(scans, poses, strict=True)])
+    overlaps = [o for pair in pairs for o in _overlaps(scans, poses, pivots, *pair, reach_mm)]
+    if not overlaps and not sightings.seen:
+        raise InputError("the scans do not overlap: there is nothing to adjust")
+    pitch_mm = scans[0].fine.pitch_mm
+    noise_mm = pitch_mm
+    if overlaps:
+        noise_mm = 1.4826 * float(np.median(np.abs(np.concatenate([o.off_mm for o in overlaps]))))
+    noise_mm = max(noise_mm, 1e-4 * pitch_mm)
+    normal, gradient = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    for overlap in overlaps:
+        columns = _columns(overlap)
+        weighted = overlap.derivatives * (_weights(overlap.off_mm, noise_mm) / inflation**2)[:, None]
+        normal[np.ix_(columns, columns)] += weighted.T @ overlap.derivatives
+        gradient[columns] += weighted.T @ overlap.off_mm
+    targets_normal, targets_gradient = sightings.normal_equations(poses, pivots)
+    prior = np.concatenate([np.r_[np.full(3, scan.survey.size_mm**-2.0), np.ones(3)] for scan in scans])
+    free = np.ones(6 * count, bool)
+    if not sightings.anchored:
+        free[6 * fixed : 6 * fixed + 6] = False
+    return _State(
+        scans,
+        overlaps,
+        pivots,
+        noise_mm,
+        targets_normal,
+        normal + targets_normal + np.diag(prior),
+        gradient + targets_gradient,
+        prior,
+        np.flatnonzero(free),
+        inflation,
+    )
+
+
+def _columns(overlap: Overlap) -> Columns:
+    return np.concatenate([6 * scan + np.arange(6) for scan in (overlap.first, overlap.second)])
+
+
+def _overlaps(
+    scans: Sequence[PreparedScan],
+    poses: Sequence[Floats],
+    pivots: Floats,
+    one: int,
+    other: int,
+    reach_mm: float,
+) -> list[Overlap]:
+    """The points of each of two scans on the surface of the other."""
+    signless = "none" in (scans[one].viewpoint.stand, scans[other].viewpoint.stand)
+    found = []
+    for first, second in ((one, other), (other, one)):
+        first_from_second = inverse_of(poses[first]) @ poses[second]
+        normals, off_mm, points, nearest_mm = distances(
+            scans[first].fine, scans[second].fine, first_from_second, reach_mm, signless=signless
+        )
+        if len(off_mm) >= _LEAST_PAIRS:
+            normals, points = normals @ poses[first][:3, :3].T, applied(poses[first], points)
+            derivatives = np.concatenate(
+                [
+                    -normals,
+                    -np.cross(points - pivots[first], normals),
+                    normals,
+                    np.cross(points - pivots[second], normals),
+                ],
+                axis=1,
+            )
+            found.append(Overlap(first, second, derivatives, off_mm, points, nearest_mm))
+    return found
+
+
+def distances(
+    first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, *, signless: bool
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of points of the second scan near the first one: normals [n, 3] there, distances along these [n], points
+    [n, 3] in the first scan's frame, and distances to its points [n]."""
+    moved = applied(first_from_second, second.points_mm)
+    away_mm, nearest = first.tree.query(moved, distance_upper_bound=reach_mm)
+    hit = np.flatnonzero(np.isfinite(away_mm))
+    facing = np.sum((second.normals[hit] @ first_from_second[:3, :3].T) * first.normals[nearest[hit]], axis=1)
+    hit = hit[(np.abs(facing) if signless else facing) > _SAME_SIDE]
+    off_mm = np.sum((moved[hit] - first.points_mm[nearest[hit]]) * first.normals[nearest[hit]], axis=1)
+    beside = away_mm[hit] ** 2 - off_mm**2 < (_BESIDE_PITCHES * first.pitch_mm) ** 2
+    steep = np.minimum(first.incidence[nearest[hit]], second.incidence[hit])
+    kept = beside & (steep > _STEEP)
+    if kept.sum() < _LEAST_PAIRS:
+        kept = beside
+    hit, off_mm = hit[kept], off_mm[kept]
+    return first.normals[nearest[hit]], off_mm, moved[hit], away_mm[hit]
+
+
+def _weights(off_mm: Floats, noise_mm: float) -> Floats:
+    return np.asarray(np.minimum(1.0, _HUBER * noise_mm / np.maximum(np.abs(off_mm), 1e-12)) / noise_mm**2)

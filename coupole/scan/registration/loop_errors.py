@@ -1,0 +1,108 @@
+"""Loops of pairs: how far the motions of pairs, each by itself, miss closing, and what that says of all poses."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import minimum_spanning_tree
+
+from coupole.scan.registration.control import Sightings
+from coupole.scan.registration.joint_fit import JointFit, Say, adjust
+from coupole.scan.registration.prepared_scan import PreparedScan
+from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between
+from coupole.scan.registration.viewpoint import Floats
+
+_MOST_SURPRISE = 50.0
+
+
+@dataclass(frozen=True)
+class PairAlone:
+    """The motion between two scans by their own overlap alone."""
+
+    first: int
+    second: int
+    first_from_second: Floats
+    surprise: float
+    """Squared difference from the joint fit over its covariance; 6 are expected on average where loops are
+    many."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Scans in a ring, and how far its motions of pairs miss closing."""
+
+    scans: tuple[int, ...]
+    error_mm: float
+    """Root mean square displacement of the first scan's points after once around."""
+    error_deg: float
+
+
+def pairs_alone(
+    scans: Sequence[PreparedScan], pairs: Sequence[tuple[int, int]], fit: JointFit, say: Say
+) -> list[PairAlone]:
+    """Each pair adjusted by itself, from where the joint fit has it."""
+    found = []
+    for done, (first, second) in enumerate(pairs):
+        say("closing loops", done + 1, len(pairs))
+        joint = inverse_of(fit.common_from_scan[first]) @ fit.common_from_scan[second]
+        both = [scans[first], scans[second]]
+        alone = adjust(both, [(0, 1)], [np.eye(4), joint], 0, Sightings(), lambda *_: None)
+        step = step_between(joint, alone.common_from_scan[1], alone.pivots_mm[1])
+        surprise = float(step @ np.linalg.solve(alone.covariance[6:, 6:], step))
+        found.append(PairAlone(first, second, alone.common_from_scan[1], min(surprise, 6 * _MOST_SURPRISE)))
+    return found
+
+
+def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[JointFit, float]:
+    """The fit with a covariance that is not smaller than the loops say, and the factor of its uncertainties."""
+    loops = len(pairs) - (count - 1)
+    if loops < 1:
+        return fit, 1.0
+    factor = max(1.0, float(np.sqrt(sum(pair.surprise for pair in pairs) / (6 * loops))))
+    return replace(fit, covariance=fit.covariance * factor**2), factor
+
+
+def find_loops(scans: Sequence[PreparedScan], pairs: Sequence[PairAlone]) -> list[Loop]:
+    """A ring for each pair beyond a spanning tree, the worst first."""
+    count = len(scans)
+    costs = np.array([1.0 + pair.surprise for pair in pairs])
+    rows, columns = np.array([[p.first, p.second] for p in pairs]).reshape(-1, 2).T
+    tree = minimum_spanning_tree(coo_matrix((costs, (rows, columns)), (count, count))).tocoo()
+    in_tree = {frozenset(edge) for edge in zip(tree.row.tolist(), tree.col.tolist(), strict=True)}
+    motions = {(p.first, p.second): p.first_from_second for p in pairs}
+    motions |= {(p.second, p.first): inverse_of(p.first_from_second) for p in pairs}
+    near: dict[int, list[int]] = {k: [] for k in range(count)}
+    for one, other in map(tuple, in_tree):
+        near[one].append(other)
+        near[other].append(one)
+    found = []
+    for pair in pairs:
+        if frozenset((pair.first, pair.second)) not in in_tree:
+            ring = _path(near, pair.second, pair.first)
+            around = pair.first_from_second
+            for one, other in pairwise(ring):
+                around = around @ motions[one, other]
+            points = scans[pair.first].coarse.points_mm
+            angle = np.degrees(np.arccos(np.clip((np.trace(around[:3, :3]) - 1) / 2, -1, 1)))
+            found.append(Loop((pair.first, *ring[:-1]), displacement_mm(around, np.eye(4), points), float(angle)))
+    return sorted(found, key=lambda loop: -loop.error_mm)
+
+
+def _path(near: dict[int, list[int]], start: int, end: int) -> list[int]:
+    before = {start: start}
+    waiting = deque([start])
+    while end not in before:
+        at = waiting.popleft()
+        for neighbour in near[at]:
+            if neighbour not in before:
+                before[neighbour] = at
+                waiting.append(neighbour)
+    path = [end]
+    while path[-1] != start:
+        path.append(before[path[-1]])
+    return path[::-1]

@@ -1,0 +1,77 @@
+"""Pairs of scans, matched by several processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+
+from coupole.scan.registration.pair_matching import PairMotion, improve, match
+from coupole.scan.registration.prepared_scan import PreparedScan
+from coupole.scan.registration.viewpoint import Floats
+
+Task = tuple[int, int, Floats | None]
+"""Numbers of two scans, and `first_from_second` if it is known about."""
+Say = Callable[[str, int, int], None]
+_WORTH_PROCESSES = 30
+"""Tasks from which on more processes are worth their start."""
+_TOGETHER = 8
+
+_scans_there: list[PreparedScan] = []
+"""Of a process that matches."""
+
+
+class Search:
+    """Matches pairs of some scans."""
+
+    def __init__(self, scans: Sequence[PreparedScan], processes: int) -> None:
+        self._scans, self._processes = scans, processes
+        self._pool: ProcessPoolExecutor | None = None
+
+    def run(self, what: str, tasks: Sequence[Task], say: Say) -> list[PairMotion]:
+        """The motions that hold, in the order of the tasks."""
+        found = []
+        for done, motion in enumerate(self._each(tasks)):
+            say(what, done + 1, len(tasks))
+            if motion is not None:
+                found.append(motion)
+        return found
+
+    def _each(self, tasks: Sequence[Task]) -> Iterable[PairMotion | None]:
+        if self._processes < 2 or (self._pool is None and len(tasks) < _WORTH_PROCESSES):
+            return (_matched(self._scans, task) for task in tasks)
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self._processes, context, _begin, (self._scans,))
+        return self._pool.map(_matched_there, tasks, chunksize=min(_TOGETHER, max(1, len(tasks) // 16)))
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def search_of(scans: Sequence[PreparedScan], processes: int | None = None) -> Iterator[Search]:
+    """A search with as many processes as the machine has processors, or as stated."""
+    search = Search(scans, processes or len(os.sched_getaffinity(0)))
+    try:
+        yield search
+    finally:
+        search.close()
+
+
+def _begin(scans: Sequence[PreparedScan]) -> None:
+    _scans_there[:] = scans
+
+
+def _matched_there(task: Task) -> PairMotion | None:
+    return _matched(_scans_there, task)
+
+
+def _matched(scans: Sequence[PreparedScan], task: Task) -> PairMotion | None:
+    first, second, guess = task
+    if guess is None:
+        return match(first, second, scans[first], scans[second])
+    return improve(first, second, scans[first], scans[second], guess, "prediction")

@@ -1,0 +1,182 @@
+"""A scan made ready to be matched: thinned clouds with normals that face the scanner, its trees and its
+picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from coupole.errors import CoupoleError, InputError
+from coupole.scan.mesh import Mesh
+from coupole.scan.registration.scan_files import read_points
+from coupole.scan.registration.viewpoint import DepthPicture, Floats, Stand, Viewpoint, folds
+
+NEIGHBOURS = 12
+"""Of a point, by which its normal is found."""
+PLACE_SPACINGS = 2.0
+_SAMPLE, _MOST_PICTURED = 100_000, 120_000
+
+
+class ExtraMissing(CoupoleError):
+    """A library that only registration needs is not installed."""
+
+    exit_code = 2
+
+
+def registration_libraries() -> tuple[Any, Any]:
+    """`small_gicp` and `kiss_matcher`. Raises ExtraMissing."""
+    try:
+        import kiss_matcher
+        import small_gicp
+    except ImportError as error:
+        raise ExtraMissing(
+            f"registration needs libraries of its own: pip install 'coupole[registration]' ({error})"
+        ) from error
+    return small_gicp, kiss_matcher
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points [n, 3] in mm in their scan's frame, one for each cell of a grid, with normals out of the surface."""
+
+    points_mm: Floats
+    normals: Floats
+    incidence: Floats
+    """[n] cosine between normal and the way to the scanner; 1 where that is not known."""
+    pitch_mm: float
+    """Of the grid."""
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.points_mm)
+
+    @cached_property
+    def sphere(self) -> tuple[Floats, float]:
+        """Middle [3] and radius of a sphere around all points, mm."""
+        middle = (self.points_mm.min(axis=0) + self.points_mm.max(axis=0)) / 2
+        return middle, float(np.linalg.norm(self.points_mm - middle, axis=1).max())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without trees and the libraries' own clouds, which every process makes for itself."""
+        return {name: self.__dict__[name] for name in ("points_mm", "normals", "incidence", "pitch_mm")}
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of a scan before pitches and viewpoints are chosen for all."""
+
+    count: int
+    spacing_mm: float
+    """Median distance of neighbouring points."""
+    size_mm: float
+    """Diagonal of the bounding box."""
+    places: int
+    """Cells of a grid of `PLACE_SPACINGS` spacings that hold points."""
+    folded: dict[Stand, float]
+    """Of each viewpoint that it could have: share of rays along which two surfaces lie."""
+
+
+@dataclass(frozen=True)
+class PreparedScan:
+    """What is kept of a scan in memory; the whole is read again when scans are merged."""
+
+    name: str
+    path: Path
+    survey: Survey
+    viewpoint: Viewpoint
+    fine: Cloud
+    coarse: Cloud
+    picture: DepthPicture | None
+    """None if the viewpoint is not known."""
+
+
+def survey(path: Path, unit: str) -> Survey:
+    """Read a scan to measure it. Raises InputError."""
+    small_gicp, _ = registration_libraries()
+    mesh = read_points(path, unit)
+    spacing_mm = spacing(mesh.vertices)
+    if spacing_mm == 0:
+        raise InputError(f"{path}: all its points lie in one place")
+    normals, some = vertex_normals(mesh), _sample(len(mesh.vertices))
+    places = len(small_gicp.voxelgrid_sampling(mesh.vertices.astype(float), PLACE_SPACINGS * spacing_mm).points())
+    thinned_mm = spacing_mm * (len(mesh.vertices) / len(some)) ** 0.5
+    folded = folds(mesh.vertices[some].astype(float), None if normals is None else normals[some], thinned_mm)
+    size_mm = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0).astype(np.float64)))
+    return Survey(len(mesh.vertices), spacing_mm, size_mm, places, folded)
+
+
+def _sample(count: int) -> NDArray[np.intp]:
+    """Numbers of points to draw a scan's picture from: drawn at random, as those in a row make stripes."""
+    if count <= _MOST_PICTURED:
+        return np.arange(count)
+    return np.random.default_rng(0).choice(count, _MOST_PICTURED, replace=False)
+
+
+def prepare(
+    name: str, path: Path, unit: str, known: Survey, viewpoint: Viewpoint, fine_mm: float, coarse_mm: float
+) -> PreparedScan:
+    """Read a scan and thin it to two pitches. Raises InputError."""
+    mesh = read_points(path, unit)
+    fine = thinned(mesh.vertices.astype(np.float64), fine_mm, viewpoint, vertex_normals(mesh))
+    coarse = thinned(fine.points_mm, coarse_mm, viewpoint, fine.normals)
+    if len(coarse.points_mm) < 3 * NEIGHBOURS:
+        raise InputError(f"{path}: its points lie in {len(coarse.points_mm)} places; expected a surface")
+    picture = None
+    if viewpoint.stand != "none":
+        some = _sample(known.count)
+        thinned_mm = known.spacing_mm * (known.count / len(some)) ** 0.5
+        picture = DepthPicture(viewpoint, mesh.vertices[some].astype(np.float64), thinned_mm)
+    return PreparedScan(name, path, known, viewpoint, fine, coarse, picture)
+
+
+def thinned(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known: Floats | None) -> Cloud:
+    """The mean point of each cell, with normals that face the scanner, or the side of the `known` ones."""
+    small_gicp, _ = registration_libraries()
+    middle = points_mm.mean(axis=0)
+    thin = small_gicp.voxelgrid_sampling(points_mm - middle, pitch_mm)
+    small_gicp.estimate_normals(thin, num_neighbors=min(NEIGHBOURS, len(thin.points())))
+    points = np.ascontiguousarray(thin.points()[:, :3]) + middle
+    normals = np.ascontiguousarray(thin.normals()[:, :3])
+    if viewpoint.stand != "none":
+        outward = viewpoint.towards(points)
+    elif known is not None:
+        outward = known[cKDTree(points_mm).query(points)[1]]
+    else:
+        return Cloud(points, normals, np.ones(len(points)), pitch_mm)
+    incidence = np.sum(normals * outward, axis=1)
+    normals *= np.where(incidence[:, None] < 0, -1.0, 1.0)
+    known_stand = viewpoint.stand != "none"
+    return Cloud(points, normals, np.abs(incidence) if known_stand else np.ones(len(points)), pitch_mm)
+
+
+def spacing(points_mm: NDArray[np.float32]) -> float:
+    """Median distance to the nearest other point, mm, by a compact part of the scan."""
+    part = points_mm
+    if len(points_mm) > _SAMPLE:
+        at = points_mm[len(points_mm) // 2]
+        away = np.abs(points_mm - at).max(axis=1)
+        part = points_mm[away <= np.partition(away, _SAMPLE)[_SAMPLE]]
+    distances: Floats = cKDTree(part).query(part[:: max(1, len(part) // 5000)], 2)[0][:, 1]
+    positive = distances[distances > 0]
+    return float(np.median(positive)) if len(positive) else 0.0
+
+
+def vertex_normals(mesh: Mesh) -> Floats | None:
+    """[n, 3] by the triangles, of length 1 or 0; None of a cloud without triangles."""
+    vertices, triangles = mesh.vertices, mesh.triangles
+    if not len(triangles):
+        return None
+    corners = vertices[triangles].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(vertices), 3))
+    for axis in range(3):
+        for corner in range(3):
+            normals[:, axis] += np.bincount(triangles[:, corner], across[:, axis], len(vertices))
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.where(lengths > 0, lengths, 1.0))

@@ -1,0 +1,247 @@
+"""Registers scans with unknown poses, in any order: found pair by pair, joined, adjusted together, proven by
+loops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from coupole.errors import InputError
+from coupole.scan.registration.control import Sightings, motions_by_targets, read_sightings
+from coupole.scan.registration.joining import Groups, join, spheres_meet
+from coupole.scan.registration.joint_fit import JointFit, adjust
+from coupole.scan.registration.loop_errors import Loop, find_loops, pairs_alone, with_loops
+from coupole.scan.registration.pair_matching import LEAST_OVERLAP, PairMotion, fit_of
+from coupole.scan.registration.pair_search import Search, search_of
+from coupole.scan.registration.prepared_scan import PLACE_SPACINGS, PreparedScan, Survey, prepare, survey
+from coupole.scan.registration.scan_files import expect_different, names_of
+from coupole.scan.registration.small_motions import inverse_of
+from coupole.scan.registration.viewpoint import Floats, Stand, Viewpoint, choose_viewpoints
+
+Say = Callable[[str, int, int], None]
+ALL_PAIRS = 20
+"""Number of scans up to which all pairs are tried; of more only until they hang together."""
+_FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
+"""Points of a scan's fine and coarse cloud: of few scans, and of many."""
+_PARTNERS = 6
+"""Of each scan in a round, of more scans than `ALL_PAIRS`."""
+_ODD_SIZE = 200.0
+"""A scan larger or smaller than most by this factor has another unit."""
+_LEAST_JOINT_OVERLAP = 0.04
+"""Share of the smaller scan, from which on a pair counts in the joint fit."""
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Scans with their poses; numbers count them in the order in which they were named."""
+
+    names: tuple[str, ...]
+    scans: tuple[PreparedScan, ...]
+    placed: tuple[int, ...]
+    """Numbers of the scans that hang together; the first is the one whose frame is the common one."""
+    first_from_scan: dict[int, Floats]
+    """4x4 mm, to the first placed scan's frame."""
+    covariance: dict[int, Floats]
+    """[6, 6] of each pose: a step (mm, rad) about the scan's middle, in the common frame; in the control points'
+    frame if there are any."""
+    site_from_first: Floats | None
+    """Into the control points' frame."""
+    unplaced: tuple[int, ...]
+    motions: tuple[PairMotion, ...]
+    rejected: tuple[PairMotion, ...]
+    pairs: int
+    """That overlap."""
+    loops: tuple[Loop, ...]
+    loop_factor: float
+    """By which the loops enlarged all uncertainties."""
+    fit: JointFit
+
+
+def register(
+    paths: Sequence[Path],
+    unit: str,
+    *,
+    stand: Stand | None = None,
+    targets: Path | None = None,
+    control: Path | None = None,
+    processes: int | None = None,
+    say: Say,
+) -> Registered:
+    """Poses of scans in files. Raises InputError for invalid files, and if no two scans overlap."""
+    if len(paths) < 2:
+        raise InputError(f"expected two scans or more, found {len(paths)}")
+    expect_different(paths)
+    names = names_of(paths)
+    sightings = read_sightings(targets, control, names, unit)
+    scans = _prepared(names, paths, unit, stand, say)
+    with search_of(scans, processes) as search:
+        groups = _found(scans, search, motions_by_targets(sightings), say)
+        main = max(groups.members.values(), key=lambda members: (len(members), -min(members)))
+        if len(main) < 2:
+            raise InputError(
+                f"no two of the {len(scans)} scans overlap by {100 * LEAST_OVERLAP:.0f} % or more in a way that "
+                f"their shape tells: {', '.join(names[:10])}. Take more scans between these, or name shared "
+                "targets with --targets"
+            )
+        placed = sorted(main)
+        _grow(scans, search, groups, placed, say)
+    return _adjusted(names, scans, groups, placed, sightings, say)
+
+
+def _prepared(
+    names: Sequence[str], paths: Sequence[Path], unit: str, stand: Stand | None, say: Say
+) -> list[PreparedScan]:
+    surveys = []
+    for done, path in enumerate(paths):
+        say("reading", done, len(paths))
+        surveys.append(survey(path, unit))
+    say("reading", len(paths), len(paths))
+    _expect_one_unit(paths, surveys)
+    if stand is None:
+        viewpoints = choose_viewpoints([one.folded for one in surveys])
+    else:
+        viewpoints = [Viewpoint(stand)] * len(paths)
+    fine_mm, coarse_mm = pitches(surveys)
+    scans = []
+    for done, (name, path, known, viewpoint) in enumerate(zip(names, paths, surveys, viewpoints, strict=True)):
+        say("preparing", done, len(paths))
+        scans.append(prepare(name, path, unit, known, viewpoint, fine_mm, coarse_mm))
+    say("preparing", len(paths), len(paths))
+    return scans
+
+
+def _expect_one_unit(paths: Sequence[Path], surveys: Sequence[Survey]) -> None:
+    usual_mm = float(np.median([one.size_mm for one in surveys]))
+    for path, one in zip(paths, surveys, strict=True):
+        if not 1 / _ODD_SIZE < one.size_mm / usual_mm < _ODD_SIZE:
+            raise InputError(
+                f"{path}: mixed units? The scan is {one.size_mm:.3g} mm in size, most are about {usual_mm:.3g} mm"
+            )
+
+
+def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
+    """Pitches of the fine and the coarse clouds, mm: the same for all scans."""
+    many = len(surveys) > ALL_PAIRS
+    spacing_mm = PLACE_SPACINGS * float(np.median([one.spacing_mm for one in surveys]))
+    places = float(
+        np.median([one.places * (PLACE_SPACINGS * one.spacing_mm / spacing_mm) ** 2 for one in surveys])
+    )
+    fine_mm = spacing_mm * max(1.0, float(np.sqrt(places / _FINE_PLACES[many])))
+    coarse_mm = spacing_mm * max(2.0, float(np.sqrt(places / _COARSE_PLACES[many])))
+    return fine_mm, coarse_mm
+
+
+def _found(scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say) -> Groups:
+    """Groups by features, and by targets."""
+    known = {(m.first, m.second) for m in by_targets}
+    untried = [pair for pair in combinations(range(len(scans)), 2) if pair not in known]
+    motions = list(by_targets)
+    groups = join(scans, motions)
+    round_number = 0
+    while untried:
+        round_number += 1
+        if len(scans) <= ALL_PAIRS:
+            chosen, untried = untried, []
+        else:
+            chosen, untried = _some(untried, groups, round_number)
+        what = "matching pairs" + (f", round {round_number}" if len(scans) > ALL_PAIRS else "")
+        motions += search.run(what, [(*pair, None) for pair in chosen], say)
+        groups = join(scans, motions)
+        untried = [(a, b) for a, b in untried if groups.group_of[a] != groups.group_of[b]]
+    return groups
+
+
+def _some(
+    untried: Sequence[tuple[int, int]], groups: Groups, round_number: int
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Pairs for a round, a few of each scan, drawn from those of different groups; and the others."""
+    order = np.random.default_rng(round_number).permutation(len(untried))
+    taken: dict[int, int] = {}
+    chosen, later = [], []
+    for k in order:
+        first, second = untried[k]
+        smaller = min((first, second), key=lambda scan: len(groups.members[groups.group_of[scan]]))
+        if taken.get(smaller, 0) < _PARTNERS:
+            taken[smaller] = taken.get(smaller, 0) + 1
+            chosen.append(untried[k])
+        else:
+            later.append(untried[k])
+    return sorted(chosen), later
+
+
+def _grow(scans: Sequence[PreparedScan], search: Search, groups: Groups, placed: Sequence[int], say: Say) -> None:
+    """Motions of the pairs that overlap by the poses found, and were not matched yet."""
+    matched = {(m.first, m.second) for m in groups.accepted}
+    tasks = []
+    every = list(combinations(placed, 2))
+    for done, pair in enumerate(every):
+        say("looking for neighbours", done + 1, len(every))
+        predicted = groups.predicted(*pair)
+        if predicted is not None and pair not in matched and _may_overlap(scans, pair, predicted):
+            tasks.append((*pair, predicted))
+    found = search.run("matching neighbours", tasks, say)
+    groups.accepted += [m for m in found if groups.agrees(scans, m)]
+    groups.rejected += [m for m in found if not groups.agrees(scans, m)]
+
+
+def _may_overlap(scans: Sequence[PreparedScan], pair: tuple[int, int], predicted: Floats) -> bool:
+    first, second = scans[pair[0]], scans[pair[1]]
+    if not spheres_meet(first, second, predicted):
+        return False
+    return fit_of(first, second, predicted, 1.5 * first.coarse.pitch_mm).overlap >= LEAST_OVERLAP
+
+
+def _overlapping(
+    scans: Sequence[PreparedScan], placed: Sequence[int], poses: Sequence[Floats]
+) -> Iterator[tuple[int, int, float]]:
+    """Pairs of the placed scans, by their places in `placed`, with the share that overlaps."""
+    for one, other in combinations(range(len(placed)), 2):
+        first, second = scans[placed[one]], scans[placed[other]]
+        first_from_second = inverse_of(poses[one]) @ poses[other]
+        if spheres_meet(first, second, first_from_second):
+            overlap = fit_of(first, second, first_from_second, 0.7 * first.coarse.pitch_mm).overlap
+            if overlap >= _LEAST_JOINT_OVERLAP:
+                yield one, other, overlap
+
+
+def _adjusted(
+    names: Sequence[str],
+    scans: Sequence[PreparedScan],
+    groups: Groups,
+    placed: Sequence[int],
+    sightings: Sightings,
+    say: Say,
+) -> Registered:
+    chosen = [scans[k] for k in placed]
+    into_first = inverse_of(groups.group_from_scan[placed[0]])
+    poses = [into_first @ groups.group_from_scan[k] for k in placed]
+    overlapping = list(_overlapping(scans, placed, poses))
+    seen = sightings.of_scans(placed)
+    fit = adjust(chosen, [pair[:2] for pair in overlapping], poses, 0, seen, say)
+    strong = [(one, other) for one, other, overlap in overlapping if overlap >= LEAST_OVERLAP]
+    alone = pairs_alone(chosen, strong, fit, say)
+    fit, factor = with_loops(fit, alone, len(placed))
+    loops = [
+        Loop(tuple(placed[k] for k in loop.scans), loop.error_mm, loop.error_deg)
+        for loop in find_loops(chosen, alone)
+    ]
+    to_first = inverse_of(fit.common_from_scan[0])
+    return Registered(
+        tuple(names),
+        tuple(scans),
+        tuple(placed),
+        {number: to_first @ fit.common_from_scan[k] for k, number in enumerate(placed)},
+        {number: fit.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k, number in enumerate(placed)},
+        fit.common_from_scan[0] if seen.anchored else None,
+        tuple(k for k in range(len(scans)) if k not in placed),
+        tuple(groups.accepted),
+        tuple(groups.rejected),
+        len(overlapping),
+        tuple(loops),
+        factor,
+        fit,
+    )

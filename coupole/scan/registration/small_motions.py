@@ -1,0 +1,53 @@
+"""Rigid motions [..., 4, 4] in mm and their small steps [..., 6]: translation in mm, then rotation in rad, both
+in the frame that a motion leads to (from the left)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coupole.scan.registration.viewpoint import Floats
+
+
+def inverse_of(motion: Floats) -> Floats:
+    """The inverse of a rigid motion [4, 4]."""
+    back = np.eye(4)
+    back[:3, :3] = motion[:3, :3].T
+    back[:3, 3] = -motion[:3, :3].T @ motion[:3, 3]
+    return back
+
+
+def applied(motion: Floats, points_mm: Floats) -> Floats:
+    """Points [n, 3] after a motion."""
+    return np.asarray(points_mm @ motion[:3, :3].T + motion[:3, 3])
+
+
+def stepped(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
+    """A motion [4, 4] after a step [6] that turns about a point of the frame it leads to."""
+    turn = Rotation.from_rotvec(step[3:]).as_matrix()
+    moved = np.eye(4)
+    moved[:3, :3] = turn @ motion[:3, :3]
+    moved[:3, 3] = turn @ (motion[:3, 3] - pivot_mm) + pivot_mm + step[:3]
+    return moved
+
+
+def step_between(before: Floats, after: Floats, pivot_mm: Floats) -> Floats:
+    """The step [6] that leads from one motion to another, about a point."""
+    turn = after[:3, :3] @ before[:3, :3].T
+    rest = after[:3, 3] - pivot_mm - turn @ (before[:3, 3] - pivot_mm)
+    return np.concatenate([rest, Rotation.from_matrix(turn).as_rotvec()])
+
+
+def displacement_mm(one: Floats, other: Floats, points_mm: Floats) -> float:
+    """Root mean square distance between places of points [n, 3] by two motions."""
+    apart = points_mm @ (one - other)[:3, :3].T + (one - other)[:3, 3]
+    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+
+def motion_of_points(from_mm: Floats, to_mm: Floats) -> Floats:
+    """4x4 that brings points [n, 3] onto others by least squares."""
+    middle_from, middle_to = from_mm.mean(axis=0), to_mm.mean(axis=0)
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.align_vectors(to_mm - middle_to, from_mm - middle_from)[0].as_matrix()
+    motion[:3, 3] = middle_to - motion[:3, :3] @ middle_from
+    return motion

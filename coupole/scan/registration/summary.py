@@ -1,0 +1,121 @@
+"""What a registration found, as JSON and in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from coupole.scan.registration.merging import Merged
+from coupole.scan.registration.registering import Registered
+
+_CONSPICUOUS = 3.0
+"""Times their uncertainty that targets may be off before a sentence says so."""
+
+
+def about(found: Registered, merged: Merged | None) -> dict[str, Any]:
+    """The content of `registration.json`; lengths in mm, angles in degrees."""
+    told: dict[str, Any] = {
+        "frame": found.names[found.placed[0]],
+        "poses": {found.names[k]: found.first_from_scan[k].tolist() for k in found.placed},
+        "uncertainties": {found.names[k]: _uncertainty(found, k) for k in found.placed},
+        "rms_mm": found.fit.rms_mm,
+        "median_overlap_mm": found.fit.median_nearest_mm,
+        "noise_mm": found.fit.noise_mm,
+        "overlapping_pairs": found.pairs,
+        "matched_pairs": len(found.motions),
+        "loops": [
+            {"scans": [found.names[k] for k in loop.scans], "error_mm": loop.error_mm, "error_deg": loop.error_deg}
+            for loop in found.loops
+        ],
+        "loop_factor": found.loop_factor,
+        "rejected": [[found.names[m.first], found.names[m.second]] for m in found.rejected],
+        "unplaced": [found.names[k] for k in found.unplaced],
+        "viewpoints": {scan.name: scan.viewpoint.stand for scan in found.scans},
+    }
+    if found.fit.sightings:
+        told["targets"] = [
+            {
+                "scan": found.names[found.placed[one.scan]],
+                "name": one.name,
+                "u_mm": one.u_mm,
+                "off_mm": one.left_mm,
+            }
+            for one in found.fit.sightings
+        ]
+    if found.site_from_first is not None:
+        told["site_from_first"] = found.site_from_first.tolist()
+    if merged is not None:
+        told["mesh"] = {
+            "vertices": merged.vertices,
+            "triangles": merged.triangles,
+            "points": merged.points,
+            "cell_mm": merged.cell_mm,
+        }
+        told["levels"] = merged.levels
+    return told
+
+
+def _uncertainty(found: Registered, number: int) -> dict[str, Any]:
+    covariance = found.covariance[number]
+    return {
+        "position_mm": np.sqrt(np.diag(covariance)[:3]).tolist(),
+        "orientation_deg": np.degrees(np.sqrt(np.diag(covariance)[3:])).tolist(),
+        "of_a_point_mm": point_uncertainty_mm(found, number),
+        "covariance": covariance.tolist(),
+        "about_mm": found.fit.pivots_mm[found.placed.index(number)].tolist(),
+    }
+
+
+def point_uncertainty_mm(found: Registered, number: int) -> float:
+    """Root mean square displacement of a scan's points by the uncertainty of its pose (68 %)."""
+    covariance, points = found.covariance[number], found.scans[number].coarse.points_mm
+    arms = points - points.mean(axis=0)
+    turn = found.fit.common_from_scan[found.placed.index(number)][:3, :3]
+    spread = (arms @ turn.T).T @ (arms @ turn.T) / len(arms)
+    turning = np.trace(spread) * np.eye(3) - spread
+    return float(np.sqrt(np.trace(covariance[:3, :3]) + np.sum(turning * covariance[3:, 3:])))
+
+
+def worst_loop_mm(found: Registered) -> float:
+    """0 where there is no loop."""
+    return found.loops[0].error_mm if found.loops else 0.0
+
+
+def remarks(found: Registered) -> Iterator[str]:
+    """What its reader must know, one sentence each."""
+    names = found.names
+    yield (
+        f"{len(found.placed)} of {len(names)} scans placed by {found.pairs} overlapping pairs; surfaces lie on "
+        f"each other within {found.fit.rms_mm:.3g} mm (root mean square along their normals)"
+    )
+    if found.loops:
+        middle = float(np.median([loop.error_mm for loop in found.loops]))
+        yield (
+            f"{len(found.loops)} loops of pairs close within {middle:.3g} mm in the median, "
+            f"{worst_loop_mm(found):.3g} mm at worst"
+        )
+    else:
+        yield "no loop closes: a wrong pair would not be noticed, and uncertainties are those of noise alone"
+    if found.loop_factor > 1.05:
+        yield (
+            f"loops close {found.loop_factor:.1f} times worse than noise explains; all uncertainties are enlarged "
+            "by that"
+        )
+    if found.unplaced:
+        yield "not placed, as they overlap no other enough: " + ", ".join(names[k] for k in found.unplaced)
+    if found.rejected:
+        yield f"{len(found.rejected)} pairs were rejected, as others contradict them"
+    blind = [scan.name for scan in found.scans if scan.viewpoint.stand == "none"]
+    if blind:
+        yield (
+            "seen from nowhere that is known, so that empty space before them proves nothing (see --seen-from): "
+            + ", ".join(blind)
+        )
+    for one in found.fit.sightings:
+        if one.left_mm > _CONSPICUOUS * np.sqrt(3) * one.u_mm:
+            yield (
+                f"target {one.name} of {names[found.placed[one.scan]]} is {one.left_mm:.3g} mm off, stated are "
+                f"{one.u_mm:.2g} mm"
+            )

@@ -1,0 +1,167 @@
+"""Two states compared: a dent and a patch of another colour are found, and nothing where nothing changed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import colour
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from coupole.commands.cli import app
+from coupole.errors import InputError
+from coupole.heritage.comparison.significance import discoveries
+from coupole.heritage.comparison.state_comparison import Comparison, compare, de00_of, lab_of
+
+NOISE_MM, DENT_MM, DENT_ACROSS_MM = 0.03, 0.2, 10.0
+
+
+def silent(*_: object) -> None: ...
+
+
+@dataclass
+class Head:
+    """A bumpy ball of 80 mm, whose vertices are about 1 mm apart."""
+
+    mesh: trimesh.Trimesh
+    dent: np.ndarray
+    patch: np.ndarray
+
+    def write(
+        self, path: Path, seed: int, *, dented: bool = False, painted: bool = False, moved: bool = False
+    ) -> Path:
+        rng = np.random.default_rng(seed)
+        points, normals = np.array(self.mesh.vertices), np.array(self.mesh.vertex_normals)
+        points += normals * rng.normal(0, NOISE_MM, (len(points), 1))
+        if dented:
+            points -= normals * (DENT_MM * self.dent)[:, None]
+        srgb = 130 + 15 * np.sin(points / 11) + rng.normal(0, 1.5, points.shape)
+        if painted:
+            srgb[self.patch] += [9.0, 0.0, -3.0]
+        if moved:
+            points = points @ Rotation.from_rotvec([0.4, -1.1, 0.3]).as_matrix().T + [30, -90, 12]
+        colours = np.clip(srgb, 0, 255).round().astype(np.uint8)
+        trimesh.Trimesh(points, self.mesh.faces, vertex_colors=colours, process=False).export(path)
+        return path
+
+
+@pytest.fixture(scope="module")
+def head() -> Head:
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=40.0)
+    unit = np.array(mesh.vertices) / 40.0
+    bumps = 1 + 0.09 * np.sin(unit @ [3.1, 1.2, 4.4]) + 0.06 * np.sin(unit @ [-5.0, 4.1, 1.3] + 1)
+    bumps += 0.08 * np.exp(-30 * np.sum((unit - [0.6, 0.64, 0.48]) ** 2, axis=1))
+    mesh.vertices = unit * (40 * bumps)[:, None]
+    points = np.array(mesh.vertices)
+    dent = np.linalg.norm(points - points[300], axis=1) < DENT_ACROSS_MM / 2
+    patch = np.linalg.norm(points - points[5000], axis=1) < 6.0
+    return Head(mesh, dent, patch)
+
+
+@pytest.fixture(scope="module")
+def before(head: Head, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return head.write(tmp_path_factory.mktemp("states") / "before.ply", 1)
+
+
+@pytest.fixture(scope="module")
+def changed(head: Head, before: Path) -> Comparison:
+    after = head.write(before.with_name("after.ply"), 2, dented=True, painted=True, moved=True)
+    return compare(before, after, "mm", None, aligned=False, say=silent)
+
+
+def test_a_dent_of_a_fifth_of_a_millimetre_is_found(head: Head, changed: Comparison) -> None:
+    assert changed.moved[head.dent].mean() > 0.5
+    assert len(changed.shape_regions) == 1
+    region = changed.shape_regions[0]
+    assert np.linalg.norm(region.middle_mm - np.array(head.mesh.vertices)[head.dent].mean(axis=0)) < 1.0
+    assert region.distance_mm == pytest.approx(-DENT_MM, abs=0.06)  # inwards
+
+
+def test_a_patch_of_another_colour_is_found(head: Head, changed: Comparison) -> None:
+    assert changed.recoloured is not None
+    assert changed.recoloured[head.patch].mean() > 0.6
+    assert changed.colour_regions[0].de00 == pytest.approx(3.0, abs=1.0)
+
+
+def test_of_what_is_marked_little_is_unchanged(head: Head, changed: Comparison) -> None:
+    assert changed.recoloured is not None
+    for marked, true in ((changed.moved, head.dent), (changed.recoloured, head.patch)):
+        middle = np.array(head.mesh.vertices)[true].mean(axis=0)
+        far = np.linalg.norm(np.array(head.mesh.vertices) - middle, axis=1) > 9.0  # local fits reach over the rim
+        assert (marked & far).sum() <= 0.1 * marked.sum()  # 5 % on average
+        assert (marked & far).sum() < 0.001 * far.sum()
+
+
+def test_the_changed_part_does_not_pull_the_alignment(changed: Comparison) -> None:
+    turn = Rotation.from_rotvec([0.4, -1.1, 0.3]).as_matrix()
+    after_from_before = np.eye(4)
+    after_from_before[:3, :3], after_from_before[:3, 3] = turn, [30, -90, 12]
+    there_and_back = changed.alignment.before_from_after @ after_from_before
+    points = changed.before.points_mm
+    off = np.linalg.norm(points @ there_and_back[:3, :3].T + there_and_back[:3, 3] - points, axis=1)
+    assert off.max() < 0.02
+
+
+def test_nothing_is_marked_where_nothing_changed(head: Head, before: Path, tmp_path: Path) -> None:
+    same = tmp_path / "same.ply"
+    same.write_bytes(before.read_bytes())
+    again = head.write(tmp_path / "again.ply", 9)
+    for after, most in ((same, 0), (again, 3)):
+        found = compare(before, after, "mm", None, aligned=False, say=silent)
+        assert found.recoloured is not None
+        assert found.moved.sum() + found.recoloured.sum() <= most
+    assert np.nanmedian(np.abs(found.distance_mm) / found.u_mm) == pytest.approx(0.674, abs=0.12)
+
+
+def test_uncertainties_hold_by_a_stated_noise(head: Head, before: Path, tmp_path: Path) -> None:
+    again = head.write(tmp_path / "again.ply", 9)
+    stated = compare(before, again, "mm", NOISE_MM, aligned=True, say=silent)
+    spread = stated.distance_mm[np.isfinite(stated.distance_mm)].std()
+    assert np.nanmedian(stated.u_mm) == pytest.approx(spread, rel=0.25)
+
+
+def test_colour_differences_are_those_of_another_library() -> None:
+    srgb = np.random.default_rng(0).integers(0, 256, (200, 2, 3)).astype(np.uint8)
+    mine = de00_of(lab_of(srgb[:, 0]), lab_of(srgb[:, 1]))
+    white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
+    labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(srgb[:, k] / 255.0), white) for k in range(2)]
+    assert mine == pytest.approx(colour.delta_E(*labs, method="CIE 2000"), abs=0.05)
+    sharma = np.array([[50.0, 2.6772, -79.7751]]), np.array([[50.0, 0.0, -82.7485]])
+    assert de00_of(*sharma) == pytest.approx([2.0425], abs=1e-4)  # Sharma, Wu, Dalal 2005, table 1, pair 1
+
+
+def test_false_discoveries_are_as_rare_as_stated() -> None:
+    rng = np.random.default_rng(3)
+    shares = []
+    for _ in range(40):
+        p = np.concatenate([rng.uniform(size=4000), rng.uniform(size=300) * 1e-4])
+        marked = discoveries(p)
+        shares.append(marked[:4000].sum() / max(1, marked.sum()))
+    assert 0.02 < np.mean(shares) < 0.06
+    assert not discoveries(np.full(5, np.nan)).any()
+
+
+def test_the_command_writes_maps_that_a_foreign_reader_reads(head: Head, before: Path, tmp_path: Path) -> None:
+    after = head.write(tmp_path / "after.ply", 2, dented=True)
+    run = CliRunner().invoke(app, ["compare", str(before), str(after), "--out", str(tmp_path / "out"), "--json"])
+    assert run.exit_code == 0, run.output
+    told = json.loads((tmp_path / "out/comparison.json").read_text())
+    loaded = trimesh.load(tmp_path / "out/maps.ply", process=False)
+    maps = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    assert maps["shape_changed"].sum() == told["shape"]["changed"] > 0
+    assert np.median(maps["distance_mm"][head.dent & (maps["shape_changed"] > 0)]) == pytest.approx(-0.2, abs=0.06)
+    assert "<img" in (tmp_path / "out/report.html").read_text()
+
+
+def test_other_objects_and_units_are_refused(head: Head, before: Path, tmp_path: Path) -> None:
+    points = np.array(head.mesh.vertices)
+    trimesh.Trimesh(points / 25.4, head.mesh.faces, process=False).export(tmp_path / "inches.ply")
+    trimesh.creation.box((90, 70, 12)).subdivide_to_size(1.5).export(tmp_path / "box.ply")
+    for name, said in (("inches.ply", "another unit"), ("box.ply", "no motion brings")):
+        with pytest.raises(InputError, match=said):
+            compare(before, tmp_path / name, "mm", None, aligned=False, say=silent)

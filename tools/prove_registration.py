@@ -1,0 +1,116 @@
+"""Many scans of a tower, by an independent caster of rays, in any order and with unknown poses: found as they are.
+
+    python tools/prove_registration.py [--scans 167] [--across 570] [--keep DIR]
+
+167 scans of 570 x 570 rays are 54 million, about as many points as were taken of Notre-Dame's west front (seed
+001). Surfaces hide each other, a third of the material is dark and loses rays, ranges have noise of 0.5 mm.
+Reading, registration and merging are timed, and memory is measured. Exits with 1 if a scan is placed wrongly or
+not at all, if fewer than 90 % of the poses lie in their 95 % regions, if it took more than 30 minutes, or if a
+process took more than 8 GB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+from ray_scanner import RayScanner, tower  # noqa: E402
+
+from coupole.scan.registration.merging import LEVELS_MM, merge  # noqa: E402
+from coupole.scan.registration.registering import Registered, register  # noqa: E402
+from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between  # noqa: E402
+
+SCANS = 167
+RADIUS_MM, HEIGHT_MM, STATUES, FACETS = 4000.0, 8000.0, 700, 1500
+NOISE_MM, FIELD_DEG, AWAY_MM = 0.5, 55.0, 3200.0
+MOST_MINUTES, MOST_GB, LEAST_COVERED, MOST_OFF_MM = 30.0, 8.0, 0.90, 20.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scans", type=int, default=SCANS)
+    parser.add_argument("--across", type=int, default=570, help="rays along each side of a scan's field")
+    parser.add_argument("--mesh-mm", type=float, default=10.0)
+    parser.add_argument("--keep", type=Path, help="folder for scans, mesh and clouds")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="coupole-registration-") as scratch:
+        folder = arguments.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        truth = make_scans(folder, arguments.scans, arguments.across)
+        paths = [folder / name for name in truth]
+        started = time.monotonic()
+        found = register(paths, "mm", say=_say)
+        placed = [found.scans[k] for k in found.placed]
+        poses = [found.first_from_scan[k] for k in found.placed]
+        out = Path(tempfile.mkdtemp(dir=folder))
+        merged = merge(placed, poses, "mm", arguments.mesh_mm, LEVELS_MM, out, _say)
+        minutes = (time.monotonic() - started) / 60
+    memory = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    print(f"{merged.points:,} points; {merged.triangles:,} triangles; {merged.levels}")
+    off_mm, covered = compared(found, truth)
+    loops = [loop.error_mm for loop in found.loops] or [np.inf]
+    print(
+        f"{len(found.placed)} placed, {len(found.unplaced)} not; {found.pairs} pairs, "
+        f"{len(found.rejected)} rejected, "
+        f"{len(loops)} loops: median {np.median(loops):.3f} mm, worst {max(loops):.3f} mm; factor "
+        f"{found.loop_factor:.2f}, inflation {found.fit.inflation:.2f}, noise {found.fit.noise_mm:.3f} mm"
+    )
+    gb = memory / 1e6
+    print(
+        f"off {np.median(off_mm):.3f} mm in the median, {off_mm.max():.3f} mm at worst; in 95 % regions "
+        f"{100 * covered:.1f} %; {minutes:.1f} minutes, {gb:.2f} GB in the largest process"
+    )
+    wrong = bool(found.unplaced) or off_mm.max() > MOST_OFF_MM or covered < LEAST_COVERED
+    return int(wrong or minutes > MOST_MINUTES or gb > MOST_GB)
+
+
+def make_scans(folder: Path, count: int, across: int) -> dict[str, np.ndarray]:
+    """Scans round the tower at several heights, shuffled; `world_from_scan` of each by its file's name."""
+    rng = np.random.default_rng(2)
+    scale = (count / SCANS) ** 0.5  # fewer scans, a smaller tower
+    radius_mm, whole_mm, statues = scale * RADIUS_MM, scale * HEIGHT_MM, round(scale**2 * STATUES)
+    scanner = RayScanner(tower(radius_mm, whole_mm, statues, FACETS, 1), noise_mm=NOISE_MM, seed=3)
+    truth = {}
+    for place, number in enumerate(rng.permutation(count)):
+        share = (number + 0.5) / count
+        angle = 2 * np.pi * number * 0.6180339887  # the golden angle spreads them evenly
+        height_mm = (share - 0.5) * 0.72 * whole_mm
+        wall = radius_mm * np.array([np.cos(angle), np.sin(angle), 0]) + [0, 0, height_mm]
+        side = rng.uniform(-0.25, 0.25)
+        away = np.array([np.cos(angle + side), np.sin(angle + side), 0])
+        eye = (radius_mm + AWAY_MM * rng.uniform(0.8, 1.1)) * away + [0, 0, height_mm + rng.uniform(-600, 600)]
+        scan = scanner.scan(eye, wall, FIELD_DEG, across)
+        truth[scan.write(folder / f"scan{place:03d}.ply").name] = scan.world_from_scan
+    return truth
+
+
+def compared(found: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
+    """Displacement of each placed scan's points from the truth, and the share of poses in their 95 % regions."""
+    first_from_world = inverse_of(truth[found.names[found.placed[0]]])
+    off_mm, inside = [], []
+    for k, number in enumerate(found.placed):
+        true = first_from_world @ truth[found.names[number]]
+        off_mm.append(displacement_mm(found.first_from_scan[number], true, found.scans[number].coarse.points_mm))
+        if k:
+            step = step_between(found.first_from_scan[number], true, found.fit.pivots_mm[k])
+            inside.append(step @ np.linalg.solve(found.covariance[number], step) < chi2.ppf(0.95, 6))
+    return np.array(off_mm), float(np.mean(inside))
+
+
+def _say(step: str, done: int, of: int) -> None:
+    if done == of:
+        print(f"{time.strftime('%H:%M:%S')} {step}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

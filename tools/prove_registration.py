@@ -95,16 +95,34 @@ def make_scans(folder: Path, count: int, across: int) -> dict[str, np.ndarray]:
 
 
 def compared(found: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
-    """Displacement of each placed scan's points from the truth, and the share of poses in their 95 % regions."""
-    first_from_world = inverse_of(truth[found.names[found.placed[0]]])
-    off_mm, inside = [], []
-    for k, number in enumerate(found.placed):
-        true = first_from_world @ truth[found.names[number]]
-        off_mm.append(displacement_mm(found.first_from_scan[number], true, found.scans[number].coarse.points_mm))
-        if k:
-            step = step_between(found.first_from_scan[number], true, found.fit.pivots_mm[k])
-            inside.append(step @ np.linalg.solve(found.covariance[number], step) < chi2.ppf(0.95, 6))
-    return np.array(off_mm), float(np.mean(inside))
+    """Displacement of each placed scan's points from the truth, in the first one's frame; and the share of poses
+    in their 95 % regions, on average over the frames of all scans, as the error of one frame is in all poses."""
+    world_from = [truth[found.names[number]] for number in found.placed]
+    first_from_world = inverse_of(world_from[0])
+    off_mm = [
+        displacement_mm(found.first_from_scan[n], first_from_world @ true, found.scans[n].coarse.points_mm)
+        for n, true in zip(found.placed, world_from, strict=True)
+    ]
+    return np.array(off_mm), float(np.mean([_covered(found, world_from, r) for r in range(len(world_from))]))
+
+
+def _covered(found: Registered, world_from: list[np.ndarray], reference: int) -> float:
+    """Share of the poses, seen from one scan, that lie in their 95 % regions."""
+    fit, inside = found.fit, []
+    true_from_world = fit.common_from_scan[reference] @ inverse_of(world_from[reference])
+    for k, pose in enumerate(fit.common_from_scan):
+        if k == reference:
+            continue
+        x, y, z = fit.pivots_mm[k] - fit.pivots_mm[reference]
+        carried = np.eye(6)  # of a step about the reference's pivot to one about this scan's
+        carried[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        both = np.zeros((6, fit.covariance.shape[0]))
+        both[:, 6 * k : 6 * k + 6] += np.eye(6)
+        both[:, 6 * reference : 6 * reference + 6] -= carried
+        step = step_between(pose, true_from_world @ world_from[k], fit.pivots_mm[k])
+        squared = step @ np.linalg.solve(both @ fit.covariance @ both.T, step)
+        inside.append(squared < chi2.ppf(0.95, 6))
+    return float(np.mean(inside))
 
 
 def _say(step: str, done: int, of: int) -> None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy comes: the tests' own workers are enough
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it for what they run in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest
 from cells import CellFolder

@@ -82,6 +82,12 @@ class Born(subprocess.Popen[str]):
         os.close(code)
         self._close_pipe_fds(*ends)  # type: ignore[attr-defined]
 
+    def __del__(self, *_: Any, **__: Any) -> None:
+        """No warning for who has ended by itself, or was killed."""
+        if self._child_created and self.returncode is None:
+            self._internal_poll()
+        super().__del__()  # type: ignore[misc]
+
     def _try_wait(self, wait_flags: int) -> tuple[int, int]:
         """As `os.waitpid`; of whoever could not tell its exit code, that it was killed."""
         if wait_flags & os.WNOHANG and not select.select([self._code], [], [], 0)[0]:

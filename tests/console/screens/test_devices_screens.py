@@ -287,7 +287,9 @@ def test_a_region_is_drawn_looked_into_and_made_white(room: Room) -> None:
     assert "1.000, 1.000, 1.000" not in ada.sees("[data-name=white-words]")
     ActionChains(ada.driver, duration=20).move_to_element(look).click().perform()
     ada.sees("[data-name=loupe]", "128 x 96 px of picture")
-    assert ada.browser.run("document.querySelector('.loupe img').naturalWidth") == 128
+    cells.wait_until(
+        lambda: ada.browser.run("document.querySelector('.loupe img').naturalWidth") == 128, "the loupe's picture"
+    )
     assert_usable(ada)
 
 

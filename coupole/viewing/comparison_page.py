@@ -111,7 +111,8 @@ def _image(found: Comparison, colours: Points, caption: str) -> str:
         sheet = drawn(state.points_mm, lambda canvas: canvas.dots(state.points_mm[some], colours[some], 1.5))
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
-    return f"<figure>{picture('png', buffer.getvalue(), caption)}<figcaption>{text(caption)}.</figcaption></figure>"
+    image = picture("png", buffer.getvalue(), caption)
+    return f"<figure>{image}<figcaption>{text(caption)}.</figcaption></figure>"
 
 
 def _regions(caption: str, regions: Sequence[Region]) -> str:

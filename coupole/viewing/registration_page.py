@@ -53,7 +53,8 @@ def _pictures(found: Registered, merged: Merged | None, folder: Path) -> str:
 def _image(sheet: Any, alternative: str) -> str:
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
-    return f"<figure>{picture('png', buffer.getvalue(), alternative)}<figcaption>{text(alternative)}.</figcaption></figure>"
+    image = picture("png", buffer.getvalue(), alternative)
+    return f"<figure>{image}<figcaption>{text(alternative)}.</figcaption></figure>"
 
 
 def scans_drawn(found: Registered) -> Any:

@@ -89,7 +89,7 @@ class LightOnObject:
 
         Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
         """
-        more_lux_h = self._more_lux_h(at_most if expected is None else expected)
+        more_lux_h = self.more_lux_h(at_most if expected is None else expected)
         if more_lux_h > self.left_lux_h:
             raise DoseBudgetReached(
                 f"object {self._id}: the next {more_lux_h:.3g} lux.h after {self.total_lux_h:.3f} lux.h would "
@@ -109,16 +109,16 @@ class LightOnObject:
         counts = at_most if given is None else given
         if self._ledger is not None and given is not None:
             self._ledger.correct(plan_id, *self._entry(counts, w_per_lm))
-        self.total_lux_h += self._more_lux_h(counts)
+        self.total_lux_h += self.more_lux_h(counts)
         self._given_lux_h = self._given_lux_h + counts
         return counts
 
-    def _more_lux_h(self, lux_h: LuxHours) -> float:
+    def more_lux_h(self, lux_h: LuxHours) -> float:
         """What these add to the dose, so that a run's entries sum to the dose of its highest point."""
         return float((self._given_lux_h + lux_h).max() - self._given_lux_h.max())
 
     def _entry(self, lux_h: LuxHours, w_per_lm: float | None) -> tuple[float, float | None]:
-        more_lux_h = max(0.0, round(self._more_lux_h(lux_h), _DIGITS))
+        more_lux_h = max(0.0, round(self.more_lux_h(lux_h), _DIGITS))
         return more_lux_h, None if w_per_lm is None else round(more_lux_h * w_per_lm, _DIGITS)
 
 
@@ -140,7 +140,7 @@ class FlashMeter:
     @property
     def total_lux_h(self) -> float:
         """Of the object's life, by its ledger, with what is planned."""
-        return self._light.total_lux_h + float(self._given_lux_h.max())
+        return self._light.total_lux_h + self._light.more_lux_h(self._given_lux_h)
 
     @property
     def left_lux_h(self) -> float:

@@ -13,7 +13,7 @@ import pytest
 from cells import CellFolder
 from places import REPO
 
-from coupole.acquisition.dose import DoseMeter
+from coupole.acquisition.dose import DoseMeter, FlashMeter
 from coupole.devices import NO_LED, STEP_RECORD_DTYPE, StepRecord
 from coupole.errors import DoseBudgetReached
 from coupole.plan.bursts import Burst
@@ -204,3 +204,15 @@ def test_damage_is_entered_where_the_lamps_spectrum_is_known(job: Job, burst: Bu
     history = ledger_of(job.cell, "relief").read()
     assert history.damage_wh_m2 == pytest.approx(1e-3 * history.total_lux_h, rel=1e-5)
     assert history.of_unknown_spectrum_lux_h == 0
+
+
+def test_flashes_with_different_highest_points_count_as_the_highest_of_their_sum(job: Job) -> None:
+    opened = SimpleNamespace(simulated=False, lights_confirmed=True)
+    flashes = FlashMeter(job, opened, "bench", 1.0)  # type: ignore[arg-type]
+    points = np.eye(len(job.shape.dose_points_mm))
+    for lux_h in 1e-3 * points[0], 8e-4 * points[0] + 7e-4 * points[1], 9e-4 * points[1]:
+        flashes.begin(lux_h, lux_h)
+        told = flashes.total_lux_h
+        flashes.settle()
+        assert told == pytest.approx(flashes.total_lux_h) == pytest.approx(total(job))
+    assert told == pytest.approx(1.8e-3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,6 +40,10 @@ _MOST_ASYMMETRY = 1e-9
 
 def _not_said(value: object) -> bool:
     return value is None
+
+
+def _none_found(value: object) -> bool:
+    return value == ()
 
 
 class Parameter(Model):
@@ -73,6 +78,23 @@ class ImageResidual(Model):
     corners: Count
     rejected: Count
     rms_px: NotNegative
+
+
+@dataclass(frozen=True)
+class LedFault:
+    """Something about LEDs that the operator should check."""
+
+    kind: str
+    """`dead`, `swapped`, `miswired`, `astray`, `moved` (a board) or `few` (too few frames show it)."""
+    leds: tuple[int, ...]
+    """Ids; none for a board."""
+    text: str
+    """What was seen and what to do."""
+
+    @property
+    def is_wrong(self) -> bool:
+        """False for a board that was mounted anew, and for an LED of which views are missing."""
+        return self.kind not in ("moved", "few")
 
 
 class Limit(Model):
@@ -143,6 +165,8 @@ class Record(Model):
     """Acceptance limits; all must be met."""
     remarks: tuple[str, ...]
     """For the operator: methods that disagree, corners that were left out."""
+    faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
+    """Of LEDs; their texts are among the remarks."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 

@@ -44,8 +44,15 @@ def leds(
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
     tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
+    accept_faults: Annotated[
+        bool,
+        typer.Option("--accept-faults", help="Accept dead, swapped, astray LEDs; the table has what was found."),
+    ] = False,
 ) -> Work:
-    """Positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more."""
+    """Positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more.
+
+    With a dead LED or swapped wires the record is not accepted and no table is written, unless --accept-faults.
+    """
     from coupole.calibration.leds.drawing import draw_leds
     from coupole.calibration.leds.equations import Stated
     from coupole.calibration.leds.sources import find_leds
@@ -67,7 +74,8 @@ def leds(
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
         stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         with console.status("adjusting boards, poses, lens and hand-eye"):
-            found = leds_from(images, table, prior, request, stated=stated, arm=_arm(cell, hand_eye))
+            arm = _arm(cell, hand_eye)
+            found = leds_from(images, table, prior, request, stated=stated, arm=arm, accept_faults=accept_faults)
         return Outcome(found.record, partial(draw_leds, found), found.files)
 
     return work

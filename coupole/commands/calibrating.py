@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
@@ -32,6 +33,8 @@ else:
 
 _SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5")
 """Of a record and of the files beside it."""
+_MOST_FAULTS = 5
+"""In a refusal; the record has all."""
 Paths = Annotated[
     list[Path],
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
@@ -159,6 +162,7 @@ def _calibrate(
                 for limit in record.limits
                 if not limit.passed
             ]
+            + [fault.text for fault in record.faults if fault.is_wrong][:_MOST_FAULTS]
         )
 
 
@@ -222,5 +226,6 @@ def _figures(record: Record) -> dict[str, Any]:
         "transforms": {name: pose.model_dump() for name, pose in record.transforms.items()},
         "noise": {n.name: {"found": n.found, "stated": n.stated, "unit": n.unit} for n in record.noise},
         "limits": [{**limit.model_dump(), "passed": limit.passed} for limit in record.limits],
+        "faults": [asdict(fault) for fault in record.faults],
         "remarks": list(record.remarks),
     }

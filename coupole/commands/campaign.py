@@ -90,8 +90,8 @@ class Campaign:
                 raise CalibrationRefused(
                     [
                         *(f"{path}: not accepted: {one.what} is {one.found:.3g} {one.unit}" for one in missed),
-                        f"Read {path.with_suffix('.html')}; remove the cause, or calibrate by hand with --limit; "
-                        f"remove {path.stem}.*, and call this again",
+                        f"Read {path.with_suffix('.html')}; remove the cause, or calibrate by hand with --limit "
+                        f"or --accept-faults; remove {path.stem}.*, and call this again",
                     ]
                 )
 

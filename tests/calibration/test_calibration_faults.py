@@ -18,6 +18,7 @@ from synthesis import frame
 
 from coupole.calibration.record import Record, read_record, sealed, write_record
 from coupole.geometry import transform
+from coupole.plan.led_table import read_led_table
 
 
 def calibrate(kind: str, *words: object) -> Ended:
@@ -145,20 +146,32 @@ def lit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def leds(folder: Path, out: Path, hand_eye: Path | None = None) -> Ended:
+def leds(folder: Path, out: Path, hand_eye: Path | None = None, *options: str) -> Ended:
     (run,) = (path.parent for path in (folder / "run").glob("*/run.json"))
     words = ("--hand-eye", hand_eye or folder / "hand-eye.yaml", "--rig", folder / "rig.yaml", "--out", out)
-    return calibrate("leds", run, *words)
+    return calibrate("leds", run, *words, *options)
 
 
 def test_a_dead_led_and_two_swapped_ones_are_named(lit: Path, tmp_path: Path) -> None:
     ended = leds(lit, tmp_path)
     assert ended.code == 3, ended.err
     assert "LEDs not found" in ended.err
+    assert "faults of LEDs and wires" in ended.err
+    assert {"dead", "swapped"} <= {fault["kind"] for fault in ended.document["faults"]}
     assert any("dead" in remark and str(DEAD) in remark for remark in ended.document["remarks"])
     assert any(
         "swapped" in remark and all(str(led) in remark for led in SWAPPED) for remark in ended.document["remarks"]
     )
+
+
+def test_accepted_faults_leave_the_table_with_swapped_leds_at_each_others_place(lit: Path, tmp_path: Path) -> None:
+    ended = leds(lit, tmp_path, None, "--accept-faults", "--limit", "missing=0.1")
+    assert ended.code == 0, ended.err
+    (written,) = tmp_path.glob("*.csv")
+    new, old = read_led_table(written), read_led_table(lit / "dome.csv")
+    off_mm = np.linalg.norm(new.positions_mm[list(SWAPPED)] - old.positions_mm[list(SWAPPED[::-1])], axis=1)
+    assert (off_mm < 5.0).all()
+    assert len(ended.document["faults"]) >= 2
 
 
 def test_a_camera_warmer_than_its_record_holds_for_is_named(lit: Path, tmp_path: Path) -> None:

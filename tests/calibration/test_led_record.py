@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -16,6 +17,7 @@ from test_led_matching import rewired
 
 from coupole.calibration.leds.drawing import draw_leds
 from coupole.calibration.leds.equations import Stated
+from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.leds.workflow import LedsFound, leds_from
 from coupole.calibration.optics import Intrinsics
@@ -35,8 +37,8 @@ def images(made: Dome) -> LedImages:
     return LedImages(made.seen, made.base_from_flange, names, SIZE_PX, (), About(simulated=True), inputs)
 
 
-def found(made: Dome) -> LedsFound:
-    return leds_from(images(made), made.table, made.prior, REQUEST, stated=Stated())
+def found(made: Dome, *, accept_faults: bool = False) -> LedsFound:
+    return leds_from(images(made), made.table, made.prior, REQUEST, stated=Stated(), accept_faults=accept_faults)
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +75,34 @@ def test_each_leds_covariance_is_kept(sound: Dome) -> None:
 
 
 def test_swapped_leds_have_each_others_place_in_the_new_table(sound: Dome) -> None:
-    result = found(replace(sound, seen=rewired(sound, {4: 29, 29: 4})))
+    result = found(replace(sound, seen=rewired(sound, {4: 29, 29: 4})), accept_faults=True)
+    assert result.record.passed
+    assert "leds-test.csv" in result.files
     assert np.linalg.norm(result.new_table.positions_mm[4] - sound.true_mm[29]) < 0.5
     assert result.new_table.boards[4] == 4
     assert any("swapped" in remark for remark in result.record.remarks)
+
+
+@pytest.mark.parametrize(
+    ("seen", "kind", "leds"),
+    [
+        (lambda dome: rewired(dome, {4: 29, 29: 4}), "swapped", (4, 29)),
+        (lambda dome: dome.seen.only(np.flatnonzero(dome.seen.led != 17)), "dead", (17,)),
+    ],
+)
+def test_a_fault_of_leds_is_kept_in_a_record_that_is_not_accepted_and_has_no_table(
+    sound: Dome, tmp_path: Path, seen: Callable[[Dome], LedSightings], kind: str, leds: tuple[int, ...]
+) -> None:
+    wrong = replace(sound, seen=seen(sound))
+    result = found(wrong)
+    assert [limit.what for limit in result.record.limits if not limit.passed] == (
+        ["faults of LEDs and wires"] if kind == "swapped" else ["LEDs not found", "faults of LEDs and wires"]
+    )
+    assert set(result.files) == {"leds-test.h5"}
+    path = tmp_path / "leds-test.yaml"
+    write_outcome(path, Outcome(result.record, partial(draw_leds, result), result.files))
+    kept = [fault for fault in read_record(path).faults if fault.is_wrong]
+    assert [(fault.kind, tuple(sorted(fault.leds))) for fault in kept] == [(kind, leds)]
 
 
 def test_a_board_that_moved_against_its_table_is_named(sound: Dome) -> None:
@@ -84,13 +110,17 @@ def test_a_board_that_moved_against_its_table_is_named(sound: Dome) -> None:
     moved_mm[18:24] += [0.0, 0.0, 14.0]
     result = found(replace(sound, table=replace(sound.table, positions_mm=moved_mm)))
     assert any(remark.startswith("board 3 stands 1") for remark in result.record.remarks)
+    assert result.record.passed, "a board that was mounted anew is what a calibration is for"
 
 
 def test_too_many_dead_leds_are_not_accepted(sound: Dome) -> None:
     dark = sound.seen.only(np.flatnonzero(sound.seen.led > 2))
     record = found(replace(sound, seen=dark)).record
     assert not record.passed
-    assert [limit.what for limit in record.limits if not limit.passed] == ["LEDs not found"]
+    assert [limit.what for limit in record.limits if not limit.passed] == [
+        "LEDs not found",
+        "faults of LEDs and wires",
+    ]
 
 
 def test_a_lens_of_another_focus_is_named_though_its_record_says_nothing() -> None:

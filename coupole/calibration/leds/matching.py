@@ -18,6 +18,7 @@ from coupole.calibration.leds.boards import Boards
 from coupole.calibration.multi_view import unproject
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.point_sets import Indices, rigid_motion
+from coupole.calibration.record import LedFault
 from coupole.calibration.rotations import Floats, rotation_vector
 
 LEAST_VIEWS = 3
@@ -57,7 +58,7 @@ class Matching:
     """[n] place at which each LED lights, -1 if none."""
     sightings: LedSightings
     """Spots that agree, their `led` still the one that was lit."""
-    faults: tuple[Fault, ...]
+    faults: tuple[LedFault, ...]
 
     @property
     def by_place_mm(self) -> Floats:
@@ -66,17 +67,6 @@ class Matching:
         rows = np.flatnonzero(self.place_of >= 0)
         there[self.place_of[rows]] = self.found_mm[rows]
         return there
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something that the operator should check."""
-
-    kind: str
-    """`dead`, `few`, `astray`, `swapped`, `miswired` or `moved`."""
-    leds: tuple[int, ...]
-    """Ids."""
-    text: str
 
 
 def match_leds(
@@ -181,26 +171,26 @@ def _meeting(rays: Floats, eyes_mm: Floats) -> Floats:
 # -- faults -----------------------------------------------------------------------------------------------
 
 
-def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Iterator[Fault]:
+def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Iterator[LedFault]:
     spots = np.bincount(seen.led, minlength=len(ids))
     views = np.bincount(np.unique(np.stack([seen.led, seen.view]), axis=1)[0], minlength=len(ids))
     frames = np.bincount(seen.frames[:, 1], minlength=len(ids))
     for row in np.flatnonzero(np.isnan(found_mm[:, 0])):
         led = int(ids[row])
         if not frames[row]:
-            yield Fault("few", (led,), f"LED {led}: no frame shows it. Take views for it")
+            yield LedFault("few", (led,), f"LED {led}: no frame shows it. Take views for it")
         elif not spots[row]:
-            yield Fault(
+            yield LedFault(
                 "dead", (led,), f"LED {led}: dead: no spot in any of {frames[row]} frames. Look at its wire"
             )
         elif views[row] < LEAST_VIEWS:
-            yield Fault(
+            yield LedFault(
                 "few",
                 (led,),
                 f"LED {led}: seen in {views[row]} of {frames[row]} views, {LEAST_VIEWS} needed. Take more views",
             )
         else:
-            yield Fault(
+            yield LedFault(
                 "astray",
                 (led,),
                 f"LED {led}: the spots of {views[row]} views agree on no point near the dome: reflections, or "
@@ -210,7 +200,7 @@ def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Ite
 
 def _places(
     found_mm: Floats, table_mm: Floats, ids: NDArray[np.int64], boards: Boards
-) -> tuple[Indices, list[Fault]]:
+) -> tuple[Indices, list[LedFault]]:
     """The place at which each LED lights, and the faults of boards and wires that follow."""
     here = np.where(np.isfinite(found_mm[:, 0]), np.arange(len(ids)), -1)
     tree = cKDTree(table_mm)
@@ -230,7 +220,7 @@ def _places(
         if here[row] < 0:
             led = int(ids[row])
             text = f"LED {led}: found {off_mm[row]:.1f} mm from its place and at no other LED's. Look at its mount"
-            faults.append(Fault("astray", (led,), text))
+            faults.append(LedFault("astray", (led,), text))
     twice = [p for p in np.unique(here[here >= 0]) if np.sum(here == p) > 1]
     for place in twice:
         rows = np.flatnonzero(here == place)
@@ -238,7 +228,7 @@ def _places(
         text = (
             f"LEDs {' and '.join(map(str, leds))} light at one place, that of LED {ids[place]}. Look at the wires"
         )
-        faults.append(Fault("miswired", leds, text))
+        faults.append(LedFault("miswired", leds, text))
         here[rows[rows != place]] = -1
     return here, faults + list(_wiring(here, ids, boards))
 
@@ -263,17 +253,19 @@ def _on_another(board: int, found_mm: Floats, tree: cKDTree, near_mm: float, boa
     return bool((off_mm < near_mm).all() and len(there) == 1 and there[0] != board)
 
 
-def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[Fault]:
+def _wiring(here: Indices, ids: NDArray[np.int64], boards: Boards) -> Iterator[LedFault]:
     """Cycles of LEDs that light at each other's places: two are swapped; more are a mis-wired board."""
     for ring in _rings(here):
         leds = tuple(int(ids[row]) for row in ring)
         on = sorted({int(boards.numbers[boards.board_of[row]]) for row in (*ring, int(here[ring[-1]]))})
         where = f"on board {on[0]}" if len(on) == 1 else f"on boards {', '.join(map(str, on))}"
         if len(ring) == 2 and here[ring[1]] == ring[0]:
-            yield Fault("swapped", leds, f"LEDs {leds[0]} and {leds[1]} are swapped, {where}. Swap their wires")
+            yield LedFault("swapped", leds, f"LEDs {leds[0]} and {leds[1]} are swapped, {where}. Swap their wires")
         else:
             chain = " -> ".join(map(str, (*leds, int(ids[here[ring[-1]]]))))
-            yield Fault("miswired", leds, f"mis-wired {where}: each of LEDs {chain} lights where the next should")
+            yield LedFault(
+                "miswired", leds, f"mis-wired {where}: each of LEDs {chain} lights where the next should"
+            )
 
 
 def _rings(here: Indices) -> Iterator[list[int]]:
@@ -287,7 +279,7 @@ def _rings(here: Indices) -> Iterator[list[int]]:
         yield ring
 
 
-def fault_lines(faults: Sequence[Fault]) -> tuple[str, ...]:
+def fault_lines(faults: Sequence[LedFault]) -> tuple[str, ...]:
     """The faults as text; all dead LEDs share one line."""
     dead = [fault.leds[0] for fault in faults if fault.kind == "dead"]
     if len(dead) < 4:

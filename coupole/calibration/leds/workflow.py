@@ -17,10 +17,20 @@ from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
 from coupole.calibration.leds.boards import Boards, boards_of, placed
 from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
-from coupole.calibration.leds.matching import Fault, Matching, fault_lines, match_leds
+from coupole.calibration.leds.matching import Matching, fault_lines, match_leds
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.record import ImageResidual, Input, Limit, Noise, Parameter, Record, Validity, sealed
+from coupole.calibration.record import (
+    ImageResidual,
+    Input,
+    LedFault,
+    Limit,
+    Noise,
+    Parameter,
+    Record,
+    Validity,
+    sealed,
+)
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats, rotation_vector
 from coupole.errors import InputError
@@ -58,10 +68,12 @@ def leds_from(
     *,
     stated: Stated,
     arm: CalibratedArm | None = None,
+    accept_faults: bool = False,
 ) -> LedsFound:
     """Find all LEDs of a dome. Raises InputError if none is found, or the spots contradict the camera's record.
 
-    `arm` corrects the reported poses by the axis zeros that the hand-eye record found.
+    `arm` corrects the reported poses by the axis zeros that the hand-eye record found. With dead, swapped or
+    astray LEDs the record is not accepted and there is no table, unless `accept_faults`.
     """
     if arm is not None and images.joints_deg is not None:
         poses, prior = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
@@ -77,12 +89,15 @@ def leds_from(
     new_table = LedTable(
         table.ids, table.boards[leds.place], geometry.centres_mm[leds.place], normals, table.flux_lm
     )
-    files = {
-        f"{request.name}.csv": led_csv(new_table, request.name).encode("ascii"),
-        f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids)),
-    }
-    limits = against_limits(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg))
     faults = (*matching.faults, *_moved_boards(boards, geometry, place))
+    of_faults = _of_faults(faults, accept_faults)
+    limits = (
+        *against_limits(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg)),
+        of_faults,
+    )
+    files = {f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids))}
+    if of_faults.passed:
+        files[f"{request.name}.csv"] = led_csv(new_table, request.name).encode("ascii")
     record = _record(
         images,
         request,
@@ -92,6 +107,7 @@ def leds_from(
         files=files,
         lines=_views(images.views, sightings.view, geometry),
         limits=limits,
+        faults=faults,
         remarks=(
             *fault_lines(faults),
             *_of_records(geometry, prior, limits),
@@ -160,6 +176,7 @@ def _record(
     files: Mapping[str, bytes],
     lines: tuple[ImageResidual, ...],
     limits: Sequence[Limit],
+    faults: tuple[LedFault, ...],
     remarks: tuple[str, ...],
 ) -> Record:
     median_u_mm, median_u_deg = float(np.median(leds.u_mm[leds.found])), float(np.median(leds.u_deg[leds.found]))
@@ -180,6 +197,7 @@ def _record(
         noise=_noise(geometry, stated),
         images=lines,
         limits=limits,
+        faults=faults,
         remarks=remarks,
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in images.inputs),
     )
@@ -247,14 +265,22 @@ def _h5(
     return buffer.getvalue()
 
 
-def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]) -> list[Fault]:
+def _of_faults(faults: Sequence[LedFault], accepted: bool) -> Limit:
+    count = float(sum(fault.is_wrong for fault in faults))
+    what = "faults of LEDs and wires"
+    if accepted and count:
+        return Limit(what=what, found=count, limit=count, unit="", usual=0.0)
+    return Limit(what=what, found=count, limit=0.0, unit="")
+
+
+def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]) -> list[LedFault]:
     before, after = boards.base_from_board, geometry.state.base_from_board
     shift_mm = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     turn = np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]
     turn_deg = np.degrees(np.linalg.norm(rotation_vector(turn), axis=1))
     seen = np.isin(np.arange(len(boards.numbers)), boards.board_of[place])
     return [
-        Fault(
+        LedFault(
             "moved",
             (),
             f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its table. "

@@ -91,10 +91,7 @@ def leds_from(
     )
     faults = (*matching.faults, *_moved_boards(boards, geometry, place))
     of_faults = _of_faults(faults, accept_faults)
-    limits = (
-        *against_limits(LEDS, request.limits, _figures(geometry, leds.found, leds.u_mm, leds.u_deg)),
-        of_faults,
-    )
+    limits = (*against_limits(LEDS, request.limits, _figures(geometry, leds)), of_faults)
     files = {f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids))}
     if of_faults.passed:
         files[f"{request.name}.csv"] = led_csv(new_table, request.name).encode("ascii")
@@ -108,12 +105,7 @@ def leds_from(
         lines=_views(images.views, sightings.view, geometry),
         limits=limits,
         faults=faults,
-        remarks=(
-            *fault_lines(faults),
-            *_of_records(geometry, prior, limits),
-            *_of_spots(images.left_out),
-            *_of_the_arm(arm),
-        ),
+        remarks=(*fault_lines(faults), *_remarks(images, geometry, prior, limits, arm)),
     )
     return LedsFound(
         record,
@@ -352,16 +344,26 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
     return tuple(lines)
 
 
-def _figures(geometry: LedGeometry, found: NDArray[np.bool_], u_mm: Floats, u_deg: Floats) -> dict[str, float]:
+def _figures(geometry: LedGeometry, leds: _InTableOrder) -> dict[str, float]:
     """The figures that `acceptance.LEDS` limits."""
     return {
-        "missing": float(1 - found.mean()),
-        "centre_mm": float(np.median(u_mm[found])),
-        "normal_deg": float(np.median(u_deg[found])),
+        "missing": float(1 - leds.found.mean()),
+        "centre_mm": float(np.median(leds.u_mm[leds.found])),
+        "normal_deg": float(np.median(leds.u_deg[leds.found])),
         "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
         "rejected": float(1 - geometry.kept.mean()),
         "record_step": float(np.abs(geometry.prior_step).max()),
     }
+
+
+def _remarks(
+    images: LedImages,
+    geometry: LedGeometry,
+    prior: CameraPrior,
+    limits: Sequence[Limit],
+    arm: CalibratedArm | None,
+) -> list[str]:
+    return [*_of_records(geometry, prior, limits), *_of_spots(images.left_out), *_of_the_arm(arm)]
 
 
 def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:

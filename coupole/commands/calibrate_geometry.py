@@ -11,13 +11,11 @@ import typer
 
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.stickers.acceptance import MESH
-from coupole.commands.calibrating import Work, bar, calibration, rig_of
-from coupole.errors import InputError
+from coupole.commands.calibrating import Work, arm_of, bar, calibration, rig_of
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
     from coupole.geometry import Transform
@@ -74,7 +72,7 @@ def leds(
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
         stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         with console.status("adjusting boards, poses, lens and hand-eye"):
-            arm = _arm(cell, hand_eye)
+            arm = arm_of(cell, hand_eye)
             found = leds_from(images, table, prior, request, stated=stated, arm=arm, accept_faults=accept_faults)
         return Outcome(found.record, partial(draw_leds, found), found.files)
 
@@ -122,7 +120,7 @@ def mesh(
             )
         console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
         support = _base_from_support(_cell(rig, runs)) if rig is not None else None
-        arm = _arm(_cell(rig, runs), hand_eye) if has_axis_zeros(hand_eye) else None
+        arm = arm_of(_cell(rig, runs), hand_eye) if has_axis_zeros(hand_eye) else None
         stated = Stated(scanner_mm=scanner_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
         found = mesh_from(
             images,
@@ -145,23 +143,6 @@ def _base_from_support(cell: Cell) -> Transform:
 
     place = cell.rig.support.base_from_support
     return transform(place.translation_mm, place.abc_deg)
-
-
-def _arm(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
-    """The rig's arm with the axis zeros of a hand-eye record; None for a record without. Raises InputError if the
-    rig's driver has no model of the arm."""
-    from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
-    from coupole.plan.rig_devices import planning_arm
-
-    if not has_axis_zeros(hand_eye):
-        return None
-    arm = planning_arm(cell.rig)
-    if arm is None:
-        raise InputError(
-            f"{hand_eye}: was made with the arm's model, but the rig's robot has none; name the rig that it was "
-            "made with by --rig"
-        )
-    return read_arm(hand_eye, arm)
 
 
 def _cell(rig: Path | None, runs: list[Path]) -> Cell:

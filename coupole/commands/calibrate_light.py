@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.calibration.light.acceptance import DARK, DRIFT, LED_POWER, RESPONSE
-from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of, rig_of
+from coupole.commands.calibrating import EmissionOption, Work, arm_of, bar, calibration, emission_of, rig_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -80,15 +80,19 @@ def flat_field(
     ] = 600.0,
     dark_record: DarkOption = None,
     response_record: ResponseOption = None,
+    hand_eye: HandEyeOption = None,
+    rig: RigOption = None,
 ) -> Work:
     """Fall-off of the lens, per channel, from views of a luminous panel, shifted and turned."""
     from coupole.calibration.light.flat_field_records import flat_field_outcome
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = open_light_frames(runs)
+        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
         with bar(console, "views of the panel") as progress:
-            return flat_field_outcome(frames, request, dark_record, response_record, panel_mm, progress)
+            return flat_field_outcome(
+                frames, request, dark_record, response_record, panel_mm, progress, hand_eye=hand_eye
+            )
 
     return work
 
@@ -111,7 +115,7 @@ def led_power(
     from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye)
+        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -146,7 +150,7 @@ def drift(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye)
+        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -160,14 +164,16 @@ def drift(
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _posed(frames: LightFrames, hand_eye: Path | None) -> LightFrames:
-    """Frames with poses by a hand-eye record. Raises InputError for another record, or one of another focus."""
+def _posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]) -> LightFrames:
+    """Frames with poses by a hand-eye record and its axis zeros. Raises InputError for another record, or one of
+    another focus, and for a rig without a model of the record's arm."""
     from coupole.calibration.posed_camera import read_posed_camera
+    from coupole.plan.cell import read_cell
 
     if hand_eye is None:
         return frames
     prior = read_posed_camera(hand_eye, None, frames.about, frames.size_px)
-    return frames.seen_through(prior.flange_from_camera)
+    return frames.seen_through(prior.flange_from_camera, arm_of(read_cell(rig or rig_of(runs[0])), hand_eye))
 
 
 def _setting(

@@ -21,10 +21,12 @@ from coupole.errors import CalibrationRefused, CoupoleError, InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.calibration.calibrated_arm import CalibratedArm
     from coupole.calibration.light.irradiance import Emission
     from coupole.calibration.record import Record
     from coupole.calibration.report import Outcome
     from coupole.calibration.request import Request
+    from coupole.plan.cell import Cell
 
     Work = Callable[[Console, Request], Outcome]
     """The work of a calibration, its options bound."""
@@ -66,6 +68,23 @@ def rig_of(run: Path) -> Path:
     if not unchanged:
         raise InputError(f"{run}: its rig {path} is gone or was changed since; name one with --rig")
     return path
+
+
+def arm_of(cell: Cell, hand_eye: Path) -> CalibratedArm | None:
+    """The rig's arm with the axis zeros of a hand-eye record; None for a record without. Raises InputError if the
+    rig's driver has no model of the arm."""
+    from coupole.calibration.calibrated_arm import has_axis_zeros, read_arm
+    from coupole.plan.rig_devices import planning_arm
+
+    if not has_axis_zeros(hand_eye):
+        return None
+    arm = planning_arm(cell.rig)
+    if arm is None:
+        raise InputError(
+            f"{hand_eye}: was made with the arm's model, but the rig's robot has none; name the rig that it was "
+            "made with by --rig"
+        )
+    return read_arm(hand_eye, arm)
 
 
 def calibration(

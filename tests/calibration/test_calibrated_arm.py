@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens, frame, looking_at_board
 from test_point_sets import layout
 
 from coupole.calibration.calibrated_arm import CalibratedArm, calibrated_poses
+from coupole.calibration.light.frames import LightFrame, LightFrames
 from coupole.calibration.multi_view import CameraView
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.rotations import moved
+from coupole.calibration.sources import About
 from coupole.calibration.stickers.mesh_to_robot import Stated, mesh_to_robot
+from coupole.errors import InputError
 from coupole.kinematics import forward, inverse, nearest
+from coupole.plan.shot_id import ShotId
 
 LENS = TrueLens((1740.0, 1740.0), (511.5, 383.5), (0.0, 0.0, 0.0, 0.0, 0.0))
 SIZE_PX = (1024, 768)
@@ -91,6 +97,36 @@ def test_poses_are_those_of_the_axes_with_their_zero_errors() -> None:
     assert np.abs(found[:, :3, 3] - true[:, :3, 3]).max() < 1e-3
     assert np.abs(found[:, :3, :3] - true[:, :3, :3]).max() < 1e-6
     assert np.linalg.norm(found[:, :3, 3] - reported(made.joints_deg)[:, :3, 3], axis=1).min() > 0.1
+
+
+def test_frames_of_light_are_posed_by_the_axes_with_their_zero_errors() -> None:
+    made = seen(1)
+    flanges = reported(made.joints_deg)
+    frames = tuple(
+        LightFrame(
+            ShotId.parse(f"v{row // 2}/led0005/e{row % 2}"),
+            1e4,
+            0.0,
+            math.nan,
+            flanges[row // 2],
+            np.eye(4),
+            blank,
+        )
+        for row in range(2 * len(flanges))
+    )
+    frames = tuple(replace(one, joints_deg=made.joints_deg[row // 2]) for row, one in enumerate(frames))
+    light = LightFrames(frames, "GBRG", 64, 4095, About(simulated=True), 1740.0, ())
+    posed = light.seen_through(made.prior.flange_from_camera, made.arm)
+    for row, one in enumerate(posed.frames):
+        true = forward(KR10_R1100_SIXX, made.joints_deg[row // 2] + made.arm.zeros_deg)
+        assert np.abs(one.base_from_flange - true).max() < 1e-3
+        assert np.abs(one.base_from_camera - true @ made.prior.flange_from_camera).max() < 1e-3
+    with pytest.raises(InputError, match="without the arm's joints"):
+        replace(light, frames=(replace(frames[0], joints_deg=None),)).seen_through(np.eye(4), made.arm)
+
+
+def blank() -> NDArray[np.uint16]:
+    return np.zeros((2, 2), np.uint16)
 
 
 @pytest.mark.full

@@ -55,9 +55,11 @@ def flat_field_outcome(
     response_record: Path | None,
     panel_mm: float,
     progress: Progress,
+    *,
+    hand_eye: Path | None = None,
 ) -> Outcome:
     """Views of a panel, shifted and turned: fall-off per channel, dust. The panel is `panel_mm` in front of the
-    camera's mean position, perpendicular to its mean axis."""
+    camera's mean position, perpendicular to its mean axis. `hand_eye` is the record that posed the frames."""
     if not frames.lit:
         raise InputError("flat field: no frame with light; acquire `coupole plan new flat-field`")
     by_view = _brightest(frames)
@@ -105,7 +107,7 @@ def flat_field_outcome(
         files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
         fixed={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
         remarks=remarks,
-        more_inputs=(*record_input(dark_record), *record_input(response_record)),
+        more_inputs=(*record_input(dark_record), *record_input(response_record), *record_input(hand_eye)),
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.calibration.calibrated_arm import CalibratedArm, corrected_poses
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256
 from coupole.errors import InputError, StorageError
@@ -88,12 +89,25 @@ class LightFrames:
         height_px, width_px = self.frames[0].read().shape
         return width_px, height_px
 
-    def seen_through(self, flange_from_camera: Floats) -> LightFrames:
-        """The same frames with another pose [4, 4] of the camera on the flange."""
+    def seen_through(self, flange_from_camera: Floats, arm: CalibratedArm | None = None) -> LightFrames:
+        """The same frames with another pose [4, 4] of the camera on the flange, and the flange's own corrected by
+        the axis zeros of `arm`. Raises InputError for frames without joints that an arm is to correct."""
+        flanges = [frame.base_from_flange for frame in self.frames] if arm is None else self._corrected(arm)
         frames = (
-            replace(frame, base_from_camera=frame.base_from_flange @ flange_from_camera) for frame in self.frames
+            replace(frame, base_from_flange=flange, base_from_camera=flange @ flange_from_camera)
+            for frame, flange in zip(self.frames, flanges, strict=True)
         )
         return replace(self, frames=tuple(frames))
+
+    def _corrected(self, arm: CalibratedArm) -> list[Floats]:
+        joints_deg = [frame.joints_deg for frame in self.frames if frame.joints_deg is not None]
+        if len(joints_deg) < len(self.frames):
+            raise InputError("frames without the arm's joints cannot be corrected by its axis zeros")
+        reported = np.stack([frame.base_from_flange for frame in self.frames]).reshape(-1, 16)
+        rows = np.concatenate([reported, np.array(joints_deg)], axis=1)
+        distinct, which = np.unique(rows, axis=0, return_inverse=True)  # a view's frames share a pose
+        found = corrected_poses(distinct[:, :16].reshape(-1, 4, 4), distinct[:, 16:], arm)
+        return list(found[which.reshape(-1)])
 
 
 def open_light_frames(paths: Sequence[Path]) -> LightFrames:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from coupole.appearance.render.lights import Light
 from coupole.appearance.render.materials import Material
@@ -93,11 +93,7 @@ class Auto(Model):
     height_px: Pixels = 1000
 
 
-def _in_full(given: Any) -> Any:
-    return {"kind": "auto"} if given == "auto" else given
-
-
-Views = Annotated[Annotated[Turntable | Cameras | Auto, Field(discriminator="kind")], BeforeValidator(_in_full)]
+Views = Literal["auto"] | Annotated[Turntable | Cameras | Auto, Field(discriminator="kind")]
 
 
 class RestorationFile(Model):
@@ -108,7 +104,8 @@ class RestorationFile(Model):
     smooth: bool = True
     """Shaded smoothly, also across the borders of parts."""
     hypotheses: Annotated[tuple[Hypothesis, ...], Field(min_length=1)]
-    views: Views = Auto(kind="auto")
+    views: Views = "auto"
+    """`auto` alone is its kind with nothing else."""
     lights: Annotated[tuple[Light, ...], Field(min_length=1)]
     surroundings: tuple[Object, ...] = ()
     """Other things of the scene: a floor, a niche."""
@@ -164,7 +161,7 @@ def reduced(
     if step_nm:
         changed["bands"] = Bands.model_validate({"step_nm": step_nm})
     if width_px:
-        changed["views"] = _narrowed(found.views, width_px)
+        changed["views"] = _narrowed(_in_full(found.views), width_px)
     return found.model_copy(update=changed)
 
 
@@ -202,9 +199,9 @@ def expect_parts(document: Document, found: RestorationFile, names: Sequence[str
 
 def cameras_of(found: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple[Camera, ...]:
     """The cameras for an object with this box in the scene's frame."""
-    match found.views:
-        case Cameras():
-            return found.views.cameras
+    match _in_full(found.views):
+        case Cameras() as given:
+            return given.cameras
         case Turntable() as table:
             names = [f"view{number:03d}" for number in range(table.views)]
             turns = np.arange(table.views) * 360.0 / table.views
@@ -216,6 +213,10 @@ def cameras_of(found: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _in_full(views: Views) -> Turntable | Cameras | Auto:
+    return Auto(kind="auto") if views == "auto" else views
 
 
 def _narrowed(views: Turntable | Cameras | Auto, width_px: int) -> Turntable | Cameras | Auto:

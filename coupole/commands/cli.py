@@ -23,6 +23,7 @@ from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.register_scans import register
 from coupole.commands.render_scene import render
+from coupole.commands.restore import restore_app
 from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, Interrupted
@@ -74,6 +75,7 @@ plan_app.command("new")(planning.plan_new)
 app.add_typer(plan_app, name="plan")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(reflectance_app, name="reflectance")
+app.add_typer(restore_app, name="restore")
 
 
 def _print_version(asked: bool) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
+from typer.core import TyperGroup
 
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError, InputError
@@ -32,6 +33,18 @@ RecordsOption = Annotated[
     ),
 ]
 RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False, autocompletion=runs)]
+
+
+class JobOrStep(TyperGroup):
+    """A first word that is a step's name is the step; anything else belongs to the main job."""
+
+    job: ClassVar[str]
+    """Name of the main job among the steps; nobody types it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = [self.job, *args]
+        return super().parse_args(ctx, args)
 
 
 def shipped_rig() -> Path:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from coupole.commands.common import JsonOption, MeshOption, RecordsOption, ResultArgument, records_named
+from coupole.commands.common import JobOrStep, JsonOption, MeshOption, RecordsOption, ResultArgument, records_named
 from coupole.commands.common import fail as fail_with
 from coupole.commands.refine import refine
 from coupole.commands.reflectance_options import (
@@ -44,17 +43,14 @@ JOB = "from"
 """Name of the main job among the steps; nobody types it."""
 
 
-class JobOrStep(TyperGroup):
-    """A first word that is a step's name is the step; anything else belongs to the main job."""
+class FromOrStep(JobOrStep):
+    """`coupole reflectance RUN` is its main job."""
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
-            args = [JOB, *args]
-        return super().parse_args(ctx, args)
+    job = JOB
 
 
 reflectance_app = typer.Typer(
-    cls=JobOrStep,
+    cls=FromOrStep,
     help="Reflectance of an object's surface from runs, normals and materials from pictures under known lights, "
     "and pictures under new lights.\n\n"
     "`coupole reflectance RUN --out OUT` and `coupole reflectance --pictures FOLDER --lights FILE --out OUT` make "

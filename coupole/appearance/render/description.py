@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,11 +22,14 @@ _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
 
-def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any) -> Description:
-    """Objects and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
+def contents(
+    scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[objects.Piece] = ()
+) -> Description:
+    """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
-    for number, thing in enumerate(scene.objects):
-        for row, piece in enumerate(objects.pieces(thing, folder)):
+    of_objects = [objects.pieces(thing, folder) for thing in scene.objects]
+    for number, pieces in enumerate([*of_objects, more]):
+        for row, piece in enumerate(pieces):
             name = f"object{number}_{row}"
             if isinstance(piece, objects.Ball):
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
@@ -82,5 +86,9 @@ def _mesh(piece: objects.Piece, path: Path) -> Description:
     import trimesh
 
     points, faces = welded(piece.corners_mm)
-    trimesh.Trimesh(points, faces, process=False).export(path)
+    normals = None
+    if piece.normals is not None:
+        normals = np.empty_like(points)
+        normals[faces.ravel()] = piece.normals.reshape(-1, 3)
+    trimesh.Trimesh(points, faces, vertex_normals=normals, process=False).export(path)
     return {"type": "ply", "filename": str(path), "face_normals": not piece.smooth}

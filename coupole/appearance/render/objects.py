@@ -41,6 +41,8 @@ class Piece:
     material: Material
     smooth: bool = False
     """True for smooth shading."""
+    normals: Array | None = None
+    """[triangles, 3, 3] for smooth shading, one for each place: those of a body of which this is a part."""
 
 
 @dataclass(frozen=True)
@@ -255,5 +257,7 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
 def placed(piece: Piece, pose: Pose) -> Piece:
     """A piece of a thing's own frame, in the scene's."""
     scene_from_thing = pose.scene_from_thing()
-    corners: NDArray[np.float64] = piece.corners_mm @ scene_from_thing[:3, :3].T + scene_from_thing[:3, 3]
-    return Piece(corners, piece.material, piece.smooth)
+    rotation = scene_from_thing[:3, :3]
+    corners: NDArray[np.float64] = piece.corners_mm @ rotation.T + scene_from_thing[:3, 3]
+    normals = None if piece.normals is None else np.asarray(piece.normals @ rotation.T)
+    return Piece(corners, piece.material, piece.smooth, normals)

@@ -3,6 +3,7 @@ simulated."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ def write(
     files = {"png": f"{stem.name}.png"} | ({"exr": f"{stem.name}.exr"} if with_spectra else {})
     write_png(stem.with_name(files["png"]), picture, told)
     if with_spectra:
-        _write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
+        write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
     summary: dict[str, Any] = {
         "files": files,
         "white_cd_m2": round(shown_white, 6),
@@ -70,8 +71,8 @@ def write(
     return summary
 
 
-def write_png(path: Path, picture: NDArray[np.uint8], about: str) -> None:
-    """An sRGB picture [h, w, 3], or a grey one [h, w], that says what it is."""
+def write_png(path: Path, picture: NDArray[np.uint8], about: str, more: Mapping[str, str] | None = None) -> None:
+    """An sRGB picture [h, w, 3], or a grey one [h, w], that says what it is; `more` texts by their keywords."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -79,11 +80,16 @@ def write_png(path: Path, picture: NDArray[np.uint8], about: str) -> None:
     chunks.add(b"sRGB", b"\x00")  # perceptual intent; with this chunk no profile is needed (PNG, 11.3.2.5)
     chunks.add_text("Description", about)
     chunks.add_text("Software", f"coupole {coupole.__version__}")
+    for keyword, words in (more or {}).items():
+        chunks.add_itxt(keyword, words)
     Image.fromarray(picture).save(path, "PNG", optimize=True, pnginfo=chunks)
 
 
-def _write_exr(path: Path, scene: PlainScene, found: Spectral, xyz: Array, about: str) -> None:
-    """Channels and attributes of Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021."""
+def write_exr(
+    path: Path, scene: PlainScene, found: Spectral, xyz: Array, about: str, more: Mapping[str, str] | None = None
+) -> None:
+    """Channels and attributes of Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021, and
+    `more` attributes. Raises OSError, InputError."""
     import mitsuba
 
     mi: Any = mitsuba
@@ -107,6 +113,8 @@ def _write_exr(path: Path, scene: PlainScene, found: Spectral, xyz: Array, about
     told["comments"] = about
     told["synthetic"] = "true"
     told["observer"] = f"CIE {scene.observer}; Y of the first light is its luminance in cd/m2"
+    for name, value in (more or {}).items():
+        told[name] = value
     try:
         bitmap.write(str(path))
     except RuntimeError as error:  # what Mitsuba makes of a full disk

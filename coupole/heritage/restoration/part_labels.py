@@ -1,0 +1,193 @@
+"""Which part each triangle of a mesh is of, by the rules of a parts file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, Problem
+from coupole.heritage.restoration.nearest_faces import nearest_faces
+from coupole.heritage.restoration.painted_mesh import Floats, PaintedMesh
+from coupole.heritage.restoration.parts_file import (
+    Box,
+    HalfSpace,
+    PartsFile,
+    PickedFile,
+    Rule,
+    Texture,
+    VertexColours,
+    read_picked,
+)
+from coupole.plan.yamlfile import Document
+
+Labels = NDArray[np.int16]
+NONE = -1
+_SHOWN = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Every triangle's part."""
+
+    names: tuple[str, ...]
+    labels: Labels
+    """[triangles] rows of `names`."""
+    remarks: tuple[str, ...] = ()
+
+    def counts(self) -> dict[str, int]:
+        """Triangles of each part."""
+        found = np.bincount(self.labels, minlength=len(self.names))
+        return {name: int(count) for name, count in zip(self.names, found, strict=True)}
+
+
+def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
+    """Raises InputError with all problems: what the mesh does not have, parts without a triangle,
+    triangles without a part."""
+    names: list[str] = []
+    labels: Labels = np.full(len(mesh.triangles), NONE, np.int16)
+    places: dict[str, int] = {}
+    remarks: list[str] = []
+    problems: list[Problem] = []
+    for number, rule in enumerate(given.rules):
+        try:
+            own, found, unknown = _by_rule(mesh, rule, document)
+        except InputError as error:
+            problems.append(document.problem(("rules", number), str(error)))
+            continue
+        for name in own:
+            places.setdefault(name, number)
+            if name not in names:
+                names.append(name)
+        rows = np.array([names.index(name) for name in own], np.int16)
+        said, new = found >= 0, np.where(found >= 0, rows[found], labels).astype(np.int16)
+        remarks += _overlaps(names, labels, new, number)
+        remarks += [f"rule {number + 1} ({rule.kind}): {unknown}"] if unknown else []
+        labels = np.where(said, new, labels)
+    labels = _with_rest(given, names, labels, document, problems)
+    counts = np.bincount(labels[labels >= 0], minlength=len(names))
+    for name, count in zip(names, counts, strict=True):
+        if count == 0 and not problems:
+            at = ("rules", places[name]) if name in places else ("rest",)
+            message = (
+                f"the part {name!r} has no triangle: none is there, or later rules took it; {_heard(remarks)}"
+            )
+            problems.append(document.problem(at, message))
+    if problems:
+        raise InputError(problems)
+    return Parts(tuple(names), labels, tuple(remarks))
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _heard(remarks: Sequence[str]) -> str:
+    return "; ".join(remarks) or "see to its rule, or leave it out"
+
+
+def _with_rest(
+    given: PartsFile, names: list[str], labels: Labels, document: Document, problems: list[Problem]
+) -> Labels:
+    none = labels == NONE
+    if given.rest is not None:
+        if given.rest not in names:
+            names.append(given.rest)
+        return np.where(none, names.index(given.rest), labels).astype(np.int16)
+    if none.any() and not problems:
+        message = f"{int(none.sum())} of {len(labels)} triangles have no part; name the part of them as `rest`"
+        problems.append(document.problem(("rules",), message))
+    return labels
+
+
+def _overlaps(names: list[str], before: Labels, after: Labels, number: int) -> list[str]:
+    """A sentence for each part that a rule takes triangles from."""
+    taken = (before >= 0) & (after != before)
+    pairs, counts = np.unique(np.stack([before[taken], after[taken]]), axis=1, return_counts=True)
+    return [
+        f"rule {number + 1} comes later, and takes {count} triangles of {names[old]!r} for {names[new]!r}"
+        for (old, new), count in zip(pairs.T, counts, strict=True)
+    ]
+
+
+def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[str], NDArray[np.int64], str]:
+    """Names, for each triangle a row of them or `NONE`, and what is to be said of colours without a part."""
+    match rule:
+        case VertexColours():
+            if mesh.srgb is None:
+                raise InputError(f"{mesh.path}: its vertices have no colours; choose another kind of rule")
+            known, unknown = _by_colour(mesh.srgb, rule.colours, rule.tolerance)
+            return list(rule.colours), _majority(known[mesh.triangles]), unknown
+        case Texture():
+            known, unknown = _by_colour(_seen(mesh, rule, document), rule.colours, rule.tolerance)
+            return list(rule.colours), known, unknown
+        case Box():
+            middles = mesh.middles_mm
+            inside = ((middles >= rule.low_mm) & (middles <= rule.high_mm)).all(axis=1)
+            return [rule.part], np.where(inside, 0, NONE), ""
+        case HalfSpace():
+            beyond = (mesh.middles_mm - rule.point_mm) @ np.asarray(rule.normal) >= 0
+            return [rule.part], np.where(beyond, 0, NONE), ""
+        case PickedFile():
+            picked = read_picked(document.resolve(rule.path))
+            faces = nearest_faces(mesh, picked.vertices_mm.astype(np.float64), picked.triangles.astype(np.int64))
+            return list(picked.names), picked.parts[faces].astype(np.int64) - 1, ""
+
+
+def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float) -> tuple[NDArray[np.int64], str]:
+    """For each colour [n, 3] the nearest row of the table, or `NONE`; and which colours have none."""
+    wanted = np.array([list(bytes.fromhex(code[1:])) for code in table.values()], float)
+    colours, which, counts = np.unique(srgb, axis=0, return_inverse=True, return_counts=True)
+    distance = np.full(len(colours), np.inf)
+    rows = np.full(len(colours), NONE)
+    for row, one in enumerate(wanted):
+        here = np.linalg.norm(colours - one, axis=1)
+        rows[here < distance] = row
+        distance = np.minimum(distance, here)
+    rows[distance > tolerance] = NONE
+    lost = np.flatnonzero(rows == NONE)
+    told = ""
+    if len(lost):
+        most = lost[np.argsort(-counts[lost], kind="stable")][:_SHOWN]
+        codes = ", ".join(f"#{bytes(colours[k].tolist()).hex()} ({counts[k]})" for k in most)
+        told = (
+            f"{int(counts[lost].sum())} of {len(srgb)} places have colours of no part within {tolerance:g}, "
+            f"most often {codes}"
+        )
+    return np.asarray(rows[which.reshape(-1)], np.int64), told
+
+
+def _majority(corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    """[m] of what the corners [m, 3] have: what two of them have; of three different ones the first that is
+    known."""
+    a, b, c = corners.T
+    first = np.where(a >= 0, a, np.where(b >= 0, b, c))
+    return np.asarray(np.where((a == b) | (a == c), a, np.where(b == c, b, first)), np.int64)
+
+
+def _seen(mesh: PaintedMesh, rule: Texture, document: Document) -> NDArray[np.uint8]:
+    """[m, 3] the picture's colour at the middle of each triangle, of the nearest pixel."""
+    picture = mesh.texture if rule.image is None else _picture(document.resolve(rule.image))
+    if mesh.uv is None:
+        raise InputError(f"{mesh.path}: its corners have no places in a picture (UV); choose another kind of rule")
+    if picture is None:
+        raise InputError(f"{mesh.path}: names no picture; name it as `image`")
+    middles: Floats = mesh.uv[mesh.triangles].mean(axis=1) % 1.0
+    height, width = picture.shape[:2]
+    column = np.minimum((middles[:, 0] * width).astype(int), width - 1)
+    row = np.minimum(((1.0 - middles[:, 1]) * height).astype(int), height - 1)
+    return np.asarray(picture[row, column])
+
+
+def _picture(path: Path) -> NDArray[np.uint8]:
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            found: Any = np.asarray(opened.convert("RGB"))
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: expected a picture of labels (PNG); {error}") from error
+    return np.asarray(found, np.uint8)

@@ -1,0 +1,185 @@
+"""The parts file: which triangles of a mesh are hair, robe, stone (docs/reference/restorations.md).
+
+Rules are applied in their order, and later ones win. Lengths are mm in the mesh's own frame.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from coupole.appearance.render.model import Model, Vector
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.yamlfile import Document
+
+PartName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}$")]
+Colour = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")]
+"""sRGB as `#rrggbb`."""
+Tolerance = Annotated[float, Field(ge=0, le=120)]
+"""Largest distance of a colour from the table's, in 8-bit steps of sRGB."""
+_MOST_BYTES = 64 * 1024**2
+
+
+class VertexColours(Model):
+    """A triangle is of the part whose colour most of its corners have."""
+
+    kind: Literal["vertex_colours"]
+    colours: Annotated[dict[PartName, Colour], Field(min_length=1)]
+    tolerance: Tolerance = 8.0
+
+
+class Texture(Model):
+    """A triangle is of the part whose colour the picture has at its middle."""
+
+    kind: Literal["texture"]
+    colours: Annotated[dict[PartName, Colour], Field(min_length=1)]
+    image: Path | None = None
+    """In place of the picture that the mesh names."""
+    tolerance: Tolerance = 8.0
+
+
+class Box(Model):
+    """Triangles whose middle is inside."""
+
+    kind: Literal["box"]
+    part: PartName
+    low_mm: Vector
+    high_mm: Vector
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Box:
+        if any(low >= high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
+            raise ValueError("the box is empty: each of `low_mm` must be less than that of `high_mm`")
+        return self
+
+
+class HalfSpace(Model):
+    """Triangles whose middle is on the side of a plane to which its normal points."""
+
+    kind: Literal["plane"]
+    part: PartName
+    point_mm: Vector
+    normal: Vector
+
+    @model_validator(mode="after")
+    def _points(self) -> HalfSpace:
+        if not any(self.normal):
+            raise ValueError("the normal has no direction: give one of x, y, z another value than 0")
+        return self
+
+
+class PickedFile(Model):
+    """A file that the page of `coupole restore pick` gave."""
+
+    kind: Literal["picked"]
+    path: Path
+
+
+Rule = Annotated[VertexColours | Texture | Box | HalfSpace | PickedFile, Field(discriminator="kind")]
+
+
+class PartsFile(Model):
+    schema_version: Literal[1]
+    rules: Annotated[tuple[Rule, ...], Field(min_length=1)]
+    rest: PartName | None = None
+    """The part of all triangles that no rule names; none: there must be no such triangle."""
+
+
+class PickedParts(Model):
+    """Painted triangles with their mesh: base64 of little-endian numbers."""
+
+    schema_version: Literal[1]
+    kind: Literal["picked parts"]
+    names: Annotated[tuple[PartName, ...], Field(min_length=1, max_length=254)]
+    vertices_mm: str
+    """float32 [n, 3]"""
+    triangles: str
+    """uint32 [m, 3]"""
+    parts: str
+    """uint8 [m]: 0 not painted, k the k-th name."""
+
+    @field_validator("names")
+    @classmethod
+    def _differ(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("two parts have the same name")
+        return names
+
+
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """What a page gave, in numbers."""
+
+    names: tuple[str, ...]
+    vertices_mm: NDArray[np.float32]
+    triangles: NDArray[np.uint32]
+    parts: NDArray[np.uint8]
+
+
+def read_parts(path: Path) -> tuple[Document, PartsFile]:
+    """A parts file, or a picked one as its only rule. Raises InputError with its place."""
+    if path.suffix.lower() == ".json":
+        document = _read_json(path)
+        if document.data.get("kind") == "picked parts":
+            return document, PartsFile(schema_version=1, rules=(PickedFile(kind="picked", path=path.resolve()),))
+    else:
+        document = yamlfile.read(path)
+    return document, document.validate(PartsFile)
+
+
+def read_picked(path: Path) -> Picked:
+    """Raises InputError if it is no such file, or its numbers do not fit together."""
+    found = _read_json(path).validate(PickedParts)
+    vertices = _numbers(path, "vertices_mm", found.vertices_mm, "<f4").reshape(-1, 3)
+    triangles = _numbers(path, "triangles", found.triangles, "<u4").reshape(-1, 3)
+    parts = _numbers(path, "parts", found.parts, "u1", columns=1)
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path}: vertices_mm: expected finite coordinates; save the file from the page again")
+    if len(triangles) == 0 or triangles.max() >= len(vertices) or len(parts) != len(triangles):
+        raise InputError(
+            f"{path}: {len(vertices)} vertices, {len(triangles)} triangles and {len(parts)} marks do not fit "
+            "together; save the file from the page again"
+        )
+    if parts.max() > len(found.names):
+        raise InputError(f"{path}: parts: found part {parts.max()}, but {len(found.names)} names")
+    return Picked(found.names, vertices, triangles, parts)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _read_json(path: Path) -> Document:
+    """JSON as a document: problems have the file's first line, and the key."""
+    try:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file")
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path}: expected at most {_MOST_BYTES} bytes")
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}:{error.lineno}:{error.colno}: not valid JSON: {error.msg}") from error
+    except (OSError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read as JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path}:1:1: expected an object of keys and values")
+    return Document(path, data, {(): (1, 1)}, {})
+
+
+def _numbers(path: Path, key: str, text: str, kind: str, columns: int = 3) -> NDArray[Any]:
+    try:
+        raw = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise InputError(f"{path}: {key}: expected base64; {error}") from error
+    size = np.dtype(kind).itemsize * columns
+    if len(raw) % size:
+        raise InputError(f"{path}: {key}: expected a multiple of {size} bytes, found {len(raw)}")
+    return np.frombuffer(raw, kind)

@@ -1,0 +1,257 @@
+"""The restoration file: hypotheses with their sources and materials, and how they are shown
+(docs/reference/restorations.md).
+
+Lengths are mm, angles degrees; z is up in the scene, and the object's front looks to -y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.appearance.render.lights import Light
+from coupole.appearance.render.materials import Material
+from coupole.appearance.render.model import Model, Pose
+from coupole.appearance.render.objects import Object
+from coupole.appearance.render.scene_file import (
+    Bands,
+    Camera,
+    Display,
+    FieldOfView,
+    Name,
+    Outputs,
+    Pixels,
+    Scene,
+    files,
+)
+from coupole.errors import InputError, Problem
+from coupole.heritage.restoration.painted_mesh import Floats
+from coupole.heritage.restoration.parts_file import PartName
+from coupole.plan import yamlfile
+from coupole.plan.yamlfile import Document
+
+_MARGIN = 1.08
+_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+
+SourceText = Annotated[str, Field(min_length=1, max_length=2000)]
+
+
+class Source(Model):
+    """Who or what says so."""
+
+    says: SourceText
+    """What it says, in one's own words."""
+    reference: SourceText
+    """Publication, archive, analysis or person, as one would cite it."""
+
+    def __str__(self) -> str:
+        return f"{self.reference}: {self.says}"
+
+
+class Hypothesis(Model):
+    """One state that the object may have had."""
+
+    name: Name
+    title: SourceText
+    sources: Annotated[tuple[Source, ...], Field(min_length=1)]
+    materials: Annotated[dict[PartName, Material], Field(min_length=1)]
+    """Of every part."""
+
+
+class Turntable(Model):
+    """Cameras about the object, as far as it takes to see all of it; the first sees its front."""
+
+    kind: Literal["turntable"]
+    views: Annotated[int, Field(ge=1, le=360)] = 8
+    height_deg: Annotated[float, Field(gt=-90, lt=90)] = 8.0
+    field_deg: Annotated[float, Field(ge=2, le=90)] = 24.0
+    width_px: Pixels = 800
+    height_px: Pixels = 1000
+
+
+class Cameras(Model):
+    kind: Literal["cameras"]
+    cameras: Annotated[tuple[Camera, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _differ(self) -> Cameras:
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names):
+            raise ValueError("two cameras have the same name; their pictures would overwrite each other")
+        return self
+
+
+class Auto(Model):
+    """From the front, and turned by 35 degrees."""
+
+    kind: Literal["auto"]
+    width_px: Pixels = 800
+    height_px: Pixels = 1000
+
+
+Views = Literal["auto"] | Annotated[Turntable | Cameras | Auto, Field(discriminator="kind")]
+
+
+class RestorationFile(Model):
+    schema_version: Literal[1]
+    name: Name
+    object: Pose = Pose()
+    """Pose of the mesh in the scene."""
+    smooth: bool = True
+    """Shaded smoothly, also across the borders of parts."""
+    hypotheses: Annotated[tuple[Hypothesis, ...], Field(min_length=1)]
+    views: Views = "auto"
+    """`auto` alone is its kind with nothing else."""
+    lights: Annotated[tuple[Light, ...], Field(min_length=1)]
+    surroundings: tuple[Object, ...] = ()
+    """Other things of the scene: a floor, a niche."""
+    observer: Literal["10 deg", "2 deg"] = "10 deg"
+    bands: Bands = Bands(step_nm=20)
+    samples: Annotated[int, Field(ge=1, le=1_000_000)] = 64
+    noise: Annotated[float, Field(gt=0, lt=1)] | None = None
+    depth: Annotated[int, Field(ge=1, le=100)] = 6
+    seed: Annotated[int, Field(ge=0, le=2**31)] = 1
+    display: Display = Display()
+    """The same for all pictures: without `white_cd_m2` one level for all hypotheses and views."""
+    outputs: Outputs = Outputs()
+
+    @model_validator(mode="after")
+    def _names(self) -> RestorationFile:
+        names = [hypothesis.name for hypothesis in self.hypotheses]
+        if len(set(names)) < len(names):
+            raise ValueError("two hypotheses have the same name; their pictures would overwrite each other")
+        if not self.outputs.xyz:
+            raise ValueError("`outputs: {xyz: false}`: pictures are shown and compared by X, Y, Z; leave it out")
+        return self
+
+
+class Stage(Scene):
+    """A scene whose restored object is given as pieces, so that it need not have another."""
+
+    objects: tuple[Object, ...] = ()
+
+
+def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
+    """Checked; the files that it names are there. Raises InputError with file:line:column."""
+    document = yamlfile.read(path)
+    found = document.validate(RestorationFile)
+    missing = [
+        document.problem(at, f"no such file: {document.resolve(named)}")
+        for at, named in _files(found)
+        if not document.resolve(named).is_file()
+    ]
+    if missing:
+        raise InputError(missing)
+    return document, found
+
+
+def reduced(
+    found: RestorationFile, samples: int | None, width_px: int | None, step_nm: int | None
+) -> RestorationFile:
+    """With fewer samples, narrower pictures or coarser bands, for a quick look. Raises InputError for a step."""
+    if step_nm not in {None, 5, 10, 20, 40}:
+        raise InputError(f"--step: expected 5, 10, 20 or 40, found {step_nm}; choose one of them")
+    changed: dict[str, Any] = {}
+    if samples:
+        changed["samples"] = samples
+    if step_nm:
+        changed["bands"] = Bands.model_validate({"step_nm": step_nm})
+    if width_px:
+        changed["views"] = _narrowed(_in_full(found.views), width_px)
+    return found.model_copy(update=changed)
+
+
+def named_files(found: RestorationFile, document: Document) -> tuple[Path, ...]:
+    """All that it names, each once."""
+    return tuple(dict.fromkeys(document.resolve(named) for _, named in _files(found)))
+
+
+def chosen(document: Document, found: RestorationFile, names: Sequence[str]) -> tuple[Hypothesis, ...]:
+    """Those of the names, in the file's order; all without names. Raises InputError for an unknown one."""
+    known = [hypothesis.name for hypothesis in found.hypotheses]
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known)} of {document.path}")
+    return tuple(one for one in found.hypotheses if not names or one.name in names)
+
+
+def expect_parts(document: Document, found: RestorationFile, names: Sequence[str], parts: Path) -> None:
+    """Raise InputError unless every hypothesis has a material for each part, and for no other."""
+    problems: list[Problem] = []
+    for number, hypothesis in enumerate(found.hypotheses):
+        at = ("hypotheses", number, "materials")
+        for name in hypothesis.materials:
+            if name not in names:
+                message = f"{parts} has no part {name!r}; it has {', '.join(names)}"
+                problems.append(document.problem((*at, name), message))
+        for name in names:
+            if name not in hypothesis.materials:
+                message = (
+                    f"hypothesis {hypothesis.name} has no material for the part {name!r} of {parts}; give one"
+                )
+                problems.append(document.problem(at, message))
+    if problems:
+        raise InputError(problems)
+
+
+def cameras_of(found: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple[Camera, ...]:
+    """The cameras for an object with this box in the scene's frame."""
+    match _in_full(found.views):
+        case Cameras() as given:
+            return given.cameras
+        case Turntable() as table:
+            names = [f"view{number:03d}" for number in range(table.views)]
+            turns = np.arange(table.views) * 360.0 / table.views
+        case Auto() as auto:
+            names, turns = ["front", "turned"], np.array([0.0, 35.0])
+            table = Turntable(kind="turntable", width_px=auto.width_px, height_px=auto.height_px)
+    corners = low_mm + _CORNERS * (high_mm - low_mm)
+    return tuple(_about(name, float(turn), table, corners) for name, turn in zip(names, turns, strict=True))
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _in_full(views: Views) -> Turntable | Cameras | Auto:
+    return Auto(kind="auto") if views == "auto" else views
+
+
+def _narrowed(views: Turntable | Cameras | Auto, width_px: int) -> Turntable | Cameras | Auto:
+    if isinstance(views, Cameras):
+        return views.model_copy(update={"cameras": tuple(one.narrowed(width_px) for one in views.cameras)})
+    if width_px >= views.width_px:
+        return views
+    height_px = max(4, round(views.height_px * width_px / views.width_px))
+    return views.model_copy(update={"width_px": width_px, "height_px": height_px})
+
+
+def _about(name: str, turn_deg: float, table: Turntable, corners: Floats) -> Camera:
+    """A camera that sees all corners [8, 3], turned from -y towards +x."""
+    turn, height = np.radians([turn_deg, table.height_deg])
+    back = np.array([np.sin(turn) * np.cos(height), -np.cos(turn) * np.cos(height), np.sin(height)])
+    right = np.array([np.cos(turn), np.sin(turn), 0.0])
+    up = np.cross(back, right)
+    middle = corners.mean(axis=0)
+    wide = np.tan(np.radians(table.field_deg / 2))
+    ways = corners - middle
+    reach = np.maximum(np.abs(ways @ right) / wide, np.abs(ways @ up) / (wide * table.height_px / table.width_px))
+    distance_mm = float((_MARGIN * reach + ways @ back).max())
+    x, y, z = (float(value) for value in middle + distance_mm * back)
+    return Camera(
+        name=name,
+        position_mm=(x, y, z),
+        target_mm=(float(middle[0]), float(middle[1]), float(middle[2])),
+        optics=FieldOfView(kind="field", degrees=table.field_deg),
+        width_px=table.width_px,
+        height_px=table.height_px,
+    )
+
+
+def _files(found: RestorationFile) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+    yield from files(found)
+    for number, hypothesis in enumerate(found.hypotheses):
+        for part, material in hypothesis.materials.items():
+            yield from files(material, ("hypotheses", number, "materials", part))

@@ -1,0 +1,257 @@
+"""From a mesh, its parts and hypotheses to spectral pictures; those that are there already are not made again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.render import pictures, variant
+from coupole.appearance.render.colour import Eye
+from coupole.appearance.render.objects import Ball, Piece, pieces, placed
+from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.scene_file import Camera, PlainScene, with_plain_lights
+from coupole.appearance.shapes.triangles import flat_normals, welded
+from coupole.errors import InputError, StorageError, reason
+from coupole.heritage.restoration import labelled_pictures
+from coupole.heritage.restoration.painted_mesh import Floats, PaintedMesh
+from coupole.heritage.restoration.part_labels import Parts
+from coupole.heritage.restoration.restoration_file import (
+    Hypothesis,
+    RestorationFile,
+    Stage,
+    cameras_of,
+    named_files,
+)
+from coupole.heritage.restoration.seen_parts import SeenParts
+from coupole.plan.yamlfile import Document
+
+Say = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Restoration:
+    """All that pictures follow from."""
+
+    mesh: PaintedMesh
+    parts: Parts
+    document: Document
+    given: RestorationFile
+    hypotheses: tuple[Hypothesis, ...]
+
+    @property
+    def folder(self) -> Path:
+        """To which paths of the restoration file are relative."""
+        return self.document.path.parent
+
+    @cached_property
+    def corners_mm(self) -> Floats:
+        """[triangles, 3, 3] in the scene's frame."""
+        pose = self.given.object.scene_from_thing()
+        return np.asarray(self.mesh.corners_mm @ pose[:3, :3].T + pose[:3, 3])
+
+    @cached_property
+    def cameras(self) -> tuple[Camera, ...]:
+        points = self.corners_mm.reshape(-1, 3)
+        return cameras_of(self.given, points.min(axis=0), points.max(axis=0))
+
+    @cached_property
+    def stage(self) -> Stage:
+        """The scene without the object."""
+        found = self.given
+        return Stage(
+            schema_version=1,
+            name=found.name,
+            cameras=self.cameras,
+            objects=found.surroundings,
+            lights=found.lights,
+            observer=found.observer,
+            bands=found.bands,
+            samples=found.samples,
+            noise=found.noise,
+            depth=found.depth,
+            seed=found.seed,
+            display=found.display,
+            outputs=found.outputs,
+        )
+
+    @cached_property
+    def lit(self) -> PlainScene:
+        """Raises InputError where sun and sky cannot be computed."""
+        return with_plain_lights(self.stage, self.folder)
+
+    @cached_property
+    def eye(self) -> Eye:
+        return pictures.eye_of(self.lit, self.folder)
+
+    @cached_property
+    def seen_parts(self) -> SeenParts:
+        others = [piece for thing in self.given.surroundings for piece in pieces(thing, self.folder)]
+        around: list[Piece | Ball] = list(others)
+        return SeenParts(self.corners_mm, self.parts.labels, around)
+
+    @cached_property
+    def _normals(self) -> Floats | None:
+        return smooth_normals(self.mesh.corners_mm) if self.given.smooth else None
+
+    def painted(self, hypothesis: Hypothesis) -> list[Piece]:
+        """The object's parts in the scene's frame."""
+        corners, found = self.mesh.corners_mm, []
+        for row, name in enumerate(self.parts.names):
+            own = self.parts.labels == row
+            normals = None if self._normals is None else self._normals[own]
+            piece = Piece(corners[own], hypothesis.materials[name], self.given.smooth, normals)
+            found.append(placed(piece, self.given.object))
+        return found
+
+    @cached_property
+    def _digest(self) -> str:
+        """Of what all pictures share: shape, parts, the scene but for display and cameras, files, renderer."""
+        told = hashlib.sha256(
+            f"{self.mesh.digest()} {self.parts.names} {variant.spectral(polarised=False)}".encode()
+        )
+        told.update(self.parts.labels.tobytes())
+        told.update(self.given.object.model_dump_json().encode() + str(self.given.smooth).encode())
+        told.update(self.stage.model_dump_json(exclude={"display", "cameras"}).encode())
+        for path in named_files(self.given, self.document):
+            told.update(path.read_bytes())
+        return told.hexdigest()
+
+    def digest(self, hypothesis: Hypothesis, camera: Camera) -> str:
+        """Of what one picture follows from."""
+        materials = {name: one.model_dump(mode="json") for name, one in hypothesis.materials.items()}
+        told = f"{self._digest} {camera.model_dump_json()} {json.dumps(materials, sort_keys=True)}"
+        return hashlib.sha256(told.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Made:
+    """A picture on disk."""
+
+    hypothesis: Hypothesis
+    camera: Camera
+    exr: Path
+    about: dict[str, Any]
+    """Digest, renderer, samples, noise, mean luminance."""
+    is_new: bool
+
+    def xyz(self) -> NDArray[np.float32]:
+        """[h, w, 3] in cd/m^2. Raises StorageError."""
+        import OpenEXR
+
+        try:
+            with OpenEXR.File(str(self.exr), separate_channels=True) as file:
+                planes = [np.asarray(file.channels()[name].pixels, np.float32) for name in "XYZ"]
+        except (OSError, RuntimeError, KeyError) as error:
+            raise StorageError(f"{self.exr}: cannot be read: {error}; remove it, and it is made again") from error
+        return np.stack(planes, axis=-1)
+
+
+def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
+    """Spectral pictures of each hypothesis from each camera in `out`/HYPOTHESIS/CAMERA.exr.
+
+    Raises InputError for what cannot be rendered, StorageError if nothing can be written.
+    """
+    made: list[Made] = []
+    try:
+        for hypothesis in restoration.hypotheses:
+            made += _of_one(restoration, hypothesis, out / hypothesis.name, say)
+    except OSError as error:
+        raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
+    return made
+
+
+def smooth_normals(corners_mm: Floats) -> Floats:
+    """[triangles, 3, 3] unit normals at the corners: means over all triangles at a place, by their areas."""
+    points, faces = welded(corners_mm)
+    cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    sums = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(points)) for column in cross.T], axis=1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    units = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)[faces]
+    lost = np.linalg.norm(units, axis=2) == 0
+    units[lost] = np.repeat(flat_normals(corners_mm)[:, None], 3, axis=1)[lost]
+    return np.asarray(units)
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say: Say) -> list[Made]:
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
+    known = {camera.name: _known(restoration, hypothesis, camera, folder) for camera in restoration.cameras}
+    wanted = [camera for camera in restoration.cameras if known[camera.name] is None]
+    step = f"rendering {hypothesis.name}"
+    if wanted:
+        say(step, 0, len(wanted))
+        with opened(restoration.stage, restoration.folder, restoration.painted(hypothesis)) as renderer:
+            written_by = f"Mitsuba {renderer.version}, {renderer.variant_name}"
+            for number, camera in enumerate(wanted):
+
+                def passes(done: int, total: int, number: int = number) -> None:
+                    say(step, number * total + done, len(wanted) * total)
+
+                found = renderer.render(camera, passes)
+                known[camera.name] = _write(restoration, (hypothesis, camera), found, folder, written_by)
+    made = []
+    for camera in restoration.cameras:
+        path = folder / f"{camera.name}.exr"
+        labelled_pictures.restamped(path, texts)
+        made.append(Made(hypothesis, camera, path, known[camera.name] or {}, camera in wanted))
+    return made
+
+
+def _known(
+    restoration: Restoration, hypothesis: Hypothesis, camera: Camera, folder: Path
+) -> dict[str, Any] | None:
+    """What is told of the same picture, if it is there."""
+    path = folder / f"{camera.name}.json"
+    if not path.is_file() or not path.with_suffix(".exr").is_file():
+        return None
+    try:
+        about: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return None
+    return about if about.get("of") == restoration.digest(hypothesis, camera) else None
+
+
+def _write(
+    restoration: Restoration, of: tuple[Hypothesis, Camera], found: Spectral, folder: Path, written_by: str
+) -> dict[str, Any]:
+    hypothesis, camera = of
+    beside = folder / f"{camera.name}.json"
+    beside.unlink(missing_ok=True)
+    xyz = restoration.eye.tristimulus(found.radiance)
+    about = f"{restoration.given.name}, hypothesis {hypothesis.name}: {pictures.SYNTHETIC}; {written_by}"
+    texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
+    pictures.write_exr(folder / f"{camera.name}.exr", restoration.lit, found, xyz, about, texts)
+    told = {
+        "of": restoration.digest(hypothesis, camera),
+        "renderer": written_by,
+        "samples": found.samples,
+        "noise": None if found.noise is None else round(found.noise, 5),
+        "mean_cd_m2": round(float(restoration.eye.luminance(found.radiance).mean()), 6),
+    }
+    beside.write_text(json.dumps(told) + "\n", encoding="utf-8")
+    return told
+
+
+def common_white(restoration: Restoration, made: Sequence[Made]) -> float:
+    """The luminance in cd/m^2 that all pictures show as white. Raises InputError if they are black."""
+    display = restoration.given.display
+    if display.white_cd_m2 is not None:
+        return display.white_cd_m2
+    some = [one.xyz()[::2, ::2, 1].ravel() for one in made]
+    white = float(np.quantile(np.concatenate(some), 1.0 - display.clipped))
+    if white <= 0.0:
+        raise InputError(
+            f"{restoration.document.path}: expected some light in the pictures, found none; see to its lights"
+        )
+    return white

@@ -1,0 +1,166 @@
+"""Pictures of hypotheses for the eye: one white for all, words below each, side by side, and their differences."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import coupole
+from coupole.appearance.render import colour, pictures
+from coupole.appearance.render.denoising import DENOISED, denoised
+from coupole.errors import StorageError, reason
+from coupole.heritage.restoration import hypotheses_compared, labelled_pictures
+from coupole.heritage.restoration.labelled_pictures import Picture, caption_lines, for_png, told, with_strip
+from coupole.heritage.restoration.restoring import Made, Restoration, Say, common_white
+
+RESULT = "result.json"
+_GAP_PX = 6
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is written of one view."""
+
+    camera: str
+    pictures: dict[str, Path]
+    """By the names of hypotheses."""
+    side_by_side: Path | None
+    differences: dict[tuple[str, str], Path]
+    of_parts: dict[tuple[str, str], dict[str, dict[str, Any]]]
+    """As `hypotheses_compared.Difference.of_parts`."""
+
+
+def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say) -> dict[str, Any]:
+    """Write PNG pictures, side by side, differences and `result.json`; what that holds.
+
+    Raises InputError if all is black or the denoiser is missing, StorageError.
+    """
+    white_cd_m2 = common_white(restoration, made)
+    shown = []
+    try:
+        for number, camera in enumerate(restoration.cameras):
+            say("showing", number, len(restoration.cameras))
+            own = [one for one in made if one.camera.name == camera.name]
+            shown.append(_of_view(restoration, own, white_cd_m2, out))
+        say("showing", len(shown), len(shown))
+        result = _result(restoration, made, shown, white_cd_m2, out)
+        (out / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
+    return result
+
+
+# -- helpers --------------------------------------------------------------------------------------------------
+
+
+def _of_view(restoration: Restoration, made: Sequence[Made], white_cd_m2: float, out: Path) -> Shown:
+    camera = made[0].camera
+    colours = [one.xyz() for one in made]
+    if restoration.given.display.denoised:
+        seen = [_displayed(restoration, denoised(xyz.astype(float)), white_cd_m2) for xyz in colours]
+    else:
+        seen = [_displayed(restoration, xyz, white_cd_m2) for xyz in colours]
+    room = max(len(caption_lines(camera.width_px, one.hypothesis)) for one in made)
+    strips = [labelled_pictures.captioned(one, of.hypothesis, room) for one, of in zip(seen, made, strict=True)]
+    files = {}
+    for picture, one in zip(strips, made, strict=True):
+        files[one.hypothesis.name] = one.exr.with_suffix(".png")
+        about = _about(restoration, one, white_cd_m2)
+        pictures.write_png(one.exr.with_suffix(".png"), picture, about, for_png(told([one.hypothesis])))
+    beside = _side_by_side(strips, made, out) if len(made) > 1 else None
+    parts = restoration.seen_parts.seen(camera)
+    differences, of_parts = {}, {}
+    for (first, one), (second, other) in combinations(enumerate(made), 2):
+        pair = one.hypothesis.name, other.hypothesis.name
+        found = hypotheses_compared.compared(
+            colours[first], colours[second], parts, restoration.parts.names, restoration.eye, white_cd_m2
+        )
+        differences[pair] = out / f"difference-{pair[0]}-{pair[1]}-{camera.name}.png"
+        of_parts[pair] = found.of_parts
+        _write_difference(found.de00, (one, other), differences[pair])
+    return Shown(camera.name, files, beside, differences, of_parts)
+
+
+def _displayed(restoration: Restoration, xyz: NDArray[Any], white_cd_m2: float) -> Picture:
+    adaptation = restoration.given.display.adaptation
+    return colour.displayed(colour.adapted(xyz / white_cd_m2, restoration.eye.white, adaptation))[0]
+
+
+def _about(restoration: Restoration, made: Made, white_cd_m2: float) -> str:
+    denoising = f"; {DENOISED}" if restoration.given.display.denoised else ""
+    return (
+        f"{restoration.given.name}, hypothesis {made.hypothesis.name}: {pictures.SYNTHETIC}; "
+        f"{made.about['renderer']}; white {white_cd_m2:.4g} cd/m2{denoising}"
+    )
+
+
+def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) -> Path:
+    height, width = strips[0].shape[:2]
+    sheet = np.zeros((height, len(strips) * (width + _GAP_PX) - _GAP_PX, 3), np.uint8)
+    for number, strip in enumerate(strips):
+        first = number * (width + _GAP_PX)
+        sheet[:, first : first + width] = strip
+    path = out / f"side-by-side-{made[0].camera.name}.png"
+    hypotheses = [one.hypothesis for one in made]
+    pictures.write_png(path, sheet, f"{len(made)} hypotheses: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
+    return path
+
+
+def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: Path) -> None:
+    names = " and ".join(one.hypothesis.name for one in pair)
+    words = f"Hypotheses {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
+    width = de00.shape[1]
+    lines = labelled_pictures.broken(words, width)
+    picture = with_strip(hypotheses_compared.drawn(de00), lines, len(lines))
+    pictures.write_png(path, picture, words, for_png(told([one.hypothesis for one in pair])))
+
+
+def _result(
+    restoration: Restoration, made: Sequence[Made], shown: Sequence[Shown], white_cd_m2: float, out: Path
+) -> dict[str, Any]:
+    def name(path: Path | None) -> str | None:
+        return None if path is None else path.relative_to(out).as_posix()
+
+    by_view = {(one.hypothesis.name, one.camera.name): one for one in made}
+    views = []
+    for view in shown:
+        own = {}
+        for hypothesis, path in view.pictures.items():
+            one = by_view[hypothesis, view.camera]
+            figures = {key: one.about[key] for key in ("renderer", "samples", "noise", "mean_cd_m2")}
+            own[hypothesis] = {"png": name(path), "exr": name(one.exr), **figures}
+        differences = [
+            {"hypotheses": list(pair), "png": name(path), "parts": view.of_parts[pair]}
+            for pair, path in view.differences.items()
+        ]
+        views.append(
+            {
+                "view": view.camera,
+                "pictures": own,
+                "side_by_side": name(view.side_by_side),
+                "differences": differences,
+            }
+        )
+    return {
+        "schema_version": 1,
+        "software": f"coupole {coupole.__version__}",
+        "restoration": restoration.given.name,
+        "synthetic": True,
+        "mesh": {"name": restoration.mesh.path.name, "sha256_of_shape": restoration.mesh.digest()},
+        "parts": restoration.parts.counts(),
+        "remarks": list(restoration.parts.remarks),
+        "hypotheses": [one.model_dump(mode="json") for one in restoration.hypotheses],
+        "observer": f"CIE {restoration.given.observer}",
+        "bands": len(range(380, 781, restoration.given.bands.step_nm)),
+        "white_cd_m2": round(white_cd_m2, 6),
+        "made_anew": sum(one.is_new for one in made),
+        "taken_as_they_were": sum(not one.is_new for one in made),
+        "views": views,
+    }

@@ -1,9 +1,11 @@
 """Rendering of 81 bands with a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of 360 to 830 nm for every path. If a spectrum is
-constant over each quarter, four of our bands are rendered at once, without noise from the choice of wavelengths;
-with the same seed every group of four has the same random numbers. So there is luminance noise, but hardly any
-colour noise. (A film of 81 channels and full spectra took 5.6 times as long here for three times the noise.)
+Mitsuba's spectral variants draw one wavelength from each quarter of what the film is sensitive to, for every path. A
+film that sees four neighbouring bands has one of them in each quarter. Spectra that are constant over each band are
+then rendered without noise from the choice of wavelengths, and those that Mitsuba knows itself (a map of the
+surroundings) have their mean over the band. With the same seed every group of four has the same random numbers. So
+there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took 5.6 times as long
+here for three times the noise.)
 
 Lights are known every 5 nm. With coarser steps a rendered band has a light's mean about it, and `weights`
 integrate over the light's own structure; only the reflectances are interpolated (as ASTM E308's tables do).
@@ -15,6 +17,7 @@ a group of bands.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -25,10 +28,15 @@ Description = dict[str, Any]
 """Argument of `mitsuba.load_dict`, with arrays [81] for spectra."""
 StepNm = Literal[5, 10, 20, 40]
 QUARTERS = 4
-_EDGES_NM = np.linspace(360.0, 830.0, QUARTERS + 1)
 _RAMP_NM = 0.01
-"""Width of the transition between two quarters: 1e-4 of the paths have a wavelength there."""
-QUARTER_NM = float(_EDGES_NM[1] - _EDGES_NM[0])
+"""Width of the transition between two bands: one path in 500 has a wavelength there, with bands of 5 nm."""
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Of the film, to one band of a group."""
+
+    quarter: int
 
 
 def chosen(step_nm: StepNm) -> list[int]:
@@ -70,36 +78,38 @@ def groups(step_nm: StepNm) -> list[list[int]]:
     return [part + [part[-1]] * (QUARTERS - len(part)) for part in parts]
 
 
-def for_group(description: Any, group: Sequence[int]) -> Any:
+def for_group(description: Any, group: Sequence[int], step_nm: StepNm) -> Any:
     """The description with Mitsuba's spectra for the four bands of `group`."""
     if isinstance(description, np.ndarray):
-        return steps(description[list(group)])
+        return _steps(description[list(group)], group, step_nm)
+    if isinstance(description, Sensitivity):
+        return _steps(np.eye(QUARTERS)[description.quarter], group, step_nm)
     if isinstance(description, dict):
-        return {key: for_group(value, group) for key, value in description.items()}
+        return {key: for_group(value, group, step_nm) for key, value in description.items()}
     return description
 
 
 def film(width_px: int, height_px: int) -> Description:
-    """A film with a channel for each quarter; box filters, so that results do not depend on threads."""
-    responses = {f"quarter{k}": steps(np.eye(QUARTERS)[k]) for k in range(QUARTERS)}
+    """A film with a channel for each band of a group; box filters, so that results do not depend on threads."""
     return {
         "type": "specfilm",
         "width": width_px,
         "height": height_px,
         "component_format": "float32",
         "rfilter": {"type": "box"},
-        **responses,
+        **{f"quarter{k}": Sensitivity(k) for k in range(QUARTERS)},
     }
 
 
-def steps(values: Array) -> Description:
-    """A spectrum that is `values` [4] over the quarters."""
+def _steps(values: Array, group: Sequence[int], step_nm: StepNm) -> Description:
+    """A spectrum that is `values` [4] over the bands, and over those after them where a group has fewer."""
     if not np.any(values):
         return {"type": "uniform", "value": 0.0}  # the other kind does not accept zero
-    nodes = [_EDGES_NM[0]]
-    for edge in _EDGES_NM[1:-1]:
+    edges_nm = WAVELENGTHS_NM[group[0]] + step_nm * (np.arange(QUARTERS + 1) - 0.5)
+    nodes = [edges_nm[0]]
+    for edge in edges_nm[1:-1]:
         nodes += [edge - _RAMP_NM / 2, edge + _RAMP_NM / 2]
-    nodes.append(_EDGES_NM[-1])
+    nodes.append(edges_nm[-1])
     return {
         "type": "irregular",
         "wavelengths": ", ".join(f"{nm:.3f}" for nm in nodes),

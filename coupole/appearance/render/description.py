@@ -36,8 +36,10 @@ def contents(
             else:
                 shape = _mesh(piece, meshes / f"{name}.ply")
             parts[name] = {**shape, "bsdf": bsdf(piece.material, folder)}
+    step_nm = scene.bands.step_nm
+    in_units = lights.radiance_unit(scene.lights, folder, step_nm)
     for number, light in enumerate(scene.lights):
-        for row, emitter in enumerate(lights.emitters(light, folder, scene.bands.step_nm, mi)):
+        for row, emitter in enumerate(lights.emitters(light, folder, step_nm, in_units, mi)):
             parts[f"light{number}_{row}"] = emitter
     return parts
 

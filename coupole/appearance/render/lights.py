@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import AwareDatetime, Field, model_validator
 
 from coupole.appearance.render.bands import Description, StepNm, around_nodes
+from coupole.appearance.render.environment_map import EnvironmentMap, emitter, factor
 from coupole.appearance.render.led_squares import read_leds
 from coupole.appearance.render.model import Model, Positive, Share, Vector, unit
 from coupole.appearance.render.spectra import DomeLed, LowSun, Power, Values, luminous, power
 from coupole.appearance.spectra import sun
-from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.grid import BANDS, Array
 from coupole.appearance.spectra.light_series import read_series
 from coupole.errors import InputError
 
@@ -76,7 +77,7 @@ class Environment(Model):
     spectrum: Power
 
 
-PlainLight = Leds | Distant | Area | Environment
+PlainLight = Leds | Distant | Area | Environment | EnvironmentMap
 
 
 class Daylight(Model):
@@ -130,16 +131,31 @@ Light = Annotated[PlainLight | Daylight, Field(discriminator="kind")]
 
 
 def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
-    """The lights, with daylight as sun and sky. Raises InputError."""
-    return tuple(
+    """The lights, with daylight as sun and sky. Raises InputError, also for two surroundings."""
+    found = tuple(
         part for light in lights for part in (light.lights(folder) if isinstance(light, Daylight) else (light,))
     )
+    around = [light.kind for light in found if isinstance(light, Environment | EnvironmentMap)]
+    if len(around) > 1:
+        raise InputError(
+            f"lights: expected one light from all directions, found {len(around)} ({', '.join(around)}); "
+            "leave one, or write `sky: false` in `daylight`"
+        )
+    return found
 
 
-def emitters(light: PlainLight, folder: Path, step_nm: StepNm, mi: Any) -> list[Description]:
-    """The light for Mitsuba, W/(m^2 sr nm); paths are relative to `folder`. Raises InputError."""
+def radiance_unit(lights: Iterable[PlainLight], folder: Path, step_nm: StepNm) -> Array:
+    """[81], the radiance that is 1 in the renderer: there a map's white is always D65. Raises InputError."""
+    maps = [light for light in lights if isinstance(light, EnvironmentMap)]
+    return factor(maps[0], folder, step_nm) if maps else np.ones(BANDS)
+
+
+def emitters(light: PlainLight, folder: Path, step_nm: StepNm, radiance_unit: Array, mi: Any) -> list[Description]:
+    """The light for Mitsuba, in `radiance_unit` [81] W/(m^2 sr nm); paths are relative to `folder`. Raises InputError."""
+    if isinstance(light, EnvironmentMap):
+        return [emitter(light, folder, mi)]
     found = power(light.spectrum, folder)
-    shape = around_nodes(found, step_nm) / luminous(found)
+    shape = around_nodes(found, step_nm) / luminous(found) / radiance_unit
     if isinstance(light, Environment):
         return [{"type": "constant", "radiance": shape * light.luminance_cd_m2}]
     if isinstance(light, Area):

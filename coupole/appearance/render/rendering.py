@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.render import bands, description, variant
+from coupole.appearance.render import bands, description, lights, variant
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.objects import Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
@@ -58,6 +58,8 @@ class Renderer:
     """Mitsuba's."""
     _mi: Any
     _parts: Description
+    _radiance_unit: NDArray[np.float64]
+    """[81] W/(m^2 sr nm), of what Mitsuba computes."""
 
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """The camera's picture; the same scene and seed give the same bits in the same variant."""
@@ -73,18 +75,18 @@ class Renderer:
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                loaded = variant.loaded(self._mi, bands.for_group(whole, group))
+                loaded = variant.loaded(self._mi, bands.for_group(whole, group, self.scene.bands.step_nm))
                 for part, count in enumerate(counts):
                     progress(done, total)
                     sums += count * self._picture(loaded, count, part, camera)
                     done += 1
-                groups.append(sums / samples)
+                groups.append((sums / samples * self._radiance_unit[group]).astype(np.float32))
             count = len(bands.chosen(self.scene.bands.step_nm))
             behind.append(np.concatenate(groups, axis=2)[..., :count])
         progress(total, total)
         stokes = _stokes(behind) if self.scene.polarisation else np.stack(behind)
         wavelengths_nm = bands.wavelengths(self.scene.bands.step_nm)
-        return Spectral(wavelengths_nm, stokes.astype(np.float32), samples, noise)
+        return Spectral(wavelengths_nm, stokes, samples, noise)
 
     def _enough(self, camera: Camera, wanted: float) -> tuple[int, float]:
         """Samples for a relative noise of `wanted` (or the scene's, if fewer), and the noise that they have.
@@ -93,7 +95,9 @@ class Renderer:
         """
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.seen(self.scene, camera, self._parts, self._mi)
-        loaded = variant.loaded(self._mi, bands.for_group(whole, groups[len(groups) // 2]))
+        loaded = variant.loaded(
+            self._mi, bands.for_group(whole, groups[len(groups) // 2], self.scene.bands.step_nm)
+        )
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
         sums = squares = np.zeros((camera.height_px, camera.width_px))
         for passes in range(1, max(2, self.scene.samples // count) + 1):
@@ -115,7 +119,7 @@ class Renderer:
                 f"{self.scene.name}, camera {camera.name}: expected finite radiances from Mitsuba {self.version} "
                 f"({self.variant_name}), found {np.count_nonzero(~np.isfinite(image))} others; report the scene"
             )
-        return image / np.float32(bands.QUARTER_NM)
+        return image / np.float32(self.scene.bands.step_nm)
 
 
 def _most(camera: Camera) -> int:
@@ -137,10 +141,12 @@ def opened(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[R
     mi = variant.mitsuba(name)
     lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi, more))
+        contents = description.contents(lit, folder, Path(meshes), mi, more)
+        unit = lights.radiance_unit(lit.lights, folder, lit.bands.step_nm)
+        yield Renderer(lit, name, mi.__version__, mi, contents, unit)
 
 
-def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _stokes(behind: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     """[4, ...] from pictures behind `FILTERS`: a polariser at angle a passes (S0 + S1 cos 2a + S2 sin 2a)/2."""
     across, upright, slanted, circular = behind
     s0 = across + upright

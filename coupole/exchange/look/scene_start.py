@@ -10,6 +10,7 @@ from typing import Any, assert_never
 
 import numpy as np
 
+from coupole.appearance.render.environment_map import EnvironmentMap
 from coupole.appearance.render.led_squares import read_leds
 from coupole.appearance.render.lights import Area, Distant, Environment, Leds, PlainLight
 from coupole.appearance.render.scene_file import Camera, PlainScene
@@ -103,6 +104,10 @@ def _lamps(light: PlainLight, folder: Path, target: Array) -> Iterator[_Lamp]:
                 intensity_cd = float(table.flux_lm[row]) / math.pi
                 way = table.positions_mm[row] - target
                 yield _square(way, table.normals[row], 49.0, intensity_cd * 1e6, light.spectrum)
+        case EnvironmentMap():
+            raise InputError(
+                f"{light.path}: a page has no light from a map; take `environment` of the same mean luminance"
+            )
         case _:
             assert_never(light)
 

@@ -1,0 +1,167 @@
+"""Light from a picture of all directions: an equirectangular HDR map, as photographed of a mirror ball or stitched.
+
+Pixels are linear, of the primaries of sRGB (ITU-R BT.709) and white D65. A pixel becomes the smooth spectrum that has
+its colour under D65 (Jakob and Hanika, "A Low-Dimensional Function Space for Efficient Spectral Upsampling", Computer
+Graphics Forum 38(2), 2019; Mitsuba's table), times the light's own white. Mitsuba draws directions by the map's
+luminance, the same for all bands.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.appearance.render.bands import StepNm, around_nodes
+from coupole.appearance.render.model import Model, Positive
+from coupole.appearance.render.spectra import Illuminant, Power, luminous, power
+from coupole.appearance.spectra import light
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+
+MOST_COLUMNS = 2048
+"""Of a map in the renderer; larger ones are reduced by means over pixels."""
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of linear sRGB (IEC 61966-2-1)."""
+_D65_AT_560_NM = 100.0 / 98.8900106203
+"""Mitsuba's D65, whose luminance is that of 1 W/(m^2 sr nm) at all wavelengths."""
+_MOST_NEGATIVE = 0.01
+_PARTS = 40
+"""Of a band, in which D65 is averaged over it as the renderer does."""
+
+
+class EnvironmentMap(Model):
+    """Luminance and colour by direction, from a file. Give one of `white_cd_m2` and `illuminance_lux`."""
+
+    kind: Literal["environment_map"]
+    path: Path
+    """Equirectangular, .hdr or .exr: twice as wide as high, up is the first row."""
+    centre_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Where the picture's middle is: degrees from +y by +x (from north by east, where +y is north)."""
+    white_cd_m2: Positive | None = None
+    """Luminance of a pixel 1, 1, 1: 1 if pixels are cd/m^2, 179 after Radiance."""
+    illuminance_lux: Positive | None = None
+    """On a level plane that sees nothing else."""
+    spectrum: Power = Illuminant(kind="illuminant", name="D65")
+    """Of a white pixel."""
+
+    @model_validator(mode="after")
+    def _one_amount(self) -> EnvironmentMap:
+        if (self.white_cd_m2 is None) == (self.illuminance_lux is None):
+            raise ValueError("give either `white_cd_m2` or `illuminance_lux`, and not both")
+        return self
+
+    def white_luminance_cd_m2(self, pixels: Array) -> float:
+        """Of a pixel 1, 1, 1. Raises InputError for an amount of light that a dark map cannot give."""
+        if self.white_cd_m2 is not None:
+            return self.white_cd_m2
+        assert self.illuminance_lux is not None
+        found = level_irradiance(pixels @ _LUMINANCE)
+        if found <= 0.0:
+            raise InputError(f"{self.path}: expected light from above, found none; give `white_cd_m2`")
+        return self.illuminance_lux / found
+
+
+def read_map(path: Path, mi: Any) -> Array:
+    """Linear pixels [h, w, 3], at most `MOST_COLUMNS` wide. Raises InputError."""
+    if path.suffix.lower() not in {".hdr", ".exr"}:
+        raise InputError(f"{path}: expected a map .hdr or .exr, found {path.suffix or 'no suffix'}; convert it")
+    if not path.is_file():
+        raise InputError(f"{path}: expected an equirectangular map, found no file")
+    try:
+        bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    except RuntimeError as error:
+        raise InputError(f"{path}: expected a picture .hdr or .exr; {' '.join(str(error).split())}") from error
+    pixels = np.array(bitmap, dtype=float)
+    height, width = pixels.shape[:2]
+    if width != 2 * height or height < 4:
+        raise InputError(
+            f"{path}: expected an equirectangular map, twice as wide as high, found {width} x {height} pixels; "
+            "stitch or unwrap it to all directions"
+        )
+    if not np.isfinite(pixels).all():
+        raise InputError(f"{path}: expected finite pixels, found {np.sum(~np.isfinite(pixels))} others; mend them")
+    negative = float((pixels < 0.0).any(axis=2).mean())
+    if negative > _MOST_NEGATIVE:
+        raise InputError(
+            f"{path}: expected colours within sRGB, found {100 * negative:.1f} % of the pixels negative; "
+            "convert the map to linear sRGB"
+        )
+    return _reduced(np.maximum(pixels, 0.0))
+
+
+def _reduced(pixels: Array) -> Array:
+    height, width = pixels.shape[:2]
+    if width <= MOST_COLUMNS:
+        return pixels
+    for axis, (found, wanted) in enumerate(((height, MOST_COLUMNS // 2), (width, MOST_COLUMNS))):
+        starts = np.linspace(0, found, wanted, endpoint=False).astype(int)
+        counts = np.diff([*starts, found]).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+        pixels = np.add.reduceat(pixels, starts, axis=axis) / counts
+    return pixels
+
+
+def level_irradiance(radiance: Array) -> float:
+    """On a plane that faces up, by radiance [h, w] of an equirectangular map."""
+    height, width = radiance.shape
+    above = np.minimum(np.linspace(0.0, np.pi, height + 1), 0.5 * np.pi)
+    return float(radiance.sum(axis=1) @ np.diff(np.sin(above) ** 2) * (np.pi / width))
+
+
+def factor(source: EnvironmentMap, folder: Path, step_nm: StepNm) -> Array:
+    """[81], what the map's light is in units of its rendered light, which has white D65. Raises InputError."""
+    white = around_nodes(power(source.spectrum, folder), step_nm)
+    if not np.all(white > 0.0):
+        raise InputError(
+            f"{source.path}: expected a light for the map with some power in all bands, found "
+            f"{np.count_nonzero(white <= 0.0)} bands without; choose another `spectrum`"
+        )
+    fine_nm = WAVELENGTHS_NM[:, None] + step_nm * ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5)
+    d65 = np.interp(fine_nm, WAVELENGTHS_NM, light.illuminant("D65")).mean(axis=1)
+    return np.asarray((white / luminous(white)) / (d65 / luminous(light.illuminant("D65"))))
+
+
+def emitter(source: EnvironmentMap, folder: Path, mi: Any) -> Any:
+    """The map for Mitsuba, under D65; loaded once for all groups of bands."""
+    pixels = read_map(folder / source.path, mi)
+    d65 = light.illuminant("D65") * (_D65_AT_560_NM / light.illuminant("D65")[WAVELENGTHS_NM == 560.0])
+    return mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(_refined(pixels).astype(np.float32)),
+            "scale": source.white_luminance_cd_m2(pixels) / float(luminous(d65)),
+            "to_world": _scene_from_map(source.centre_azimuth_deg, mi),
+        }
+    )
+
+
+def _refined(pixels: Array) -> Array:
+    """The map at nodes of Mitsuba's, whose rows go from zenith to nadir, where pixels are half a step from the poles.
+
+    Mitsuba interpolates brightness and colour apart: they are close together, and interpolated here, by their
+    products.
+    """
+    height, width = pixels.shape[:2]
+    finer = max(1, MOST_COLUMNS // 2 // width)
+    rows = np.linspace(0.0, height, 2 * max(1, finer // 2) * height + 1) - 0.5
+    columns = (np.arange(finer * width) + 0.5) / finer - 0.5
+    return _between(_between(pixels, np.clip(rows, 0.0, height - 1.0), 0), columns, 1)
+
+
+def _between(pixels: Array, places: Array, axis: int) -> Array:
+    """Interpolated linearly along an axis that is periodic."""
+    first = np.floor(places).astype(int)
+    part = np.reshape(places - first, (-1, 1, 1) if axis == 0 else (1, -1, 1))
+    count = pixels.shape[axis]
+    one, other = np.take(pixels, first % count, axis), np.take(pixels, (first + 1) % count, axis)
+    return np.asarray(one + part * (other - one))
+
+
+def _scene_from_map(centre_azimuth_deg: float, mi: Any) -> Any:
+    """Mitsuba's map has its middle at +z, up at +y, and what is right of the middle towards -x."""
+    east, north = np.sin(np.radians(centre_azimuth_deg)), np.cos(np.radians(centre_azimuth_deg))
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = [-north, east, 0.0], [0.0, 0.0, 1.0], [east, north, 0.0]
+    return mi.ScalarTransform4f(matrix)

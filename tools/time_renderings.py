@@ -1,0 +1,63 @@
+"""Times of renderings beside those of the papers: a table for docs/gallery.md.
+
+    uv run python tools/time_renderings.py [NAME[=NOISE] ...] [--size 1200] [--step 5] [--samples 512]
+
+Each scene of `configs/scenes` is rendered, first camera, square, until half of the pixels have the noise (or at most
+`--samples`). Seed 001 took 8 hours for a picture of the gilded portal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.scene_file import Bands, FieldOfView, Scene
+from coupole.commands.render_scene import read_scene
+
+SCENES = Path(__file__).parent.parent / "configs" / "scenes"
+NOISES = {"gilt-step-wedge-d65": 0.05, "sunset-gilding": 0.1, "nashiji-stereo": 0.1}
+_HEAD = ("scene", "pixels", "bands", "noise wanted", "noise reached", "paths a pixel", "wall s", "CPU s")
+
+
+def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) -> Scene:
+    """The scene for its first camera alone, as many pixels high as wide."""
+    camera = scene.cameras[0]
+    optics = FieldOfView(kind="field", degrees=camera.field_deg())
+    seen = camera.model_copy(update={"width_px": size_px, "height_px": size_px, "optics": optics})
+    bands = Bands.model_validate({"step_nm": step_nm})
+    return scene.model_copy(update={"cameras": (seen,), "bands": bands, "noise": noise, "samples": most})
+
+
+def timed(scene: Scene) -> tuple[Spectral, float, float]:
+    """The picture, and the seconds that it took: on the clock, and of all cores together."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    with opened(scene, SCENES) as renderer:
+        found = renderer.render(scene.cameras[0])
+    return found, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", metavar="NAME[=NOISE]", help=f"Default: {', '.join(NOISES)}.")
+    parser.add_argument("--size", type=int, default=1200, help="Pixels along each side.")
+    parser.add_argument("--step", type=int, nargs="+", default=[5], choices=[5, 10, 20, 40], help="nm.")
+    parser.add_argument("--samples", type=int, default=512, help="Paths through a pixel, at most.")
+    wanted = parser.parse_args()
+    print(f"{os.cpu_count()} cores; load before: {os.getloadavg()[0]:.1f}")
+    print(f"| {' | '.join(_HEAD)} |\n|{'---|' * len(_HEAD)}", flush=True)
+    for text in wanted.scenes or list(NOISES):
+        name, _, given = text.partition("=")
+        noise = float(given) if given else NOISES.get(name, 0.1)
+        for step_nm in wanted.step:
+            _, scene = read_scene(SCENES / f"{name}.yaml")
+            found, wall_s, cpu_s = timed(square(scene, wanted.size, step_nm, noise, wanted.samples))
+            row = (name, f"{wanted.size} x {wanted.size}", len(found.wavelengths_nm), f"{noise:g}")
+            ended = (f"{found.noise:.3f}", found.samples, f"{wall_s:.0f}", f"{cpu_s:.0f}")
+            print(f"| {' | '.join(str(cell) for cell in (*row, *ended))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

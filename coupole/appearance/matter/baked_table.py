@@ -67,7 +67,7 @@ class BakedTable:
 
 
 def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, side: int = SIDE) -> BakedTable:
-    """The table of an isotropic BRDF, of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
+    """Of an isotropic BRDF of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
     steps = np.linspace(0.0, 1.0, thetas)
     theta_i = np.asarray(0.5 * np.pi * (1.0 - (1.0 - steps) ** _CROWDING), np.float32)
     ndf = _back(source)

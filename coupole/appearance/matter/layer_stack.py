@@ -1,7 +1,7 @@
 """Layers over layers in one binder under one face, for light of any direction.
 
 A ground is known by what it does with light inside the binder: diffuse to diffuse, directed to diffuse, directed
-to its mirror image. A layer over a ground is a ground again, so that layers are laid from the bottom up: two fluxes
+to its mirror image. A layer over a ground is a ground again; so layers are laid from the bottom up: two fluxes
 (Kubelka and Munk), four fluxes (seed 000, section 3.4, with the directed light's path 1/cos longer), clear ones
 (Beer and Lambert), metal leaves (thin films). A face closes the stack.
 

@@ -15,10 +15,12 @@ a group of bands.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from coupole.appearance.matter.baked_table import BakedTable
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
 
 Description = dict[str, Any]
@@ -70,13 +72,26 @@ def groups(step_nm: StepNm) -> list[list[int]]:
     return [part + [part[-1]] * (QUARTERS - len(part)) for part in parts]
 
 
-def for_group(description: Any, group: Sequence[int]) -> Any:
-    """The description with Mitsuba's spectra for the four bands of `group`."""
+def for_group(description: Any, group: Sequence[int], files: Path) -> Any:
+    """The description with Mitsuba's spectra for the four bands of `group`; a `table` is written to the folder
+    `files`."""
     if isinstance(description, np.ndarray):
         return steps(description[list(group)])
     if isinstance(description, dict):
-        return {key: for_group(value, group) for key, value in description.items()}
+        parts = {key: for_group(value, group, files) for key, value in description.items() if key != "table"}
+        if (table := description.get("table")) is not None:
+            parts["filename"] = _written(table, group, files)
+        return parts
     return description
+
+
+def _written(table: BakedTable, group: Sequence[int], files: Path) -> str:
+    """A file of `measured` with the group's values over the quarters. The one before it is replaced, not changed:
+    it may still be open."""
+    path, new = files / f"{id(table)}.bsdf", files / "new.bsdf"
+    new.write_bytes(table.encode(_nodes_nm(), np.repeat(list(group), 2).tolist()))
+    new.replace(path)
+    return str(path)
 
 
 def film(width_px: int, height_px: int) -> Description:
@@ -96,12 +111,16 @@ def steps(values: Array) -> Description:
     """A spectrum that is `values` [4] over the quarters."""
     if not np.any(values):
         return {"type": "uniform", "value": 0.0}  # the other kind does not accept zero
+    return {
+        "type": "irregular",
+        "wavelengths": ", ".join(f"{nm:.3f}" for nm in _nodes_nm()),
+        "values": ", ".join(f"{value:.9g}" for value in np.repeat(np.asarray(values, dtype=float), 2)),
+    }
+
+
+def _nodes_nm() -> list[float]:
+    """Begin and end of each quarter."""
     nodes = [_EDGES_NM[0]]
     for edge in _EDGES_NM[1:-1]:
         nodes += [edge - _RAMP_NM / 2, edge + _RAMP_NM / 2]
-    nodes.append(_EDGES_NM[-1])
-    return {
-        "type": "irregular",
-        "wavelengths": ", ".join(f"{nm:.3f}" for nm in nodes),
-        "values": ", ".join(f"{value:.9g}" for value in np.repeat(np.asarray(values, dtype=float), 2)),
-    }
+    return [*nodes, _EDGES_NM[-1]]

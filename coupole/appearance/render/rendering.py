@@ -57,6 +57,8 @@ class Renderer:
     """Mitsuba's."""
     _mi: Any
     _parts: Description
+    _files: Path
+    """A folder for what Mitsuba reads."""
 
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """The camera's picture; the same scene and seed give the same bits in the same variant."""
@@ -72,7 +74,7 @@ class Renderer:
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                loaded = variant.loaded(self._mi, bands.for_group(whole, group))
+                loaded = variant.loaded(self._mi, bands.for_group(whole, group, self._files))
                 for part, count in enumerate(counts):
                     progress(done, total)
                     sums += count * self._picture(loaded, count, part, camera)
@@ -92,7 +94,7 @@ class Renderer:
         """
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.seen(self.scene, camera, self._parts, self._mi)
-        loaded = variant.loaded(self._mi, bands.for_group(whole, groups[len(groups) // 2]))
+        loaded = variant.loaded(self._mi, bands.for_group(whole, groups[len(groups) // 2], self._files))
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
         sums = squares = np.zeros((camera.height_px, camera.width_px))
         for passes in range(1, max(2, self.scene.samples // count) + 1):
@@ -136,7 +138,8 @@ def opened(scene: Scene, folder: Path) -> Iterator[Renderer]:
     mi = variant.mitsuba(name)
     lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, Path(meshes), mi))
+        files = Path(meshes)
+        yield Renderer(lit, name, mi.__version__, mi, description.contents(lit, folder, files, mi), files)
 
 
 def _stokes(behind: list[NDArray[np.float64]]) -> NDArray[np.float64]:

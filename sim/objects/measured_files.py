@@ -14,11 +14,11 @@ import numpy as np
 from coupole.appearance.matter.alta_samples import interpolated, read_alta
 from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.matter.hemisphere import albedo
+from coupole.appearance.matter.merl_table import read_merl
 from coupole.appearance.matter.rgl_table import read_bsdf
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 from coupole.errors import InputError
-from sim.objects.merl_file import read_merl
 from sim.optics.led_light import LedModel, camera_weights
 from sim.scene.brdf_table import tabulate
 from sim.scene.surface import Material

@@ -23,7 +23,7 @@ _ANGLES = 65
 _FACETS = 32
 _GAUSS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(48)
 # Squares of equal steps: reflectance varies most at grazing incidence.
-_COSINES: Array = np.linspace(0.0, 1.0, _ANGLES) ** 2
+COSINES: Array = np.linspace(0.0, 1.0, _ANGLES) ** 2
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Sheet:
     """A smooth sheet's reflectance and transmittance. Arrays [angles, bands] are for light from air."""
 
     reflectance: Array
-    """At `_COSINES`."""
+    """At `COSINES`."""
     transmittance: Array
     """Into the body's medium."""
     normal_reflectance: Array
@@ -72,7 +72,7 @@ def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
     passing, passed = from_body(np.sqrt(critical**2 + (mu / body_index) ** 2))
     caught, _ = from_body(np.sqrt(critical**2 - (critical * mu) ** 2))
     share = 2.0 * mu * weight
-    at_grazing = np.maximum(_COSINES, 1e-9)
+    at_grazing = np.maximum(COSINES, 1e-9)
     reflected, transmitted = from_air(at_grazing)
     return Sheet(
         reflectance=reflected,
@@ -134,7 +134,7 @@ def _facets(roughness: float) -> Array:
     radius2, weight = 0.5 * (radius2 + 1.0), 0.5 * weight
     phi = (np.arange(_FACETS) + 0.5) * 2.0 * np.pi / _FACETS
     table = np.zeros((_ANGLES, _ANGLES))
-    for row, z in enumerate(np.maximum(_COSINES, 1e-6)):
+    for row, z in enumerate(np.maximum(COSINES, 1e-6)):
         wi = np.array([np.sqrt(1.0 - z * z), 0.0, z])
         stretched = np.array([alpha * wi[0], 0.0, z]) / np.hypot(alpha * wi[0], z)
         t1 = np.sqrt(radius2)[:, None] * np.cos(phi)

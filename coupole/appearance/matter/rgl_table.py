@@ -159,11 +159,7 @@ class RglTable:
 def read_bsdf(path: Path) -> RglTable:
     """Raises InputError for a file that is not there, of another kind, cut short, or whose tables do not belong
     together."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the material: {error.strerror}") from error
-    fields = _fields(path, data)
+    fields = read_fields(path)
 
     def field(name: str, *shape: int | None) -> Array:
         if name not in fields:
@@ -204,6 +200,15 @@ def read_bsdf(path: Path) -> RglTable:
         phi_i, theta_i, density["ndf"], density["sigma"], density["vndf"], planes, wavelengths_nm, bool(flag[0]),
         text,
     )  # fmt: skip
+
+
+def read_fields(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Fields of a tensor file by name, as they are. Raises InputError."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the material: {error.strerror}") from error
+    return _fields(path, data)
 
 
 def _densities(grid: tuple[int, int]) -> dict[str, tuple[int | None, ...]]:

@@ -18,10 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from coupole.appearance.matter.baked_table import BakedTable
 from coupole.appearance.spectra.grid import BANDS, STEP_NM, WAVELENGTHS_NM, Array
 
 Description = dict[str, Any]
@@ -78,15 +80,30 @@ def groups(step_nm: StepNm) -> list[list[int]]:
     return [part + [part[-1]] * (QUARTERS - len(part)) for part in parts]
 
 
-def for_group(description: Any, group: Sequence[int], step_nm: StepNm) -> Any:
-    """The description with Mitsuba's spectra for the four bands of `group`."""
+def for_group(description: Any, group: Sequence[int], step_nm: StepNm, files: Path) -> Any:
+    """The description with Mitsuba's spectra for the four bands of `group`; a `table` is written to the folder
+    `files`."""
     if isinstance(description, np.ndarray):
         return _steps(description[list(group)], group, step_nm)
     if isinstance(description, Sensitivity):
         return _steps(np.eye(QUARTERS)[description.quarter], group, step_nm)
     if isinstance(description, dict):
-        return {key: for_group(value, group, step_nm) for key, value in description.items()}
+        parts = {
+            key: for_group(value, group, step_nm, files) for key, value in description.items() if key != "table"
+        }
+        if (table := description.get("table")) is not None:
+            parts["filename"] = _written(table, group, step_nm, files)
+        return parts
     return description
+
+
+def _written(table: BakedTable, group: Sequence[int], step_nm: StepNm, files: Path) -> str:
+    """A file of `measured` with the group's values over the quarters. The one before it is replaced, not changed:
+    it may still be open."""
+    path, new = files / f"{id(table)}.bsdf", files / "new.bsdf"
+    new.write_bytes(table.encode(_nodes_nm(group, step_nm), np.repeat(list(group), 2).tolist()))
+    new.replace(path)
+    return str(path)
 
 
 def film(width_px: int, height_px: int) -> Description:
@@ -105,13 +122,17 @@ def _steps(values: Array, group: Sequence[int], step_nm: StepNm) -> Description:
     """A spectrum that is `values` [4] over the bands, and over those after them where a group has fewer."""
     if not np.any(values):
         return {"type": "uniform", "value": 0.0}  # the other kind does not accept zero
+    return {
+        "type": "irregular",
+        "wavelengths": ", ".join(f"{nm:.3f}" for nm in _nodes_nm(group, step_nm)),
+        "values": ", ".join(f"{value:.9g}" for value in np.repeat(np.asarray(values, dtype=float), 2)),
+    }
+
+
+def _nodes_nm(group: Sequence[int], step_nm: StepNm) -> list[float]:
+    """Begin and end of each of the four bands."""
     edges_nm = WAVELENGTHS_NM[group[0]] + step_nm * (np.arange(QUARTERS + 1) - 0.5)
     nodes = [edges_nm[0]]
     for edge in edges_nm[1:-1]:
         nodes += [edge - _RAMP_NM / 2, edge + _RAMP_NM / 2]
-    nodes.append(edges_nm[-1])
-    return {
-        "type": "irregular",
-        "wavelengths": ", ".join(f"{nm:.3f}" for nm in nodes),
-        "values": ", ".join(f"{value:.9g}" for value in np.repeat(np.asarray(values, dtype=float), 2)),
-    }
+    return [*nodes, edges_nm[-1]]

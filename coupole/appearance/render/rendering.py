@@ -60,6 +60,8 @@ class Renderer:
     _parts: Description
     _radiance_unit: NDArray[np.float64]
     """[81] W/(m^2 sr nm), of what Mitsuba computes."""
+    _files: Path
+    """A folder for what Mitsuba reads."""
 
     def render(self, camera: Camera, progress: Progress = lambda done, total: None) -> Spectral:
         """The camera's picture; the same scene and seed give the same bits in the same variant."""
@@ -75,7 +77,8 @@ class Renderer:
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                loaded = variant.loaded(self._mi, bands.for_group(whole, group, self.scene.bands.step_nm))
+                found = bands.for_group(whole, group, self.scene.bands.step_nm, self._files)
+                loaded = variant.loaded(self._mi, found)
                 for part, count in enumerate(counts):
                     progress(done, total)
                     sums += count * self._picture(loaded, count, part, camera)
@@ -95,8 +98,9 @@ class Renderer:
         """
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.seen(self.scene, camera, self._parts, self._mi)
+        middle = groups[len(groups) // 2]
         loaded = variant.loaded(
-            self._mi, bands.for_group(whole, groups[len(groups) // 2], self.scene.bands.step_nm)
+            self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files)
         )
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
         sums = squares = np.zeros((camera.height_px, camera.width_px))
@@ -141,9 +145,10 @@ def opened(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[R
     mi = variant.mitsuba(name)
     lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:
-        contents = description.contents(lit, folder, Path(meshes), mi, more)
+        files = Path(meshes)
+        contents = description.contents(lit, folder, files, mi, more)
         unit = lights.radiance_unit(lit.lights, folder, lit.bands.step_nm)
-        yield Renderer(lit, name, mi.__version__, mi, contents, unit)
+        yield Renderer(lit, name, mi.__version__, mi, contents, unit, files)
 
 
 def _stokes(behind: list[NDArray[np.float32]]) -> NDArray[np.float32]:

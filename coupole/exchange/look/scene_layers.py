@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +73,7 @@ def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
         case Glass():
             raise InputError(f"material of kind glass: a page does not refract; it shows {SHOWN}")
         case _:
-            assert_never(material)
+            raise InputError(f"material of kind {material.kind}: a page does not know it; it shows {SHOWN}")
 
 
 def flake_layers(gold: float, roughness: float, longest_mm: float) -> list[tuple[Layer, ...]]:

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.appearance.matter.rgl_table import RglTable
-from coupole.errors import InputError
-from coupole.exchange.of_results.bsdf import (
+from coupole.appearance.matter.rgl_writing import (
     cosine_weighted,
     drawn_by,
-    fields_of,
     half_vectors,
     nodes_for_linear_reading,
     tensors,
 )
+from coupole.errors import InputError
+from coupole.exchange.of_results.bsdf import fields_of
 from coupole.exchange.of_results.material_tables import Material
 from coupole.exchange.of_results.measured_surface import Floats
 
@@ -80,7 +80,7 @@ class AdaptiveTable:
 
     @cached_property
     def _values(self) -> NDArray[np.float32]:
-        return cosine_weighted(self.material, self.theta_i, half_vectors(self.side))
+        return cosine_weighted(self.material.reflectance, self.theta_i, half_vectors(self.side))
 
     @cached_property
     def rgb(self) -> NDArray[np.float32]:

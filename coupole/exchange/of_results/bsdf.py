@@ -9,6 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.appearance.matter.rgl_writing import (
+    cosine_weighted,
+    drawn_by,
+    half_vectors,
+    nodes_for_linear_reading,
+    tensors,
+)
 from coupole.exchange.of_results.material_tables import Material, materials_of
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.storage.durable import write_synced
@@ -17,9 +24,6 @@ THETAS, SIDE = 64, 128
 """Angles of incidence; rows and columns of half vectors at each."""
 _NDF = 4.0
 """Over 4 sigma it is 1."""
-_LEAST_DRAWN = 1e-3
-"""Of the mean density: nothing that reflects is never drawn."""
-_TYPES = {"uint8": 1, "float32": 10}
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
@@ -40,69 +44,9 @@ def encode(material: Material, told: str = "") -> bytes:
     """f cos(theta_o) for isotropic incidence at `THETAS` angles; half vectors at azimuth (2 u - 1) pi by rows, and
     elevation pi/2 v^2 by columns."""
     theta_i = np.linspace(0.0, 0.5 * np.pi, THETAS, dtype=np.float32)
-    values = cosine_weighted(material, theta_i, half_vectors(SIDE))
+    values = cosine_weighted(material.reflectance, theta_i, half_vectors(SIDE))
     rgb = nodes_for_linear_reading(values, theta_i)
     return tensors(fields_of(theta_i, rgb, drawn_by(values, theta_i), f"{material.name}; {told}"))
-
-
-def half_vectors(side: int) -> NDArray[np.float64]:
-    """[side, side, 3] unit vectors of the rows and columns."""
-    steps = np.linspace(0.0, 1.0, side)
-    phi_m, theta_m = np.meshgrid((2.0 * steps - 1.0) * np.pi, 0.5 * np.pi * steps**2, indexing="ij")
-    sine = np.sin(theta_m)
-    return np.stack([sine * np.cos(phi_m), sine * np.sin(phi_m), np.cos(theta_m)], axis=-1)
-
-
-def way_in(theta_i: float) -> NDArray[np.float64]:
-    """[3] at azimuth 0, and above the horizon."""
-    return np.array([np.sin(theta_i), 0.0, max(np.cos(theta_i), 1e-6)])
-
-
-def cosine_weighted(
-    material: Material, theta_i: NDArray[np.float32], half: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """[1, theta_i, 3, rows, columns] f cos(theta_o) of half vectors [rows, columns, 3], 0 below the horizon."""
-    found = np.zeros((1, len(theta_i), 3, *half.shape[:2]), np.float32)
-    ways = half.reshape(-1, 3)
-    for number, theta in enumerate(theta_i.astype(np.float64)):
-        light = way_in(theta)
-        ways_out = 2.0 * (ways @ light)[:, None] * ways - light
-        values = material.reflectance(np.broadcast_to(light, ways.shape), ways_out) * ways_out[:, 2:]
-        found[0, number] = np.maximum(values, 0.0).T.reshape(3, *half.shape[:2])
-    return found
-
-
-def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Nodes [1, theta_i, channels, phi, theta_m] whose linear interpolation misses least, of values there.
-
-    Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
-    much is taken from the nodes, of h before and after them, but not where f ends at the horizon.
-    """
-    found = values.copy()
-    even = np.linspace(0.0, 1.0, values.shape[3])
-    for axis, places in ((1, theta_i.astype(np.float64)), (3, even), (4, np.linspace(0.0, 1.0, values.shape[4]))):
-        along, nodes = np.moveaxis(values, axis, 0), np.moveaxis(found, axis, 0)
-        before, after = (step.reshape(-1, 1, 1, 1, 1) for step in (np.diff(places)[:-1], np.diff(places)[1:]))
-        whole = along > 0.0
-        inner = whole[2:] & whole[1:-1] & whole[:-2]
-        second = 2.0 * ((along[2:] - along[1:-1]) / after - (along[1:-1] - along[:-2]) / before) / (before + after)
-        nodes[1:-1] -= np.where(inner, second * (before**2 + after**2) / 24.0, 0.0)
-        if axis == 3:  # azimuth, whose first node is the last
-            bend = np.where(whole[1] & whole[0] & whole[-2], along[1] - 2.0 * along[0] + along[-2], 0.0) / 12.0
-            nodes[0] -= bend
-            nodes[-1] -= bend
-    return np.maximum(found, 0.0)
-
-
-def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[1, theta_i, rows, columns] `luminance`, by which renderers draw directions: the light that a step of rows
-    and columns reflects, of `values` f cos(theta_o). Its ways out take a solid angle as (wi m) u sin(theta_m)."""
-    half = half_vectors(values.shape[-1])
-    u = np.linspace(0.0, 1.0, values.shape[-1])
-    lights = np.stack([way_in(float(theta)) for theta in theta_i])
-    solid_angle = np.maximum(half @ lights.T, 0.0) * (u * np.sin(0.5 * np.pi * u**2))[None, :, None]
-    found = values.mean(axis=2) * np.moveaxis(solid_angle, -1, 0)[None]
-    return np.asarray(found + _LEAST_DRAWN * found.mean(axis=(2, 3), keepdims=True) + 1e-12, np.float32)
 
 
 def fields_of(
@@ -120,19 +64,3 @@ def fields_of(
         "description": np.frombuffer(text.encode(), np.uint8),
         "jacobian": np.ones(1, np.uint8),
     }
-
-
-def tensors(fields: dict[str, NDArray[np.float32] | NDArray[np.uint8]]) -> bytes:
-    """A tensor file: its head, then the fields, each at a multiple of 8 bytes."""
-    size = 12 + 2 + 4 + sum(2 + len(name) + 2 + 1 + 8 + 8 * values.ndim for name, values in fields.items())
-    head = [b"tensor_file\0", bytes([1, 0]), len(fields).to_bytes(4, "little")]
-    blocks: list[bytes] = []
-    for name, values in fields.items():
-        gap = -size % 8
-        blocks += [bytes(gap), values.tobytes()]
-        size += gap
-        head += [len(name).to_bytes(2, "little"), name.encode(), values.ndim.to_bytes(2, "little")]
-        head += [bytes([_TYPES[values.dtype.name]]), size.to_bytes(8, "little")]
-        head += [length.to_bytes(8, "little") for length in values.shape]
-        size += values.nbytes
-    return b"".join(head + blocks)

@@ -14,15 +14,15 @@ from scenes import camera_above, quad, scene_of
 from scipy.spatial.transform import Rotation
 
 from coupole.appearance.matter.hemisphere import albedo
+from coupole.appearance.matter.merl_table import read_merl
+from coupole.appearance.matter.rgl_writing import tensors
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
-from coupole.exchange.of_results.bsdf import tensors
 from coupole.exchange.of_results.material_tables import Material as ExportedMaterial
 from coupole.exchange.of_results.merl import encode as encode_merl
 from sim.objects.measured_files import alta_material, bsdf_material, merl_material
-from sim.objects.merl_file import read_merl
 from sim.objects.specimens import SPECIMENS, specimen
 from sim.optics.led_light import LedModel, camera_weights
 from sim.render.camera_view import Viewer

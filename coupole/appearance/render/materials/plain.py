@@ -1,4 +1,4 @@
-"""Materials of a scene file as Mitsuba's plugins, with spectra of `appearance.matter`.
+"""Materials by Mitsuba's own plugins, with spectra of `appearance.matter`.
 
 Kept: complex indices of metals, interference in films by reflectance at every angle, Kubelka and Munk's layers,
 Fresnel surfaces with all internal reflections (Saunderson), GGX facets, polarisation by surfaces. Simplified:
@@ -9,13 +9,15 @@ once (docs/decisions/0013).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
-from coupole.appearance.matter import gilding, kubelka_munk, lacquer, layered
+from coupole.appearance.matter import brdf, gilding, kubelka_munk, lacquer, layered
+from coupole.appearance.matter.baked_table import bake
 from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.appearance.matter.pigments import from_opaque, opaque_reflectance
 from coupole.appearance.optics import fresnel, indices
@@ -37,6 +39,8 @@ from coupole.appearance.render.spectra import (
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
 
 THINNEST_NM = 1e-3
+Facets = Literal["ggx", "beckmann", "cook_torrance"]
+"""`beckmann`: its slopes under Smith's shadowing; `cook_torrance`: the same in V-shaped grooves (seed 001)."""
 _LEAST_SHARE = 0.1
 """Least share of the paths for each part of a sum."""
 
@@ -82,6 +86,8 @@ class Metal(Model):
     index: IndexFile | None = None
     """Of another metal, in place of gold and silver."""
     roughness: Roughness = 0.1
+    """Alpha, of GGX's or of Beckmann's slopes."""
+    distribution: Facets = "ggx"
     depth_mm: Annotated[float, Field(ge=0)] | None = None
     """Under the lacquer's face. None: in air."""
     face: bool = True
@@ -130,29 +136,30 @@ class Glass(Model):
     index: Index = indices.BINDER
 
 
-Material = Annotated[Diffuse | Paint | Lacquer | Metal | Gilt | Films | Glass, Field(discriminator="kind")]
-
-
-def bsdf(material: Material, folder: Path) -> Description:
-    """The material for Mitsuba, arrays [81] for spectra; paths of spectra are relative to `folder`."""
-    if isinstance(material, Glass):
-        return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
-    return {"type": "twosided", "material": _one_side(material, folder)}
+Plain = Diffuse | Paint | Lacquer | Metal | Gilt | Films
 
 
 def diffuse(spectral: Array) -> Description:
     return {"type": "diffuse", "reflectance": spectral}
 
 
-def metal(index: Complex, roughness: float, factor: Array | float = 1.0) -> Description:
+def metal(
+    index: Complex, roughness: float, factor: Array | float = 1.0, distribution: Facets = "ggx"
+) -> Description:
     """A rough conductor of complex index [81] (relative to its surroundings) times `factor`."""
+    share = np.broadcast_to(np.asarray(factor, dtype=float), BANDS).copy()
+    if distribution == "cook_torrance":
+        grooves = partial(
+            brdf.cook_torrance, slope=roughness, fresnel=lambda c: share * fresnel.reflectance(c[..., None], index)
+        )
+        return {"type": "measured", "table": bake(grooves)}
     return {
         "type": "roughconductor",
-        "distribution": "ggx",
+        "distribution": distribution,
         "alpha": roughness,
         "eta": np.asarray(index.real),
         "k": np.asarray(index.imag),
-        "specular_reflectance": np.broadcast_to(np.asarray(factor, dtype=float), BANDS).copy(),
+        "specular_reflectance": share,
     }
 
 
@@ -226,7 +233,8 @@ def metal_index(gold: float) -> Complex:
     return pure[gold]() if gold in pure else indices.gold_silver(gold)
 
 
-def _one_side(material: Material, folder: Path) -> Description:
+def plain_bsdf(material: Plain, folder: Path) -> Description:
+    """One side of it, arrays [81] for spectra; paths are relative to `folder`."""
     if isinstance(material, Diffuse):
         return diffuse(matt(material.reflectance, folder).values)
     if isinstance(material, Paint):
@@ -238,17 +246,16 @@ def _one_side(material: Material, folder: Path) -> Description:
     if isinstance(material, Films):
         films, base = films_of(material, folder)
         return metal(_equivalent(films, base), material.roughness)
-    assert isinstance(material, Gilt)
     return _gilt(material, folder)
 
 
 def _metal(material: Metal, folder: Path) -> Description:
     index = metal_of(material, folder)
     if material.depth_mm is None:
-        return metal(index, material.roughness)
+        return metal(index, material.roughness, distribution=material.distribution)
     inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
     left = lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())
-    return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2)
+    return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2, material.distribution)
 
 
 def _gilt(material: Gilt, folder: Path) -> Description:

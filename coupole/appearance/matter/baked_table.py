@@ -1,0 +1,126 @@
+"""Any isotropic BRDF as a table of RGL's format, which a renderer reads natively.
+
+Angles of incidence and half vectors as in the format; `ndf` has the reflectance back to the light, by the half
+vector's elevation, so that what is left to the table changes little within a lobe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.matter.hemisphere import directions
+from coupole.appearance.matter.rgl_table import RglTable, read_fields
+from coupole.appearance.matter.rgl_writing import (
+    cosine_weighted,
+    drawn_by,
+    half_vectors,
+    nodes_for_linear_reading,
+    tensors,
+)
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+
+THETAS, SIDE = 32, 64
+_CROWDING = 1.3
+_NDF_NODES = 2048
+_STEEPEST = np.radians(80.0)
+"""Beyond it the reflectance back to the light is held, as some models diverge there."""
+_FLOOR = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class BakedTable:
+    """Fields of a tensor file whose channels make bands."""
+
+    fields: Mapping[str, NDArray[Any]]
+    """All but the values and their wavelengths."""
+    values: NDArray[np.float32]
+    """[phi_i, theta_i, channels, rows, columns]"""
+    to_bands: Array
+    """[channels, bands]"""
+
+    def encode(self, wavelengths_nm: Sequence[float], bands: Sequence[int]) -> bytes:
+        """A file with the values of `bands` at `wavelengths_nm`."""
+        mixed = np.einsum("ptcrk,cb->ptbrk", self.values, self.to_bands[:, list(bands)].astype(np.float32))
+        return tensors(
+            {
+                **self.fields,
+                "wavelengths": np.asarray(wavelengths_nm, np.float32),
+                "spectra": np.ascontiguousarray(mixed, np.float32),
+            }
+        )
+
+    def read(self) -> RglTable:
+        """As a reader of the file has it; of all channels."""
+        phi_i, theta_i, ndf, sigma, vndf = (
+            np.asarray(self.fields[name], np.float64) for name in ("phi_i", "theta_i", "ndf", "sigma", "vndf")
+        )
+        planes = np.ascontiguousarray(np.moveaxis(self.values, 2, -1))
+        jacobian = bool(self.fields["jacobian"][0])
+        return RglTable(phi_i, theta_i, ndf, sigma, vndf, planes, None, jacobian=jacobian, description="")
+
+
+def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, side: int = SIDE) -> BakedTable:
+    """Of an isotropic BRDF of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
+    steps = np.linspace(0.0, 1.0, thetas)
+    theta_i = np.asarray(0.5 * np.pi * (1.0 - (1.0 - steps) ** _CROWDING), np.float32)
+    ndf = _back(source)
+    half = half_vectors(side)[: side // 2]
+    one_side = cosine_weighted(source, theta_i, half)
+    cosine = np.concatenate([one_side, one_side[..., ::-1, :]], axis=3)
+    over = np.interp(np.linspace(0.0, 1.0, side), np.linspace(0.0, 1.0, _NDF_NODES), ndf).astype(np.float32)
+    fields: dict[str, NDArray[Any]] = {
+        "theta_i": theta_i,
+        "phi_i": np.zeros(1, np.float32),
+        "ndf": np.repeat(ndf[None], 2, axis=0).astype(np.float32),
+        "sigma": np.full((2, 2), 0.25, np.float32),
+        "vndf": np.ones((1, thetas, 2, 2), np.float32),
+        "luminance": drawn_by(cosine, theta_i),
+        "description": np.frombuffer(b"baked", np.uint8),
+        "jacobian": np.ones(1, np.uint8),
+    }
+    values = nodes_for_linear_reading(np.asarray(cosine / over, np.float32), theta_i)
+    return BakedTable(fields, values, np.eye(values.shape[2]) if to_bands is None else to_bands)
+
+
+def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
+    """An isotropic file of the format as it is, with its own grid. Raises InputError."""
+    fields = {
+        name: value for name, value in read_fields(path).items() if name not in {"rgb", "spectra", "wavelengths"}
+    }
+    return BakedTable(fields, np.ascontiguousarray(np.moveaxis(table.values, -1, 2)), to_bands)
+
+
+def missed(table: BakedTable, source: Brdf, pairs: int = 400) -> Array:
+    """[directions, channels] what the table misses of its source, over the source's greatest value from that
+    direction of light; light and eye up to 80 degrees from the normal."""
+    random = np.random.default_rng(1)
+    cosines = random.uniform(np.cos(_STEEPEST), 1.0, (2, pairs))
+    wi = directions(cosines[0], np.zeros(pairs))
+    wo = directions(cosines[1], random.uniform(0.0, 2.0 * np.pi, pairs))
+    wo[::2] = wi[::2] * np.array([-1.0, -1.0, 1.0]) + 0.05 * random.normal(size=wi[::2].shape)
+    wo[:, 2] = np.maximum(np.abs(wo[:, 2]), np.cos(_STEEPEST))
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    peak = np.maximum(source(wi, wi * np.array([-1.0, -1.0, 1.0])), source(wi, wo))
+    return np.asarray(np.abs(table.read()(wi, wo) - source(wi, wo)) / np.maximum(peak, 1e-12))
+
+
+def _back(source: Brdf) -> Array:
+    """[nodes] the channels' mean of the reflectance back to the light."""
+    theta = 0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2
+    ways = directions(np.cos(np.minimum(theta, _STEEPEST)), np.zeros(_NDF_NODES))
+    found = source(ways, ways).mean(axis=-1)
+    return np.asarray(np.maximum(found, _FLOOR * max(float(found.max()), 1e-9)))
+
+
+def wavelengths_of(table: RglTable) -> Array:
+    """[channels, 81] straight between the table's own wavelengths, ends held."""
+    assert table.wavelengths_nm is not None
+    nodes_nm = table.wavelengths_nm
+    return np.stack([np.interp(WAVELENGTHS_NM, nodes_nm, one) for one in np.eye(len(nodes_nm))])

@@ -1,0 +1,68 @@
+"""Materials of a scene file, by kind, as Mitsuba's plugins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.materials.coatings import Coating, FourFlux, Layers, coating_bsdf
+from coupole.appearance.render.materials.plain import (
+    THINNEST_NM,
+    Diffuse,
+    Films,
+    Gilt,
+    Glass,
+    Lacquer,
+    Metal,
+    Paint,
+    Plain,
+    films_of,
+    gilt_of,
+    lacquer_body,
+    metal_index,
+    metal_of,
+    paint_inside,
+    plain_bsdf,
+    under_face,
+)
+
+__all__ = [
+    "THINNEST_NM",
+    "Diffuse",
+    "Films",
+    "FourFlux",
+    "Gilt",
+    "Glass",
+    "Lacquer",
+    "Layers",
+    "Material",
+    "Metal",
+    "Paint",
+    "Plain",
+    "bsdf",
+    "films_of",
+    "gilt_of",
+    "lacquer_body",
+    "metal_index",
+    "metal_of",
+    "paint_inside",
+    "under_face",
+]
+
+Material = Annotated[Plain | Coating | Glass, Field(discriminator="kind")]
+
+
+def bsdf(material: Material, folder: Path) -> Description:
+    """The material for Mitsuba, arrays [81] for spectra; paths of spectra are relative to `folder`."""
+    if isinstance(material, Glass):
+        return {"type": "dielectric", "int_ior": material.index, "ext_ior": 1.0}
+    return {"type": "twosided", "material": _one_side(material, folder)}
+
+
+def _one_side(material: Plain | Coating, folder: Path) -> Description:
+    if isinstance(material, Coating):
+        return coating_bsdf(material, folder)
+    return plain_bsdf(material, folder)

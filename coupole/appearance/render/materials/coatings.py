@@ -1,0 +1,277 @@
+"""Layers over layers in one binder: paints, glazes of four fluxes, varnishes, gold leaf, and one face over all.
+
+The physics is `coupole.appearance.matter.layer_stack`; Mitsuba reads it as a table (`baked_table`).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.appearance.matter import four_flux, gilding, lacquer
+from coupole.appearance.matter.baked_table import bake
+from coupole.appearance.matter.layer_stack import Binder, Ground, Stack, stack, stack_brdf
+from coupole.appearance.matter.paint_file import read_paint
+from coupole.appearance.matter.pigments import from_opaque
+from coupole.appearance.optics import indices
+from coupole.appearance.optics.thin_film import Film
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.materials.plain import metal_index
+from coupole.appearance.render.model import Model, Positive, Roughness, Share
+from coupole.appearance.render.refraction import IndexFile, Refraction, complex_index, real_index
+from coupole.appearance.render.spectra import (
+    Colouring,
+    Constant,
+    MeasuredPaint,
+    Reflectance,
+    coefficients,
+    internal,
+)
+from coupole.appearance.spectra import measured, resampling
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
+from coupole.errors import InputError
+
+NotNegative = Annotated[float, Field(ge=0)]
+_BLACK = Constant(kind="constant", value=0.0)
+
+
+class NumbersFile(Model):
+    """Numbers by wavelength, in columns; those beyond it keep its ends."""
+
+    kind: Literal["file"]
+    path: Path
+    column: int | None = None
+
+
+PerMm = NotNegative | NumbersFile
+"""A coefficient per mm, the same at all wavelengths or by a file."""
+
+
+class Coefficients(Model):
+    """Of four fluxes, per mm: K and S of diffuse light; k, s_i (forwards), s_j (backwards) of directed light."""
+
+    kind: Literal["values"]
+    absorption: PerMm
+    scattering: PerMm
+    direct_absorption: PerMm
+    forward: PerMm
+    backward: PerMm
+
+
+FourFluxes = Annotated[Coefficients | MeasuredPaint, Field(discriminator="kind")]
+"""A paint file has them if `coupole layer` was given spectra under directional light."""
+
+
+class FourFlux(Model):
+    """A glaze: part of the light passes it as it came, and returns from a glossy ground as its mirror image."""
+
+    kind: Literal["four_flux"]
+    coefficients: FourFluxes
+    thickness_mm: Positive
+    ground: Reflectance = _BLACK
+    """Inside the binder; measured under a face of the same index."""
+    ground_mirror: Share = 0.0
+    """Of a glossy ground, for directed light: in addition to `ground`."""
+    ground_roughness: Roughness = 0.1
+    index: Annotated[float, Field(ge=1.01, le=3)] = indices.BINDER
+    roughness: Roughness = 0.05
+
+
+class PaintLayer(Model):
+    kind: Literal["paint"]
+    pigment: Colouring
+    thickness_mm: Positive
+    scattering_per_mm: Positive = 30.0
+    """Of a pigment whose reflectance is given; a paint file has its own."""
+
+
+class GlazeLayer(Model):
+    kind: Literal["four_flux"]
+    coefficients: FourFluxes
+    thickness_mm: Positive
+
+
+class Urushi(Model):
+    """Of clear urushi, an assumed shape (`coupole.appearance.matter.lacquer`)."""
+
+    kind: Literal["urushi"]
+    at_450_nm_per_mm: NotNegative = 6.0
+
+
+class TypicalVarnish(Model):
+    """Of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
+
+    age k exp(-fall (w - 450 nm)): strong in the violet, next to nothing in the red.
+    """
+
+    kind: Literal["typical_varnish"]
+    age: NotNegative
+    """0 is fresh and clear, 1 yellowed for long."""
+    at_450_nm_per_mm: NotNegative = 15.0
+    """At age 1."""
+    fall_per_nm: Positive = 0.018
+
+
+class Absorbance(Model):
+    """A film's decadic absorbance by wavelength, measured: that of an aged one less that of a fresh one, or of
+    one whose faces do not count."""
+
+    kind: Literal["absorbance"]
+    path: Path
+    column: int | None = None
+    film_mm: Positive
+    """Of the film that was measured."""
+    age: NotNegative = 1.0
+    """In parts of the one that was measured."""
+
+
+class AbsorptionPerMm(Model):
+    kind: Literal["values"]
+    per_mm: PerMm
+    """Natural, of directed light."""
+
+
+Absorption = Annotated[Urushi | TypicalVarnish | Absorbance | AbsorptionPerMm, Field(discriminator="kind")]
+
+
+class ClearLayer(Model):
+    """A varnish, or a lacquer tinted by a dye: it absorbs, and does not scatter."""
+
+    kind: Literal["clear"]
+    absorption: Absorption
+    thickness_mm: Positive
+
+
+class Leaf(Model):
+    """A leaf of gold, of an alloy with silver, or of another metal."""
+
+    kind: Literal["leaf"]
+    thickness_nm: Positive = 100.0
+    gold: Share = 1.0
+    index: IndexFile | None = None
+    holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
+    uncovered: Share = 0.0
+    roughness: Roughness = 0.12
+
+
+Layer = Annotated[PaintLayer | GlazeLayer | ClearLayer | Leaf, Field(discriminator="kind")]
+
+
+class Layers(Model):
+    """From the top to the bottom, in one binder; a leaf on top lies bare in the air."""
+
+    kind: Literal["layers"]
+    layers: Annotated[tuple[Layer, ...], Field(min_length=1, max_length=20)]
+    ground: Reflectance = _BLACK
+    """Inside the binder; measured under a face of the same index."""
+    index: Refraction = indices.BINDER
+    roughness: Roughness = 0.05
+    """Of the face; a leaf on top has its own."""
+
+    @model_validator(mode="after")
+    def _covered(self) -> Layers:
+        first = self.layers[0]
+        if isinstance(first, Leaf) and first.uncovered:
+            raise ValueError("a leaf on top has no face where it is `uncovered`: take `kind: worn`, or varnish it")
+        return self
+
+
+Coating = FourFlux | Layers
+
+
+def coating_bsdf(material: Coating, folder: Path) -> Description:
+    """One side of it. Raises InputError."""
+    return {"type": "measured", "table": bake(partial(stack_brdf, stack=stack_of(material, folder)))}
+
+
+def stack_of(material: Coating, folder: Path) -> Stack:
+    """Ready for `stack_brdf`; paths are relative to `folder`. Raises InputError."""
+    if isinstance(material, FourFlux):
+        binder = Binder(material.index)
+        below = binder.matt(internal(material.ground, folder, material.index).values)
+        if material.ground_mirror:
+            below = binder.mirroring(below, material.ground_mirror, material.ground_roughness)
+        below = binder.four_flux(below, _glaze(material, folder))
+        return stack(binder, below, material.roughness)
+    index = real_index(material.index, folder)
+    binder = Binder(indices.at_d_line(index.astype(complex)))
+    below = binder.matt(internal(material.ground, folder, index).values)
+    first = material.layers[0]
+    on_top = first if isinstance(first, Leaf) else None
+    for layer in reversed(material.layers[1:] if on_top else material.layers):
+        below = _laid(binder, layer, below, folder, index)
+    if on_top:
+        return stack(binder, below, on_top.roughness, [_film(on_top, folder)])
+    return stack(binder, below, material.roughness)
+
+
+def _laid(binder: Binder, layer: Layer, below: Ground, folder: Path, index: Array) -> Ground:
+    match layer:
+        case PaintLayer():
+            if isinstance(layer.pigment, MeasuredPaint):
+                pigment = coefficients(layer.pigment, folder, needs_mm=True)
+            else:
+                pigment = from_opaque("", internal(layer.pigment, folder, index), layer.scattering_per_mm)
+            return binder.two_flux(below, pigment.absorption, pigment.scattering, layer.thickness_mm)
+        case GlazeLayer():
+            return binder.four_flux(below, _glaze(layer, folder))
+        case ClearLayer():
+            return binder.clear(below, absorption_of(layer.absorption, folder), layer.thickness_mm)
+        case Leaf():
+            return binder.leaf(below, [_film(layer, folder)], layer.roughness, layer.uncovered)
+
+
+def absorption_of(absorption: Absorption, folder: Path) -> Array:
+    """[81] per mm, natural, of directed light. Raises InputError."""
+    match absorption:
+        case Urushi():
+            return lacquer.urushi_absorption(absorption.at_450_nm_per_mm)
+        case TypicalVarnish():
+            shape = np.exp(-absorption.fall_per_nm * (WAVELENGTHS_NM - 450.0))
+            return np.asarray(absorption.age * absorption.at_450_nm_per_mm * shape)
+        case Absorbance():
+            decadic = _numbers(folder / absorption.path, absorption.column)
+            return np.asarray(absorption.age * np.log(10.0) * decadic / absorption.film_mm)
+        case AbsorptionPerMm():
+            return _per_mm(absorption.per_mm, folder)
+
+
+def _film(leaf: Leaf, folder: Path) -> Film:
+    index: Complex = complex_index(leaf.index, folder) if leaf.index is not None else metal_index(leaf.gold)
+    return Film(gilding.leaf_index(index, leaf.holes) if leaf.holes else index, leaf.thickness_nm)
+
+
+def _glaze(layer: FourFlux | GlazeLayer, folder: Path) -> four_flux.Layer:
+    given = layer.coefficients
+    if isinstance(given, Coefficients):
+        names = ("absorption", "scattering", "direct_absorption", "forward", "backward")
+        k, s, direct, forward, backward = (_per_mm(getattr(given, name), folder) for name in names)
+    else:
+        diffuse, found = coefficients(given, folder, needs_mm=True), read_paint(folder / given.path)
+        if missing := [name for name in ("k", "s_i", "s_j") if name not in found.other]:
+            raise InputError(
+                f"{folder / given.path}: expected k, s_i, s_j of four fluxes, found no {', '.join(missing)}; "
+                "give `coupole layer` spectra under directional light, or take `kind: paint`"
+            )
+        k, s = diffuse.absorption, diffuse.scattering
+        direct, forward, backward = (
+            np.maximum(np.interp(WAVELENGTHS_NM, found.wavelengths_nm, found.other[name]), 0.0)
+            for name in ("k", "s_i", "s_j")
+        )
+    return four_flux.Layer(k, s, direct, forward, backward, layer.thickness_mm)
+
+
+def _per_mm(value: PerMm, folder: Path) -> Array:
+    if isinstance(value, NumbersFile):
+        return _numbers(folder / value.path, value.column)
+    return np.full(BANDS, value)
+
+
+def _numbers(path: Path, column: int | None) -> Array:
+    """[81], not below 0."""
+    read = measured.read_spectrum(path, unit="power", column=column)
+    return np.asarray(np.maximum(resampling.held(resampling.on_grid(read)), 0.0))

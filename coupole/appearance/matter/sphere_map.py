@@ -1,13 +1,14 @@
 """The sphere map of a glossy finish under several lights, on meshes that follow its lobes (seed 002, section 3.3).
 
 For an eye and lights far away, reflected radiance depends on the normal alone: the map gives it for each, as a
-sphere shows it. Each light has a mesh of its own, and the maps are added. Its lines have constant angles theta and phi
-of the table (`tabulated`): with s' at theta and phi about the eye's direction, the normal halves the angle between s'
-and the light. The lines of theta are the table's own, dense where the lobe is steep, so that nothing is interpolated
-over theta when a map is made. Both halves of a mesh are alike, on either side of the plane through eye and light.
+sphere shows it. Each light has a mesh of its own, and the maps are added. Its lines have constant angles theta
+and phi of the table (`tabulated`): with s' at theta and phi about the eye's direction, the normal halves the
+angle between s' and the light. The lines of theta are the table's own, dense where the lobe is steep, so that
+nothing is interpolated over theta when a map is made. Both halves of a mesh are alike, on either side of the
+plane through eye and light.
 
-Nodes have what the finish makes of its light; the cosine to the light, which bends more, is taken at each normal.
-Within 6 degrees of a horizon the map may miss much of the radiance: the table ends there.
+Nodes have what the finish makes of its light; the cosine to the light, which bends more, is taken at each
+normal. Within 6 degrees of a horizon the map may miss much of the radiance: the table ends there.
 """
 
 from __future__ import annotations

@@ -238,6 +238,14 @@ def bench_workers(rounds: int) -> None:
         line(**figure)
 
 
+def bench_urushi(rounds: int) -> None:
+    """Sphere maps of gold under ten lights, made anew for each place of the lights."""
+    from bench_urushi import figures
+
+    for figure in figures(rounds):
+        line(**figure)
+
+
 FRAMES_OF = {"reflectance": 300}
 BENCHES: dict[str, Callable[[int], None]] = {
     "check": bench_check,
@@ -252,6 +260,7 @@ BENCHES: dict[str, Callable[[int], None]] = {
     "mesh": bench_mesh,
     "calibration": bench_calibration,
     "reflectance": bench_reflectance,
+    "urushi": bench_urushi,
     "workers": bench_workers,
     "console": bench_console,
 }

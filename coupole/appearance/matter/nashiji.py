@@ -7,7 +7,7 @@ A flake is a superquadric (Barr 1981), |x/a|^(2/e2) + |y/b|^(2/e2) to the power 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,8 @@ class Slab:
     roundness: tuple[float, float] = (0.3, 0.8)
     """e1 and e2: 1 is an ellipsoid, towards 0 a box."""
     seed: int = 1
+    flattens: bool = False
+    """Whether a flake too steep for the lacquer is tilted only as far as it fits; else it is refused."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,9 @@ def flakes(slab: Slab) -> Flakes:
     turn, spin = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(0.0, 2.0 * np.pi, n)
     # Slopes along x and y are normal and independent, so that the tilt's tangent is Rayleigh distributed.
     tilt = np.arctan(np.tan(np.radians(slab.tilt_deg)) * np.sqrt(0.5) * rng.rayleigh(1.0, n))
+    if slab.flattens:
+        room = np.maximum(0.5 * slab.depth_mm - half_axes[:, 2], 0.0) / np.hypot(half_axes[:, 0], half_axes[:, 1])
+        tilt = np.minimum(tilt, np.arcsin(np.minimum(room, 1.0)))
     rotation = _about_z(turn) @ _about_y(tilt) @ _about_z(spin)
     # The box of the flake's half axes encloses it, so its vertical extent bounds the centre's depth.
     reach = np.einsum("nk,nk->n", np.abs(rotation[:, 2, :]), half_axes)
@@ -100,6 +105,16 @@ def triangulate(found: Flakes, *, around: int = 24, along: int = 6) -> tuple[Arr
     one = _faces(around, along)
     faces = one + (np.arange(len(corners)) * len(unit))[:, None, None]
     return corners.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def settled(found: Flakes, tops_mm: Array, frames: Array) -> Flakes:
+    """The same flakes, each at its depth and tilt under a place [n, 3] of another surface than the slab's.
+
+    `frames` [n, 3, 3] there have the surface's outward normals as third columns. Where the surface is curved, a
+    flake is as flat as before: that is a deviation of its radius squared over twice the surface's radius.
+    """
+    centres = tops_mm + found.centres_mm[:, 2:] * frames[:, :, 2]
+    return replace(found, centres_mm=centres, slab_from_flake=frames @ found.slab_from_flake)
 
 
 def sparkles(

@@ -15,6 +15,7 @@ from coupole.appearance.render.lights import Distant, PlainLight
 from coupole.appearance.render.materials import Diffuse, Gilt, Material, Metal, metal_of
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.photon_map import Matt, Mirror, Room, seen_by_gold
+from coupole.appearance.render.pieces import Ball
 from coupole.appearance.render.rendering import Spectral, opened
 from coupole.appearance.render.scene_file import Camera, Gathered, PlainScene
 from coupole.appearance.render.spectra import Constant, matt, power, scaled
@@ -93,7 +94,7 @@ def _room(scene: PlainScene, folder: Path) -> Room:
     surfaces: list[Mirror | Matt] = []
     for thing in scene.objects:
         for piece in objects.pieces(thing, folder):
-            corners = _ball(piece) if isinstance(piece, objects.Ball) else piece.corners_mm
+            corners = _ball(piece) if isinstance(piece, Ball) else piece.corners_mm
             surfaces.append(_surface(piece.material, corners, folder, scene.name))
     if not any(isinstance(surface, Mirror) for surface in surfaces):
         raise InputError(
@@ -120,7 +121,7 @@ def _bare(material: Metal, folder: Path) -> Reflectance:
     return lambda cosines: fresnel.reflectance(cosines, index)
 
 
-def _ball(ball: objects.Ball) -> Array:
+def _ball(ball: Ball) -> Array:
     import trimesh
 
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=ball.radius_mm)

@@ -8,10 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coupole.appearance.render import bands, lights, objects
+from coupole.appearance.render import absorption, bands, lights, objects
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.materials import bsdf
+from coupole.appearance.render.materials import Glass, Material, bsdf
 from coupole.appearance.render.model import unit
+from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.shapes.triangles import welded
 
@@ -31,11 +32,11 @@ def contents(
     for number, pieces in enumerate([*of_objects, more]):
         for row, piece in enumerate(pieces):
             name = f"object{number}_{row}"
-            if isinstance(piece, objects.Ball):
+            if isinstance(piece, Ball):
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
                 shape = _mesh(piece, meshes / f"{name}.ply")
-            parts[name] = {**shape, "bsdf": bsdf(piece.material, folder)}
+            parts[name] = {**shape, "bsdf": bsdf(piece.material, folder), **_inside(piece.material, folder)}
     step_nm = scene.bands.step_nm
     in_units = lights.radiance_unit(scene.lights, folder, step_nm)
     for number, light in enumerate(scene.lights):
@@ -65,13 +66,27 @@ def seen(
     depth = scene.depth + 1 + (through is not None)
     description = {
         "type": "scene",
-        "integrator": {"type": "path", "max_depth": depth, "rr_depth": depth + 1},
+        "integrator": {"type": _integrator(parts), "max_depth": depth, "rr_depth": depth + 1},
         "camera": sensor,
         **parts,
     }
     if through is not None:
         description["polariser"] = _filter(camera, look, through, mi)
     return description
+
+
+def _inside(material: Material, folder: Path) -> Description:
+    """The medium of a body, if it absorbs."""
+    if not isinstance(material, Glass) or material.absorption is None:
+        return {}
+    taken = absorption.per_mm(material.absorption, material.index, folder)
+    return {"interior": {"type": "homogeneous", "sigma_t": taken, "albedo": 0.0}}
+
+
+def _integrator(parts: Description) -> str:
+    """For media, that which weighs a way by all bands of a group: their absorption may differ by far."""
+    has_media = any(isinstance(part, dict) and "interior" in part for part in parts.values())
+    return "volpathmis" if has_media else "path"
 
 
 def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:
@@ -84,7 +99,7 @@ def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:
     return {"type": "rectangle", "to_world": look @ place, "bsdf": kind}
 
 
-def _mesh(piece: objects.Piece, path: Path) -> Description:
+def _mesh(piece: Piece, path: Path) -> Description:
     import trimesh
 
     points, faces = welded(piece.corners_mm)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, assert_never
 
@@ -14,44 +13,23 @@ from pydantic import Field
 from coupole.appearance.matter import nashiji
 from coupole.appearance.optics import indices
 from coupole.appearance.render import arcature
+from coupole.appearance.render.absorption import Urushi
 from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
 from coupole.appearance.render.model import Pose, Positive, Roughness, Share
+from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.spectra import Constant, Shape
+from coupole.appearance.render.urushi import Makie, Nashiji, makie_pieces, nashiji_pieces
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.mesh_file import mesh_corners
 from coupole.appearance.shapes.solids import relief
 from coupole.appearance.shapes.triangles import rectangle, slab
-from coupole.appearance.spectra.grid import Array
 
 _PRINT = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.035))
 """The black body of the wedges."""
 _NASHIJI_BODY_MM = 6.0
-_NASHIJI_LEVELS = 6
 _DIP_MM = 0.01
 _RELIEF_MM = 18.0
 _STEP_MM, _GILT_ROW_MM, _PAINT_ROW_MM = 15.0, 30.0, 20.0
-
-
-@dataclass(frozen=True)
-class Piece:
-    """Triangles of one material."""
-
-    corners_mm: Array
-    """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
-    material: Material
-    smooth: bool = False
-    """True for smooth shading."""
-    normals: Array | None = None
-    """[triangles, 3, 3] for smooth shading, one for each place: those of a body of which this is a part."""
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A sphere, exactly."""
-
-    centre_mm: Array
-    radius_mm: float
-    material: Material
 
 
 class Mesh(Pose):
@@ -122,8 +100,8 @@ class MakieTile(Pose):
 class NashijiSlab(Pose):
     """Gold flakes in clear lacquer over black (seed 002, section 5); x and y go from 0 to the slab's size.
 
-    Rays are refracted at the lacquer's face, which also reflects the lights, and hit the flakes at their
-    positions. Absorption in the lacquer is taken along the normal, for `_NASHIJI_LEVELS` depths.
+    Rays are refracted at the lacquer's face, which also reflects the lights, are absorbed along their ways through
+    it, and hit the flakes at their positions.
     """
 
     kind: Literal["nashiji_slab"]
@@ -149,7 +127,18 @@ class Arcature(Pose):
     stone: Material = Diffuse(kind="diffuse", reflectance=Shape(kind="shape", name="dull_yellow_shape"))
 
 
-LocalObject = Mesh | Plane | SculptedRelief | GiltStepWedge | PaintWedge | MakieTile | NashijiSlab | Arcature
+LocalObject = (
+    Mesh
+    | Plane
+    | SculptedRelief
+    | GiltStepWedge
+    | PaintWedge
+    | MakieTile
+    | Makie
+    | NashijiSlab
+    | Nashiji
+    | Arcature
+)
 """Objects of triangles."""
 Object = Annotated[LocalObject | Sphere, Field(discriminator="kind")]
 
@@ -182,8 +171,12 @@ def _local(thing: LocalObject, folder: Path) -> list[Piece]:
             black = Lacquer(kind="lacquer")
             gold = Metal(kind="metal", roughness=thing.roughness)
             return [Piece(tile.powder, gold), Piece(tile.ground, black), Piece(tile.body, black)]
+        case Makie():
+            return makie_pieces(thing, folder)
         case NashijiSlab():
             return _nashiji(thing)
+        case Nashiji():
+            return nashiji_pieces(thing, folder)
         case Arcature():
             parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
             return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
@@ -238,11 +231,8 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
     points, faces = nashiji.triangulate(found, around=12, along=4)
     top_mm = _NASHIJI_BODY_MM + thing.depth_mm
     corners = (points + np.array([0.0, 0.0, top_mm]))[faces].reshape(len(found.centres_mm), -1, 3, 3)
-    level = (-found.centres_mm[:, 2] / thing.depth_mm * _NASHIJI_LEVELS).astype(int).clip(0, _NASHIJI_LEVELS - 1)
-    for k in np.unique(level):
-        depth_mm = (k + 0.5) / _NASHIJI_LEVELS * thing.depth_mm
-        gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=depth_mm, face=False)
-        parts.append(Piece(corners[level == k].reshape(-1, 3, 3), gold))
+    gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=0.0, face=False)
+    parts.append(Piece(corners.reshape(-1, 3, 3), gold))
     return [*parts, _clear(width, length, thing.depth_mm, 2.0 * thing.flake_radius_mm)]
 
 
@@ -251,7 +241,7 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
     over it."""
     box = slab(width + 2 * rim_mm, length + 2 * rim_mm, thickness_mm + _DIP_MM)
     lift = np.array([0.5 * width, 0.5 * length, _NASHIJI_BODY_MM - _DIP_MM])
-    return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI))
+    return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI, absorption=Urushi(kind="urushi")))
 
 
 def placed(piece: Piece, pose: Pose) -> Piece:

@@ -16,8 +16,9 @@ from pydantic import AwareDatetime, BaseModel, Field, model_validator
 from coupole.appearance.render.bands import StepNm
 from coupole.appearance.render.lights import Daylight, Light, PlainLight, plain
 from coupole.appearance.render.model import Model, Positive, Vector
-from coupole.appearance.render.objects import Object, PaintWedge
+from coupole.appearance.render.objects import Object, PaintWedge, Plane
 from coupole.appearance.render.spectra import Shape
+from coupole.geometry import transform
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Pixels = Annotated[int, Field(ge=4, le=8192)]
@@ -130,6 +131,18 @@ class Film(Model):
         return [self.begins + timedelta(seconds=number * self.every_s) for number in range(count)]
 
 
+class Turntable(Model):
+    """A picture for each step of a turn of all objects but planes about the scene's z axis; lights stand still."""
+
+    frames: Annotated[int, Field(ge=2, le=1000)] = 48
+    degrees: Annotated[float, Field(ge=-3600, le=3600)] = 360.0
+    """From the first picture to the one that would follow the last."""
+    frames_per_s: Annotated[int, Field(ge=1, le=60)] = 12
+
+    def angles_deg(self) -> list[float]:
+        return [number * self.degrees / self.frames for number in range(self.frames)]
+
+
 class Scene(Model):
     """One scene; all cameras see the same."""
 
@@ -154,6 +167,7 @@ class Scene(Model):
     caustic: Caustic | None = None
     gathered: Gathered | None = None
     film: Film | None = None
+    turntable: Turntable | None = None
 
     @model_validator(mode="after")
     def _names(self) -> Scene:
@@ -173,6 +187,8 @@ class Scene(Model):
             raise ValueError("`gathered` needs a light of kind `distant` or `daylight`, and no polarisation")
         if self.film is not None and "daylight" not in kinds:
             raise ValueError("`film` needs a light of kind `daylight`, whose time it moves")
+        if self.film is not None and self.turntable is not None:
+            raise ValueError("`film` and `turntable` exclude each other: a film moves one thing")
         return self
 
     def at(self, when: datetime) -> Scene:
@@ -182,6 +198,19 @@ class Scene(Model):
             for light in self.lights
         )
         return self.model_copy(update={"lights": moved})
+
+    def turned(self, angle_deg: float) -> Scene:
+        """The scene with all objects but planes turned about its z axis, anticlockwise from above."""
+        about_z = transform(abc_deg=(angle_deg, 0.0, 0.0))
+
+        def moved(thing: Object) -> Object:
+            if isinstance(thing, Plane):
+                return thing
+            x, y, z = (about_z[:3, :3] @ thing.translation_mm).tolist()
+            a, b, c = thing.abc_deg
+            return thing.model_copy(update={"translation_mm": (x, y, z), "abc_deg": (a + angle_deg, b, c)})
+
+        return self.model_copy(update={"objects": tuple(moved(thing) for thing in self.objects)})
 
 
 class PlainScene(Scene):

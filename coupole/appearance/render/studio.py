@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 from coupole.appearance.render import by_gold, pictures, variant, wall
 from coupole.appearance.render.film import write_film
 from coupole.appearance.render.rendering import Renderer, Spectral, opened
-from coupole.appearance.render.scene_file import Camera, Film, Scene, remarks
+from coupole.appearance.render.scene_file import Camera, Scene, remarks
 from coupole.appearance.render.spectra import power
 
 Progress = Callable[[str, int, int], None]
@@ -49,9 +50,8 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
 
     Raises InputError for an inconsistent scene or a missing library, OSError for files.
     """
-    summary = (
-        _film(scene, scene.film, folder, out, progress) if scene.film else _still(scene, folder, out, progress)
-    )
+    moves = _moves(scene)
+    summary = _film(scene, moves, folder, out, progress) if moves else _still(scene, folder, out, progress)
     return {
         "scene": scene.name,
         "synthetic": True,
@@ -84,30 +84,48 @@ def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
     return summary
 
 
-def _film(scene: Scene, film: Film, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-    """A PNG and its summary for each camera and time, then the film; pictures of the same scene stay as they are.
+@dataclass(frozen=True)
+class _Moves:
+    """What changes from picture to picture of a film."""
+
+    steps: Sequence[Callable[[Scene], Scene]]
+    frames_per_s: int
+    told: str
+
+
+def _moves(scene: Scene) -> _Moves | None:
+    if scene.film is not None:
+        times = scene.film.times()
+        steps = [lambda fixed, when=when: fixed.at(when) for when in times]
+        return _Moves(steps, scene.film.frames_per_s, f"{times[0].isoformat()} to {times[-1].isoformat()}")
+    if scene.turntable is not None:
+        turns = [lambda fixed, angle=angle: fixed.turned(angle) for angle in scene.turntable.angles_deg()]
+        return _Moves(turns, scene.turntable.frames_per_s, f"turned by {scene.turntable.degrees:g} degrees")
+    return None
+
+
+def _film(scene: Scene, moves: _Moves, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
+    """A PNG and its summary for each camera and step, then the film; pictures of the same scene stay as they are.
 
     All have the scene's `white_cd_m2`, or the level that the first of each camera has by itself.
     """
-    times, seen, written_by = film.times(), {}, ""
+    count, seen, written_by = len(moves.steps), {}, ""
     for camera in scene.cameras:
         frames = out / f"{scene.name}-{camera.name}-frames"
         frames.mkdir(parents=True, exist_ok=True)
-        fixed = scene.model_copy(update={"cameras": (camera,), "film": None, "caustic": None})
+        fixed = scene.model_copy(update={"cameras": (camera,), "film": None, "turntable": None, "caustic": None})
         made: list[dict[str, Any]] = []
-        for number, when in enumerate(times):
-            progress(camera.name, number, len(times))
-            made.append(_frame(fixed.at(when), folder, frames / f"{number:04d}"))
+        for number, step in enumerate(moves.steps):
+            progress(camera.name, number, count)
+            made.append(_frame(step(fixed), folder, frames / f"{number:04d}"))
             written_by = made[-1]["renderer"]
             if number == 0:
                 display = fixed.display.model_copy(update={"white_cd_m2": made[0]["white_cd_m2"]})
                 fixed = fixed.model_copy(update={"display": display})
-        progress(camera.name, len(times), len(times))
+        progress(camera.name, count, count)
         path = out / f"{scene.name}-{camera.name}.mp4"
-        told = (
-            f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {times[0].isoformat()} to {times[-1].isoformat()}"
-        )
-        write_film([frames / one["files"]["png"] for one in made], path, film.frames_per_s, told)
+        told = f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {moves.told}"
+        write_film([frames / one["files"]["png"] for one in made], path, moves.frames_per_s, told)
         seen[camera.name] = {
             "files": {"film": path.name, "frames": frames.name},
             "frames": len(made),

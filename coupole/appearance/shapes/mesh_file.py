@@ -15,6 +15,22 @@ _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 
 def mesh_corners(path: Path, unit: str) -> Array:
     """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads; no vertex is merged. Raises InputError."""
+    mesh = _read(path)
+    corners: Array = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
+    return corners
+
+
+def mesh_and_uv(path: Path, unit: str) -> tuple[Array, Array]:
+    """As `mesh_corners`, and the corners' texture coordinates [triangles, 3, 2]. Raises InputError."""
+    mesh = _read(path)
+    uv = getattr(mesh.visual, "uv", None)
+    if uv is None or len(uv) != len(mesh.vertices):
+        raise InputError(f"{path}: expected a mesh with texture coordinates (OBJ, glTF); found none")
+    faces = np.asarray(mesh.faces)
+    return np.asarray(mesh.vertices)[faces] * _UNIT_MM[unit], np.asarray(uv, dtype=float)[faces]
+
+
+def _read(path: Path) -> Any:
     import trimesh
 
     try:
@@ -23,5 +39,4 @@ def mesh_corners(path: Path, unit: str) -> Array:
         raise InputError(f"{path}: expected a mesh of triangles (PLY, STL, OBJ); {error}") from error
     if len(mesh.faces) == 0:
         raise InputError(f"{path}: expected a mesh of triangles; found none")
-    corners: Array = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
-    return corners
+    return mesh

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from coupole.appearance.optics import indices
 from coupole.appearance.render import objects
 from coupole.appearance.render.materials import Glass, Lacquer, Material, Metal
-from coupole.appearance.render.objects import Ball, MakieTile, NashijiSlab, Piece
+from coupole.appearance.render.objects import MakieTile, NashijiSlab
+from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import PlainScene, Scene, remarks, with_plain_lights
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.solids import unit_sphere

@@ -22,6 +22,7 @@ from coupole.appearance.matter.glossy_face import InternalReflectance
 from coupole.appearance.matter.pigments import from_opaque, opaque_reflectance
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
+from coupole.appearance.render.absorption import Absorption
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.equivalent import equivalent_index
 from coupole.appearance.render.model import Index, Model, Positive, Roughness, Share
@@ -130,10 +131,11 @@ class Films(Model):
 
 
 class Glass(Model):
-    """Transparent, smooth, without absorption: a closed body of it refracts."""
+    """Transparent and smooth: a closed body of it refracts, and absorbs along light's way through it."""
 
     kind: Literal["glass"]
     index: Index = indices.BINDER
+    absorption: Absorption | None = None
 
 
 Plain = Diffuse | Paint | Lacquer | Metal | Gilt | Films

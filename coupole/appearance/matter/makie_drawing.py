@@ -1,0 +1,93 @@
+"""Drawings for makie: the share of powder at places on a plane, from a picture or a classic motif.
+
+A drawing is a function of places [n, 2] in mm that returns shares [n], 0 to 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+
+Drawing = Callable[[Array], Array]
+Motif = Literal["waves", "flowers"]
+_RINGS = 4
+_PETALS = 5
+_HALF_LINE = 0.014
+"""In periods."""
+
+
+def motif(name: Motif, period_mm: float, edge_mm: float) -> Drawing:
+    """A motif repeated every `period_mm`: blue-sea waves (seigaiha) or five-petalled flowers in staggered rows.
+
+    Over `edge_mm` the share falls from 1 in the line to 0, as powder scatters beside it.
+    """
+    distance = {"waves": _waves, "flowers": _flowers}[name]
+    return lambda places_mm: np.clip(0.5 - distance(places_mm / period_mm) * period_mm / edge_mm, 0.0, 1.0)
+
+
+def picture(path: Path, width_mm: float) -> Drawing:
+    """A picture `width_mm` wide about the origin, upright along +y; none beside it.
+
+    Its alpha channel is the share if it has one (as `makie.decompose` makes it), otherwise its grey value over
+    white: white is metal. Values are taken as they are, without a transfer function. Raises InputError.
+    """
+    share = _shares(path)
+    rows, columns = share.shape
+
+    def drawn(places_mm: Array) -> Array:
+        from scipy.ndimage import map_coordinates
+
+        scale = columns / width_mm
+        place = [0.5 * (rows - 1) - places_mm[:, 1] * scale, 0.5 * (columns - 1) + places_mm[:, 0] * scale]
+        return np.asarray(np.clip(map_coordinates(share, place, order=1, cval=0.0), 0.0, 1.0))
+
+    return drawn
+
+
+def _shares(path: Path) -> Array:
+    """[rows, columns]."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            if "A" in opened.getbands():
+                return np.asarray(opened.getchannel("A"), dtype=float) / 255.0
+            if opened.mode.startswith("I"):
+                return np.asarray(opened, dtype=float) / 65535.0
+            return np.asarray(opened.convert("L"), dtype=float) / 255.0
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected a picture (PNG, TIFF), white where metal is; {error}") from error
+
+
+def _waves(place: Array) -> Array:
+    """Distance to the line, negative in it, both in periods: rows of ringed disks, each over the one above it."""
+    lowest = np.floor(4.0 * place[:, 1]) - 2.0
+    distance, covered = np.full(len(place), np.inf), np.zeros(len(place), bool)
+    for row in range(5):
+        level = lowest + row
+        across = np.mod(place[:, 0] - 0.5 * np.mod(level, 2.0) + 0.5, 1.0) - 0.5
+        radius = np.hypot(across, place[:, 1] - 0.25 * level)
+        takes = (radius <= 0.5) & ~covered
+        to_ring = np.abs(np.mod((0.48 - radius) * 2.0 * _RINGS + 0.5, 1.0) - 0.5) / (2.0 * _RINGS)
+        distance = np.where(takes, to_ring - _HALF_LINE, distance)
+        covered |= takes
+    return distance
+
+
+def _flowers(place: Array) -> Array:
+    """Distance to petals and hearts, negative in them, in periods: petals have a bare vein."""
+    row = np.round(place[:, 1] / 0.75)
+    x = np.mod(place[:, 0] - 0.5 * np.mod(row, 2.0) + 0.5, 1.0) - 0.5
+    y = place[:, 1] - 0.75 * row
+    r, phi = np.hypot(x, y), np.arctan2(y, x) + row
+    step = 2.0 * np.pi / _PETALS
+    beside = np.mod(phi + 0.5 * step, step) - 0.5 * step
+    edge = 0.17 + 0.18 * np.abs(np.cos(0.5 * _PETALS * phi)) ** 0.7
+    petal = np.maximum(np.maximum(r - edge, 0.10 - r), _HALF_LINE - np.abs(r * np.sin(beside)))
+    return np.asarray(np.minimum(petal, r - 0.06))

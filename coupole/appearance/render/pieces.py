@@ -1,0 +1,30 @@
+"""What objects consist of: triangles and balls, each of one material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from coupole.appearance.render.materials import Material
+from coupole.appearance.spectra.grid import Array
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one material."""
+
+    corners_mm: Array
+    """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
+    material: Material
+    smooth: bool = False
+    """True for smooth shading."""
+    normals: Array | None = None
+    """[triangles, 3, 3] for smooth shading, one for each place: those of a body of which this is a part."""
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere, exactly."""
+
+    centre_mm: Array
+    radius_mm: float
+    material: Material

@@ -121,6 +121,8 @@ def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any
         "chosen": found.chosen + 1,
         "noise": found.noise,
         "bands": int(found.bands.sum()),
+        "told_within": {name: found.told_within(name) for name in found.best.shares},
+        "rivals": list(found.rivals),
         "recipes": [_told(one, under) for one, under in zip(found.recipes, matches, strict=True)],
     }
 
@@ -153,14 +155,29 @@ def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> 
     from rich.table import Table
 
     best = found.best
-    table = Table("paint", "share", "+- 95 %", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    from coupole.heritage.analysis.recipe_search import TOLD_WITHIN
+
+    table = Table(
+        "paint",
+        "share",
+        "+- 95 %",
+        f"{100 * TOLD_WITHIN:.0f} % told",
+        box=None,
+        padding=(0, 2, 0, 0),
+        pad_edge=False,
+    )
     for name, share in sorted(best.shares.items(), key=lambda item: -item[1]):
-        table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %")
+        within = found.told_within(name)
+        told = "yes" if within <= TOLD_WITHIN else f"no, {100 * within:.0f} %"
+        table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %", told)
     console.print(table)
     for match in matches[found.chosen]:
         left = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
         console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{left}", markup=False)
     console.print(f"{found.verdict()}.", markup=False)
+    for rival in found.rivals[:_FEWER]:
+        shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
+        console.print(f"not told from it at a noise of {found.noise:g}: {shares}", markup=False)
     for number in range(found.chosen - 1, max(-1, found.chosen - _FEWER), -1):
         fewer = found.recipes[number]
         told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())

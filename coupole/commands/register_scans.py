@@ -21,27 +21,46 @@ def _option(name: str, help_text: str) -> typer.models.OptionInfo:
     return typer.Option(name, help=help_text, show_default=False)  # type: ignore[no-any-return]
 
 
+ScansArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Two or more, in any order: PLY, STL, OBJ, PTX, PTS, E57, or text with x y z; a PTX, PTS or E57 "
+        "may hold several.",
+        show_default=False,
+    ),
+]
+SeenFromOption = Annotated[
+    str | None,
+    _option(
+        "--seen-from",
+        "Where the scanner stood in each scan's frame: origin, or far away along +x, -x, +y, -y, +z or -z, or "
+        "none; found by the scans themselves without it.",
+    ),
+]
+TrustOption = Annotated[
+    bool,
+    typer.Option(
+        "--trust-poses",
+        help="Begin with the poses that PTX and E57 state; they are tested and adjusted all the same.",
+    ),
+]
+
+
 def register(
-    scans: Annotated[
-        list[Path],
-        typer.Argument(help="Two or more, in any order: PLY, STL, OBJ, or text with x y z.", show_default=False),
-    ],
+    scans: ScansArgument,
     out: Annotated[Path, _option("--out", "A new folder for poses, mesh and report.")],
-    unit: Annotated[str, typer.Option("--unit", help="Of the scans and tables: mm, cm, m, um or in.")] = "mm",
+    unit: Annotated[
+        str | None,
+        _option("--unit", "Of scans and tables: mm, cm, m, um or in; mm without it. E57 is always in m."),
+    ] = None,
     targets: Annotated[
         Path | None, _option("--targets", "Table of targets in the scans: scan, name, x, y, z, u_mm.")
     ] = None,
     control: Annotated[
         Path | None, _option("--control", "Table of targets whose places are known: name, x, y, z, u_mm.")
     ] = None,
-    seen_from: Annotated[
-        str | None,
-        _option(
-            "--seen-from",
-            "Where the scanner stood in each scan's frame: origin, or far away along +x, -x, +y, -y, +z or -z, or "
-            "none; found by the scans themselves without it.",
-        ),
-    ] = None,
+    seen_from: SeenFromOption = None,
+    trust_poses: TrustOption = False,
     mesh_mm: Annotated[
         float | None, _option("--mesh-mm", "Cells of the merged mesh; 1.5 times the points' spacing without it.")
     ] = None,
@@ -52,20 +71,21 @@ def register(
     """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""
     from coupole.scan.registration.registering import register as registered
     from coupole.scan.registration.summary import about, remarks
-    from coupole.scan.scan import UNITS, new_scan_folder
+    from coupole.scan.scan import new_scan_folder
     from coupole.viewing import registration_page
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
     try:
-        if unit not in UNITS:
-            raise InputError(f"--unit {unit}: expected one of {', '.join(UNITS)}")
+        unit = _unit(unit, scans)
         stand = _stand(seen_from)
         if mesh_mm is not None and not mesh_mm > 0:
             raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
         levels_mm = _levels(levels)
         with new_scan_folder(out) as folder, step_bars(console) as say:
-            found = registered(scans, unit, stand=stand, targets=targets, control=control, say=say)
+            found = registered(
+                scans, unit, stand=stand, targets=targets, control=control, trust_poses=trust_poses, say=say
+            )
             merged = None if no_mesh else _merged(found, unit, mesh_mm, levels_mm, folder, say)
             told = about(found, merged)
             (folder / "registration.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
@@ -80,6 +100,20 @@ def register(
     console.print(f"[bold]{out}[/]: report.html, registration.json" + ("" if no_mesh else ", mesh.ply"))
     if as_json:
         print(json.dumps(told))
+
+
+def _unit(stated: str | None, scans: list[Path]) -> str:
+    from coupole.scan.registration.text_scans import HEADED_SUFFIXES
+    from coupole.scan.scan import UNITS
+
+    if stated is None:
+        unclear = next((path for path in scans if path.suffix.lower() in HEADED_SUFFIXES), None)
+        if unclear is not None:
+            raise InputError(f"{unclear}: some scanners write it in m, others in mm: state --unit")
+        return "mm"
+    if stated not in UNITS:
+        raise InputError(f"--unit {stated}: expected one of {', '.join(UNITS)}")
+    return stated
 
 
 def _stand(seen_from: str | None) -> Stand | None:

@@ -78,6 +78,21 @@ def test_shares_come_back_in_their_intervals_and_no_other_paint_is_used(tmp_path
     assert np.mean(held) > 0.85
 
 
+def test_a_paint_that_another_may_stand_for_is_not_said_to_be_told(tmp_path: Path) -> None:
+    palette = read_palette([library(tmp_path, list(paints()))])
+    blue = next(paint for paint in palette if paint.name == "blue")
+    twin = Paint(**{**vars(blue), "name": "twin", "absorption": 1.001 * blue.absorption})
+
+    alone = recipe_search.find(on_grid(target(SHARES)), palette, FACE, NOISE, 3)
+    beside = recipe_search.find(on_grid(target(SHARES)), [*palette, twin], FACE, NOISE, 3)
+
+    assert alone.rivals == ()
+    assert all(alone.told_within(name) < recipe_search.TOLD_WITHIN for name in SHARES)
+    unsure = next(name for name in beside.best.shares if name in ("blue", "twin"))
+    assert beside.told_within(unsure) == pytest.approx(0.3, abs=0.02)
+    assert beside.told_within("white") < recipe_search.TOLD_WITHIN
+
+
 def test_without_one_paint_the_verdict_says_where_it_is_missed(tmp_path: Path) -> None:
     palette = read_palette([library(tmp_path, ["white", "red", "ochre"])])
 

@@ -27,6 +27,10 @@ _EXHAUSTIVE = 5000
 _REFINED = 6
 _WORTH = 16.0
 """Squared standard uncertainties by which one paint more must improve a recipe to be worth it."""
+_UNTOLD = 6.0
+"""Squared standard uncertainties within which two recipes are not told apart: 95 % of a chi-square of two."""
+TOLD_WITHIN = 0.02
+"""Of a share: what is asked of a recipe."""
 _EXPLAINED = 1.5
 """Root mean square residual over its uncertainty up to which a recipe explains the target."""
 _LEAST_BANDS = 10
@@ -63,6 +67,15 @@ class Found:
     """[81], seen."""
     bands: NDArray[np.bool_]
     noise: float
+    rivals: tuple[dict[str, float], ...] = ()
+    """Shares of other paints that the target does not tell from the recipe's: of as many or fewer within noise,
+    and of one more where it is nearer beyond noise, but not enough to be worth it."""
+
+    def told_within(self, name: str) -> float:
+        """Within which a share of the best recipe is known: its 95 % interval, and what rivals have instead."""
+        share = self.best.shares[name]
+        apart = [abs(other.get(name, 0.0) - share) for other in self.rivals]
+        return max(self.best.half_widths[name], *apart, 0.0)
 
     @property
     def best(self) -> Recipe:
@@ -103,14 +116,32 @@ def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_m
         )
     problem = _Problem(target[bands], palette, bands, face, noise)
     recipes: list[Recipe] = []
+    tried: list[tuple[float, tuple[int, ...], Array]] = []
     before: list[tuple[int, ...]] = [()]
     for size in range(1, min(at_most, len(palette)) + 1):
         candidates = _subsets(len(palette), size, before)
         ranked = sorted(candidates, key=problem.roughly)[:_REFINED]
         refined = sorted((problem.refined(subset) for subset in ranked), key=lambda found: found[0])
         before = [subset for _, subset, _ in refined[:3]]
+        tried += refined
         recipes.append(problem.recipe(refined[0][1], refined[0][2]))
-    return Found(tuple(recipes), _chosen(recipes, int(bands.sum())), target, bands, noise)
+    chosen = _chosen(recipes, int(bands.sum()))
+    rivals = _rivals(tried, chosen + 1, max(1.0, recipes[chosen].misfit) ** 2, palette)
+    return Found(tuple(recipes), chosen, target, bands, noise, rivals)
+
+
+def _rivals(
+    tried: Sequence[tuple[float, tuple[int, ...], Array]], size: int, scale: float, palette: Sequence[Paint]
+) -> tuple[dict[str, float], ...]:
+    """Shares of the recipes tried that are not told from the best one of a size, the nearest first."""
+    best = min(cost for cost, subset, _ in tried if len(subset) == size)
+    found = []
+    for cost, subset, shares in sorted(tried, key=lambda one: one[0]):
+        worse = (cost - best) / scale
+        near = worse < _UNTOLD if len(subset) <= size else len(subset) == size + 1 and worse < -_UNTOLD
+        if near and not (len(subset) == size and cost == best):
+            found.append({palette[i].name: float(share) for i, share in zip(subset, shares, strict=True)})
+    return tuple(found)
 
 
 def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterable[tuple[int, ...]]:

@@ -18,7 +18,8 @@ from coupole.heritage.comparison.local_surface import FREEDOM, fit_locally
 from coupole.heritage.comparison.significance import discoveries, of_lengths, of_vectors
 from coupole.heritage.comparison.state_files import Floats, State, read_state
 from coupole.heritage.comparison.unchanged_alignment import Alignment, align
-from coupole.scan.registration.prepared_scan import ExtraMissing, thinned
+from coupole.scan.registration.extra import ExtraMissing
+from coupole.scan.registration.prepared_scan import thinned
 from coupole.scan.registration.small_motions import applied, inverse_of
 from coupole.scan.registration.viewpoint import Viewpoint
 

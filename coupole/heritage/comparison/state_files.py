@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.scan.registration.prepared_scan import spacing, vertex_normals
-from coupole.scan.registration.scan_files import read_points
+from coupole.scan.registration.scan_files import read_scan, sources_of
 
 Floats = NDArray[np.float64]
-_HEADER_BYTES = 65536
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,15 @@ class State:
 
 def read_state(path: Path, unit: str) -> State:
     """PLY (its colours too), STL, OBJ or text. Raises InputError."""
-    mesh = read_points(path, unit)
+    sources = sources_of([path])
+    if len(sources) != 1:
+        raise InputError(
+            f"{path}: expected one state; the file holds {len(sources)} scans: register and merge them"
+        )
+    content = read_scan(sources[0], unit, colours=True)
+    mesh, srgb = content.mesh, None
+    if content.srgba is not None and np.all(content.srgba[:, 3] == 255):
+        srgb = content.srgba[:, :3]
     spacing_mm = spacing(mesh.vertices)
     if spacing_mm == 0:
         raise InputError(f"{path}: all its points lie in one place")
@@ -49,26 +55,6 @@ def read_state(path: Path, unit: str) -> State:
         mesh.vertices.astype(np.float64),
         mesh.triangles.astype(np.int64),
         vertex_normals(mesh),
-        _colours(path, len(mesh.vertices)),
+        srgb,
         spacing_mm,
     )
-
-
-def _colours(path: Path, count: int) -> NDArray[np.uint8] | None:
-    """[n, 3] `red`, `green` and `blue` of a PLY's vertices, 8 bit; None without them."""
-    if path.suffix.lower() != ".ply":
-        return None
-    with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES).split(b"end_header")[0]
-    if b" red" not in head or b" blue" not in head:
-        return None
-    import trimesh
-
-    loaded: Any = trimesh.load(path, process=False)
-    colours = getattr(loaded, "colors", None)
-    if colours is None:
-        colours = loaded.visual.vertex_colors
-    colours = np.asarray(colours)
-    if len(colours) != count or colours.dtype != np.uint8:
-        raise InputError(f"{path}: expected colours of {count} vertices, 8 bit; found {len(colours)}")
-    return np.asarray(colours[:, :3])

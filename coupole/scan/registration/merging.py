@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
-from coupole.scan.registration.prepared_scan import (
-    NEIGHBOURS,
-    ExtraMissing,
-    PreparedScan,
-    registration_libraries,
-    vertex_normals,
-)
-from coupole.scan.registration.scan_files import read_points
+from coupole.scan.registration.extra import ExtraMissing, registration_libraries
+from coupole.scan.registration.merged_colours import around, encoded, linear_light
+from coupole.scan.registration.prepared_scan import NEIGHBOURS, PreparedScan, vertex_normals
+from coupole.scan.registration.scan_files import read_scan
 from coupole.scan.registration.small_motions import applied
 from coupole.scan.registration.viewpoint import Floats
 
@@ -43,7 +39,9 @@ _NEAR_CELLS, _COVERED_CELLS = 2.5, 1.3
 _MOST_NEIGHBOURS = 32
 _STEEPEST = 0.2
 """Cosine of incidence below which points are left out: they are smeared over rims."""
-_RECORD = np.dtype([("point", "<f4", 3), ("normal", "<f4", 3), ("weight", "<f4")])
+_RECORD = np.dtype([("point", "<f4", 3), ("normal", "<f4", 3), ("weight", "<f4"), ("light", "<f4", 4)])
+"""`light`: as `linear_light` has it."""
+_COLOURS_HEAD = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
 _FACE = np.dtype([("corners", "u1"), ("indices", "<u4", 3)])
 _CHUNK = 2_000_000
 
@@ -57,6 +55,8 @@ class Merged:
     points: int = 0
     """Read, of all scans."""
     cell_mm: float = 0.0
+    coloured: bool = False
+    """Whether a scan had colours, and mesh and clouds have them."""
     levels: dict[str, int] = field(default_factory=dict)
     """Points of each thinner cloud, by the name of its file."""
 
@@ -83,16 +83,21 @@ def merge(
     for done, (scan, pose) in enumerate(zip(scans, common_from_scan, strict=True)):
         say("distributing points", done, len(scans))
         found.points += scan.survey.count
-        _distribute(_records(scan, pose, unit, cell_mm), cell_mm, blocks)
+        records = _records(scan, pose, unit, cell_mm)
+        found.coloured |= bool(records["light"][:, 3].any())
+        _distribute(records, cell_mm, blocks)
     say("distributing points", len(scans), len(scans))
-    clouds = {f"points-{level:g}mm.ply": _Level(level) for level in levels_mm if level > cell_mm}
+    clouds = {
+        f"points-{level:g}mm.ply": _Level(level, coloured=found.coloured) for level in levels_mm if level > cell_mm
+    }
     files = sorted(blocks.iterdir())
-    with _MeshFile(folder) as mesh:
+    with _MeshFile(folder, coloured=found.coloured) as mesh:
         for done, path in enumerate(files):
             say("merging blocks", done, len(files))
             block = np.array([int(word) for word in path.stem.split("_")])
             records = np.fromfile(path, _RECORD)
-            mesh.add(*_surface(records, block, cell_mm), block)
+            vertices, triangles = _surface(records, block, cell_mm)
+            mesh.add(vertices, triangles, block, _shades(records, vertices, block, cell_mm))
             own = np.all(_block_of(records["point"], cell_mm) == block, axis=1)
             for level in clouds.values():
                 level.add(records[own])
@@ -110,7 +115,8 @@ def merge(
 def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDArray[np.void]:
     """A scan's points, one for each cell, in the common frame."""
     small_gicp, _ = registration_libraries()
-    whole = read_points(scan.path, unit)
+    content = read_scan(scan.source, unit, colours=True)
+    whole = content.mesh
     points_mm = whole.vertices.astype(np.float64)
     middle = points_mm.mean(axis=0)
     thin = small_gicp.voxelgrid_sampling(points_mm - middle, cell_mm)
@@ -124,7 +130,7 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
         outward = known[cKDTree(points_mm).query(points)[1]]
     else:
         raise InputError(
-            f"{scan.path}: neither triangles nor a viewpoint say which side of its surface is out; state with "
+            f"{scan.source}: neither triangles nor a viewpoint say which side of its surface is out; state with "
             "--seen-from where the scanner stood, or leave out the mesh with --no-mesh"
         )
     incidence = np.sum(normals * outward, axis=1)
@@ -134,6 +140,10 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
     records["point"] = applied(pose, points[kept])
     records["normal"] = normals[kept] @ pose[:3, :3].T
     records["weight"] = np.abs(incidence[kept])
+    records["light"] = 0.0
+    if content.srgba is not None:
+        records["light"] = around(points_mm, linear_light(content.srgba), points[kept], cell_mm, cell_mm / 2)
+        records["light"] /= np.maximum(records["light"][:, 3:], 1e-12)
     return records
 
 
@@ -204,6 +214,18 @@ def _surface(
     return vertices[used], triangles.reshape(-1, 3)
 
 
+def _shades(
+    records: NDArray[np.void], vertices: NDArray[np.float32], block: NDArray[np.int64], cell_mm: float
+) -> NDArray[np.uint8]:
+    """[n, 3] sRGB colours of vertices in cells from a block's first corner."""
+    if not len(vertices) or not records["light"][:, 3].any():
+        return np.zeros((len(vertices), 3), np.uint8)
+    lit = records[records["light"][:, 3] > 0]
+    points = lit["point"].astype(np.float64) / cell_mm - block * BLOCK_CELLS
+    light = lit["light"] * lit["weight"][:, None].astype(np.float64)
+    return encoded(around(points, light, vertices.astype(np.float64), _REACH_CELLS, _KERNEL_CELLS))
+
+
 def _corners_near(points: Floats) -> NDArray[np.bool_]:
     """[65, 65, 65] corners of a block that have a point within three cells along each axis."""
     margin = 4
@@ -219,7 +241,9 @@ def _corners_near(points: Floats) -> NDArray[np.bool_]:
 class _MeshFile:
     """A mesh that grows on the disk; vertices on the borders of blocks are welded at the end."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, coloured: bool) -> None:
+        self._coloured = coloured
+        self._shades: list[NDArray[np.uint8]] = []
         self._vertices_path, self._faces_path = folder / "vertices.part", folder / "faces.part"
         self._keys: list[NDArray[np.int64]] = []
         self._numbers: list[NDArray[np.int64]] = []
@@ -235,8 +259,14 @@ class _MeshFile:
         self._vertices_path.unlink(missing_ok=True)
         self._faces_path.unlink(missing_ok=True)
 
-    def add(self, vertices: NDArray[np.float32], triangles: NDArray[np.int64], block: NDArray[np.int64]) -> None:
-        """Vertices in cells from the first corner of a block, and triangles of them."""
+    def add(
+        self,
+        vertices: NDArray[np.float32],
+        triangles: NDArray[np.int64],
+        block: NDArray[np.int64],
+        shades: NDArray[np.uint8],
+    ) -> None:
+        """Vertices in cells from the first corner of a block, triangles of them, and colours [n, 3]."""
         if not len(triangles):
             return
         whole = np.round(vertices)
@@ -244,6 +274,8 @@ class _MeshFile:
         self._keys.append(_edge_keys(vertices[rim], block))
         self._numbers.append(self._count + rim)
         (vertices.astype(np.float64) + block * BLOCK_CELLS).tofile(self._vertices)
+        if self._coloured:
+            self._shades.append(shades)
         (triangles + self._count).astype("<i8").tofile(self._faces)
         self._count += len(vertices)
         self._triangles += len(triangles)
@@ -259,17 +291,21 @@ class _MeshFile:
             stands_for[numbers] = numbers[first[back.reshape(-1)]]
         kept = stands_for == np.arange(self._count)
         renumbered = (np.cumsum(kept) - 1)[stands_for]
+        every = np.concatenate(self._shades or [np.zeros((0, 3), np.uint8)])
         with path.open("wb") as file:
             file.write(
                 (
                     "ply\nformat binary_little_endian 1.0\ncomment mm\n"
                     f"element vertex {int(kept.sum())}\nproperty float x\nproperty float y\nproperty float z\n"
+                    f"{_COLOURS_HEAD if self._coloured else ''}"
                     f"element face {self._triangles}\nproperty list uchar uint vertex_indices\nend_header\n"
                 ).encode()
             )
             for first_row in range(0, self._count, _CHUNK):
                 part = np.fromfile(self._vertices_path, "<f8", 3 * _CHUNK, offset=24 * first_row).reshape(-1, 3)
-                (part[kept[first_row : first_row + _CHUNK]] * cell_mm).astype("<f4").tofile(file)
+                chosen = kept[first_row : first_row + _CHUNK]
+                shades = every[first_row : first_row + _CHUNK][chosen] if self._coloured else None
+                _write_points(file, part[chosen] * cell_mm, shades)
             for first_row in range(0, self._triangles, _CHUNK):
                 corners = np.fromfile(self._faces_path, "<i8", 3 * _CHUNK, offset=24 * first_row).reshape(-1, 3)
                 faces = np.empty(len(corners), _FACE)
@@ -278,6 +314,15 @@ class _MeshFile:
             file.flush()
             os.fsync(file.fileno())
         return int(kept.sum()), self._triangles
+
+
+def _write_points(file: BinaryIO, points: Floats, shades: NDArray[np.uint8] | None) -> None:
+    if shades is None:
+        points.astype("<f4").tofile(file)
+        return
+    rows = np.empty(len(points), [("point", "<f4", 3), ("shade", "u1", 3)])
+    rows["point"], rows["shade"] = points, shades
+    rows.tofile(file)
 
 
 def _edge_keys(vertices: NDArray[np.float32], block: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -294,7 +339,8 @@ def _edge_keys(vertices: NDArray[np.float32], block: NDArray[np.int64]) -> NDArr
 class _Level:
     """A cloud with one point, the mean, for each cell of a grid."""
 
-    def __init__(self, pitch_mm: float) -> None:
+    def __init__(self, pitch_mm: float, *, coloured: bool) -> None:
+        self._coloured = coloured
         self._pitch_mm = pitch_mm
         self._keys: list[NDArray[np.int64]] = []
         self._sums: list[Floats] = []
@@ -302,22 +348,24 @@ class _Level:
     def add(self, records: NDArray[np.void]) -> None:
         cells = np.floor(records["point"].astype(np.float64) / self._pitch_mm).astype(np.int64)
         keys, number = np.unique(cells, axis=0, return_inverse=True)
-        columns = np.concatenate([records["point"], np.ones((len(records), 1))], axis=1)
+        columns = np.concatenate([records["point"], np.ones((len(records), 1)), records["light"]], axis=1)
         self._keys.append(keys)
         self._sums.append(np.stack([np.bincount(number.reshape(-1), c, len(keys)) for c in columns.T], axis=1))
 
     def write(self, path: Path) -> int:
         keys, number = np.unique(np.concatenate(self._keys), axis=0, return_inverse=True)
         sums = np.concatenate(self._sums)
-        whole = np.stack([np.bincount(number.reshape(-1), c, len(keys)) for c in sums.T], axis=1)
-        points = (whole[:, :3] / whole[:, 3:]).astype("<f4")
+        whole: Floats = np.stack([np.bincount(number.reshape(-1), c, len(keys)) for c in sums.T], axis=1).astype(
+            np.float64
+        )
+        points = whole[:, :3] / whole[:, 3:4]
         with path.open("wb") as file:
             file.write(
                 (
                     "ply\nformat binary_little_endian 1.0\ncomment mm\n"
                     f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
-                    "end_header\n"
+                    f"{_COLOURS_HEAD if self._coloured else ''}end_header\n"
                 ).encode()
             )
-            points.tofile(file)
+            _write_points(file, points, encoded(whole[:, 4:]) if self._coloured else None)
         return len(points)

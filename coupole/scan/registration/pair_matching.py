@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from coupole.scan.registration.prepared_scan import Cloud, PreparedScan, registration_libraries
+from coupole.scan.registration.extra import registration_libraries
+from coupole.scan.registration.prepared_scan import Cloud, PreparedScan
 from coupole.scan.registration.viewpoint import Floats
 
 LEAST_OVERLAP = 0.12

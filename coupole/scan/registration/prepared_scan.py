@@ -5,40 +5,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from coupole.errors import CoupoleError, InputError
+from coupole.errors import InputError
 from coupole.scan.mesh import Mesh
-from coupole.scan.registration.scan_files import read_points
+from coupole.scan.registration.extra import registration_libraries
+from coupole.scan.registration.scan_content import ScanSource
+from coupole.scan.registration.scan_files import read_scan
 from coupole.scan.registration.viewpoint import DepthPicture, Floats, Stand, Viewpoint, folds
 
 NEIGHBOURS = 12
 """Of a point, by which its normal is found."""
 PLACE_SPACINGS = 2.0
 _SAMPLE, _MOST_PICTURED = 100_000, 120_000
-
-
-class ExtraMissing(CoupoleError):
-    """A library that only registration needs is not installed."""
-
-    exit_code = 2
-
-
-def registration_libraries() -> tuple[Any, Any]:
-    """`small_gicp` and `kiss_matcher`. Raises ExtraMissing."""
-    try:
-        import kiss_matcher
-        import small_gicp
-    except ImportError as error:
-        raise ExtraMissing(
-            f"registration needs libraries of its own: pip install 'coupole[registration]' ({error})"
-        ) from error
-    return small_gicp, kiss_matcher
+_COARSEST_STEP = 0.05
+"""Of 32-bit coordinates, over the points' spacing."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +71,9 @@ class Survey:
 class PreparedScan:
     """What is kept of a scan in memory; the whole is read again when scans are merged."""
 
-    name: str
-    path: Path
+    source: ScanSource
+    stated_pose: Floats | None
+    """4x4 mm that the scan's file states."""
     survey: Survey
     viewpoint: Viewpoint
     fine: Cloud
@@ -95,20 +81,36 @@ class PreparedScan:
     picture: DepthPicture | None
     """None if the viewpoint is not known."""
 
+    @property
+    def name(self) -> str:
+        return self.source.name
 
-def survey(path: Path, unit: str) -> Survey:
+
+def survey(source: ScanSource, unit: str) -> Survey:
     """Read a scan to measure it. Raises InputError."""
     small_gicp, _ = registration_libraries()
-    mesh = read_points(path, unit)
+    mesh = read_scan(source, unit).mesh
     spacing_mm = spacing(mesh.vertices)
     if spacing_mm == 0:
-        raise InputError(f"{path}: all its points lie in one place")
+        raise InputError(f"{source}: all its points lie in one place")
+    _expect_fine_steps(source, mesh, spacing_mm)
     normals, some = vertex_normals(mesh), _sample(len(mesh.vertices))
     places = len(small_gicp.voxelgrid_sampling(mesh.vertices.astype(float), PLACE_SPACINGS * spacing_mm).points())
     thinned_mm = spacing_mm * (len(mesh.vertices) / len(some)) ** 0.5
     folded = folds(mesh.vertices[some].astype(float), None if normals is None else normals[some], thinned_mm)
     size_mm = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0).astype(np.float64)))
     return Survey(len(mesh.vertices), spacing_mm, size_mm, places, folded)
+
+
+def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> None:
+    """Raise InputError if coordinates are too far from their origin for 32-bit numbers."""
+    farthest_mm = np.abs(mesh.vertices).max()
+    step_mm = float(np.spacing(farthest_mm))
+    if step_mm > _COARSEST_STEP * spacing_mm:
+        raise InputError(
+            f"{source}: points are up to {farthest_mm / 1000:.0f} m from their origin, where 32-bit coordinates "
+            f"have steps of {step_mm:.2g} mm, and {spacing_mm:.2g} mm apart: subtract the same from all scans"
+        )
 
 
 def _sample(count: int) -> NDArray[np.intp]:
@@ -119,20 +121,21 @@ def _sample(count: int) -> NDArray[np.intp]:
 
 
 def prepare(
-    name: str, path: Path, unit: str, known: Survey, viewpoint: Viewpoint, fine_mm: float, coarse_mm: float
+    source: ScanSource, unit: str, known: Survey, viewpoint: Viewpoint, fine_mm: float, coarse_mm: float
 ) -> PreparedScan:
     """Read a scan and thin it to two pitches. Raises InputError."""
-    mesh = read_points(path, unit)
+    content = read_scan(source, unit)
+    mesh = content.mesh
     fine = thinned(mesh.vertices.astype(np.float64), fine_mm, viewpoint, vertex_normals(mesh))
     coarse = thinned(fine.points_mm, coarse_mm, viewpoint, fine.normals)
     if len(coarse.points_mm) < 3 * NEIGHBOURS:
-        raise InputError(f"{path}: its points lie in {len(coarse.points_mm)} places; expected a surface")
+        raise InputError(f"{source}: its points lie in {len(coarse.points_mm)} places; expected a surface")
     picture = None
     if viewpoint.stand != "none":
         some = _sample(known.count)
         thinned_mm = known.spacing_mm * (known.count / len(some)) ** 0.5
         picture = DepthPicture(viewpoint, mesh.vertices[some].astype(np.float64), thinned_mm)
-    return PreparedScan(name, path, known, viewpoint, fine, coarse, picture)
+    return PreparedScan(source, content.stated_pose, known, viewpoint, fine, coarse, picture)
 
 
 def thinned(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known: Floats | None) -> Cloud:

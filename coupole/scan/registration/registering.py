@@ -16,9 +16,10 @@ from coupole.scan.registration.joining import Groups, join, spheres_meet
 from coupole.scan.registration.joint_fit import JointFit, adjust
 from coupole.scan.registration.loop_errors import Loop, find_loops, pairs_alone, with_loops
 from coupole.scan.registration.pair_matching import LEAST_OVERLAP, PairMotion, fit_of
-from coupole.scan.registration.pair_search import Search, search_of
+from coupole.scan.registration.pair_search import Search, Task, search_of
 from coupole.scan.registration.prepared_scan import PLACE_SPACINGS, PreparedScan, Survey, prepare, survey
-from coupole.scan.registration.scan_files import expect_different, names_of
+from coupole.scan.registration.scan_content import ScanSource
+from coupole.scan.registration.scan_files import expect_different, sources_of
 from coupole.scan.registration.small_motions import inverse_of
 from coupole.scan.registration.viewpoint import Floats, Stand, Viewpoint, choose_viewpoints
 
@@ -68,18 +69,28 @@ def register(
     stand: Stand | None = None,
     targets: Path | None = None,
     control: Path | None = None,
+    trust_poses: bool = False,
     processes: int | None = None,
     say: Say,
 ) -> Registered:
-    """Poses of scans in files. Raises InputError for invalid files, and if no two scans overlap."""
-    if len(paths) < 2:
-        raise InputError(f"expected two scans or more, found {len(paths)}")
+    """Poses of scans in files; with `trust_poses` those that PTX and E57 state are first guesses.
+
+    Raises InputError for invalid files, and if no two scans overlap; ExtraMissing.
+    """
     expect_different(paths)
-    names = names_of(paths)
+    sources = sources_of(paths)
+    if len(sources) < 2:
+        raise InputError(f"expected two scans or more, found {len(sources)}")
+    names = [source.name for source in sources]
     sightings = read_sightings(targets, control, names, unit)
-    scans = _prepared(names, paths, unit, stand, say)
+    scans = _prepared(sources, unit, stand, say)
+    if trust_poses and not any(scan.stated_pose is not None for scan in scans):
+        raise InputError("--trust-poses: no scan states a pose; only PTX and E57 can")
     with search_of(scans, processes) as search:
-        groups = _found(scans, search, motions_by_targets(sightings), say)
+        known = motions_by_targets(sightings)
+        if trust_poses:
+            known += search.run("testing stated poses", list(_stated(scans)), say)
+        groups = _found(scans, search, known, say, every=not trust_poses)
         main = max(groups.members.values(), key=lambda members: (len(members), -min(members)))
         if len(main) < 2:
             raise InputError(
@@ -92,34 +103,33 @@ def register(
     return _adjusted(names, scans, groups, placed, sightings, say)
 
 
-def _prepared(
-    names: Sequence[str], paths: Sequence[Path], unit: str, stand: Stand | None, say: Say
-) -> list[PreparedScan]:
+def _prepared(sources: Sequence[ScanSource], unit: str, stand: Stand | None, say: Say) -> list[PreparedScan]:
     surveys = []
-    for done, path in enumerate(paths):
-        say("reading", done, len(paths))
-        surveys.append(survey(path, unit))
-    say("reading", len(paths), len(paths))
-    _expect_one_unit(paths, surveys)
+    for done, source in enumerate(sources):
+        say("reading", done, len(sources))
+        surveys.append(survey(source, unit))
+    say("reading", len(sources), len(sources))
+    _expect_one_unit(sources, surveys)
     if stand is None:
         viewpoints = choose_viewpoints([one.folded for one in surveys])
     else:
-        viewpoints = [Viewpoint(stand)] * len(paths)
+        viewpoints = [Viewpoint(stand)] * len(sources)
     fine_mm, coarse_mm = pitches(surveys)
     scans = []
-    for done, (name, path, known, viewpoint) in enumerate(zip(names, paths, surveys, viewpoints, strict=True)):
-        say("preparing", done, len(paths))
-        scans.append(prepare(name, path, unit, known, viewpoint, fine_mm, coarse_mm))
-    say("preparing", len(paths), len(paths))
+    for done, (source, known, viewpoint) in enumerate(zip(sources, surveys, viewpoints, strict=True)):
+        say("preparing", done, len(sources))
+        scans.append(prepare(source, unit, known, viewpoint, fine_mm, coarse_mm))
+    say("preparing", len(sources), len(sources))
     return scans
 
 
-def _expect_one_unit(paths: Sequence[Path], surveys: Sequence[Survey]) -> None:
+def _expect_one_unit(sources: Sequence[ScanSource], surveys: Sequence[Survey]) -> None:
     usual_mm = float(np.median([one.size_mm for one in surveys]))
-    for path, one in zip(paths, surveys, strict=True):
+    for source, one in zip(sources, surveys, strict=True):
         if not 1 / _ODD_SIZE < one.size_mm / usual_mm < _ODD_SIZE:
             raise InputError(
-                f"{path}: mixed units? The scan is {one.size_mm:.3g} mm in size, most are about {usual_mm:.3g} mm"
+                f"{source}: mixed units? The scan is {one.size_mm:.3g} mm in size, most are about "
+                f"{usual_mm:.3g} mm"
             )
 
 
@@ -135,12 +145,26 @@ def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
     return fine_mm, coarse_mm
 
 
-def _found(scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say) -> Groups:
-    """Groups by features, and by targets."""
+def _stated(scans: Sequence[PreparedScan]) -> Iterator[Task]:
+    """Pairs that overlap by the poses of their files, with their motions."""
+    for first, second in combinations(range(len(scans)), 2):
+        one, other = scans[first].stated_pose, scans[second].stated_pose
+        if one is not None and other is not None:
+            motion = inverse_of(one) @ other
+            if _may_overlap(scans, (first, second), motion):
+                yield first, second, motion
+
+
+def _found(
+    scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say, *, every: bool
+) -> Groups:
+    """Groups by features, and by motions that are known; `every` pair is tried, else those of different groups."""
     known = {(m.first, m.second) for m in by_targets}
     untried = [pair for pair in combinations(range(len(scans)), 2) if pair not in known]
     motions = list(by_targets)
     groups = join(scans, motions)
+    if not every:
+        untried = [(a, b) for a, b in untried if groups.group_of[a] != groups.group_of[b]]
     round_number = 0
     while untried:
         round_number += 1

@@ -4,62 +4,104 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, reason
-from coupole.scan.mesh import Mesh, expect_finite
+from coupole.scan.mesh import Mesh
 from coupole.scan.mesh_files import read_mesh
 from coupole.scan.mesh_ply import read_ply
+from coupole.scan.registration import e57_scans
+from coupole.scan.registration.scan_content import ScanContent, ScanSource
+from coupole.scan.registration.text_scans import (
+    HEADED_SUFFIXES,
+    TEXT_SUFFIXES,
+    headed_sources,
+    read_headed,
+    read_plain,
+)
 from coupole.scan.scanner_export import MM_PER_UNIT
 
-TEXT_SUFFIXES = (".xyz", ".txt", ".asc")
-SUFFIXES = (".ply", ".stl", ".obj", *TEXT_SUFFIXES)
+SUFFIXES = (".ply", ".stl", ".obj", ".e57", *HEADED_SUFFIXES, *TEXT_SUFFIXES)
 LEAST_POINTS = 200
 """Of a scan: with fewer no shape can be recognized."""
+_HEADER_BYTES = 65536
 PLAUSIBLE_SIZE_MM = (2.0, 1e6)
 """Diagonal of a scan's bounding box: from a coin to a cathedral."""
 
 
-def read_points(path: Path, unit: str) -> Mesh:
-    """A mesh, or points without triangles, in mm: PLY, STL, OBJ, or text with x, y and z first in each line.
+def sources_of(paths: Sequence[Path]) -> list[ScanSource]:
+    """The scans of files, of which a PTX, PTS or E57 may hold several; their names are paths where two files have
+    the same name. Raises InputError with the place of the error, ExtraMissing."""
+    found: list[ScanSource] = []
+    for path in paths:
+        suffix = path.suffix.lower()
+        if suffix not in SUFFIXES:
+            raise InputError(f"{path}: expected a scan with the ending {', '.join(SUFFIXES)}")
+        if not path.is_file():
+            raise InputError(f"{path}: expected a scan; there is no such file")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: expected a scan; the file is empty")
+        if suffix in HEADED_SUFFIXES:
+            found += headed_sources(path)
+        elif suffix == ".e57":
+            found += e57_scans.e57_sources(path)
+        else:
+            found.append(ScanSource(path, path.name))
+    if len({source.name for source in found}) == len(found):
+        return found
+    return [replace(one, name=str(one.path) + one.name[len(one.path.name) :]) for one in found]
 
-    Raises InputError with the place of the error.
-    """
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path}: expected a scan with the ending {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise InputError(f"{path}: expected a scan; there is no such file")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: expected a scan; the file is empty")
-    if suffix == ".ply":
-        found = read_ply(path)
+
+def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanContent:
+    """A scan in mm; an E57 is in metres, whatever the `unit`. Raises InputError with the place of the error,
+    ExtraMissing."""
+    suffix = source.path.suffix.lower()
+    if suffix == ".e57":
+        found, unit = e57_scans.read_e57(source, colours=colours), e57_scans.UNIT
+    elif suffix in HEADED_SUFFIXES:
+        found = read_headed(source)
     elif suffix in TEXT_SUFFIXES:
-        found = Mesh(_read_text(path), np.zeros((0, 3), np.uint32))
+        found = read_plain(source.path)
+    elif suffix == ".ply":
+        mesh = read_ply(source.path)
+        found = ScanContent(mesh, _ply_colours(source.path, len(mesh.vertices)) if colours else None)
     else:
-        found = read_mesh(path)
-    if len(found.vertices) < LEAST_POINTS:
-        raise InputError(f"{path}: expected {LEAST_POINTS} points or more, found {len(found.vertices)}")
-    mesh = Mesh(found.vertices * np.float32(MM_PER_UNIT[unit]), found.triangles)
-    _expect_plausible(path, mesh, unit)
-    return mesh
+        found = ScanContent(read_mesh(source.path))
+    if len(found.mesh.vertices) < LEAST_POINTS:
+        raise InputError(f"{source}: expected {LEAST_POINTS} points or more, found {len(found.mesh.vertices)}")
+    mesh = Mesh(found.mesh.vertices * np.float32(MM_PER_UNIT[unit]), found.mesh.triangles)
+    _expect_plausible(source, mesh, unit)
+    pose = found.stated_pose
+    if pose is not None:
+        pose = pose.copy()
+        pose[:3, 3] *= MM_PER_UNIT[unit]
+    return ScanContent(mesh, found.srgba, pose)
 
 
-def _read_text(path: Path) -> NDArray[np.float32]:
-    try:
-        points = np.loadtxt(path, dtype=np.float32, usecols=(0, 1, 2), comments=("#", "//"), ndmin=2)
-    except (ValueError, UnicodeDecodeError, OSError) as error:
-        raise InputError(
-            f"{path}: expected x, y and z first in each line, separated by blanks; {reason(error)}"
-        ) from error
-    expect_finite(path, points, "point {}")
-    return points
+def _ply_colours(path: Path, count: int) -> NDArray[np.uint8] | None:
+    """[n, 4] of `red`, `green` and `blue` of a PLY's vertices, 8 bit; None without them."""
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES).split(b"end_header")[0]
+    if b" red" not in head or b" blue" not in head:
+        return None
+    import trimesh
+
+    loaded: Any = trimesh.load(path, process=False)
+    colours = getattr(loaded, "colors", None)
+    if colours is None:
+        colours = loaded.visual.vertex_colors
+    colours = np.asarray(colours)
+    if len(colours) != count or colours.dtype != np.uint8:
+        raise InputError(f"{path}: expected colours of {count} vertices, 8 bit; found {len(colours)}")
+    return np.column_stack([colours[:, :3], np.full(count, 255, np.uint8)])
 
 
-def _expect_plausible(path: Path, mesh: Mesh, unit: str) -> None:
+def _expect_plausible(source: ScanSource, mesh: Mesh, unit: str) -> None:
     size_mm = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0).astype(np.float64)))
     low_mm, high_mm = PLAUSIBLE_SIZE_MM
     if low_mm <= size_mm <= high_mm:
@@ -67,7 +109,7 @@ def _expect_plausible(path: Path, mesh: Mesh, unit: str) -> None:
     fitting = [u for u, mm in MM_PER_UNIT.items() if low_mm <= size_mm / MM_PER_UNIT[unit] * mm <= high_mm]
     hint = f": is it in {' or '.join(fitting)}? Give its unit with --unit" if fitting and size_mm > 0 else ""
     raise InputError(
-        f"{path}: the scan is {size_mm:.3g} mm in size if it is in {unit}; expected {low_mm:g} to {high_mm:g} mm"
+        f"{source}: the scan is {size_mm:.3g} mm in size if it is in {unit}; expected {low_mm:g} to {high_mm:g} mm"
         f"{hint}"
     )
 
@@ -85,9 +127,3 @@ def expect_different(paths: Sequence[Path]) -> None:
             again = "is named twice" if seen[digest] == path else f"holds the same bytes as {seen[digest]}"
             raise InputError(f"{path}: {again}; name each scan once")
         seen[digest] = path
-
-
-def names_of(paths: Sequence[Path]) -> list[str]:
-    """The scans' names: those of their files, or paths where two files have the same name."""
-    short = [path.name for path in paths]
-    return short if len(set(short)) == len(short) else [str(path) for path in paths]

@@ -9,6 +9,7 @@ import numpy as np
 
 from coupole.scan.registration.merging import Merged
 from coupole.scan.registration.registering import Registered
+from coupole.scan.registration.small_motions import displacement_mm, inverse_of
 
 _CONSPICUOUS = 3.0
 """Times their uncertainty that targets may be off before a sentence says so."""
@@ -46,12 +47,16 @@ def about(found: Registered, merged: Merged | None) -> dict[str, Any]:
         ]
     if found.site_from_first is not None:
         told["site_from_first"] = found.site_from_first.tolist()
+    stated = stated_poses_off_mm(found)
+    if stated:
+        told["stated_poses_off_mm"] = stated
     if merged is not None:
         told["mesh"] = {
             "vertices": merged.vertices,
             "triangles": merged.triangles,
             "points": merged.points,
             "cell_mm": merged.cell_mm,
+            "colours": merged.coloured,
         }
         told["levels"] = merged.levels
     return told
@@ -76,6 +81,21 @@ def point_uncertainty_mm(found: Registered, number: int) -> float:
     spread = (arms @ turn.T).T @ (arms @ turn.T) / len(arms)
     turning = np.trace(spread) * np.eye(3) - spread
     return float(np.sqrt(np.trace(covariance[:3, :3]) + np.sum(turning * covariance[3:, 3:])))
+
+
+def stated_poses_off_mm(found: Registered) -> dict[str, float]:
+    """Root mean square displacement of each scan's points from where the pose that its file states puts them, seen
+    from the first placed scan that states one."""
+    stated = {k: pose for k in found.placed if (pose := found.scans[k].stated_pose) is not None}
+    if len(stated) < 2:
+        return {}
+    first = min(stated)
+    off = {}
+    for k, pose in stated.items():
+        by_file = inverse_of(stated[first]) @ pose
+        by_us = inverse_of(found.first_from_scan[first]) @ found.first_from_scan[k]
+        off[found.names[k]] = displacement_mm(by_file, by_us, found.scans[k].coarse.points_mm)
+    return off
 
 
 def worst_loop_mm(found: Registered) -> float:
@@ -107,6 +127,12 @@ def remarks(found: Registered) -> Iterator[str]:
         yield "not placed, as they overlap no other enough: " + ", ".join(names[k] for k in found.unplaced)
     if found.rejected:
         yield f"{len(found.rejected)} pairs were rejected, as others contradict them"
+    if stated := stated_poses_off_mm(found):
+        worst = max(stated, key=lambda name: stated[name])
+        yield (
+            f"poses stated by the files put points {np.median(list(stated.values())):.3g} mm in the median from "
+            f"where they are found, {stated[worst]:.3g} mm at worst ({worst})"
+        )
     blind = [scan.name for scan in found.scans if scan.viewpoint.stand == "none"]
     if blind:
         yield (

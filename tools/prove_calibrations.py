@@ -9,7 +9,7 @@ uncertainty, about 1. Then the distances of camera, LEDs and mesh from the truth
 over the cells. The file `--keep` gets a line for each cell; in a later call only missing cells are computed.
 
 With `--stranger` each cell has one cause that calibrations have no term for (`strange_cells`); judged are camera
-and hand-eye by their rays, and LEDs if the stranger is theirs. Cells whose calibration is refused are counted, with
+and hand-eye by their rays, and LEDs if the stranger is theirs. Cells whose calibration is refused are counted with
 the reasons; the intervals of all others must hold.
 
 The exit code is 1 if a cell could not be calibrated, or if a parameter's intervals are wrong: 90 to 99 % must

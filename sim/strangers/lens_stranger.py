@@ -71,5 +71,5 @@ class LensStranger(BaseModel):
         for place, weight in zip(places, (1.0 - places) / np.sum(1.0 - places), strict=True):
             at = (rows - place * shift[..., 1], columns - place * shift[..., 0])
             for channel in range(image.shape[2]):
-                out[..., channel] += weight * map_coordinates(image[..., channel], at, order=1, mode="nearest")
-        return out
+                out[..., channel] += weight * map_coordinates(image[..., channel], at, order=3, mode="nearest")
+        return np.maximum(out, np.float32(0.0))

@@ -32,6 +32,7 @@ from coupole.calibration.sources import About
 from coupole.calibration.stickers.mesh_to_robot import Stated as StatedOfMesh
 from coupole.calibration.stickers.sources import Scan, find_all_stickers, read_scan
 from coupole.calibration.stickers.workflow import mesh_from
+from coupole.errors import CoupoleError
 from coupole.geometry import apply, inverse, transform
 from coupole.kinematics import Arm
 from coupole.plan.rig_devices import planning_arm
@@ -50,6 +51,7 @@ from random_cells import (
     RandomCell,
     some_leds,
 )
+from ray_proof import LIGHT_STRANGERS, has_truth, judged_rays, true_board
 from sim.devices.kuka_kinematics import flange_pose
 from sim.devices.scanner import export_scan, scanner_from_thing
 from sim.optics.dome import as_built
@@ -75,11 +77,17 @@ class Proof:
     judged: list[Judged]
     accuracy: dict[str, float]
     """Distances from the truth in mm and deg, by name; `_in_true_base`: including the arm's common error."""
+    refused: str | None = None
+    """Why a calibration of this cell was refused or its record missed its limits; None: all were accepted."""
 
 
-def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool) -> Proof:
+def prove_cell(
+    seed: int, *, at: Postures, width_px: int, samples: int, absolute: bool, stranger: str | None = None
+) -> Proof:
     """Render, detect, adjust, and compare the records with the truth."""
-    cell = RandomCell(seed, width_px, samples, absolute)
+    cell = RandomCell(seed, width_px, samples, absolute, stranger)
+    if stranger is not None:
+        return _prove_strange_cell(cell, at)
     request = Request(f"cell{seed}", datetime.now(UTC))
     model: Arm | None = planning_arm(cell.cell.rig) if absolute else None
     with tempfile.TemporaryDirectory() as name:
@@ -93,6 +101,34 @@ def prove_cell(seed: int, *, at: Postures, width_px: int, samples: int, absolute
         _prove_leds(proof, cell, at, request, prior, arm)
         _prove_mesh(proof, cell, at, request, prior, arm, folder)
     return proof
+
+
+def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
+    """Camera and hand-eye, by their rays and by those parameters that have a truth; LEDs if it is they that are
+    strange. A refusal is a result."""
+    request = Request(f"cell{cell.seed}", datetime.now(UTC))
+    model: Arm | None = planning_arm(cell.cell.rig) if cell.absolute else None
+    try:
+        camera, hand_eye = _camera_and_hand_eye(cell, at, request, model)
+        if missed := [*_missed(camera), *_missed(hand_eye)]:
+            return Proof([], {}, "; ".join(missed))
+        judged = [Judged(*one) for one in judged_rays(cell, camera, hand_eye, at.board)]
+        judged += [one for one in _of_hand_eye(cell, hand_eye) if has_truth(cell, one.name)]
+        proof = Proof(judged, {})
+        if cell.stranger in LIGHT_STRANGERS:
+            with tempfile.TemporaryDirectory() as name:
+                write_record(Path(name) / "hand-eye.yaml", hand_eye)
+                prior = read_posed_camera(Path(name) / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
+            _prove_leds(proof, cell, at, request, prior, None)
+    except CoupoleError as error:
+        return Proof([], {}, str(error))
+    return proof
+
+
+def _missed(record: Record) -> Iterator[str]:
+    for limit in record.limits:
+        if not limit.passed:
+            yield f"{record.kind}: {limit.what} above its limit"
 
 
 def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
@@ -141,12 +177,9 @@ def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
 
 
 def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
-    place = cell.place(0)
-    corner_mm = (-0.5 * SQUARES[0] * SQUARE_MM, 0.5 * SQUARES[1] * SQUARE_MM, THICKNESS_MM)
-    in_support = transform(place["translation_mm"], place["abc_deg"]) @ transform(corner_mm, (0.0, 0.0, 180.0))
     true = {
         "flange_from_camera": cell.flange_from_camera,
-        "base_from_board": cell.shifted_base(cell.base_from_support @ in_support),  # A1's zero is in its interval
+        "base_from_board": cell.shifted_base(true_board(cell)),  # A1's zero is in its interval
     }
     by_name = {parameter.name: parameter for parameter in record.parameters}
     for name, pose in record.transforms.items():

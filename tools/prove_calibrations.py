@@ -1,11 +1,16 @@
 """Checks the stated intervals of calibrations on many random simulated cells, rendered and calibrated.
 
-    python tools/prove_calibrations.py --cells 100 [--width 1024] [--images 20] [--absolute] [--keep FILE] [--json]
+    python tools/prove_calibrations.py --cells 100 [--width 1024] [--images 20] [--absolute] [--stranger NAME]
+        [--keep FILE] [--json]
 
 Each cell (`random_cells`) has its own lens, hand-eye, arm, dome and object. Printed is one line per parameter: the
 fraction of the stated 95 % intervals that contain the truth, and the root mean square of error over standard
 uncertainty, about 1. Then the distances of camera, LEDs and mesh from the truth, as median and 95th percentile
 over the cells. The file `--keep` gets a line for each cell; in a later call only missing cells are computed.
+
+With `--stranger` each cell has one cause that calibrations have no term for (`strange_cells`); judged are camera
+and hand-eye by their rays, and LEDs if the stranger is theirs. Cells whose calibration is refused are counted with
+the reasons; the intervals of all others must hold.
 
 The exit code is 1 if a cell could not be calibrated, or if a parameter's intervals are wrong: 90 to 99 % must
 contain the truth, and rms(error/u) must be between 0.8 and 1.25; both limits are widened to what chance exceeds
@@ -19,6 +24,7 @@ import json
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -36,8 +42,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
 from random_cells import postures
+from strange_cells import STRANGERS
 
-SETTINGS = ("width", "images", "samples", "led_boards", "absolute")
+SETTINGS = ("width", "images", "samples", "led_boards", "absolute", "stranger")
 """Options that determine the cells."""
 _CHANCE = 1e-3
 
@@ -79,6 +86,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=8, help="rays per pixel and direction")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--absolute", action="store_true", help="add absolute errors of the arm: 0.3 mm, 0.02 deg")
+    parser.add_argument("--stranger", choices=STRANGERS, help="a cause without a term in any calibration")
     parser.add_argument("--keep", type=Path, help="file of finished cells, one line of JSON each")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -93,6 +101,7 @@ def main() -> None:
             width_px=arguments.width,
             samples=arguments.samples,
             absolute=arguments.absolute,
+            stranger=arguments.stranger,
         )
         started_s = time.monotonic()
         with ProcessPoolExecutor(arguments.jobs) as pool:
@@ -109,6 +118,8 @@ def main() -> None:
                 print(f"\r{len(done)} of {len(wanted)} cells, {spent_s:.0f} s", end="", file=sys.stderr)
         print(file=sys.stderr)
     proofs = [done[seed] for seed in wanted if seed in done]
+    tell_refused(proofs, as_json=arguments.json)
+    proofs = [proof for proof in proofs if proof.refused is None]
     for verdict in verdicts(proofs):
         failed += verdict.faults
         if arguments.json:
@@ -134,13 +145,27 @@ def kept(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:
     cells = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     if others := [cell["settings"] for cell in cells if cell["settings"] != settings]:
         sys.exit(f"{path}: its cells were made with {others[0]}, now it is {settings}; name another file")
-    return {cell["seed"]: Proof([Judged(**one) for one in cell["judged"]], cell["accuracy"]) for cell in cells}
+    return {
+        cell["seed"]: Proof([Judged(**one) for one in cell["judged"]], cell["accuracy"], cell.get("refused"))
+        for cell in cells
+    }
 
 
 def keep(path: Path | None, settings: dict[str, Any], seed: int, proof: Proof) -> None:
     if path is not None:
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"seed": seed, "settings": settings, **asdict(proof)}) + "\n")
+
+
+def tell_refused(proofs: Sequence[Proof], *, as_json: bool) -> None:
+    """Print how many cells were refused, and why."""
+    reasons = Counter(proof.refused for proof in proofs if proof.refused is not None)
+    if as_json and reasons:
+        print(json.dumps({"refused": reasons.total(), "cells": len(proofs), "reasons": reasons}))
+    elif reasons:
+        print(f"{reasons.total()} of {len(proofs)} cells refused:")
+        for reason, cells in reasons.most_common():
+            print(f"  {cells}: {reason}")
 
 
 def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:

@@ -27,8 +27,10 @@ from coupole.plan.templates import TEMPLATES
 from coupole.preflight.job import read_job
 from coupole.preflight.simulated_world import world_config
 from sim.devices.kuka_kinematics import PoseErrors, flange_pose
+from sim.strangers import Strangers
 from sim.world.config import Config
 from sim.world.stills import Stills
+from strange_cells import drawn
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"
@@ -127,6 +129,12 @@ class RandomCell:
     """Rays per pixel and direction."""
     absolute: bool
     """The arm has absolute errors of 0.3 mm and 0.02 deg in addition to its repeatability."""
+    stranger: str | None = None
+    """One of `strange_cells.STRANGERS`, or nothing that calibrations have no term for."""
+
+    @cached_property
+    def strangers(self) -> Strangers:
+        return Strangers.model_validate(drawn(self.stranger, self.seed, self.width_px))
 
     @cached_property
     def cell(self) -> Cell:
@@ -138,7 +146,8 @@ class RandomCell:
 
     @cached_property
     def arm_errors(self) -> PoseErrors:
-        return PoseErrors(self.seed, 30.0, 0.003, 0.3 if self.absolute else 0.0, 0.02 if self.absolute else 0.0)
+        absolute = (0.3, 0.02) if self.absolute else (0.0, 0.0)
+        return PoseErrors(self.seed, 30.0, 0.003, *absolute, self.strangers.arm)
 
     @cached_property
     def flange_from_camera(self) -> Floats:
@@ -185,11 +194,13 @@ class RandomCell:
             "flange_from_camera": self.flange_from_camera.tolist(),
             "focus_distance_mm": self.lens["focus_mm"],
         }
-        distortion = (self.lens["k1"], 0.0, self.lens["p1"], self.lens["p2"], 0.0)
+        k4 = self.strangers.lens.rational[0]  # divides what k1 multiplies
+        distortion = (self.lens["k1"] + k4, 0.0, self.lens["p1"], self.lens["p2"], 0.0)
         config["settings"] |= {
             "seed": self.seed,
             "things": list(things),
             "arm_shadows": False,
+            "strangers": self.strangers.model_dump(),
             "camera": {"kind": "memory", "samples_per_side": self.samples, "distortion": distortion},
             "dome": {"seed": self.seed, "board_shift_mm": 1.0, "board_turn_deg": 0.2, "led_shift_mm": 0.05},
         }
@@ -226,7 +237,8 @@ class Photographs:
         self._lamps = lamps(cell.cell.leds, cell.base_from_support)
         self.reported = np.stack([flange_pose(joints) for joints in joints_deg])
         self._true = [
-            cell.arm_errors.true_flange_pose(joints, first_stop + stop) for stop, joints in enumerate(joints_deg)
+            cell.arm_errors.true_flange_pose(joints, first_stop + stop, joints_deg[max(stop - 1, 0)])
+            for stop, joints in enumerate(joints_deg)
         ]
 
     def frame(self, number: int, leds: Sequence[int]) -> NDArray[np.uint16]:

@@ -33,6 +33,9 @@ class Axes:
         self.commanded_deg: Axes6 = settings.start_joints_deg
         self.stops = 0
         """How often the axes have come to rest."""
+        self.came_from_deg: Axes6 = settings.start_joints_deg
+        """The commanded axes at the stop before the last."""
+        self._stood_at_deg: Axes6 = settings.start_joints_deg
         self.brakes_closed = False
         self._settings = settings
         self._pushed_deg: Axes6 = _NOWHERE
@@ -107,6 +110,7 @@ class Axes:
         elif self._stood_ns is None:
             self._stood_ns = now_ns
             self.stops += 1
+            self.came_from_deg, self._stood_at_deg = self._stood_at_deg, self.commanded_deg
             swing_deg = self._settings.vibration_deg
             self._swing_deg = tuple(math.copysign(swing_deg, s) if s else 0.0 for s in self._step_deg)
         self._change_deg = tuple(map(float.__sub__, step_deg, self._step_deg))

@@ -25,6 +25,7 @@ from sim.devices.kuka_kinematics import PoseErrors
 from sim.devices.kuka_rsi_wire import Answer, PacketWriter, answer_reader
 from sim.devices.kuka_settings import Settings
 from sim.devices.refusals import Refusals, untold
+from sim.strangers.arm_stranger import NO_STRANGER, ArmStranger
 from sim.world.reactor import Reactor, Timer
 
 __all__ = ["ALIKE", "KukaController", "Settings"]
@@ -46,7 +47,13 @@ class _Does(Enum):
 class KukaController:
     """See the module. All methods must be called on the reactor's thread."""
 
-    def __init__(self, reactor: Reactor, settings: Settings, tell: Callable[[str], None] = untold) -> None:
+    def __init__(
+        self,
+        reactor: Reactor,
+        settings: Settings,
+        tell: Callable[[str], None] = untold,
+        stranger: ArmStranger = NO_STRANGER,
+    ) -> None:
         """`tell` gets a line for everything that is refused."""
         self.fault = ""
         """Why RSI stopped; empty while it runs or waits for a client."""
@@ -59,6 +66,7 @@ class KukaController:
             repeatability_deg=settings.repeatability_deg,
             absolute_mm=settings.absolute_mm,
             absolute_deg=settings.absolute_deg,
+            stranger=stranger,
         )
         self._reactor, self._settings = reactor, settings
         self._cycle_ns = settings.cycle_ms * 1_000_000
@@ -109,7 +117,7 @@ class KukaController:
 
     def true_base_from_flange(self) -> Transform:
         """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
-        return self.errors.true_flange_pose(self.joints_deg, self._axes.stops)
+        return self.errors.true_flange_pose(self.joints_deg, self._axes.stops, self._axes.came_from_deg)
 
     def estop(self) -> None:
         """Emergency stop: the axes brake, packets continue for a while, then RSI ends until `reset`."""

@@ -20,6 +20,7 @@ from coupole.geometry import Transform, abc_from_rotation
 from sim.devices.kuka_eki_wire import ASK, MOVE, Command, Messages
 from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
 from sim.devices.kuka_ptp import Motion, braked, point_to_point, standing
+from sim.strangers.arm_stranger import NO_STRANGER, ArmStranger
 from sim.world.pushes import Pushes
 from sim.world.reactor import Reactor, Timer
 
@@ -66,7 +67,7 @@ class Settings(BaseModel):
 class KukaEkiController:
     """See the module. All methods must be called on the reactor's thread."""
 
-    def __init__(self, reactor: Reactor, settings: Settings) -> None:
+    def __init__(self, reactor: Reactor, settings: Settings, stranger: ArmStranger = NO_STRANGER) -> None:
         self.fault = ""
         """Why the robot program does not run; empty while it does."""
         self.settled_since_ns: int | None = reactor.now_ns
@@ -77,6 +78,7 @@ class KukaEkiController:
             repeatability_deg=settings.repeatability_deg,
             absolute_mm=settings.absolute_mm,
             absolute_deg=settings.absolute_deg,
+            stranger=stranger,
         )
         self._reactor, self._settings = reactor, settings
         self._motion: Motion = standing(settings.start_joints_deg)
@@ -84,6 +86,8 @@ class KukaEkiController:
         self._acceleration_deg_s2 = settings.full_acceleration_deg_s2
         self._pushes = Pushes(reactor)
         self._stops = 0
+        self._came_from_deg = self._stood_at_deg = tuple(settings.start_joints_deg)
+        """The axes at the stop before the last, and at the last."""
         self._end: Timer | None = None
         self._session = self._taken = self._done = self._order = 0
         self._refused = False
@@ -116,7 +120,7 @@ class KukaEkiController:
 
     def true_base_from_flange(self) -> Transform:
         """True pose of the flange: the controller's, with the arm's constant error and that of the last stop."""
-        return self.errors.true_flange_pose(self.joints_deg, self._stops)
+        return self.errors.true_flange_pose(self.joints_deg, self._stops, self._came_from_deg)
 
     def estop(self) -> None:
         """Emergency stop: the axes brake hard, the robot program ends until `reset`; statuses continue."""
@@ -307,6 +311,7 @@ class KukaEkiController:
         if self.settled_since_ns is None:
             self.settled_since_ns = self._reactor.now_ns
             self._stops += 1
+            self._came_from_deg, self._stood_at_deg = self._stood_at_deg, tuple(self._motion.joints_deg(0.0))
         if self.fault:
             return
         if self._target is None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform
 from sim.devices import newton
+from sim.strangers.arm_stranger import NO_STRANGER, ArmStranger
 
 _CHAIN = (
     ((0.0, 0.0, 400.0), (0.0, 0.0, -1.0)),
@@ -76,6 +77,8 @@ class PoseErrors:
     repeatability_deg: float
     absolute_mm: float
     absolute_deg: float
+    stranger: ArmStranger = NO_STRANGER
+    """Errors that depend on where the arm is and from where it came."""
 
     def base_error_mm(self) -> NDArray[np.float64]:
         """[3]."""
@@ -85,9 +88,18 @@ class PoseErrors:
         """[6]."""
         return np.random.default_rng((self.seed, 1)).normal(0.0, 1.0, 6) * self.absolute_deg
 
-    def true_flange_pose(self, joints_deg: Sequence[float], stop: int) -> Transform:
-        """True `base_from_flange` at the reported angles, in the arm's stop number `stop`."""
-        base_from_flange = flange_pose((np.array(joints_deg) + self.axis_zero_error_deg()).tolist())
+    def true_flange_pose(
+        self, joints_deg: Sequence[float], stop: int, came_from_deg: Sequence[float] | None = None
+    ) -> Transform:
+        """True `base_from_flange` at the reported angles, in the arm's stop number `stop`; `came_from_deg` are
+        those from which it came, None: these."""
+        error_deg = self.axis_zero_error_deg()
+        if self.stranger != NO_STRANGER:
+            flange, origins_mm, axes = _chain(joints_deg)
+            origins_mm = np.vstack([origins_mm, flange[:3, 3]])
+            came_from_deg = joints_deg if came_from_deg is None else came_from_deg
+            error_deg = error_deg + self.stranger.errors_deg(joints_deg, came_from_deg, origins_mm, axes)
+        base_from_flange = flange_pose((np.array(joints_deg) + error_deg).tolist())
         random = np.random.default_rng((self.seed, 2, stop))
         stop_error_mm = random.normal(0.0, 1.0, 3) * self.repeatability_um / 1e3
         turned_deg = random.normal(0.0, 1.0, 3) * self.repeatability_deg

@@ -12,6 +12,7 @@ from pydantic import Discriminator, Tag
 
 from coupole.geometry import Transform
 from sim.devices import kuka_controller, kuka_eki_controller, ur_controller
+from sim.strangers.arm_stranger import ArmStranger
 from sim.world import faults
 from sim.world.reactor import Reactor
 
@@ -67,10 +68,10 @@ def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
 
 
 def build(
-    reactor: Reactor, settings: RobotSettings, tell: Callable[[str], None]
+    reactor: Reactor, settings: RobotSettings, tell: Callable[[str], None], stranger: ArmStranger
 ) -> tuple[RobotStandIn, dict[str, Any]]:
     """The stand-in, and the driver settings with which a client reaches it. `tell` gets a line for every
-    correction that is refused."""
+    correction that is refused; `stranger` are errors of a KUKA's axes."""
     match settings:
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
@@ -79,9 +80,9 @@ def build(
             paced = settings.lock_step or reactor.clock.speed != 1.0
             declared = {"declared_cycle_ms": settings.cycle_ms} if paced else {}
             endpoint = {"listen": sends_to, "sends_to": sends_to, **alike, **declared}
-            return kuka_controller.KukaController(reactor, settings, tell), endpoint
+            return kuka_controller.KukaController(reactor, settings, tell, stranger), endpoint
         case kuka_eki_controller.Settings():
-            eki = kuka_eki_controller.KukaEkiController(reactor, settings)
+            eki = kuka_eki_controller.KukaEkiController(reactor, settings, stranger)
             theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
             return eki, {"address": eki.address, **theirs}
         case ur_controller.Settings():

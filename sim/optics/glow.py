@@ -89,7 +89,7 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
     height, width = lens.height_px, lens.width_px
     if (seen_mm[:, 2] < _NEAR_MM).any():
         return slice(0, height), slice(0, width)
-    at = distorted(seen_mm[:, :2] / seen_mm[:, 2:], lens.distortion) * lens.focal_px + lens.centre_px
+    at = distorted(seen_mm[:, :2] / seen_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
     # Distortion bends the edges outwards by less than it moves the corners.
     straight = seen_mm[:, :2] / seen_mm[:, 2:] * lens.focal_px + lens.centre_px
     points = np.concatenate([at, straight])

@@ -60,10 +60,19 @@ def illuminance_per_radiance(objective: Objective) -> float:
     return float(np.pi * objective.transmission / (4.0 * objective.working_f_number**2))
 
 
-def vignetting(objective: Objective, tangent: ArrayLike) -> Array:
-    """Illuminance relative to the centre at a tangent of the angle to the axis: cos^4 and the rim's vignetting."""
+def vignetting(
+    objective: Objective, tangent: ArrayLike, stop_shift_mm: tuple[ArrayLike, float] = (0.0, 0.0)
+) -> Array:
+    """Illuminance relative to the centre at a tangent of the angle to the axis: cos^4 and the rim's vignetting.
+
+    `stop_shift_mm`: of a decentred stop, along the direction of the tangent and the length of the whole shift.
+    """
     t = np.asarray(tangent, dtype=float)
-    return np.asarray((1.0 + t * t) ** -2.0 * _overlap(objective.rim_radius, objective.rim_shift * t))
+    pupil_mm = 0.5 * objective.focal_length_mm / objective.f_number
+    along, whole = np.asarray(stop_shift_mm[0]) / pupil_mm, stop_shift_mm[1] / pupil_mm
+    rim = objective.rim_shift * t
+    shift = np.sqrt(np.maximum(rim * rim - 2.0 * rim * along + whole * whole, 0.0))
+    return np.asarray((1.0 + t * t) ** -2.0 * _overlap(objective.rim_radius, shift))
 
 
 def defocus_px(objective: Objective, depth_mm: ArrayLike, pixel_pitch_um: float) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,11 +23,11 @@ from sim.optics.led_light import channel_factors
 from sim.optics.objective import Objective, vignetting
 from sim.optics.sensor import electrons, expose, expose_electrons
 from sim.render import arm_shadow
-from sim.render.camera_view import View, Viewer, tangents
+from sim.render.camera_view import View, Viewer, slopes
 from sim.render.embree import Obstacles
 from sim.render.emitter import LED_SIDE_MM, Emitter, irradiance_of_each, square, squares
 from sim.render.interreflection import Neighbourhood, add_indirect, exchange, indirect_lux, neighbourhood
-from sim.render.lens import Lens, sight
+from sim.render.lens import Lens, Sight, sight
 from sim.render.radiance import albedo, led_radiance, panel_radiance
 from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
@@ -74,6 +74,8 @@ class Look:
     """Blur by defocus, once it is needed."""
     glows: dict[int, Glow | None] = field(default_factory=dict)
     """Images of lamps, by the same numbers."""
+    through: Sight | None = None
+    """The lens of this pose, if it is not that of all."""
 
     @cached_property
     def empty(self) -> NDArray[np.float32]:
@@ -96,14 +98,17 @@ class Photographer:
             (_surface(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
             for mesh in scene.objects
         ]
-        surfaces += placed(settings.things, base_from_support)
+        surfaces += placed(settings.things, base_from_support, settings.strangers.target)
+        self._strangers = settings.strangers
+        self._up = base_from_support[:3, 2]
         self._scene = build_scene(surfaces)
         self._emission = scene.emission
         table = read_leds(scene.leds)
         self.leds: Leds = as_built(table, settings.dome)
         """The LEDs where they really are; the controller has the table."""
         self._led_model = settings.leds
-        self._emitters = _emitters(self.leds)
+        dies = settings.strangers.light.tilted(self.leds.normals, self.leds.ids)
+        self._emitters = _emitters(replace(self.leds, normals=dies))
         self._row_of_led = {int(led): row for row, led in enumerate(self.leds.ids)}
         self._objective = Objective(
             camera.focal_length_mm,
@@ -122,10 +127,11 @@ class Photographer:
             focus_distance_mm=camera.focus_distance_mm,
             distortion=camera.distortion,
         )
-        self._sight = sight(lens)
-        self._falloff = vignetting(self._objective, tangents(self._sight)).astype(np.float32)
+        self._lens = settings.strangers.lens.disturbed(lens, camera.focus_distance_mm)
+        self._sight = sight(self._lens)
+        self._falloff = self._vignetted()
         self._shading = settings.shading
-        self._viewer = Viewer(self._scene, lens, camera.samples_per_side, self._shading)
+        self._viewer = Viewer(self._scene, self._lens, camera.samples_per_side, self._shading)
         self.sensor = camera.true_sensor(settings.seed)
         self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
         self.reference_lux = _reference_lux(_emitters(table), base_from_support)
@@ -155,6 +161,15 @@ class Photographer:
         arm_shadow.warm_up()
         glow(_AHEAD, "lambertian", self._sight, np.eye(4), look.empty, None)
 
+    def _vignetted(self) -> NDArray[np.float32]:
+        """[h, w] illuminance of each pixel over that of the centre."""
+        x, y = slopes(self._sight)
+        tangent = np.hypot(x, y)
+        shift_x, shift_y = self._strangers.lens.stop_shift_mm
+        along_mm = (x * shift_x + y * shift_y) / np.maximum(tangent, 1e-12)
+        stop_mm = (along_mm, float(np.hypot(shift_x, shift_y)))
+        return vignetting(self._objective, tangent, stop_mm).astype(np.float32)
+
     def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
         look = self._look_from(exposed.base_from_flange, exposed.arm_mm)
@@ -163,20 +178,14 @@ class Photographer:
             "model": self.sensor,
             "frame": exposed.number,
             "exposure_s": exposed.exposure_s,
-            "gain": exposed.gain,
+            "gain": exposed.gain * self._strangers.sensor.gain(exposed.number),
             "temperature_c": self._camera.sensor_temperature_c,
         }
         glows = self._glows(look, exposed)
         scale = self._electrons * seconds
-        if self._camera.blur:
+        if self._camera.blur or self._strangers.lens.coma_px:
             sharp = electrons(look.view.site, radiance, self._falloff, electrons_per_radiance=scale)
-            mean_e = through(
-                self._objective,
-                sharp,
-                self._disk_px(look),
-                self.sensor.channels(),
-                pixel_pitch_um=self._camera.pixel_pitch_um,
-            )
+            mean_e = self._blurred(look, sharp)
             if glows is not None:
                 mean_e += glows
             expose_electrons(out, mean_e, **sensed)
@@ -190,6 +199,18 @@ class Photographer:
                 more_e=glows,
                 **sensed,
             )
+        self._strangers.sensor.add_tails(out, exposed.number, self.sensor.white_dn)
+
+    def _blurred(self, look: Look, sharp: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[h, w] electrons after the Bayer filter, from those [h, w, 3] of a perfect lens."""
+        if self._strangers.lens.coma_px:
+            sharp = self._strangers.lens.blurred(sharp)
+        channels = self.sensor.channels()
+        if not self._camera.blur:
+            rows, columns = np.ogrid[: sharp.shape[0], : sharp.shape[1]]
+            return np.asarray(sharp[rows, columns, channels[rows & 1, columns & 1]])
+        pitch_um = self._camera.pixel_pitch_um
+        return through(self._objective, sharp, self._disk_px(look), channels, pixel_pitch_um=pitch_um)
 
     def _disk_px(self, look: Look) -> NDArray[np.float32]:
         """[h, w] standard deviation of the blur by defocus, computed once per pose."""
@@ -215,10 +236,17 @@ class Photographer:
         base_from_camera = base_from_flange @ self.flange_from_camera
         look = self._look
         if look is None or np.abs(base_from_camera - look.base_from_camera).max() > _POSE_TOLERANCE:
-            view = self._viewer.look(base_from_camera)
+            viewer, lens_now = self._viewer, self._sight
+            if self._strangers.lens.breathing:
+                down = -float(base_from_camera[:3, 2] @ self._up)
+                lens = self._strangers.lens.breathed(self._lens, down)
+                viewer = Viewer(self._scene, lens, self._camera.samples_per_side, self._shading)
+                lens_now = sight(lens)
+            view = viewer.look(base_from_camera)
             places = self._shadows.places(view.sides) if self._shading == "flat" else None
             samples = self._camera.samples_per_side
             look = self._look = Look(base_from_camera, arm_mm, view, places, samples, self._scene)
+            look.through = lens_now
         arm_moved = arm_mm.shape != look.arm_mm.shape or np.abs(arm_mm - look.arm_mm).max(initial=0.0)
         if arm_moved > _ARM_TOLERANCE_MM:
             look.arm_mm = arm_mm
@@ -265,6 +293,8 @@ class Photographer:
             radiance = led_radiance(view, *matter, emitter, emission)
             self._obstacles.cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
         arm_shadow.cast(radiance, view.points_mm, look.arm_mm, emitter.centre_mm)
+        if self._strangers.light.lobe and row < len(self._emitters):
+            radiance *= self._strangers.light.over_cosine(emitter, view.points_mm)[:, None]
         return radiance
 
     def _add_indirect(self, radiance: Radiance, look: Look, emitter: Emitter, emission: str) -> None:
@@ -291,7 +321,10 @@ class Photographer:
         """[h, w] mean electrons from lamps in the picture, or None if there are none."""
         seen: list[tuple[Glow, NDArray[np.float32]]] = []
         for led, lit_s in exposed.seconds_of_led.items():
-            if spot := self._glow(look, led, self._emitters[self._row_of_led[led]], self._emission):
+            die = self._emitters[self._row_of_led[led]]
+            if self._strangers.light.primary_lens_mm:
+                die = self._strangers.light.seen_from(die, look.base_from_camera[:3, 3])
+            if spot := self._glow(look, led, die, self._emission):
                 seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
         for panel in exposed.panels:
             if panel <= len(self._panels):
@@ -312,7 +345,7 @@ class Photographer:
         if light not in look.glows:
             blur = (self._objective, self._camera.pixel_pitch_um) if self._camera.blur else None
             look.glows[light] = glow(
-                lamp, emission, self._sight, look.base_from_camera, look.empty, blur, unevenness
+                lamp, emission, look.through or self._sight, look.base_from_camera, look.empty, blur, unevenness
             )
         return look.glows[light]
 

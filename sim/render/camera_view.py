@@ -98,12 +98,18 @@ class Viewer:
 
 def tangents(through: Sight) -> NDArray[np.float64]:
     """[h, w] tangent of the angle between a pixel's ray and the optical axis."""
+    return np.asarray(np.hypot(*slopes(through)))
+
+
+def slopes(through: Sight) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[h, w] x and y of each pixel's ray at a depth of 1."""
     lens = through.lens
     x = (np.arange(lens.width_px)[None, :] - lens.centre_px[0]) / lens.focal_px
     y = (np.arange(lens.height_px)[:, None] - lens.centre_px[1]) / lens.focal_px
     if through.shift is not None:
         x, y = x + through.shift[0, :, : lens.width_px], y + through.shift[1, :, : lens.width_px]
-    return np.asarray(np.hypot(x, y))
+    both = np.array(np.broadcast_arrays(x, y))
+    return both[0], both[1]
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

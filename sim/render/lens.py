@@ -5,6 +5,9 @@ Distortion is the Brown-Conrady model in OpenCV's order and sign (k1, k2, p1, p2
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
+Lenses that are strangers to calibration (`sim.strangers`) have OpenCV's seven further terms: k4, k5, k6 divide the
+radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6, s1 to s4 add s1 r^2 + s2 r^4 to x and s3 r^2 + s4 r^4 to y.
+
 The renderer needs the inverse, once per lens and for every pixel: it tests triangles along the true ray of each
 pixel, so that edges of long triangles are curved in the picture, as they should be.
 """
@@ -19,7 +22,8 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 
-Distortion = tuple[float, float, float, float, float]
+Distortion = tuple[float, ...]
+"""k1, k2, p1, p2, k3, or these and k4, k5, k6, s1, s2, s3, s4."""
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 LANES = 8
 """Pixels of a row that the rasteriser tests at once; tables by column are longer than the image by this number."""
@@ -30,8 +34,8 @@ _MARGIN = 1.25
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal length in pixels, and distortion; the principal point is the image's centre, and pixels' centres have
-    integer coordinates."""
+    """Focal length in pixels, and distortion; pixels' centres have integer coordinates. The principal point is the
+    image's centre unless it is `off_axis`."""
 
     width_px: int
     height_px: int
@@ -39,6 +43,8 @@ class Lens:
     distortion: Distortion = NO_DISTORTION
     samples: int = 1
     """Subdivision of a sensor pixel along each side: 1, except for a lens that is `supersampled`."""
+    off_axis: tuple[float, float] = (0.0, 0.0)
+    """Principal point less image centre, over the focal length; distortion stays centred on the image."""
 
     @staticmethod
     def focused(
@@ -56,7 +62,16 @@ class Lens:
 
     @property
     def centre_px(self) -> tuple[float, float]:
-        return 0.5 * self.width_px - 0.5, 0.5 * self.height_px - 0.5
+        x, y = self.off_axis
+        return 0.5 * self.width_px - 0.5 + x * self.focal_px, 0.5 * self.height_px - 0.5 + y * self.focal_px
+
+    @property
+    def terms(self) -> NDArray[np.float64]:
+        """Of `bend` and `distorted`: the distortion's, and for a lens with more than Brown's its centre too."""
+        if len(self.distortion) == 5 and not any(self.off_axis):
+            return np.array(self.distortion)
+        more = (0.0,) * (12 - len(self.distortion))
+        return np.array([*self.distortion, *more, -self.off_axis[0], -self.off_axis[1]])
 
     def supersampled(self, factor: int) -> Lens:
         """The lens with sensor pixels divided into `factor` x `factor`; see `rook_shifts_px`."""
@@ -95,11 +110,15 @@ class Sight:
 
 def sight(lens: Lens) -> Sight:
     """The inverse of a lens. Raises InputError if distortion folds the image."""
-    half_x, half_y = ((centre + 1.5) / lens.focal_px for centre in lens.centre_px)
-    if lens.distortion == NO_DISTORTION:
+    sizes = lens.width_px, lens.height_px
+    half_x, half_y = (
+        (max(centre, size - 1 - centre) + 1.5) / lens.focal_px
+        for centre, size in zip(lens.centre_px, sizes, strict=True)
+    )
+    if not any(lens.distortion):
         return Sight(lens, None, 0.0, (half_x, half_y), 0.0)
     shift = np.zeros((2, lens.height_px, lens.width_px + LANES), np.float32)
-    terms = np.array(lens.distortion)
+    terms = lens.terms
     rooks = rook_shifts_px(lens.samples, max(lens.width_px, lens.height_px))
     if not _undistort(lens.focal_px, *lens.centre_px, terms, rooks, shift):
         raise InputError(
@@ -119,23 +138,25 @@ def _bend_slope(lens: Lens, reach: tuple[float, float]) -> float:
     grid = np.stack(np.meshgrid(*(np.linspace(-far, far, _PROBES) for far in reach)), axis=-1)
     step = 1e-6
     columns = [
-        (distorted(grid + np.array(direction) * step, lens.distortion) - distorted(grid, lens.distortion)) / step
+        (distorted(grid + np.array(direction) * step, lens.terms) - distorted(grid, lens.terms)) / step
         for direction in ((1, 0), (0, 1))
     ]
     jacobian = np.stack(columns, axis=-1) - np.eye(2)
     return float(np.linalg.norm(jacobian, ord=2, axis=(-2, -1)).max()) * _MARGIN
 
 
-def distorted(xy: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
-    """Brown-Conrady model on normalised image coordinates [..., 2]."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = xy[..., 0], xy[..., 1]
+def distorted(xy: NDArray[np.float64], distortion: Distortion | NDArray[np.float64]) -> NDArray[np.float64]:
+    """The model on normalised image coordinates [..., 2]; `distortion` may also be `Lens.terms`."""
+    terms = np.zeros(14)
+    terms[: len(distortion)] = distortion
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = terms[:12]
+    x, y = xy[..., 0] - terms[12], xy[..., 1] - terms[13]
     r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     return np.stack(
         [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2) + terms[12],
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4) + terms[13],
         ],
         axis=-1,
     )
@@ -143,12 +164,20 @@ def distorted(xy: NDArray[np.float64], distortion: Distortion) -> NDArray[np.flo
 
 @numba.njit(cache=True, nogil=True)
 def bend(x, y, terms):  # type: ignore[no-untyped-def]
-    """Displacement of a normalised position (x, y) by distortion."""
+    """Displacement of a normalised position (x, y) by distortion; `terms` as of `Lens.terms`."""
+    more = len(terms) > 5
+    if more:
+        x, y = x - terms[12], y - terms[13]
     r2 = x * x + y * y
     radial = r2 * (terms[0] + r2 * (terms[1] + r2 * terms[4]))
+    by_x, by_y = 0.0, 0.0
+    if more:
+        below = r2 * (terms[5] + r2 * (terms[6] + r2 * terms[7]))
+        radial = (radial - below) / (1.0 + below)
+        by_x, by_y = r2 * (terms[8] + r2 * terms[9]), r2 * (terms[10] + r2 * terms[11])
     return (
-        x * radial + 2.0 * terms[2] * x * y + terms[3] * (r2 + 2.0 * x * x),
-        y * radial + terms[2] * (r2 + 2.0 * y * y) + 2.0 * terms[3] * x * y,
+        x * radial + 2.0 * terms[2] * x * y + terms[3] * (r2 + 2.0 * x * x) + by_x,
+        y * radial + terms[2] * (r2 + 2.0 * y * y) + 2.0 * terms[3] * x * y + by_y,
     )
 
 

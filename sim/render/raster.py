@@ -50,12 +50,12 @@ def visible_triangles(
         [
             lens.focal_px,
             *lens.centre_px,
-            *lens.distortion,
             sight.shift_slope,
             sight.bend_slope,
             *sight.reach,
             1.0 / lens.focal_px,
             0.0 if lens.samples == 1 else 0.5,
+            *lens.terms,
         ]
     )
     rooks = None if lens.samples == 1 else rook_shifts_px(lens.samples, max(width, height) + LANES)
@@ -113,17 +113,17 @@ def _box(v, lens, width, height):  # type: ignore[no-untyped-def]
             x = (v[k, 0] + share * (v[n, 0] - v[k, 0])) / NEAR_MM
             y = (v[k, 1] + share * (v[n, 1] - v[k, 1])) / NEAR_MM
             x0, x1, y0, y1 = min(x0, x), max(x1, x), min(y0, y), max(y1, y)
-    focal, centre_x, centre_y, slope = lens[0], lens[1], lens[2], lens[9]
+    focal, centre_x, centre_y, slope = lens[0], lens[1], lens[2], lens[4]
     if slope > 0.0:
         # Distortion moves the visible part of the box by the shift of its middle, within the bound `slope`.
-        x0, x1, y0, y1 = max(x0, -lens[10]), min(x1, lens[10]), max(y0, -lens[11]), min(y1, lens[11])
+        x0, x1, y0, y1 = max(x0, -lens[5]), min(x1, lens[5]), max(y0, -lens[6]), min(y1, lens[6])
         if x0 > x1 or y0 > y1:
             return 0, -1, 0, -1
-        by_x, by_y = bend(0.5 * (x0 + x1), 0.5 * (y0 + y1), lens[3:8])
+        by_x, by_y = bend(0.5 * (x0 + x1), 0.5 * (y0 + y1), lens[9:])
         spare = slope * 0.5 * (x1 - x0 + y1 - y0)
         x0, x1, y0, y1 = x0 + by_x - spare, x1 + by_x + spare, y0 + by_y - spare, y1 + by_y + spare
     # A thousandth of a pixel for rounding: the box may be too large, but must not miss a pixel.
-    spare = lens[13] + 1e-3
+    spare = lens[8] + 1e-3
     first_col = np.ceil(max(x0 * focal + centre_x - spare, 0.0))
     last_col = np.floor(min(x1 * focal + centre_x + spare, width - 1.0))
     first_row = np.ceil(max(y0 * focal + centre_y - spare, 0.0))
@@ -237,7 +237,7 @@ def _move_corners(v, lens):  # type: ignore[no-untyped-def]
     """Move the corners, at the same depth, to where a lens without distortion would give the same image."""
     for k in range(3):
         inverse_z = 1.0 / v[k, 2]
-        by_x, by_y = bend(v[k, 0] * inverse_z, v[k, 1] * inverse_z, lens[3:8])
+        by_x, by_y = bend(v[k, 0] * inverse_z, v[k, 1] * inverse_z, lens[9:])
         v[k, 0] += by_x * v[k, 2]
         v[k, 1] += by_y * v[k, 2]
 
@@ -259,7 +259,7 @@ def _fill_triangle(v, box, member, lens, shift, rooks, top, nearest):  # type: i
         a0, b0, c0, a1, b1, c1, a2, b2, c2 = -a0, -b0, -c0, -a1, -b1, -c1, -a2, -b2, -c2
     per_volume = 1.0 / abs(volume)
     z0, z1, z2 = (a0 + a1 + a2) * per_volume, (b0 + b1 + b2) * per_volume, (c0 + c1 + c2) * per_volume
-    centre_x, centre_y, scale = lens[1], lens[2], lens[12]
+    centre_x, centre_y, scale = lens[1], lens[2], lens[7]
     edges = (a0, b0, c0, a1, b1, c1, a2, b2, c2)
     below, nothing, too_near = _LAST - member, np.float32(0.0), np.float32(1.0 / NEAR_MM)
     for row in range(first_row, last_row + 1):
@@ -301,12 +301,12 @@ def _span(row, start, stop, edges, lens, shift):  # type: ignore[no-untyped-def]
     """Reduce a row's columns, `start` to before `stop`, to those between a triangle's edges."""
     a0, b0, c0, a1, b1, c1, a2, b2, c2 = edges
     focal, centre_x, centre_y = lens[0], lens[1], lens[2]
-    y, shift_x, spare = (row - centre_y) / focal, 0.0, lens[13] / focal
+    y, shift_x, spare = (row - centre_y) / focal, 0.0, lens[8] / focal
     if shift is not None:
         # The shift in the middle of the row; towards the ends it changes by at most `spare`.
         middle = (start + stop) >> 1
         shift_x, y = np.float64(shift[0, row, middle]), y + shift[1, row, middle]
-        spare = 0.5 * (stop - start + 2) * lens[8] + 2.0 * spare
+        spare = 0.5 * (stop - start + 2) * lens[3] + 2.0 * spare
     low, high = _between(a0, b0 * y + c0 + abs(b0) * spare, -1e30, 1e30)
     low, high = _between(a1, b1 * y + c1 + abs(b1) * spare, low, high)
     low, high = _between(a2, b2 * y + c2 + abs(b2) * spare, low, high)

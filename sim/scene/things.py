@@ -7,7 +7,7 @@ controller does not know of them: views must keep clear of tall ones.
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Literal, assert_never
+from typing import Annotated, Literal, Protocol, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +153,20 @@ class Sample(_Thing):
 Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 
 
-def placed(things: tuple[Thing, ...], base_from_support: Transform) -> list[tuple[Surface, Transform]]:
+class Disturbance(Protocol):
+    """What changes a thing's surface behind the back of whoever described it."""
+
+    def disturbed(self, kind: str, surface: Surface) -> Surface: ...
+
+
+def placed(
+    things: tuple[Thing, ...], base_from_support: Transform, disturbance: Disturbance
+) -> list[tuple[Surface, Transform]]:
     """Surfaces and their `base_from_surface`."""
-    return [(thing.surface(), np.asarray(base_from_support @ thing.support_from_thing())) for thing in things]
+    return [
+        (
+            disturbance.disturbed(thing.kind, thing.surface()),
+            np.asarray(base_from_support @ thing.support_from_thing()),
+        )
+        for thing in things
+    ]

@@ -21,6 +21,8 @@ from sim.optics.panels import Panel
 from sim.optics.sensor_model import SensorModel
 from sim.scene.surface import Layer
 from sim.scene.things import Stickers, Thing
+from sim.strangers import Strangers
+from sim.strangers.arm_stranger import NO_STRANGER
 from sim.world import faults as script
 
 WHITE_SHARE = 0.6
@@ -188,6 +190,8 @@ class Settings(_Model):
     """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
     dome: DomeErrors = DomeErrors()
     """Deviations of the dome from its table."""
+    strangers: Strangers = Strangers()
+    """Causes that no calibration has a term for."""
     exposures_remembered: Annotated[int, Field(ge=0)] = 0
     """Number of last exposures whose true light the world tells on its control connection."""
     panels: tuple[Panel, ...] = ()
@@ -212,6 +216,8 @@ class Settings(_Model):
                 or impossible_for_box(fault, self.ledbox)
             ):
                 raise ValueError(why)
+        if self.robot.kind == "ur" and self.strangers.arm != NO_STRANGER:
+            raise ValueError("`strangers.arm` is for a KUKA: the world has no weights and gears of a UR")
         if self.robot.kind == "ur" and self.speed != 1.0:
             raise ValueError("a world with a robot of kind `ur` has speed 1: ur-rtde works in real time only")
         return self

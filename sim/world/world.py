@@ -56,7 +56,7 @@ class World:
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
         self._cables = tool_capsules(np.array(config.scene.base_from_support), settings.cables)
         tell = _told if config.tells_refusals else untold
-        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell)
+        self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell, settings.strangers.arm)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
         self.box = ledbox_stand_in.build(
             self.reactor,

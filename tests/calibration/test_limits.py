@@ -23,7 +23,10 @@ def test_a_limit_is_set_by_its_name() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["rays=1"], "expected one of pixel_px, bare_field, rejected, clipped, ray_px, then =VALUE"),
+        (
+            ["rays=1"],
+            "expected one of pixel_px, bare_field, rejected, clipped, pattern, predicted, ray_px, then =VALUE",
+        ),
         (["ray_px=1", "ray_px=2"], "given twice"),
         (["ray_px"], "expected a number greater than 0 after `ray_px=`"),
         (["ray_px=-1"], "greater than 0"),

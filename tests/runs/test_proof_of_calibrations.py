@@ -66,7 +66,7 @@ def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) ->
 
 def judge(folder: Path, errors: list[float], *options: str) -> subprocess.CompletedProcess[str]:
     """The tool on cells that were done before: one parameter with u 0.1."""
-    settings = {"width": 1024, "images": 20, "samples": 8, "led_boards": None, "absolute": False}
+    settings = {"width": 1024, "images": 20, "samples": 8, "led_boards": None, "absolute": False, "stranger": None}
     kept = folder / "cells.jsonl"
     with kept.open("w") as file:
         for seed, error in enumerate(errors, start=1):

@@ -11,10 +11,17 @@ IMAGES = (
     Allowed("clipped", "images too clipped for corners", 0.2),
 )
 """`bare_field`: share of the field's 8 x 6 cells. `rejected`: share of the corners left out as gross errors."""
-CAMERA = (*IMAGES, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
+DOUBTS = (
+    Allowed("pattern", "lens: form that the model lacks, over its uncertainty", 1.0),
+    Allowed("predicted", "views left out: error over uncertainty", 1.5),
+)
+"""`pattern`: root mean square over the field of what a richer lens would change, over the standard uncertainty of
+a direction's image. `predicted`: of all views, each left out in turn."""
+CAMERA = (*IMAGES, *DOUBTS, Allowed("ray_px", "uncertainty at the field's corners", 0.5, "px"))
 """`ray_px`: standard uncertainty of the image of a direction at the field's corners."""
 HAND_EYE = (
     *IMAGES,
+    *DOUBTS,
     Allowed("centre_mm", "camera centre on the flange", 0.3, "mm"),
     Allowed("turn_deg", "camera's turn", 0.05, "deg"),
     Allowed("robot_ratio", "robot's noise, found over stated", 3.0),

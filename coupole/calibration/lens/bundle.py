@@ -11,14 +11,16 @@ reported poses, in which they cancel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Adjusted, Component, adjust
 from coupole.calibration.lens.board import Sighting
-from coupole.calibration.lens.camera import PIXEL_SIGMA_PX, Corners, board_pose
+from coupole.calibration.lens.camera import board_pose
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
+from coupole.calibration.lens.doubts import Doubts, Seen, doubts_of
 from coupole.calibration.lens.equations import (
     CORNERS,
     ORIENTATION,
@@ -30,6 +32,7 @@ from coupole.calibration.lens.equations import (
     State,
 )
 from coupole.calibration.lens.hand_eye import Solution, solve
+from coupole.calibration.lens.suspects import Field
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.rotations import Floats, rotation_vector
 from coupole.errors import InputError
@@ -88,6 +91,8 @@ class HandEyeCalibration:
     noise: RobotFound
     sightings: tuple[Sighting, ...]
     steps: int
+    doubts: Doubts | None = None
+    """What the model may lack, already in values and covariance; None: not asked."""
 
     def u(self, name: str) -> float:
         """Standard uncertainty of a parameter."""
@@ -114,12 +119,14 @@ def calibrate_hand_eye(
     lens: Intrinsics | EarlierLens,
     robot: RobotNoise,
     board_scale_u_ppm: float = 0.0,
+    size_px: tuple[int, int] | None = None,
 ) -> HandEyeCalibration:
     """Hand-eye, board and intrinsics from images [n] and the robot's poses.
 
     `lens` is a start for the intrinsics (all parameters of `model` free), or an earlier calibration, whose
     covariance then counts as an observation. `sightings` are without gross errors (`camera.without_gross_errors`).
-    Raises InputError: too few poses, or poses that do not determine the result.
+    With `size_px`, width and height of the images, the residuals are searched for what the model lacks
+    (`lens.doubts`). Raises InputError: too few poses, or poses that do not determine the result.
     """
     if len(sightings) != len(poses.base_from_flange):
         raise InputError(
@@ -157,7 +164,23 @@ def calibrate_hand_eye(
         layout.shared + 6 * len(sightings),
         what="hand-eye",
     )
-    return _result(found, problem, start, stated, tuple(sightings))
+    if size_px is None:
+        return _result(found, problem, start, stated, tuple(sightings))
+    better, doubts = _doubted(found, problem, size_px)
+    result = _result(better, problem, start, stated, tuple(sightings))
+    return replace(result, noise=replace(result.noise, pixel_px=doubts.sigma_px), doubts=doubts)
+
+
+def _doubted(found: Adjusted[State], problem: Bundle, size_px: tuple[int, int]) -> tuple[Adjusted[State], Doubts]:
+    """The result with what the model may lack."""
+    state, count = found.state, len(problem.corners.parts)
+    field = Field.of(state.intrinsics, problem.layout.free, size_px)
+    seen = Seen(field, problem.corners, problem.camera_from_board(state))
+    views = [(view, count + 2 * view, count + 2 * view + 1) for view in range(count)]
+    doubts, step, covariance = doubts_of(
+        found, problem.evaluate(state), views, seen, range(problem.layout.hand_eye)
+    )
+    return replace(found, state=problem.move(state, step), covariance=covariance), doubts
 
 
 def _result(

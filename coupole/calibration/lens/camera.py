@@ -14,13 +14,14 @@ import numpy as np
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Adjusted, Block, Group, adjust
 from coupole.calibration.lens.board import Sighting
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
+from coupole.calibration.lens.doubts import Doubts, Seen, doubts_of
+from coupole.calibration.lens.suspects import Field
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.rotations import Floats, moved, rotation, skew
 from coupole.errors import InputError
 
 LEAST_VIEWS, MOST_VIEWS = 4, 400
-PIXEL_SIGMA_PX = 0.1
-"""Stated noise of a corner, per coordinate; the adjustment estimates the true one."""
 _START_VIEWS = 20
 
 
@@ -53,12 +54,15 @@ class CameraCalibration:
     sightings: tuple[Sighting, ...]
     size_px: tuple[int, int]
     """Width and height."""
+    doubts: Doubts | None = None
+    """What the model may lack, already in values and covariance; None: not asked."""
 
 
 def calibrate_camera(
-    sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5"
+    sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5", *, doubted: bool = False
 ) -> CameraCalibration:
-    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`.
+    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`. With `doubted` the
+    residuals are searched for what the model lacks (`lens.doubts`).
 
     Raises InputError: too few images, or views that do not determine the model.
     """
@@ -96,7 +100,16 @@ def calibrate_camera(
 
     groups = [Group("corners", estimated=True, rejects=2)]
     found = adjust(start, evaluate, move, groups, own + 6 * len(sightings), what="camera")
-    return _result(found, free, sightings, size_px)
+    if not doubted:
+        return _result(found, free, sightings, size_px)
+    state = found.state
+    field = Field.of(state.intrinsics, free, size_px)
+    seen = Seen(field, corners, state.camera_from_board)
+    views = [[view] for view in range(len(sightings))]
+    doubts, step, covariance = doubts_of(found, evaluate(state), views, seen, range(own))
+    better = replace(found, state=move(state, step), covariance=covariance)
+    result = _result(better, free, sightings, size_px)
+    return replace(result, sigma_px=doubts.sigma_px, doubts=doubts)
 
 
 def _result(
@@ -116,34 +129,6 @@ def _result(
         tuple(sightings),
         size_px,
     )
-
-
-@dataclass(frozen=True)
-class Corners:
-    """All corners of all images, one after the other."""
-
-    board_mm: Floats
-    pixels: Floats
-    view: np.ndarray[tuple[int], np.dtype[np.intp]]
-    """[n], the number of the image."""
-    parts: tuple[slice, ...]
-    """Where each image's corners lie."""
-
-    @staticmethod
-    def of(sightings: Sequence[Sighting]) -> Corners:
-        counts = [len(sighting.ids) for sighting in sightings]
-        ends = np.cumsum(counts)
-        return Corners(
-            np.concatenate([sighting.board_mm for sighting in sightings]),
-            np.concatenate([sighting.pixels for sighting in sightings]),
-            np.repeat(np.arange(len(counts)), counts),
-            tuple(slice(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)),
-        )
-
-    def in_camera(self, camera_from_board: Floats) -> Floats:
-        """[n, 3], mm."""
-        pose = camera_from_board[self.view]
-        return np.asarray((pose[:, :3, :3] @ self.board_mm[:, :, None])[..., 0] + pose[:, :3, 3])
 
 
 def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: str) -> CameraState:

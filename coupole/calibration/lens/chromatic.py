@@ -16,7 +16,8 @@ import numpy as np
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Block, Group, adjust
 from coupole.calibration.lens.board import Sighting
-from coupole.calibration.lens.camera import PIXEL_SIGMA_PX, Corners, calibrate_camera
+from coupole.calibration.lens.camera import calibrate_camera
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.rotations import Floats, moved, skew
 from coupole.errors import InputError

@@ -18,10 +18,10 @@ import numpy as np
 
 from coupole.calibration import optics
 from coupole.calibration.adjustment import Block, Group
-from coupole.calibration.lens.camera import PIXEL_SIGMA_PX, Corners
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.record import step_names
-from coupole.calibration.rotations import Floats, moved, rotation, rotation_vector, skew
+from coupole.calibration.rotations import Floats, inverses, moved, rotation, rotation_vector, skew
 
 CORNERS, POSITION, ORIENTATION, BOARD_SCALE, AXIS_ZEROS, EARLIER = (
     "corners",
@@ -143,6 +143,13 @@ class Bundle:
     def evaluate(self, state: State) -> list[Block]:
         names = [group.name for group in self.groups]
         return [*self._corner_blocks(state), *self._robot_blocks(state), *self._held_blocks(state, names)]
+
+    def camera_from_board(self, state: State) -> Floats:
+        """[n, 4, 4] at each pose."""
+        base_from_camera = (
+            self.poses.base_from_flange @ self._zero_steps(state) @ state.pose_errors @ state.flange_from_camera
+        )
+        return np.asarray(inverses(base_from_camera) @ state.base_from_board)
 
     def move(self, state: State, change: Floats) -> State:
         at = self.layout

@@ -21,6 +21,7 @@ from coupole.calibration.lens.board import Board, Sighting
 from coupole.calibration.lens.bundle import HandEyeCalibration, RobotNoise, calibrate_hand_eye
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera, without_gross_errors
 from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
+from coupole.calibration.lens.doubts import Doubts
 from coupole.calibration.lens.equations import EarlierLens, Poses
 from coupole.calibration.lens.images import Found
 from coupole.calibration.poses import ReportedPoses
@@ -62,7 +63,7 @@ class Shown:
 
 def camera_from(found: Found, sources: Sources, model: str, request: Request) -> tuple[CameraCalibration, Shown]:
     """Calibrate a lens from the images of a board."""
-    fit = calibrate_camera(found.sightings, found.size_px, model)
+    fit = calibrate_camera(found.sightings, found.size_px, model, doubted=True)
     kept = without_gross_errors(fit)
     residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
     u = np.sqrt(np.diag(fit.covariance))
@@ -83,8 +84,12 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         parameters=tuple(parameters),
         covariance=rows_of(fit.covariance),
         noise=(_noise("corners", "px", 0.0, fit.sigma_px, redundancy),),
-        limits=against_limits(CAMERA, request.limits, {**image_figures(fit, found), "ray_px": ray_u_px(fit)}),
-        remarks=found.left_out,
+        limits=against_limits(
+            CAMERA,
+            request.limits,
+            {**image_figures(fit, found), "ray_px": ray_u_px(fit), **doubted_figures(fit.doubts)},
+        ),
+        remarks=(*found.left_out, *sentences_of(fit.doubts)),
         fixed=held(fit.intrinsics, fit.free),
         images=image_lines(kept, residuals, fit.sightings),
         **content_of(found, sources, request),
@@ -126,6 +131,7 @@ def hand_eye_from(
         lens=lens or fit.intrinsics,
         robot=robot,
         board_scale_u_ppm=board.scale_u_ppm,
+        size_px=found.size_px,
     )
     record = sealed(
         kind="hand-eye",
@@ -137,9 +143,14 @@ def hand_eye_from(
         covariance=rows_of(result.covariance),
         noise=_hand_eye_noise(result),
         limits=against_limits(
-            HAND_EYE, request.limits, {**image_figures(fit, found), **_hand_eye_figures(result)}
+            HAND_EYE,
+            request.limits,
+            {**image_figures(fit, found), **_hand_eye_figures(result), **doubted_figures(result.doubts)},
         ),
-        remarks=tuple(filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods()))),
+        remarks=(
+            *filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods())),
+            *sentences_of(result.doubts),
+        ),
         fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
         images=image_lines(kept, result.residuals_px, fit.sightings),
         **content_of(found, sources, request),
@@ -248,6 +259,15 @@ def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
         "rejected": float(rejected.mean()),
         "clipped": clipped / (len(found.sightings) + len(found.left_out)),
     }
+
+
+def doubted_figures(doubts: Doubts | None) -> dict[str, float]:
+    """The figures that `acceptance.DOUBTS` limits."""
+    return {} if doubts is None else {"pattern": doubts.pattern, "predicted": doubts.predicted.ratio}
+
+
+def sentences_of(doubts: Doubts | None) -> tuple[str, ...]:
+    return () if doubts is None else tuple(doubts.sentences())
 
 
 def _hand_eye_figures(result: HandEyeCalibration) -> dict[str, float]:

@@ -1,0 +1,65 @@
+"""How well a fit predicts views that it did not have: each left out in turn, without fitting anew.
+
+With H the part of the hat matrix that belongs to a view, the residuals that it would have if it had been left out
+are (I - H)^-1 r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks). What only
+the view itself determines, such as the board's pose in it, does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.calibration.adjustment import Block
+from coupole.calibration.rotations import Floats
+
+_OWN = 1e-6
+"""Directions of a view's residuals with less than this redundancy are determined by the view alone."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Predictions of the views."""
+
+    ratios: Floats
+    """[views] root mean square of the prediction error over its standard uncertainty; about 1."""
+    off: Floats
+    """[views] root mean square of the group's prediction errors, over the stated noise."""
+
+    @property
+    def ratio(self) -> float:
+        """Over all views."""
+        return float(np.sqrt(np.mean(self.ratios**2)))
+
+
+def left_out(
+    views: Sequence[Sequence[int]],
+    blocks: Sequence[Block],
+    weights: Sequence[Floats],
+    factors: Floats,
+    covariance: Floats,
+    group: int = 0,
+) -> LeftOut:
+    """`views` are the numbers of each view's blocks; `covariance` is that of all parameters, with these noises."""
+    ratios, off = np.zeros(len(views)), np.zeros(len(views))
+    for number, mine in enumerate(views):
+        columns = np.unique(np.concatenate([blocks[i].columns for i in mine]))
+        jacobians, residuals, of_group = [], [], []
+        for i in mine:
+            block, kept = blocks[i], weights[i] > 0
+            jacobian = np.zeros((int(kept.sum()), len(columns)))
+            jacobian[:, np.searchsorted(columns, block.columns)] = block.jacobian[kept] / factors[block.group]
+            jacobians.append(jacobian)
+            residuals.append(block.residuals[kept] / factors[block.group])
+            of_group.append(np.full(len(jacobian), block.group == group))
+        jacobian, residual = np.concatenate(jacobians), np.concatenate(residuals)
+        hat = jacobian @ covariance[np.ix_(columns, columns)] @ jacobian.T
+        values, vectors = np.linalg.eigh(np.eye(len(residual)) - hat)
+        told = values > _OWN
+        along = vectors[:, told].T @ residual
+        ratios[number] = np.sqrt(np.sum(along**2 / values[told]) / max(int(told.sum()), 1))
+        predicted = (vectors[:, told] @ (along / values[told]))[np.concatenate(of_group)]
+        off[number] = factors[group] * np.sqrt(np.mean(predicted**2))
+    return LeftOut(ratios, off)

@@ -1,0 +1,99 @@
+"""Doubts about a fit of a board's images: what its model may lack, and how it predicts views that were left out.
+
+Both are part of the record. A pattern that a richer lens would explain widens the lens's covariance, to a limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.adjustment import Adjusted, Block
+from coupole.calibration.cross_validation import LeftOut, left_out
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
+from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, Field, suspects_of
+from coupole.calibration.model_error import ModelError, with_suspects
+from coupole.calibration.rotations import Floats
+
+CLEAR = 15.0
+"""Evidence from which a suspect is named: by noise alone once in 20,000 fits."""
+_WORDS = {
+    LENS: "the lens has a form that its model lacks",
+    BOARD: "the board is not flat",
+    FOCUS: "the focal length changes from view to view",
+}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The corners as computed at the solution."""
+
+    field: Field
+    corners: Corners
+    camera_from_board: Floats
+    """[views, 4, 4]."""
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What may be wrong with the model, and how well it predicts."""
+
+    error: ModelError
+    field: Field
+    predicted: LeftOut
+    pattern: float
+    """Root mean square over the field of what the lens's form leaves of the true one, over the standard
+    uncertainty of a direction's image by the record's lens."""
+
+    @property
+    def sigma_px(self) -> float:
+        """Noise of a corner without the patterns."""
+        return PIXEL_SIGMA_PX * self.error.noise
+
+    @property
+    def predicted_px(self) -> float:
+        """Root mean square over the views of the corners' prediction errors, per coordinate."""
+        return float(PIXEL_SIGMA_PX * np.sqrt(np.mean(self.predicted.off**2)))
+
+    def sentences(self) -> Iterator[str]:
+        """What was found, for the record's remarks."""
+        for one in self.error.suspects:
+            if one.evidence >= CLEAR:
+                pattern_px = PIXEL_SIGMA_PX * one.pattern
+                yield (
+                    f"{_WORDS[one.name]}: its pattern in the residuals is {pattern_px:.2g} px "
+                    f"(log-likelihood ratio {one.evidence:.0f}); values and uncertainties account for it"
+                )
+        yield (
+            f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predicted.ratio:.2f} of "
+            "the stated uncertainty"
+        )
+
+
+def doubts_of(
+    found: Adjusted[Any], blocks: Sequence[Block], views: Sequence[Sequence[int]], seen: Seen, lens: Sequence[int]
+) -> tuple[Doubts, Floats, Floats]:
+    """The doubts, the step of the parameters and their covariance with them.
+
+    `blocks` are those of `found`, the corners' (group 0) first and in their order; `views` the numbers of each
+    view's blocks; `lens` the columns of the free intrinsics.
+    """
+    factors = np.array([component.factor for component in found.components])
+    weights = [kept.astype(np.float64) for kept in found.kept]
+    corners = seen.corners
+    computed = optics.project(corners.in_camera(seen.camera_from_board), seen.field.lens)
+    suspects = suspects_of(seen.field, corners, seen.camera_from_board, computed.by_point, computed.pixels)
+    redundancy = found.components[0].redundancy
+    error = with_suspects(blocks, weights, factors, len(found.covariance), redundancy, suspects)
+    of_lens = error.of(LENS)
+    columns = np.ix_(lens, lens)
+    covariance = error.covariance.copy()
+    left_px = seen.field.rms_px(of_lens.coefficients, of_lens.coefficient_covariance)
+    pattern = left_px / seen.field.ray_u_px(covariance[columns])
+    covariance[columns] *= 1.0 + pattern**2
+    predicted = left_out(views, blocks, weights, factors, found.covariance)
+    return Doubts(error, seen.field, predicted, pattern), error.step, covariance

@@ -1,0 +1,119 @@
+"""What may be wrong with the model of a board's images: the lens's form, the board's shape, a focus that changes.
+
+Modes of the lens are polynomials over the field less the best lens of the record's own form, so that what a record
+says of its lens is the best of that form over the whole field, and its modes are the rest (orthogonal in the sense
+of Plumlee, J. Am. Stat. Assoc. 112, 2017).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander2d
+
+from coupole.calibration import optics
+from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
+from coupole.calibration.model_error import Suspect
+from coupole.calibration.rotations import Floats
+
+LENS, BOARD, FOCUS = "lens", "board", "focus"
+_LENS_DEGREE, _BOARD_DEGREE = 6, 3
+_GRID = 13
+
+
+@dataclass(frozen=True)
+class Field:
+    """Patterns over the field that a lens of the record's form does not have."""
+
+    lens: Floats
+    """[9] intrinsics."""
+    free: tuple[str, ...]
+    size_px: tuple[int, int]
+    best: Floats
+    """[free + 3, modes] lens and turn of the camera that come nearest to each polynomial."""
+
+    @staticmethod
+    def of(lens: Floats, free: Sequence[str], size_px: tuple[int, int]) -> Field:
+        bare = Field(lens, tuple(free), size_px, np.zeros((0, 0)))
+        grid = bare.grid_px()
+        own, polynomials = bare._own(grid), bare._polynomials(grid)
+        return Field(
+            lens, tuple(free), size_px, np.asarray(np.linalg.lstsq(own, polynomials, rcond=None)[0], np.float64)
+        )
+
+    def grid_px(self) -> Floats:
+        """[n, 2] places all over the field."""
+        width, height = self.size_px
+        x, y = np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID))
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def modes(self, pixels: Floats) -> Floats:
+        """[2 n, modes] px at pixels [n, 2]; each is about 1 px."""
+        return np.asarray(self._polynomials(pixels) - self._own(pixels) @ self.best)
+
+    def ray_u_px(self, covariance: Floats) -> float:
+        """Root mean square over the field of the standard uncertainty of a direction's image, both coordinates, of
+        a lens with this covariance [free, free]; a turn of the camera does not count."""
+        own = self._own(self.grid_px())
+        turns, lens = own[:, -3:], own[:, :-3]
+        left = lens - turns @ np.linalg.lstsq(turns, lens, rcond=None)[0]
+        return float(np.sqrt(2.0 * np.mean(np.einsum("ki,ij,kj->k", left, covariance, left))))
+
+    def rms_px(self, coefficients: Floats, covariance: Floats) -> float:
+        """Root mean square over the field of a pattern, both coordinates, its uncertainty included."""
+        modes = self.modes(self.grid_px())
+        squares = (modes @ coefficients) ** 2 + np.einsum("ki,ij,kj->k", modes, covariance, modes)
+        return float(np.sqrt(2.0 * np.mean(squares)))
+
+    def _own(self, pixels: Floats) -> Floats:
+        """[2 n, free + 3] derivatives by the free lens parameters and by a turn of the camera."""
+        rays = np.column_stack([(pixels - self.lens[2:4]) / self.lens[:2], np.ones(len(pixels))])
+        seen = optics.project(rays, self.lens)
+        by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in self.free]]
+        turns = np.cross(np.eye(3)[None], rays[:, None])
+        by_turn = np.einsum("kij,kaj->kia", seen.by_point, turns)
+        return np.concatenate([by_lens, by_turn], axis=2).reshape(2 * len(pixels), -1)
+
+    def _polynomials(self, pixels: Floats) -> Floats:
+        """[2 n, modes] products of Legendre's polynomials, in x and in y."""
+        width, height = self.size_px
+        x, y = 2.0 * pixels[:, 0] / (width - 1) - 1.0, 2.0 * pixels[:, 1] / (height - 1) - 1.0
+        found = _products(x, y, 0, _LENS_DEGREE)
+        both = np.zeros((len(pixels), 2, 2 * found.shape[1]))
+        both[:, 0, : found.shape[1]] = both[:, 1, found.shape[1] :] = found
+        return both.reshape(2 * len(pixels), -1)
+
+
+def _products(x: Floats, y: Floats, least: int, most: int) -> Floats:
+    """[n, modes] of total degree `least` to `most`, each with a mean square of 1 over the square."""
+    degrees = np.array([(i, j) for i in range(most + 1) for j in range(most + 1) if least <= i + j <= most])
+    size = np.sqrt((2 * degrees[:, 0] + 1) * (2 * degrees[:, 1] + 1))
+    table = legvander2d(x, y, (most, most)).reshape(len(x), most + 1, most + 1)
+    return np.asarray(table[:, degrees[:, 0], degrees[:, 1]] * size)
+
+
+def suspects_of(
+    field: Field, corners: Corners, camera_from_board: Floats, by_point: Floats, pixels: Floats
+) -> list[Suspect]:
+    """The lens, the board and the focus as suspects. `by_point` [n, 2, 3] and `pixels` [n, 2] are those of the
+    corners computed in the camera frames `camera_from_board` [views, 4, 4]."""
+    off = pixels - field.lens[2:4]
+    focus = np.zeros((len(pixels), 2, len(camera_from_board)))
+    focus[np.arange(len(pixels)), :, corners.view] = 2.0 * off / field.size_px[0]
+    return [
+        Suspect(LENS, field.modes(pixels) / PIXEL_SIGMA_PX),
+        Suspect(BOARD, _of_board(corners, camera_from_board, by_point) / PIXEL_SIGMA_PX),
+        Suspect(FOCUS, focus.reshape(2 * len(pixels), -1) / PIXEL_SIGMA_PX),
+    ]
+
+
+def _of_board(corners: Corners, camera_from_board: Floats, by_point: Floats) -> Floats:
+    """[2 n, modes] px for heights of the board of about 1 mm, as polynomials over it without those of a plane."""
+    low, high = corners.board_mm.min(axis=0), corners.board_mm.max(axis=0)
+    places = 2.0 * (corners.board_mm - low) / np.maximum(high - low, 1e-9) - 1.0
+    up = camera_from_board[corners.view, :3, 2]
+    rise = np.einsum("nij,nj->ni", by_point, up)
+    heights = _products(places[:, 0], places[:, 1], 2, _BOARD_DEGREE)
+    return np.asarray((rise[:, :, None] * heights[:, None, :]).reshape(2 * len(rise), -1))

@@ -1,0 +1,211 @@
+"""What a model lacks, found in the structure of its residuals, and what that adds to values and uncertainties.
+
+A least-squares fit takes residuals for independent noise. A cause that the model has no term for leaves a pattern
+in them: over the field, over the board, from view to view. Each suspected cause is a set of modes with one unknown
+amplitude, r = sum_k F_k c_k + noise with c_k ~ N(0, s_k^2). Amplitudes and noise maximise the likelihood of what
+the fit left over (restricted maximum likelihood: Patterson and Thompson, Biometrika 58, 1971). Then the modes are
+unknowns like all others, with that prior: they move the result and widen its covariance as far as the residuals
+leave open. Kennedy and O'Hagan (J. R. Stat. Soc. B 63, 2001) treat the error of a model so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from coupole.calibration.adjustment import Block
+from coupole.calibration.rotations import Floats
+
+_NULL = 1e-7
+"""Directions of the modes with less than this share of their information left are the model's own."""
+_LEAST_LOG = -60.0
+_ROUNDS, _SETTLED = 4, 0.01
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A cause that the model has no term for: derivatives [observations, modes] of the computed values over their
+    stated noise, in the order of the blocks of the group."""
+
+    name: str
+    modes: Floats
+
+
+@dataclass(frozen=True)
+class Suspected:
+    """One suspect by the evidence of the residuals."""
+
+    name: str
+    amplitude: float
+    """Standard deviation of its modes' coefficients."""
+    evidence: float
+    """Twice the gain of log-likelihood by it."""
+    coefficients: Floats
+    """[modes], most probable."""
+    coefficient_covariance: Floats
+    pattern: float
+    """Root mean square of its pattern in the residuals, over the stated noise; what the model absorbs left out."""
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """The fit with the suspects as unknowns."""
+
+    step: Floats
+    """[p] change of the parameters."""
+    covariance: Floats
+    """[p, p]."""
+    noise: float
+    """Of the group, over the stated noise: without the patterns."""
+    suspects: tuple[Suspected, ...]
+
+    def of(self, name: str) -> Suspected:
+        return next(one for one in self.suspects if one.name == name)
+
+
+def with_suspects(
+    blocks: Sequence[Block],
+    weights: Sequence[Floats],
+    factors: Floats,
+    parameters: int,
+    redundancy: float,
+    suspects: Sequence[Suspect],
+    group: int = 0,
+) -> ModelError:
+    """Judge the suspects by the residuals of `group`, at the solution of an adjustment.
+
+    `weights` are 1 for a residual that was kept, else 0; `factors` [groups] are the estimated noises over the
+    stated ones, `redundancy` that of the group.
+    """
+    noise = float(factors[group])
+    for _ in range(_ROUNDS):
+        scaled = factors.copy()
+        scaled[group] = noise
+        fit = _Fit(blocks, weights, scaled, parameters, suspects, group)
+        logs = fit.most_likely(redundancy, [True] * len(suspects))
+        again = noise * float(np.exp(0.5 * logs[0]))
+        settled = abs(again / noise - 1.0) < _SETTLED
+        noise = again
+        if settled:
+            break
+    return fit.result(logs, redundancy, noise)
+
+
+class _Fit:
+    """Normal equations with the modes, the parameters eliminated; the group's noise is 1 here."""
+
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        weights: Sequence[Floats],
+        factors: Floats,
+        parameters: int,
+        suspects: Sequence[Suspect],
+        group: int,
+    ) -> None:
+        self.suspects = suspects
+        modes = np.concatenate([one.modes for one in suspects], axis=1) / factors[group]
+        self.of_mode = np.repeat(np.arange(len(suspects)), [one.modes.shape[1] for one in suspects])
+        normal = np.zeros((parameters, parameters))
+        cross, gram, side = np.zeros((parameters, modes.shape[1])), 0.0, np.zeros(modes.shape[1])
+        self.chi2, first = 0.0, 0
+        self._own: list[tuple[Floats, Block, Floats, slice]] = []
+        for block, weight in zip(blocks, weights, strict=True):
+            jacobian = block.jacobian / factors[block.group]
+            normal[np.ix_(block.columns, block.columns)] += (jacobian * weight[:, None]).T @ jacobian
+            if block.group != group:
+                continue
+            rows = slice(first, first + len(weight))
+            first += len(weight)
+            kept = modes[rows] * weight[:, None]
+            residuals = block.residuals / factors[group]
+            cross[block.columns] += jacobian.T @ kept
+            gram = gram + modes[rows].T @ kept
+            side += kept.T @ residuals
+            self.chi2 += float(weight @ residuals**2)
+            self._own.append((jacobian, block, weight, rows))
+        self.modes, self.cross = modes, cross
+        self.covariance = np.asarray(cho_solve(cho_factor(normal), np.eye(parameters)))
+        left = gram - cross.T @ self.covariance @ cross
+        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
+        told = values > _NULL * max(float(np.max(np.diag(gram))), 1e-300)
+        self.root = np.sqrt(values[told])[:, None] * vectors[:, told].T
+        self.seen = (vectors[:, told].T @ side) / np.sqrt(values[told])
+
+    def _spread(self, logs: Floats) -> Floats:
+        """[modes] prior variances."""
+        return np.asarray(np.exp(logs[1:])[self.of_mode])
+
+    def _variance(self, logs: Floats) -> Floats:
+        return np.asarray(
+            np.exp(logs[0]) * np.eye(len(self.seen)) + (self.root * self._spread(logs)) @ self.root.T
+        )
+
+    def minus_twice_log_likelihood(self, logs: Floats, redundancy: float) -> float:
+        """By the logarithms of the noise's variance and of the suspects' amplitudes squared."""
+        factor = cho_factor(self._variance(logs), lower=True)
+        told = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(self.seen @ cho_solve(factor, self.seen))
+        rest = max(redundancy - len(self.seen), 1.0)
+        unexplained = max(self.chi2 - float(self.seen @ self.seen), 0.0)
+        return told + rest * float(logs[0]) + unexplained * float(np.exp(-logs[0]))
+
+    def most_likely(self, redundancy: float, allowed: Sequence[bool]) -> Floats:
+        """[1 + suspects] those logarithms; suspects that are not allowed have none."""
+        free = np.flatnonzero([True, *allowed])
+        start = np.full(1 + len(self.suspects), _LEAST_LOG)
+        start[0] = 0.0
+        for number in np.flatnonzero(allowed):
+            information = np.mean(np.sum(self.root[:, self.of_mode == number] ** 2, axis=0))
+            start[1 + number] = -np.log(max(float(information), 1e-12))
+        bounds = [(-12.0, 3.0) if place == 0 else (start[place] - 14.0, start[place] + 14.0) for place in free]
+
+        def cost(values: Floats) -> float:
+            logs = start.copy()
+            logs[free] = values
+            return self.minus_twice_log_likelihood(logs, redundancy)
+
+        found = minimize(cost, start[free], method="L-BFGS-B", bounds=bounds)
+        best = start.copy()
+        best[free] = found.x
+        return best
+
+    def result(self, logs: Floats, redundancy: float, noise: float) -> ModelError:
+        spread = self._spread(logs)
+        factor = cho_factor(self._variance(logs))
+        gain = spread[:, None] * self.root.T
+        coefficients = gain @ cho_solve(factor, self.seen)
+        covariance = np.diag(spread) - gain @ cho_solve(factor, gain.T)
+        by = self.covariance @ self.cross
+        step = -by @ coefficients
+        at_best = self.minus_twice_log_likelihood(logs, redundancy)
+        suspects = []
+        for number, suspect in enumerate(self.suspects):
+            own = self.of_mode == number
+            without = self.most_likely(redundancy, [n != number for n in range(len(self.suspects))])
+            evidence = self.minus_twice_log_likelihood(without, redundancy) - at_best
+            pattern = self._pattern(np.where(own, coefficients, 0.0), by)
+            suspects.append(
+                Suspected(
+                    suspect.name,
+                    float(np.exp(0.5 * logs[1 + number])),
+                    max(float(evidence), 0.0),
+                    coefficients[own],
+                    covariance[np.ix_(own, own)],
+                    pattern * noise,
+                )
+            )
+        return ModelError(step, self.covariance + by @ covariance @ by.T, noise, tuple(suspects))
+
+    def _pattern(self, coefficients: Floats, by: Floats) -> float:
+        """Root mean square of what these coefficients leave in the residuals."""
+        step = -by @ coefficients
+        total, count = 0.0, 0
+        for jacobian, block, weight, rows in self._own:
+            left = self.modes[rows] @ coefficients + jacobian @ step[block.columns]
+            total += float(weight @ left**2)
+            count += int(weight.sum())
+        return float(np.sqrt(total / max(count, 1)))

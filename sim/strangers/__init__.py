@@ -1,0 +1,26 @@
+"""What no calibration has a term for: causes that disturb the simulated cell, in modules by what they disturb.
+
+Each is off until the rig switches it on (`world.settings.strangers`). None of them is known to any calibration.
+"""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+from sim.strangers.arm_stranger import ArmStranger
+from sim.strangers.lens_stranger import LensStranger
+from sim.strangers.light_stranger import LightStranger
+from sim.strangers.sensor_stranger import SensorStranger
+from sim.strangers.target_stranger import TargetStranger
+
+
+class Strangers(BaseModel):
+    """The rig's `world.settings.strangers`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lens: LensStranger = LensStranger()
+    light: LightStranger = LightStranger()
+    target: TargetStranger = TargetStranger()
+    arm: ArmStranger = ArmStranger()
+    sensor: SensorStranger = SensorStranger()

@@ -1,0 +1,77 @@
+"""LEDs that are no Lambertian squares: a measured lobe, tilted dies, a primary lens."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from sim.render.emitter import Emitter
+
+_TILT = 11
+"""Number of the seed's random stream."""
+_LEAST_COSINE = 0.02
+Floats = NDArray[np.float64]
+
+
+class LightStranger(BaseModel):
+    """How the dome's LEDs radiate."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lobe: tuple[tuple[float, float], ...] = ()
+    """Pairs of angle from the die's normal, deg, and luminous intensity in any unit, as measured by a goniometer;
+    straight between them, nothing beyond the last. The flux stays the table's. Empty: the cosine."""
+    die_tilt_deg: Annotated[float, Field(ge=0, le=30)] = 0.0
+    """Standard deviation of each die's turn about two axes of its board: its position stays."""
+    seed: int = 1
+    primary_lens_mm: float = 0.0
+    """Shift of the die's image by the lens on it, across its normal and towards whoever looks at it, over the sine
+    of the angle to the normal."""
+
+    @field_validator("lobe")
+    @classmethod
+    def _from_the_normal_on(cls, lobe: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        angles = [angle for angle, _ in lobe]
+        rising = all(a < b for a, b in pairwise(angles))
+        if lobe and (angles[0] != 0.0 or not rising or angles[-1] > 90.0 or min(i for _, i in lobe) < 0.0):
+            raise ValueError("expected angles that rise from 0 to at most 90 deg, and intensities of 0 or more")
+        return lobe
+
+    def tilted(self, normals: Floats, ids: NDArray[np.int64]) -> Floats:
+        """Unit normals [n, 3] of the dies of LEDs `ids` on boards with these normals."""
+        if not self.die_tilt_deg:
+            return normals
+        turned = normals.copy()
+        for row, led in enumerate(ids):
+            off = np.tan(np.radians(self.die_tilt_deg))
+            lean = off * np.random.default_rng((self.seed, _TILT, int(led))).standard_normal(3)
+            turned[row] += lean - (lean @ normals[row]) * normals[row]
+        return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+    def over_cosine(self, emitter: Emitter, points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[n] factor of the light at points [n, 3] over that of the same flux by the cosine."""
+        away = points_mm - emitter.centre_mm
+        cosine = np.clip(away @ emitter.normal / np.linalg.norm(away, axis=1), _LEAST_COSINE, 1.0)
+        return np.asarray(self.intensity(np.degrees(np.arccos(cosine))) / cosine, np.float32)
+
+    def intensity(self, angle_deg: Floats) -> Floats:
+        """Relative to pi times the flux: the cosine without a lobe, and of the same flux with it."""
+        if not self.lobe:
+            return np.asarray(np.cos(np.radians(angle_deg)))
+        at_deg, given = np.array(self.lobe).T
+        grid = np.linspace(0.0, np.pi / 2, 1801)
+        lobe = np.interp(np.degrees(grid), at_deg, given, right=0.0)
+        flux = 2.0 * np.trapezoid(lobe * np.sin(grid), grid)
+        return np.asarray(np.interp(angle_deg, at_deg, given, right=0.0) / flux)
+
+    def seen_from(self, emitter: Emitter, eye_mm: Floats) -> Emitter:
+        """The die's image that the primary lens shows an eye."""
+        away = eye_mm - emitter.centre_mm
+        away = away / np.linalg.norm(away)
+        across = away - (away @ emitter.normal) * emitter.normal
+        return replace(emitter, centre_mm=emitter.centre_mm + self.primary_lens_mm * across)

@@ -1,0 +1,125 @@
+"""Model error from the structure of residuals: by closed forms, and on cells that a fit has no term for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthesis import Cell, make_cell
+
+from coupole.calibration.adjustment import Block
+from coupole.calibration.cross_validation import left_out
+from coupole.calibration.lens.camera import calibrate_camera
+from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, Field
+from coupole.calibration.model_error import Suspect, with_suspects
+
+GROUPS, EACH = 30, 12
+
+
+def one_mean(values: np.ndarray) -> Block:
+    """Observations of one unknown mean, each with the stated noise 1."""
+    return Block(values, np.ones((len(values), 1)), np.array([0]), 0)
+
+
+def grouped(between: float, seed: int = 1) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return (random.normal(0, between, GROUPS)[:, None] + random.normal(0, 0.5, (GROUPS, EACH))).ravel()
+
+
+def test_amplitude_and_uncertainty_are_those_of_the_analysis_of_variance() -> None:
+    """Balanced one-way random effects, for which REML is ANOVA (Searle, Variance Components, 1992)."""
+    values = grouped(0.4)
+    values -= values.mean()
+    table = values.reshape(GROUPS, EACH)
+    between = EACH * np.sum(table.mean(axis=1) ** 2) / (GROUPS - 1)
+    within = np.sum((table - table.mean(axis=1, keepdims=True)) ** 2) / (GROUPS * (EACH - 1))
+    suspect = Suspect("groups", np.repeat(np.eye(GROUPS), EACH, axis=0))
+    weights = [np.ones(len(values))]
+    found = with_suspects(
+        [one_mean(values)], weights, np.array([values.std(ddof=1)]), 1, len(values) - 1, [suspect]
+    )
+    assert found.noise**2 == pytest.approx(within, rel=0.01)
+    assert found.of("groups").amplitude ** 2 == pytest.approx((between - within) / EACH, rel=0.02)
+    assert found.covariance[0, 0] == pytest.approx(between / len(values), rel=0.02)
+    assert found.of("groups").evidence > 50
+
+
+def test_noise_without_structure_gives_a_suspect_neither_evidence_nor_weight() -> None:
+    values = grouped(0.0)
+    values -= values.mean()
+    suspect = Suspect("groups", np.repeat(np.eye(GROUPS), EACH, axis=0))
+    found = with_suspects(
+        [one_mean(values)], [np.ones(len(values))], np.array([0.5]), 1, len(values) - 1, [suspect]
+    )
+    assert found.of("groups").evidence < 4
+    assert found.covariance[0, 0] == pytest.approx(0.25 / len(values), rel=0.3)
+
+
+def test_views_left_out_are_predicted_as_by_a_fit_without_them() -> None:
+    random = np.random.default_rng(4)
+    design, values = random.normal(size=(24, 3)), random.normal(size=24)
+    solution = np.linalg.lstsq(design, values, rcond=None)[0]
+    parts = [slice(4 * n, 4 * n + 4) for n in range(6)]
+    blocks = [Block((values - design @ solution)[part], design[part], np.arange(3), 0) for part in parts]
+    covariance = np.linalg.inv(design.T @ design)
+    found = left_out([[n] for n in range(6)], blocks, [np.ones(4)] * 6, np.ones(1), covariance)
+    for number, part in enumerate(parts):
+        rest = np.delete(np.arange(24), np.arange(24)[part])
+        without = np.linalg.lstsq(design[rest], values[rest], rcond=None)[0]
+        off = values[part] - design[part] @ without
+        spread = np.eye(4) + design[part] @ np.linalg.inv(design[rest].T @ design[rest]) @ design[part].T
+        assert found.off[number] == pytest.approx(np.sqrt(np.mean(off**2)))
+        assert found.ratios[number] == pytest.approx(np.sqrt(off @ np.linalg.solve(spread, off) / 4))
+
+
+# -- cells ----------------------------------------------------------------------------------------------------
+
+
+def with_pattern(cell: Cell, shift_px: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Cell:
+    """The cell with its corners shifted by a function of pixels and places on the board."""
+    moved = [replace(one, pixels=one.pixels + shift_px(one.pixels, one.board_mm)) for one in cell.sightings]
+    return replace(cell, sightings=tuple(moved))
+
+
+def test_a_cell_of_the_model_s_form_raises_no_doubt() -> None:
+    cell = make_cell(31, images=16)
+    plain, fit = (calibrate_camera(cell.sightings, cell.size_px, doubted=doubted) for doubted in (False, True))
+    assert fit.doubts is not None
+    assert max(one.evidence for one in fit.doubts.error.suspects) < 10
+    assert fit.doubts.predicted.ratio == pytest.approx(1.0, abs=0.1)
+    assert fit.doubts.pattern < 0.5
+    assert fit.sigma_px == pytest.approx(plain.sigma_px, rel=0.02)
+    assert np.median(np.diag(fit.covariance) / np.diag(plain.covariance)) ** 0.5 < 1.15
+
+
+def test_a_lens_of_another_form_is_named_and_refused_by_its_pattern() -> None:
+    cell = make_cell(32, images=16)
+
+    def wavy(pixels: np.ndarray, board_mm: np.ndarray) -> np.ndarray:
+        return 0.5 * np.sin(7.0 * pixels[:, ::-1] / cell.size_px[0])
+
+    fit = calibrate_camera(with_pattern(cell, wavy).sightings, cell.size_px, doubted=True)
+    assert fit.doubts is not None
+    evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
+    assert max(evidence, key=lambda name: evidence[name]) == LENS
+    assert evidence[LENS] > 100 > evidence[BOARD]
+    assert fit.doubts.pattern > 1.0
+    assert any("form that its model lacks" in line for line in fit.doubts.sentences())
+    field = Field.of(fit.intrinsics.vector(), fit.free, cell.size_px)
+    assert np.abs(field.modes(field.grid_px()).T @ field._own(field.grid_px())).max() < 1e-4
+
+
+def test_a_focal_length_that_changes_from_view_to_view_is_named() -> None:
+    cell, random = make_cell(33, images=16), np.random.default_rng(3)
+    middle = np.array(cell.size_px) / 2
+
+    def breathing(pixels: np.ndarray, board_mm: np.ndarray) -> np.ndarray:
+        return 3e-3 * random.standard_normal() * (pixels - middle)
+
+    fit = calibrate_camera(with_pattern(cell, breathing).sightings, cell.size_px, doubted=True)
+    assert fit.doubts is not None
+    evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
+    assert max(evidence, key=lambda name: evidence[name]) == FOCUS
+    assert evidence[FOCUS] > 20

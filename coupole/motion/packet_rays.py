@@ -23,9 +23,9 @@ from coupole.errors import CoupoleError
 _TRIANGLES, _INDEX, _VERTEX, _UINT3, _FLOAT3 = 0, 0, 1, 0x5003, 0x9003
 _COMPACT, _ROBUST = 1 << 1, 1 << 2
 _COHERENT, _EVERY_FEATURE = 1 << 16, 0xFFFFFFFF
-_ARGUMENTS = np.array([_EVERY_FEATURE << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
+ARGUMENTS = np.array([_EVERY_FEATURE << 32 | _COHERENT, 0, 0, 0, 0, 0], np.uint64)
 LANES = 16
-_FAR, _MASK, _FLAGS, _NUMBER, _GEOMETRY = 8, 9, 11, 17, 18
+FAR, _MASK, _FLAGS, _NUMBER, _GEOMETRY = 8, 9, 11, 17, 18
 """Rows of a packet, after the origin (0 to 2), the nearest distance (3) and the way (4 to 6)."""
 _ROWS = 24
 _NONE = 0xFFFFFFFF
@@ -76,7 +76,7 @@ class PacketMesh:
         """Numbers of the triangles that rays from one place along `ways` [n, 3] meet first, -1 for none, and how
         far, in lengths of the ways, NaN for none."""
         number, distance = np.empty(len(ways), np.int32), np.empty(len(ways), np.float32)
-        _first_met(_address("rtcIntersect16"), self.scene, start_mm, ways, _ARGUMENTS, number, distance)
+        _first_met(_address("rtcIntersect16"), self.scene, start_mm, ways, ARGUMENTS, number, distance)
         return number, distance
 
     def blocked(
@@ -84,19 +84,14 @@ class PacketMesh:
     ) -> NDArray[np.bool_]:
         """[asked] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the end."""
         found = np.empty(len(asked), np.bool_)
-        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, _ARGUMENTS, found)
+        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, ARGUMENTS, found)
         return found
 
-    def blocked_along(
-        self, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32], *, alike: bool = True
-    ) -> NDArray[np.bool_]:
+    def blocked_along(self, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[n] True where the way [n, 3], or the one way [1, 3] of all, from a start [n, 3] to its end meets a
-        triangle. Neighbours in the list that are `alike` go faster in packets, others one by one."""
+        triangle. They are traced one by one: of ways that lead everywhere, packets would be slower."""
         found = np.empty(len(starts_mm), np.bool_)
-        if alike:
-            _blocked_along(blocked16(), self.scene, starts_mm, ways_mm, _ARGUMENTS, found)
-        else:
-            _blocked_one_by_one(_address("rtcOccluded1"), self.scene, starts_mm, ways_mm, _ARGUMENTS, found)
+        _blocked_one_by_one(_address("rtcOccluded1"), self.scene, starts_mm, ways_mm, ARGUMENTS, found)
         return found
 
 
@@ -162,7 +157,7 @@ _call_embree_of_one: Any = intrinsic(_call_for_ray)
 
 
 @numba.njit(cache=True, nogil=True)
-def _packet():  # type: ignore[no-untyped-def]
+def packet():  # type: ignore[no-untyped-def]
     """Rows of a packet of rays and hits, as float32 and as uint32, and its lanes' mask, aligned to 64 bytes."""
     memory = np.zeros((_ROWS + 1) * LANES + LANES, np.float32)
     skip = np.int64((-np.int64(memory.ctypes.data) // 4) % LANES)
@@ -171,10 +166,12 @@ def _packet():  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: ignore[no-untyped-def]
+def trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: ignore[no-untyped-def]
+    """Trace the first `lanes` rays of a `packet` as far as `far`, in lengths of their ways, by the function at an
+    address (`blocked16`). In row `FAR` a blocked ray has then minus infinity."""
     for lane in range(LANES):
         valid[lane] = -1 if lane < lanes else 0
-        rays[3, lane], rays[_FAR, lane] = 0.0, far
+        rays[3, lane], rays[FAR, lane] = 0.0, far
         words[_MASK, lane], words[_FLAGS, lane], words[_GEOMETRY, lane] = _NONE, 0, _NONE
     _call_embree(
         function,
@@ -187,57 +184,43 @@ def _trace(function, scene, rays, words, valid, lanes, far, arguments):  # type:
 
 @numba.njit(cache=True, nogil=True)
 def _blocked(function, scene, starts, asked, end, arguments, found):  # type: ignore[no-untyped-def]
-    rays, words, valid = _packet()
+    rays, words, valid = packet()
     for first in range(0, len(asked), LANES):
         lanes = min(LANES, len(asked) - first)
         for lane in range(lanes):
             start = starts[asked[first + lane]]
             for k in range(3):
                 rays[k, lane], rays[4 + k, lane] = start[k], np.float32(end[k] - start[k])
-        _trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
+        trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
         for lane in range(lanes):
-            found[first + lane] = rays[_FAR, lane] < 0.0  # minus infinity for a ray that met something
-
-
-@numba.njit(cache=True, nogil=True)
-def _blocked_along(function, scene, starts, ways, arguments, found):  # type: ignore[no-untyped-def]
-    rays, words, valid = _packet()
-    for first in range(0, len(starts), LANES):
-        lanes = min(LANES, len(starts) - first)
-        for lane in range(lanes):
-            way = ways[min(first + lane, len(ways) - 1)]
-            for k in range(3):
-                rays[k, lane], rays[4 + k, lane] = starts[first + lane, k], way[k]
-        _trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
-        for lane in range(lanes):
-            found[first + lane] = rays[_FAR, lane] < 0.0
+            found[first + lane] = rays[FAR, lane] < 0.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _blocked_one_by_one(function, scene, starts, ways, arguments, found):  # type: ignore[no-untyped-def]
     """A ray's numbers lie one behind the other as a packet's rows do."""
-    rays, words, _ = _packet()
+    rays, words, _ = packet()
     ray, word = rays[0], words[0]
     address, more = np.uint64(ray.ctypes.data), np.uint64(arguments.ctypes.data)
     word[_MASK] = _NONE
     for n in range(len(starts)):
         for k in range(3):
             ray[k], ray[4 + k] = starts[n, k], ways[min(n, len(ways) - 1), k]
-        ray[_FAR] = 1.0
+        ray[FAR] = 1.0
         _call_embree_of_one(function, scene, address, more)
-        found[n] = ray[_FAR] < 0.0
+        found[n] = ray[FAR] < 0.0
 
 
 @numba.njit(cache=True, nogil=True)
 def _first_met(function, scene, start, ways, arguments, number, distance):  # type: ignore[no-untyped-def]
-    rays, words, valid = _packet()
+    rays, words, valid = packet()
     for first in range(0, len(ways), LANES):
         lanes = min(LANES, len(ways) - first)
         for lane in range(lanes):
             for k in range(3):
                 rays[k, lane], rays[4 + k, lane] = np.float32(start[k]), ways[first + lane, k]
-        _trace(function, scene, rays, words, valid, lanes, np.float32(np.inf), arguments)
+        trace(function, scene, rays, words, valid, lanes, np.float32(np.inf), arguments)
         for lane in range(lanes):
             met = words[_GEOMETRY, lane] != _NONE
             number[first + lane] = np.int32(words[_NUMBER, lane]) if met else -1
-            distance[first + lane] = rays[_FAR, lane] if met else np.nan
+            distance[first + lane] = rays[FAR, lane] if met else np.nan

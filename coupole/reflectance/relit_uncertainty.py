@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.new_light.light_kinds import AnyLight
-from coupole.reflectance.new_light.shading import coats_of
+from coupole.reflectance.new_light.shading import Picture, coats_of
 from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, materials_of
 from coupole.reflectance.run_result import MATERIALS, RunResult
 from coupole.reflectance.run_result_files import refuse_without_uncertainty
@@ -44,20 +44,21 @@ def uncertainty_of_picture(
     roots = vectors * np.sqrt(np.maximum(scales, 0.0))[:, None]
     count = 2 * UNKNOWNS + 1
 
-    def picture(reflecting: TriangleMaterials, number: int) -> NDArray[np.float32]:
-        made = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(lights, samples)
+    def picture(reflecting: TriangleMaterials, number: int, into: Picture | None = None) -> Picture:
+        made = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(lights, samples, into=into)
         say(number + 1, count)
         return made
 
     straight = picture(materials, 0)
+    moved = np.empty_like(straight), np.empty_like(straight)
     seen = scene.surface.seen
     square = (straight * np.append(common, 0.0)[seen][..., None]) ** 2  # -1, for nothing, takes the last
     for part in range(UNKNOWNS):
         deviation = roots[:, :, part]
         shorter = _LONGEST_STEP / np.maximum(np.abs(deviation[:, _NOT_LINEAR]).max(axis=1), _LONGEST_STEP)
         up, down = (
-            picture(_moved(materials, wider, sign * shorter[:, None] * deviation), 1 + 2 * part + (sign > 0))
-            for sign in (-1.0, 1.0)
+            picture(_moved(materials, wider, sign * shorter[:, None] * deviation), 1 + 2 * part + (sign > 0), into)
+            for sign, into in zip((-1.0, 1.0), moved, strict=True)
         )
         square += ((up - down) / (2.0 * np.append(shorter, 1.0)[seen][..., None])) ** 2
     known = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[seen]

@@ -16,7 +16,13 @@ from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
 from coupole.reflectance.new_light.mirrored import add_mirrored
-from coupole.reflectance.new_light.pictured_surface import FreeCamera, Surface, surface_from, surface_of_view
+from coupole.reflectance.new_light.pictured_surface import (
+    FreeCamera,
+    Surface,
+    in_strips,
+    surface_from,
+    surface_of_view,
+)
 from coupole.reflectance.new_light.shading import (
     MIRROR_SHARE,
     Coats,
@@ -87,17 +93,25 @@ class RelitScene:
     """What throws shadows."""
 
     def picture(
-        self, lights: Sequence[AnyLight], samples: int = SAMPLES, *, say: Say = lambda done, of: None
-    ) -> NDArray[np.float32]:
+        self,
+        lights: Sequence[AnyLight],
+        samples: int = SAMPLES,
+        *,
+        into: Picture | None = None,
+        say: Say = lambda done, of: None,
+    ) -> Picture:
         """[h, w, channels] radiance, linear, in the unit of `coupole.reflectance.new_light.light_kinds`; 0 where
         no triangle with a material is seen. Light from surface to surface is not in it.
 
-        `samples` of each area and environment. Raises InputError for a light that the result does not have.
+        `samples` of each area and environment. The picture is made in the memory of `into`, one of before that is
+        wanted no more. Raises InputError for a light that the result does not have.
         """
         paper = read_about(self.result.folder).get("emission") == "paper"
         base_from_support, channels = self.result.base_from_support, self.result.channels
         lighting = lighting_of(lights, self.views, base_from_support, channels, samples, paper=paper)
-        picture = np.zeros((*self.surface.seen.shape, channels), np.float32)
+        picture = np.zeros((*self.surface.seen.shape, channels), np.float32) if into is None else into
+        if into is not None:
+            in_strips(len(into), lambda rows: into[rows].fill(0.0))
         if isinstance(self.reflecting, Slices | Pairs):
             self._by_values(picture, lighting, self.reflecting, say)
         else:
@@ -111,23 +125,22 @@ class RelitScene:
         for beams in alike(lighting.beams):
             alone = len(beams) == 1 and beams[0].density == 0.0
             for lane, beam in enumerate(beams):
-                found = reached(self.mesh, self.surface, beam)
-                if alone:
-                    add_beam(picture, self.surface, coats, found, beam)
-                else:
-                    codes[lane] = found
+                reached(self.mesh, self.surface, beam, codes[lane])
                 done += 1
                 say(done, work)
-            if not alone:
+            if alone:
+                add_beam(picture, self.surface, coats, codes[0], beams[0])
+            else:
                 add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
         for number, emitter in enumerate(lighting.emitters):
             add_mirrored(picture, self.surface, coats, self.mesh, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)
 
     def _by_values(self, picture: Picture, lighting: Lighting, reflecting: Slices | Pairs, say: Say) -> None:
+        codes = np.zeros(self.surface.seen.shape, np.uint8)
         for number, beam in enumerate(lighting.beams):
-            values = self._triangle_values(reflecting, beam)
-            add_values(picture, self.surface, values, reached(self.mesh, self.surface, beam), beam)
+            reached(self.mesh, self.surface, beam, codes)
+            add_values(picture, self.surface, self._triangle_values(reflecting, beam), codes, beam)
             say(number + 1, len(lighting.beams))
 
     def _triangle_values(self, reflecting: Slices | Pairs, beam: Beam) -> NDArray[np.float32]:

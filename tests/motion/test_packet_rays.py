@@ -27,14 +27,13 @@ def test_what_lies_between_two_points_is_found(rays: int) -> None:
         assert 100 < found.sum() < 900
 
 
-@pytest.mark.parametrize("alike", [True, False])
 @pytest.mark.parametrize("compact", [True, False])
-def test_what_lies_on_a_way_is_found(alike: bool, compact: bool) -> None:
+def test_what_lies_on_a_way_is_found(compact: bool) -> None:
     corners, random = soup(400), np.random.default_rng(5)
     mesh, alone = PacketMesh(corners, compact), ray_mesh(corners)
     starts, ways = (random.normal(0, 60, (1003, 3)).astype(np.float32) for _ in range(2))
     for given in (ways, ways[:1]):
-        found = mesh.blocked_along(starts, given, alike=alike)
+        found = mesh.blocked_along(starts, given)
         assert np.array_equal(found, blocked_along(alone, starts, np.broadcast_to(given, ways.shape)))
         assert 50 < found.sum() < 950
 

@@ -201,12 +201,17 @@ def test_a_light_alone_gives_what_its_two_halves_give_together(tmp_path: Path, c
             found, wanted = scene.picture([light]), scene.picture([half, half])
             assert wanted.max() > 2 * wanted.mean()
             np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+            again = scene.picture([light], into=wanted)
+            assert again is wanted
+            assert np.array_equal(again, found)
 
 
 def reached_and_traced(scene: RelitScene, beam: Beam) -> tuple[np.ndarray, np.ndarray]:
     """[pixels] codes, and whether a ray from each pixel, one after the other, says that it is lit."""
     surface, seen = scene.surface, scene.surface.seen >= 0
-    codes = reached(scene.mesh, surface, beam)[seen]
+    whole = np.empty(surface.seen.shape, np.uint8)
+    reached(scene.mesh, surface, beam, whole)
+    codes = whole[seen]
     normals, places_mm = surface.normals[surface.seen[seen]], surface.places_mm[seen]
     starts = places_mm + 0.1 * normals
     ends = np.broadcast_to(beam.place, starts.shape) if beam.near else starts + 3000.0 * beam.place

@@ -48,7 +48,7 @@ def add_mirrored(
                 pixels, rows.start, seen, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter, ray,
                 lobe_rays, met, gains, ways_mm,
             )  # fmt: skip
-            free = ~mesh.blocked_along(starts_mm[met[:count]], ways_mm[:count], alike=False)
+            free = ~mesh.blocked_along(starts_mm[met[:count]], ways_mm[:count])
             sums[met[:count][free]] += gains[:count][free]
         part[row, column] += sums
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.motion.occlusion import RAY_START_MM
-from coupole.motion.packet_rays import PacketMesh
+from coupole.motion.packet_rays import ARGUMENTS, FAR, LANES, PacketMesh, blocked16, packet, trace
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 
@@ -31,9 +31,8 @@ _PACKET = 4
 """Rays of the grid down and across that go together."""
 
 
-def reached(mesh: PacketMesh, surface: Surface, beam: Beam) -> Codes:
-    """[h, w] codes; `mesh` is what throws shadows."""
-    codes = np.empty(surface.seen.shape, np.uint8)
+def reached(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
+    """Into `codes` [h, w] which pixels are; `mesh` is what throws shadows."""
     by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
     in_strips(len(codes), lambda rows: _begin(surface.seen[rows], surface.places_mm[rows], *by, codes[rows]))
     _trace(mesh, surface, beam, _asked_on_grid(codes), codes)
@@ -44,34 +43,37 @@ def reached(mesh: PacketMesh, surface: Surface, beam: Beam) -> Codes:
         _trace(mesh, surface, beam, _asked_in(codes, fresh), codes)
         fresh = _spread(codes, open_cells, fresh)
     in_strips(len(codes), lambda rows: _fill(codes, rows.start, rows.stop))
-    return codes
 
 
 def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.int64], codes: Codes) -> None:
-    seen, places_mm, flat = surface.seen.reshape(-1), surface.places_mm.reshape(-1, 3), codes.reshape(-1)
+    on = surface.seen.reshape(-1), surface.places_mm.reshape(-1, 3), surface.normals
+    how, flat = (blocked16(), mesh.scene, ARGUMENTS), codes.reshape(-1)
 
-    def trace(first: int) -> None:
-        mine = pixels[first : first + _RAYS]
-        starts_mm = np.empty((len(mine), 3), np.float32)
-        ways_mm = np.empty_like(starts_mm[: None if beam.near else 1])
-        _begin_rays(mine, seen, places_mm, surface.normals, beam.near, beam.place, starts_mm, ways_mm)
-        flat[mine] = np.where(mesh.blocked_along(starts_mm, ways_mm), SHADED, LIT)
+    def some(first: int) -> None:
+        _trace_rays(*how, pixels[first : first + _RAYS], *on, beam.near, beam.place, flat)
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(trace, range(0, len(pixels), _RAYS)))
+        list(pool.map(some, range(0, len(pixels), _RAYS)))
 
 
 @numba.njit(cache=True, nogil=True)
-def _begin_rays(pixels, seen, places_mm, normals, near, place, starts_mm, ways_mm):  # type: ignore[no-untyped-def]
-    for n in range(len(pixels)):
-        triangle = seen[pixels[n]]
-        for k in range(3):
-            start_mm = places_mm[pixels[n], k] + RAY_START_MM * normals[triangle, k]
-            starts_mm[n, k] = start_mm
-            if near:
-                ways_mm[n, k] = place[k] - start_mm
-    if not near:
-        ways_mm[0] = DISTANT_MM * place
+def _trace_rays(  # type: ignore[no-untyped-def]
+    function, scene, arguments, pixels, seen, places_mm, normals, near, place, codes
+):
+    """Codes of some pixels, by a ray from each; neighbours in the list go together."""
+    rays, words, valid = packet()
+    for first in range(0, len(pixels), LANES):
+        lanes = min(LANES, len(pixels) - first)
+        for lane in range(lanes):
+            pixel = pixels[first + lane]
+            triangle = seen[pixel]
+            for k in range(3):
+                start_mm = places_mm[pixel, k] + RAY_START_MM * normals[triangle, k]
+                rays[k, lane] = start_mm
+                rays[4 + k, lane] = place[k] - start_mm if near else DISTANT_MM * place[k]
+        trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
+        for lane in range(lanes):
+            codes[pixels[first + lane]] = SHADED if rays[FAR, lane] < 0.0 else LIT
 
 
 @numba.njit(cache=True, nogil=True)

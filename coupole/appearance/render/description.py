@@ -23,9 +23,7 @@ _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
 
-def contents(
-    scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[objects.Piece] = ()
-) -> Description:
+def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[Piece] = ()) -> Description:
     """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
     of_objects = [objects.pieces(thing, folder) for thing in scene.objects]

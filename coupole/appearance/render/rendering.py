@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import bands, description, lights, variant
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.objects import Piece
+from coupole.appearance.render.pieces import Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene, Scene, with_plain_lights
 from coupole.errors import CoupoleError
 
@@ -99,9 +99,7 @@ class Renderer:
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.seen(self.scene, camera, self._parts, self._mi)
         middle = groups[len(groups) // 2]
-        loaded = variant.loaded(
-            self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files)
-        )
+        loaded = variant.loaded(self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files))
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
         sums = squares = np.zeros((camera.height_px, camera.width_px))
         for passes in range(1, max(2, self.scene.samples // count) + 1):

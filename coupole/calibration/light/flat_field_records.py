@@ -67,8 +67,7 @@ def flat_field_outcome(
     dark = dark_signal(frames, dark_record)
     channels = channels_of(frames.pattern)
     straight = {channel: linearise(response_record, channel, frames) for channel in channels}
-    height, width = frames.lit[0].read().shape
-    size_px = (width, height)
+    width, height = size_px = frames.size_px
     views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
     for number, ((view, light), found) in enumerate(by_view.items()):
         for channel, reduced in _reduced(

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import pictures, variant
 from coupole.appearance.render.colour import Eye
-from coupole.appearance.render.objects import Ball, Piece, pieces, placed
+from coupole.appearance.render.objects import pieces, placed
+from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.rendering import Spectral, opened
 from coupole.appearance.render.scene_file import Camera, PlainScene, with_plain_lights
 from coupole.appearance.shapes.triangles import flat_normals, welded

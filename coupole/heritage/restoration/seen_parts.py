@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.render.objects import Ball, Piece
+from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera
 from coupole.appearance.shapes.solids import unit_sphere
 from coupole.heritage.restoration.painted_mesh import Floats

@@ -42,6 +42,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
 from random_cells import postures
+from ray_proof import LIGHT_STRANGERS
 from strange_cells import STRANGERS
 
 SETTINGS = ("width", "images", "samples", "led_boards", "absolute", "stranger")
@@ -95,9 +96,10 @@ def main() -> None:
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     seeds = [seed for seed in wanted if seed not in done]
     if seeds:
+        needs_leds = arguments.stranger is None or arguments.stranger in LIGHT_STRANGERS
         work = partial(
             prove_cell,
-            at=postures(arguments.images, led_boards=arguments.led_boards),
+            at=postures(arguments.images, led_boards=arguments.led_boards, leds=needs_leds),
             width_px=arguments.width,
             samples=arguments.samples,
             absolute=arguments.absolute,

@@ -96,10 +96,13 @@ def main() -> None:
     wanted = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     seeds = [seed for seed in wanted if seed not in done]
     if seeds:
-        needs_leds = arguments.stranger is None or arguments.stranger in LIGHT_STRANGERS
         work = partial(
             prove_cell,
-            at=postures(arguments.images, led_boards=arguments.led_boards, leds=needs_leds),
+            at=postures(
+                arguments.images,
+                led_boards=arguments.led_boards,
+                leds=arguments.stranger in (None, *LIGHT_STRANGERS),
+            ),
             width_px=arguments.width,
             samples=arguments.samples,
             absolute=arguments.absolute,

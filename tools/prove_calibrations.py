@@ -41,7 +41,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
-from random_cells import postures
+from random_cells import Postures, postures
+from ray_proof import LIGHT_STRANGERS
 from strange_cells import STRANGERS
 
 SETTINGS = ("width", "images", "samples", "led_boards", "absolute", "stranger")
@@ -97,7 +98,7 @@ def main() -> None:
     if seeds:
         work = partial(
             prove_cell,
-            at=postures(arguments.images, led_boards=arguments.led_boards),
+            at=_postures(arguments),
             width_px=arguments.width,
             samples=arguments.samples,
             absolute=arguments.absolute,
@@ -136,6 +137,11 @@ def main() -> None:
             print(f"{name:32} median {median:.4f}, 95 % of cells below {most:.4f}")
     if failed:
         sys.exit("\n".join(failed))
+
+
+def _postures(arguments: argparse.Namespace) -> Postures:
+    needs_leds = arguments.stranger in (None, *LIGHT_STRANGERS)
+    return postures(arguments.images, led_boards=arguments.led_boards, leds=needs_leds)
 
 
 def kept(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:

@@ -60,24 +60,28 @@ class Postures:
     """[v] boards of the dome that are lit at each."""
 
 
-def postures(images: int, *, led_boards: int | None = None) -> Postures:
+def postures(images: int, *, led_boards: int | None = None, leds: bool = True) -> Postures:
     """Postures as planned by `coupole plan new`, for `images` images of the calibration board and for the LEDs of
-    `led_boards` neighbouring boards of the dome, or of all."""
+    `led_boards` neighbouring boards of the dome, or of all; without `leds` for none."""
     cell = read_cell(RIG)
-    middles_mm = cell.leds.positions_mm.reshape(-1, 6, 3).mean(axis=1)
-    nearest = np.argsort(np.linalg.norm(middles_mm - middles_mm[_MIDDLE_BOARD], axis=1))[:led_boards]
-    cell = replace(cell, leds=some_leds(cell.leds, cell.leds.boards[::6][nearest]))
     with tempfile.TemporaryDirectory() as folder:
         board, mesh = (_itinerary(Path(folder), TEMPLATES[name]) for name in ("charuco", "mesh"))
-        plan = Path(folder) / "leds.yaml"
-        plan.write_text(led_plan(cell, name="leds", rig=str(RIG)))
-        views = read_job(plan).plan.views
+        views = _led_views(cell, led_boards, Path(folder)) if leds else ()
     return Postures(
         _some(board, images),
         _some(mesh, MESH_IMAGES),
-        np.array([view.joints_deg for view in views]),
+        np.array([view.joints_deg for view in views]).reshape(-1, 6),
         tuple(view.lights.boards for view in views),
     )
+
+
+def _led_views(cell: Cell, led_boards: int | None, folder: Path) -> Sequence[Any]:
+    middles_mm = cell.leds.positions_mm.reshape(-1, 6, 3).mean(axis=1)
+    nearest = np.argsort(np.linalg.norm(middles_mm - middles_mm[_MIDDLE_BOARD], axis=1))[:led_boards]
+    cell = replace(cell, leds=some_leds(cell.leds, cell.leds.boards[::6][nearest]))
+    plan = folder / "leds.yaml"
+    plan.write_text(led_plan(cell, name="leds", rig=str(RIG)))
+    return tuple(read_job(plan).plan.views)
 
 
 def some_leds(table: LedTable, boards: Sequence[int] | NDArray[np.int64]) -> LedTable:

@@ -54,6 +54,26 @@ def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]], scale: Cal
         assert line["rms_over_u"] < scale(4, 2), line
 
 
+@pytest.mark.timeout(18000)  # 40 cells with --full
+def test_a_bent_board_is_in_the_intervals(scale: Callable[[int, int], int]) -> None:
+    """Two cells of small frames tell an interval that is wrong altogether; forty whether 95 % hold."""
+    settings = {
+        "cells": scale(2, 40),
+        "width": scale(448, 640),
+        "images": scale(12, 24),
+        "samples": scale(2, 6),
+    }
+    options = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
+    command = [*COMMAND, "--stranger", "bend", *options]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    lines = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert not any("refused" in line for line in lines)
+    assert {line["name"].split(".")[0] for line in lines} == {"camera", "hand-eye", "flange_from_camera"}
+    for line in lines:
+        assert line["rms_over_u"] < scale(4, 2), line
+
+
 @pytest.mark.full
 def test_camera_leds_and_mesh_are_near_the_truth(proof: list[dict[str, Any]]) -> None:
     """An eighth of the real camera's resolution allows for twice the distances that the real one must meet."""

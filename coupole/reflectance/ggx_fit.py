@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from coupole.reflectance.ggx import UNKNOWNS, tangents
+from coupole.reflectance.kernel_arrays import assign, assign_rows
 from coupole.reflectance.lanes import LANES, if_less, lanes, larger, loaded, root, store, total
 from coupole.reflectance.normal_fit import (
     _MOST_STEPS,
@@ -67,7 +68,9 @@ def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled):  # type
             )
         if moved < cost:
             gain = cost - moved
-            unknowns[:], matrix[:], right[:] = trial, new_matrix, new_right
+            assign(unknowns, trial)
+            assign_rows(matrix, new_matrix)
+            assign(right, new_right)
             damping = max(damping * 0.2, 1e-9)
             cost, spread = moved, moved_spread
             if gain < settled * (cost + gain):

@@ -15,6 +15,8 @@ from numba import types
 from numba.extending import get_cython_function_address
 from threadpoolctl import ThreadpoolController
 
+from coupole.reflectance.kernel_arrays import assign_rows
+
 _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uint8))
 
 
@@ -74,7 +76,7 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
     """Into `factor` [n, n], Cholesky's of what `gram` left + diag(penalty); whether there is one."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(penalty), 0], np.intc)
-    factor[:] = product
+    assign_rows(factor, product)
     for n in range(len(penalty)):
         factor[n, n] += penalty[n]
     _dpotrf(upper.ctypes, sizes.ctypes, factor.ctypes, sizes.ctypes, sizes[1:].ctypes)
@@ -114,7 +116,8 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
     solve(factor, values)
     sums(rows, values, right)
     for k in range(count):
-        right[:, k] /= penalty[k]
+        for one in range(len(right)):
+            right[one, k] /= penalty[k]
     return True
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
+from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS, colour_weight
 from coupole.reflectance.triangle_fit import (
     HELD,
@@ -163,7 +164,7 @@ def _fill(  # type: ignore[no-untyped-def]
         bread[4, 4] += USUAL
         meat[4, 4] += USUAL
         inverse = np.linalg.inv(bread)
-        found[triangle] = inverse @ meat @ inverse.T
+        assign_rows(found[triangle], inverse @ meat @ inverse.T)
         _colours(
             own, good[:n], lights, half, views, view_of, group, normals[triangle], grey[triangle], kd[triangle],
             ks[triangle], found[triangle], u_kd[triangle], u_ks[triangle],
@@ -198,7 +199,7 @@ def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread,
                 single[i, j] += (weight * off / scale) ** 2 * row[i] * row[j]
     _add_square(score, meat)
     if groups < _FEWEST_GROUPS:
-        meat += single
+        _add(single.reshape(-1), meat.reshape(-1))
     few = groups / max(groups - 1.0, 1.0) * (len(good) - 1.0) / max(len(good) - UNKNOWNS, 1.0)
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):
@@ -247,7 +248,7 @@ def _colours(  # type: ignore[no-untyped-def]
     for channel in range(channels + 1):
         _add_square(score[channel], meat[channel])
     if groups < _FEWEST_GROUPS:
-        meat += single
+        _add(single.reshape(-1), meat.reshape(-1))
     bread[0, 0] += 1e-12
     bread[1, 1] += 1e-9 * bread[0, 0]
     inverse = np.linalg.inv(bread)
@@ -258,6 +259,12 @@ def _colours(  # type: ignore[no-untyped-def]
         alone = inverse @ meat[channel] @ inverse
         u_kd[channel] = math.sqrt(alone[0, 0] / max(kd[channel], 1e-9) ** 2 + more_kd)
         u_ks[channel] = math.sqrt(alone[1, 1] / max(ks[channel], 1e-9) ** 2 + more_ks)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(single, meat):  # type: ignore[no-untyped-def]
+    for i in range(len(meat)):
+        meat[i] += single[i]
 
 
 @numba.njit(cache=True, nogil=True)

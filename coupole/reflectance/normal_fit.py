@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import UNKNOWNS, lobe, root_by_unknowns, tangents
+from coupole.reflectance.kernel_arrays import assign
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +85,9 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
 
     def fit(begin: int) -> None:
         part = slice(begin, begin + _BLOCK)
-        _fit_all(scaled[part], lights, half, view[None], only_view, normals[part], albedo[part], found[part])
+        least = _LEAST_SHARE * np.quantile(scaled[part], _OF_QUANTILE, axis=1)
+        of_part = normals[part], albedo[part], least, found[part]
+        _fit_all(scaled[part], lights, half, view[None], only_view, *of_part)
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, len(values), _BLOCK)))
@@ -159,29 +162,28 @@ def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_all(values, lights, half, views, view_of, normals, albedo, found):  # type: ignore[no-untyped-def]
+def _fit_all(values, lights, half, views, view_of, normals, albedo, least, found):  # type: ignore[no-untyped-def]
     for pixel in range(len(values)):
         sample = values[pixel]
-        least = _LEAST_SHARE * np.quantile(sample, _OF_QUANTILE)
-        used = np.flatnonzero(sample > max(least, 0.0))
+        used = np.flatnonzero(sample > max(least[pixel], 0.0))
         if len(used) < _FEWEST or albedo[pixel] <= 0.0:
             continue
         roots = np.sqrt(sample[used])
         best = np.inf
         for alpha in _STARTS:
             unknowns = np.empty(6)
-            unknowns[:3] = normals[pixel]
+            assign(unknowns[:3], normals[pixel])
             unknowns[3], unknowns[4], unknowns[5] = (
                 math.log(albedo[pixel]),
                 math.log(0.02 * albedo[pixel]),
                 math.log(alpha),
             )
             if _least_cosine(unknowns, views) < 0.05:
-                unknowns[:3] = views[0]
+                assign(unknowns[:3], views[0])
             cost, spread = fit_from(roots, used, lights, half, views, view_of, unknowns, views[0], 0.0, 0.0)
             if cost < best:
                 best = cost
-                found[pixel, :3] = unknowns[:3]
+                assign(found[pixel, :3], unknowns[:3])
                 found[pixel, 3], found[pixel, 4] = math.exp(unknowns[3]), math.exp(unknowns[4])
                 found[pixel, 5], found[pixel, 6] = math.exp(unknowns[5]), spread
 
@@ -212,7 +214,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
             moved, moved_spread = np.inf, 0.0
         if moved < cost:
             gain = cost - moved
-            unknowns[:] = trial
+            assign(unknowns, trial)
             damping = max(damping * 0.2, 1e-9)
             if gain < _SETTLED * cost:
                 cost, spread = moved, moved_spread

@@ -125,7 +125,8 @@ def _harmonics(x, y, z, rows):  # type: ignore[no-untyped-def]
     for m in range(_DEGREES):
         p_mm *= _DIAGONAL[m]
         if m == 1:
-            cosine, sine = math.sqrt(2.0) * x, math.sqrt(2.0) * y
+            for n in range(len(x)):
+                cosine[n], sine[n] = math.sqrt(2.0) * x[n], math.sqrt(2.0) * y[n]
         for n in range(len(x) if m > 1 else 0):
             cosine[n], sine[n] = x[n] * cosine[n] - y[n] * sine[n], x[n] * sine[n] + y[n] * cosine[n]
         before[:], now[:] = 0.0, p_mm
@@ -148,4 +149,5 @@ def _radial(x, y, z, rows):  # type: ignore[no-untyped-def]
         for n in range(len(x)):
             dx, dy, dz = x[n] - cx, y[n] - cy, z[n] - cz
             rows[k, n] = -math.sqrt(dx * dx + dy * dy + dz * dz)
-    rows[count], rows[count + 1], rows[count + 2], rows[count + 3] = 1.0, x, y, z
+    for n in range(len(x)):
+        rows[count, n], rows[count + 1, n], rows[count + 2, n], rows[count + 3, n] = 1.0, x[n], y[n], z[n]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy import ascontiguousarray as ordered  # functions are compiled for each layout
 from numpy.typing import NDArray
 
+from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.least_squares import (
     factorise,
     gram,
@@ -169,19 +170,20 @@ def _fit_one(  # type: ignore[no-untyped-def]
     mine, right = wanted[: channels * n].reshape(channels, n), solution[:channels]
     factor = matrix[: size * size].reshape(size, size)
     _wanted(left, which, first, mine)
-    held[:] = penalty
-    if over:
-        held *= _held_by(mine, values, which, first)
+    share = _held_by(mine, values, which, first) if over else 1.0
+    for k in range(COUNT):
+        held[k] = share * penalty[k]
     if not _solve(rows, product, held, mine, room, factor, right):
         return
-    found[:, :COUNT] = right
+    assign_rows(found[:, :COUNT], right)
     found[:, COUNT] = 1.0
     if over:
         step = max(1, n // _LEFT_OUT)
         off = np.empty((2, channels, (n + step - 1) // step))
         left_out(rows, mine, right, factor, step, off[0])
         _wanted(values, which, first, mine)
-        held[:] = LEAST_RESIDUAL * penalty
+        for k in range(COUNT):
+            held[k] = LEAST_RESIDUAL * penalty[k]
         if _solve(rows, product, held, mine, room, factor, right):
             left_out(rows, mine, right, factor, step, off[1])
             _stack(off, right, found)

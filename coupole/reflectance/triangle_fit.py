@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.ggx import lobe
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
+from coupole.reflectance.kernel_arrays import assign
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.normal_fit import colours_from
 
@@ -163,6 +164,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     views = np.empty((len(cameras_mm), 3))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
     own, packs = np.empty((samples, channels)), np.empty((samples // LANES + 1, ROWS, LANES))
+    grey = np.empty(3)
     for triangle in range(count):
         normal, held = normals[triangle], stiffness[triangle]
         n = gather(
@@ -174,12 +176,14 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held, packs)
         count = pack(roots[:n], good[:n], lights, half, views, view_of, packs)
         _, spread = fit_packs(packs[:count], views, chosen, normal, held, USUAL, _SETTLED)
-        found[triangle, :3] = chosen[:3] if free else normal
+        assign(found[triangle, :3], chosen[:3] if free else normal)
         found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
         kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
-        grey = np.exp(chosen[3:6])
+        for k in range(3):
+            grey[k] = math.exp(chosen[3 + k])
         colours_from(own, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
-        ks[:] = np.minimum(ks, MOST_KS)
+        for channel in range(channels):
+            ks[channel] = min(ks[channel], MOST_KS)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -198,7 +202,8 @@ def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, us
         colours_from(
             own, good[:n], normal, grey[triangle], lights, half, views, view_of, kd[triangle], ks[triangle]
         )
-        ks[triangle] = np.minimum(ks[triangle], MOST_KS)
+        for channel in range(channels):
+            ks[triangle, channel] = min(ks[triangle, channel], MOST_KS)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -226,7 +231,7 @@ def gather(  # type: ignore[no-untyped-def]
         n += 1
     for view in range(len(cameras_mm)):
         if not seeing[view]:
-            views[view] = normal
+            assign(views[view], normal)
     return n
 
 
@@ -238,12 +243,12 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, pa
     count = pack(roots[::step], good[::step], lights, half, views, view_of, packs)
     unknowns, chosen, best = np.empty(6), np.empty(6), np.inf
     for alpha in _STARTS:
-        unknowns[:3] = normal
+        assign(unknowns[:3], normal)
         unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
         cost, _ = fit_packs(packs[:count], views, unknowns, normal, stiffness, USUAL, _CHOSEN)
         if cost < best:
             best = cost
-            chosen[:] = unknowns
+            assign(chosen, unknowns)
     return chosen
 
 

@@ -89,7 +89,8 @@ def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def
             spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
             unknowns[_X] += spread2 * unknowns[_ALONG_X]
             unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
-            found[n] = unknowns
+            for k in range(_UNKNOWNS):
+                found[n, k] = unknowns[k]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -153,7 +154,8 @@ def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
         left, count, tried_normal, tried_right = _equations(image, known, x, y, radius, tried)
         if left <= squares:
             change = math.hypot(tried[_X] - unknowns[_X], tried[_Y] - unknowns[_Y])
-            unknowns[:] = tried
+            for k in range(_UNKNOWNS):
+                unknowns[k] = tried[k]
             squares, normal, right = left, tried_normal, tried_right
             damping *= 0.1
             if change < _CLOSE_PX:

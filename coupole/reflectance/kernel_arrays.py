@@ -1,0 +1,24 @@
+"""Assignment of arrays in compiled code.
+
+What numba makes of `a[:] = b` can say which shapes do not fit: that text and its formatting take two seconds to
+compile, and are optimised anew with each kernel that has them.
+"""
+
+from __future__ import annotations
+
+import numba
+
+
+@numba.njit(cache=True, nogil=True)
+def assign(to, values):  # type: ignore[no-untyped-def]
+    """Into `to` [n] the numbers `values` [n]; the lengths are not checked."""
+    for n in range(len(to)):
+        to[n] = values[n]
+
+
+@numba.njit(cache=True, nogil=True)
+def assign_rows(to, values):  # type: ignore[no-untyped-def]
+    """Into `to` [m, n] the numbers `values` [m, n]; the shapes are not checked."""
+    for row in range(to.shape[0]):
+        for column in range(to.shape[1]):
+            to[row, column] = values[row, column]

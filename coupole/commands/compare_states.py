@@ -13,7 +13,13 @@ from coupole.errors import CoupoleError, InputError
 
 
 def compare(
-    before: Annotated[Path, typer.Argument(help="A mesh or cloud: PLY, STL, OBJ.", show_default=False)],
+    before: Annotated[
+        Path,
+        typer.Argument(
+            help="A mesh or cloud (PLY, STL, OBJ), or the folder of a fitted `coupole reflectance`.",
+            show_default=False,
+        ),
+    ],
     after: Annotated[Path, typer.Argument(help="Another one of the same object.", show_default=False)],
     out: Annotated[
         Path | None, typer.Option("--out", help="A new folder for report and maps.", show_default=False)

@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 from coupole.commands.cli import app
 from coupole.errors import InputError
 from coupole.heritage.comparison.significance import discoveries
-from coupole.heritage.comparison.state_comparison import Comparison, compare, de00_of, lab_of
+from coupole.heritage.comparison.state_comparison import Comparison, compare, de00_of
+from coupole.heritage.comparison.state_files import lab_of
 
 NOISE_MM, DENT_MM, DENT_ACROSS_MM = 0.03, 0.2, 10.0
 

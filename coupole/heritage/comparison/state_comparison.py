@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
-from coupole.heritage.comparison.local_surface import FREEDOM, fit_locally
+from coupole.heritage.comparison.local_surface import FREEDOM, LocalFits, fit_locally
+from coupole.heritage.comparison.result_state import read_result_state
 from coupole.heritage.comparison.significance import discoveries, of_lengths, of_vectors
-from coupole.heritage.comparison.state_files import Floats, State, read_state
+from coupole.heritage.comparison.state_files import Colours, Floats, State, colour_library, read_state
 from coupole.heritage.comparison.unchanged_alignment import Alignment, align
-from coupole.scan.registration.extra import ExtraMissing
 from coupole.scan.registration.prepared_scan import thinned
 from coupole.scan.registration.small_motions import applied, inverse_of
 from coupole.scan.registration.viewpoint import Viewpoint
@@ -61,7 +61,7 @@ class Comparison:
     """[n] significantly."""
     noise_factor: float
     de00: Floats | None
-    """[n] CIEDE2000 of the sRGB colours under D65."""
+    """[n] CIEDE2000 under D65."""
     recoloured: NDArray[np.bool_] | None
     colour_factor: float
     shape_regions: tuple[Region, ...]
@@ -71,12 +71,12 @@ class Comparison:
 def compare(
     before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, aligned: bool, say: Say
 ) -> Comparison:
-    """Compare two files. `noise_mm` is the standard deviation of a point, else found by the scatter; `aligned`
-    takes the files' frame as common. Raises InputError."""
+    """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point,
+    else found by the scatter; `aligned` takes the files' frame as common. Raises InputError, ExtraMissing."""
     say("reading", 0, 2)
-    before = read_state(before_path, unit)
+    before = _read(before_path, unit)
     say("reading", 1, 2)
-    after = read_state(after_path, unit)
+    after = _read(after_path, unit)
     say("reading", 2, 2)
     if not 0.2 < before.size_mm / after.size_mm < 5:
         raise InputError(
@@ -91,20 +91,22 @@ def compare(
     return _compared(before, after, alignment, noise_mm, say)
 
 
+def _read(path: Path, unit: str) -> State:
+    return read_result_state(path) if path.is_dir() else read_state(path, unit)
+
+
 def _compared(before: State, after: State, alignment: Alignment, noise_mm: float | None, say: Say) -> Comparison:
     spacing_mm = max(before.spacing_mm, after.spacing_mm)
     reach_mm = max(_REACH_SHARE * before.size_mm, _REACH_SPACINGS * spacing_mm)
     normals = _normals(before)
     after_mm = applied(alignment.before_from_after, after.points_mm)
-    labs = None
-    if before.srgb is not None and after.srgb is not None:
-        labs = lab_of(before.srgb), lab_of(after.srgb)
+    colours = None
+    if before.colours is not None and after.colours is not None:
+        colours = before.colours, after.colours
     say("fitting surfaces", 0, 2)
-    one = fit_locally(
-        cKDTree(before.points_mm), None if labs is None else labs[0], before.points_mm, normals, reach_mm
-    )
+    one = _fits(before.points_mm, colours and colours[0], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 1, 2)
-    two = fit_locally(cKDTree(after_mm), None if labs is None else labs[1], before.points_mm, normals, reach_mm)
+    two = _fits(after_mm, colours and colours[1], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 2, 2)
     differences = two.values - one.values
     covariance = one.covariance + two.covariance
@@ -114,8 +116,10 @@ def _compared(before: State, after: State, alignment: Alignment, noise_mm: float
     p, factor = of_lengths(differences[:, 0], u_mm, 2 * FREEDOM if noise_mm is None else 1e9)
     moved = discoveries(p)
     de00, recoloured, colour_factor = None, None, 1.0
-    if labs is not None:
+    if colours is not None:
         known = covariance[:, 1:, 1:] + np.eye(3) * _SMALLEST_SPREAD
+        for points_mm, of_state in zip((before.points_mm, after_mm), colours, strict=True):
+            known = known + _of_result(points_mm, of_state, before.points_mm)
         p, colour_factor = of_vectors(differences[:, 1:], known, 2 * FREEDOM)
         recoloured = discoveries(p)
         de00 = de00_of(one.values[:, 1:], two.values[:, 1:])
@@ -128,6 +132,33 @@ def _compared(before: State, after: State, alignment: Alignment, noise_mm: float
     return Comparison(**{**found.__dict__, "shape_regions": shape, "colour_regions": colour})
 
 
+def _fits(
+    points_mm: Floats, colours: Colours | None, places_mm: Floats, normals: Floats, reach_mm: float
+) -> LocalFits:
+    """Local fits of shape by all points of a state, and of colour by those that have one."""
+    if colours is None:
+        return fit_locally(cKDTree(points_mm), None, places_mm, normals, reach_mm)
+    there = np.isfinite(colours.lab).all(axis=1)
+    if there.all():
+        return fit_locally(cKDTree(points_mm), colours.lab, places_mm, normals, reach_mm)
+    shape = fit_locally(cKDTree(points_mm), None, places_mm, normals, reach_mm)
+    found = fit_locally(cKDTree(points_mm[there]), colours.lab[there], places_mm, normals, reach_mm)
+    for own, of_shape in ((found.values, shape.values), (found.leverage, shape.leverage)):
+        own[:, 0] = of_shape[:, 0]
+    found.scatter[:, 0, 0] = shape.scatter[:, 0, 0]
+    return found
+
+
+def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats:
+    """[n, 3, 3] covariance of a result's colour at places: that of the nearest point that has one. It is not
+    divided by the number of points around: what they have in common is most of it."""
+    if colours.covariance is None:
+        return np.zeros((len(places_mm), 3, 3))
+    there = np.isfinite(colours.lab).all(axis=1)
+    nearest = cKDTree(points_mm[there]).query(places_mm)[1]
+    return np.asarray(colours.covariance[there][nearest])
+
+
 def _normals(state: State) -> Floats:
     """[n, 3]: by triangles, else by neighbours, and then which side is out is not known."""
     if state.outward is not None and np.linalg.norm(state.outward, axis=1).min() > 0:
@@ -136,25 +167,10 @@ def _normals(state: State) -> Floats:
     return np.asarray(cloud.normals[cloud.tree.query(state.points_mm)[1]])
 
 
-def lab_of(srgb: NDArray[np.uint8]) -> Floats:
-    """[n, 3] CIELAB under D65, 2 degrees, of sRGB colours. Raises ExtraMissing."""
-    return np.asarray(_colour_library().rgb2lab(srgb[None].astype(np.float64) / 255.0)[0], np.float64)
-
-
 def de00_of(lab: Floats, other: Floats) -> Floats:
     """[n] CIEDE2000 between CIELAB values [n, 3] (Luo, Cui, Rigg, Color Res. Appl. 26(5), 2001). Raises
     ExtraMissing."""
-    return np.asarray(_colour_library().deltaE_ciede2000(lab, other), np.float64)
-
-
-def _colour_library() -> Any:
-    try:
-        from skimage import color
-    except ImportError as error:
-        raise ExtraMissing(
-            f"comparing needs scikit-image: pip install 'coupole[registration]' ({error})"
-        ) from error
-    return color
+    return np.asarray(colour_library().deltaE_ciede2000(lab, other), np.float64)
 
 
 def _regions(found: Comparison, marked: NDArray[np.bool_]) -> tuple[Region, ...]:

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.scan.registration.extra import ExtraMissing
 from coupole.scan.registration.prepared_scan import spacing, vertex_normals
 from coupole.scan.registration.scan_files import read_scan, sources_of
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Colours:
+    """Of a state's points, as CIELAB under D65."""
+
+    lab: Floats
+    """[n, 3]; NaN where a point has none."""
+    covariance: Floats | None = None
+    """[n, 3, 3], if it is known; else the scatter from point to point tells."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +38,7 @@ class State:
     """[m, 3], none of a cloud."""
     outward: Floats | None
     """[n, 3] normals by the triangles."""
-    srgb: NDArray[np.uint8] | None
-    """[n, 3] colours of the vertices."""
+    colours: Colours | None
     spacing_mm: float
 
     @property
@@ -37,16 +48,17 @@ class State:
 
 
 def read_state(path: Path, unit: str) -> State:
-    """PLY (its colours too), STL, OBJ or text. Raises InputError."""
+    """A file of a scan, with its colours. Raises InputError, ExtraMissing."""
     sources = sources_of([path])
     if len(sources) != 1:
         raise InputError(
             f"{path}: expected one state; the file holds {len(sources)} scans: register and merge them"
         )
     content = read_scan(sources[0], unit, colours=True)
-    mesh, srgb = content.mesh, None
-    if content.srgba is not None and np.all(content.srgba[:, 3] == 255):
-        srgb = content.srgba[:, :3]
+    mesh, colours = content.mesh, None
+    if content.srgba is not None:
+        lab = np.where(content.srgba[:, 3:] > 0, lab_of(content.srgba[:, :3]), np.nan)
+        colours = Colours(lab)
     spacing_mm = spacing(mesh.vertices)
     if spacing_mm == 0:
         raise InputError(f"{path}: all its points lie in one place")
@@ -55,6 +67,22 @@ def read_state(path: Path, unit: str) -> State:
         mesh.vertices.astype(np.float64),
         mesh.triangles.astype(np.int64),
         vertex_normals(mesh),
-        srgb,
+        colours,
         spacing_mm,
     )
+
+
+def lab_of(srgb: NDArray[np.uint8]) -> Floats:
+    """[n, 3] CIELAB under D65, 2 degrees, of sRGB colours. Raises ExtraMissing."""
+    return np.asarray(colour_library().rgb2lab(srgb[None].astype(np.float64) / 255.0)[0], np.float64)
+
+
+def colour_library() -> Any:
+    """`skimage.color`. Raises ExtraMissing."""
+    try:
+        from skimage import color
+    except ImportError as error:
+        raise ExtraMissing(
+            f"comparing needs scikit-image: pip install 'coupole[registration]' ({error})"
+        ) from error
+    return color

@@ -111,7 +111,7 @@ def led_power(
     from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye)
+        frames = posed(open_light_frames(runs), hand_eye)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -146,7 +146,7 @@ def drift(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye)
+        frames = posed(open_light_frames(runs), hand_eye)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -160,7 +160,7 @@ def drift(
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _posed(frames: LightFrames, hand_eye: Path | None) -> LightFrames:
+def posed(frames: LightFrames, hand_eye: Path | None) -> LightFrames:
     """Frames with poses by a hand-eye record. Raises InputError for another record, or one of another focus."""
     from coupole.calibration.posed_camera import read_posed_camera
 
@@ -194,7 +194,7 @@ def _setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
         by_table if leds is None else calibrated_positions(leds),
-        _lens(camera, frames),
+        lens_of(camera, frames),
         dark_record,
         response_record,
         flat,
@@ -203,7 +203,8 @@ def _setting(
     )
 
 
-def _lens(record_path: Path | None, frames: LightFrames) -> Intrinsics:
+def lens_of(record_path: Path | None, frames: LightFrames) -> Intrinsics:
+    """The lens by a camera's record, or the rig's without one. Raises InputError for another camera's."""
     from coupole.calibration.earlier import read_earlier
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.record import intrinsics_of

@@ -108,3 +108,17 @@ def _spectrum(path: Path, column: int) -> Floats:
     if values.min() < -_NOISE * values.max():
         raise InputError(f"{path}: column {column} goes below 0; expected relative sensitivities or power")
     return np.maximum(values, 0.0)
+
+
+def colour_of_record(path: Path) -> CameraColour:
+    """By the matrix of a record of `coupole calibrate colour`, adapted from D50 to D65. Raises InputError for another
+    record, or one that missed its limits."""
+    from coupole.calibration.colour.colorimetry import d65_from_d50
+    from coupole.calibration.colour.colour_workflow import MATRIX
+    from coupole.calibration.earlier import read_accepted
+
+    record = read_accepted(path, "colour")
+    matrix = np.array([[record.value(f"{MATRIX}{axis}{channel}") for channel in "rgb"] for axis in "XYZ"])
+    neutral = np.array([record.value(f"neutral.{channel}") for channel in "RGB"])
+    told = f"XYZ under D65 by the chart of the record {record.name} ({record.sha256[:12]}); white by the chart"
+    return CameraColour(d65_from_d50() @ matrix, lambda led: neutral, told)

@@ -24,7 +24,7 @@ EyeOption = Annotated[
     bool,
     typer.Option(
         "--for-the-eye",
-        help="sRGB by spectra in place of the camera's channels; needs --colour, or --sensor-spectra and --led-spectrum.",
+        help="sRGB in place of the camera's channels; needs --colour, or --sensor-spectra and --led-spectrum.",
     ),
 ]
 SensorOption = Annotated[
@@ -61,8 +61,8 @@ def colour_asked(
     if sensor is None or leds is None:
         missing = ", ".join(name for name, path in tables.items() if path is None)
         raise InputError(
-            f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a record "
-            "of `calibrate colour`"
+            f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a "
+            "record of `calibrate colour`"
         )
     return camera_colour(sensor, leds)
 

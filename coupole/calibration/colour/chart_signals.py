@@ -136,14 +136,14 @@ def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, 
     """One signal for each patch, from its readings under all lights.
 
     `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. Raises InputError
-    with the names of patches that are saturated under every light, dark, or in shadow under more than half of
-    them.
+    with the names of patches that are dark, or saturated or in shadow under more than half of them.
     """
     light = lights if lights.ndim == 3 else lights[:, :, None]
     mean, u = (np.stack([getattr(one, what) for one in readings]) / light for what in ("mean", "u"))
     sd = np.stack([one.pixel_sd / np.maximum(one.mean, 1e-300) for one in readings])
     good = ~np.stack([one.full for one in readings])
-    _refuse([n for n in range(len(names)) if not good[:, n].any()], names, "saturated", "expose less")
+    bright = [n for n in range(len(names)) if 2 * good[:, n].sum() < len(good)]
+    _refuse(bright, names, "saturated under most lights", "expose less")
     dark = ~(np.nanmedian(np.where(good[:, :, None], mean, np.nan), axis=0) > 0.0).all(axis=1)
     unlit = [int(n) for n in np.flatnonzero(dark)]
     _refuse(unlit, names, "without light", "see to the lights and the chart's place")

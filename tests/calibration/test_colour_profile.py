@@ -66,7 +66,7 @@ def test_the_chart_lists_the_simulators_spectra_and_their_xyz_is_that_of_colour_
     functions = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     light = colour.SDS_ILLUMINANTS["D50"].copy().align(functions.shape)
     for number, drawn in enumerate(DRAWN.values()):
-        shape = colour.SpectralShape(380, 780, 5)
+        shape = functions.shape
         spectrum = colour.SpectralDistribution(drawn.at(shape.wavelengths), shape.wavelengths)
         xyz = colour.sd_to_XYZ(spectrum, functions, light, method="Integration") / 100.0
         assert np.allclose(known.xyz[number], xyz, atol=4e-4)

@@ -6,6 +6,7 @@
     leds/           positions and normals of the LEDs, from views of the LEDs themselves
     stickers/       pose of a scanned object, by its stickers
     light/          radiometry of sensor, lens and LEDs, and its drift
+    colour/         colour profile from a chart, and figures of image quality
     budget/         uncertainty of a reflectance, from the records of all calibrations
 
     sources.py      runs and folders of pictures; grey_image.py: an image, one colour at a time

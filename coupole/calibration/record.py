@@ -30,7 +30,17 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 Kind = Literal[
-    "camera", "chromatic", "hand-eye", "leds", "mesh", "flat-field", "dark", "response", "led-power", "drift"
+    "camera",
+    "chromatic",
+    "hand-eye",
+    "leds",
+    "mesh",
+    "flat-field",
+    "dark",
+    "response",
+    "led-power",
+    "drift",
+    "colour",
 ]
 SEAL = "# A calibration of Coupole"
 """First words of a record's file."""

@@ -88,7 +88,7 @@ def flat_field(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
+        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
         with bar(console, "views of the panel") as progress:
             return flat_field_outcome(
                 frames, request, dark_record, response_record, panel_mm, progress, hand_eye=hand_eye
@@ -115,7 +115,7 @@ def led_power(
     from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
+        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -150,7 +150,7 @@ def drift(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = _posed(open_light_frames(runs), hand_eye, rig, runs)
+        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
         used = rig or rig_of(runs[0])
         setting = _setting(
             frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
@@ -164,7 +164,7 @@ def drift(
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]) -> LightFrames:
+def posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]) -> LightFrames:
     """Frames with poses by a hand-eye record and its axis zeros. Raises InputError for another record, or one of
     another focus, and for a rig without a model of the record's arm."""
     from coupole.calibration.posed_camera import read_posed_camera
@@ -200,7 +200,7 @@ def _setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
         by_table if leds is None else calibrated_positions(leds),
-        _lens(camera, frames),
+        lens_of(camera, frames),
         dark_record,
         response_record,
         flat,
@@ -209,7 +209,8 @@ def _setting(
     )
 
 
-def _lens(record_path: Path | None, frames: LightFrames) -> Intrinsics:
+def lens_of(record_path: Path | None, frames: LightFrames) -> Intrinsics:
+    """The lens by a camera's record, or the rig's without one. Raises InputError for another camera's."""
     from coupole.calibration.earlier import read_earlier
     from coupole.calibration.optics import Intrinsics
     from coupole.calibration.record import intrinsics_of

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 else:
     Work = Callable
 
-_SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5")
+_SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5", ".icc")
 """Of a record and of the files beside it."""
 _MOST_FAULTS = 5
 """In a refusal; the record has all."""

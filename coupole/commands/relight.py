@@ -14,6 +14,7 @@ from coupole.commands.common import JsonOption, ResultArgument, fail
 from coupole.commands.relight_for_the_eye import (
     PEAK_QUANTILE,
     EyeOption,
+    RecordOption,
     SensorOption,
     SpectrumOption,
     bright,
@@ -149,6 +150,7 @@ def relight(
     for_the_eye: EyeOption = False,
     sensor_spectra: SensorOption = None,
     led_spectrum: SpectrumOption = None,
+    colour_record: RecordOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that lights which were not there would give. Lights that are named together are summed."""
@@ -157,7 +159,7 @@ def relight(
     console = make_console(quiet=as_json)
     try:
         _refuse_target(to, uncertainty, turn, white, for_the_eye=for_the_eye)
-        colour = colour_asked(sensor_spectra, led_spectrum, for_the_eye=for_the_eye)
+        colour = colour_asked(sensor_spectra, led_spectrum, colour_record, for_the_eye=for_the_eye)
         wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
         camera = _camera(from_, look_at, size, field_of_view)
         with step_bars(console) as bars:

@@ -1,4 +1,5 @@
-"""`coupole reflectance relight --for-the-eye`: relit pictures in colours, by spectra of sensor and LEDs."""
+"""`coupole reflectance relight --for-the-eye`: relit pictures in colours, by a chart or by spectra of sensor and
+LEDs."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ EyeOption = Annotated[
     bool,
     typer.Option(
         "--for-the-eye",
-        help="sRGB by spectra in place of the camera's channels; needs --sensor-spectra and --led-spectrum.",
+        help="sRGB in place of the camera's channels; needs --colour, or --sensor-spectra and --led-spectrum.",
     ),
 ]
 SensorOption = Annotated[
@@ -35,12 +36,23 @@ SpectrumOption = Annotated[
     typer.Option("--led-spectrum", help="Table of nm, power: that of the dome's LEDs."),
 ]
 
+RecordOption = Annotated[
+    Path | None,
+    typer.Option("--colour", help="A record of `calibrate colour`, in place of tables of spectra."),
+]
 
-def colour_asked(sensor: Path | None, leds: Path | None, *, for_the_eye: bool) -> CameraColour | None:
-    """By tables of spectra; None if no picture for the eye is wanted. Raises InputError for what does not go
-    together, and as `camera_colour`."""
-    from coupole.exchange.camera_colour import camera_colour
 
+def colour_asked(
+    sensor: Path | None, leds: Path | None, record: Path | None, *, for_the_eye: bool
+) -> CameraColour | None:
+    """By a record, or by tables of spectra; None if no picture for the eye is wanted. Raises InputError for what
+    does not go together, and as `camera_colour` and `colour_of_record`."""
+    from coupole.exchange.camera_colour import camera_colour, colour_of_record
+
+    if record is not None:
+        if not for_the_eye or sensor is not None or leds is not None:
+            raise InputError("--colour: is for --for-the-eye, in place of --sensor-spectra and --led-spectrum")
+        return colour_of_record(record)
     tables = {"--sensor-spectra": sensor, "--led-spectrum": leds}
     if not for_the_eye:
         if given := [name for name, path in tables.items() if path is not None]:
@@ -48,7 +60,10 @@ def colour_asked(sensor: Path | None, leds: Path | None, *, for_the_eye: bool) -
         return None
     if sensor is None or leds is None:
         missing = ", ".join(name for name, path in tables.items() if path is None)
-        raise InputError(f"--for-the-eye: expected {missing} too, a table of what its maker has measured")
+        raise InputError(
+            f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a "
+            "record of `calibrate colour`"
+        )
     return camera_colour(sensor, leds)
 
 

@@ -1,9 +1,10 @@
-"""Colour of frames for the eye: from the sensor's sensitivities and the LEDs' spectrum to CIE XYZ.
+"""Colour of frames for the eye, to CIE XYZ: by a chart's record, or by the sensor's sensitivities and the LEDs'
+spectrum.
 
-The transform is the linear one that misses least, in the mean over smooth reflectances, what the same surface has
-under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken as a random process
-of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral estimation techniques for
-the spectral calibration of a color image scanner, Applied Optics 15, 1976).
+The transform by spectra is the linear one that misses least, in the mean over smooth reflectances, what the same
+surface has under daylight (D65) for the 1931 observer; the perfect white is exact. Reflectances are taken as a
+random process of wavelength with a Gaussian covariance (Wiener estimation: Pratt and Mancill, Spectral
+estimation techniques for the spectral calibration of a color image scanner, Applied Optics 15, 1976).
 """
 
 from __future__ import annotations
@@ -108,3 +109,19 @@ def _spectrum(path: Path, column: int) -> Floats:
     if values.min() < -_NOISE * values.max():
         raise InputError(f"{path}: column {column} goes below 0; expected relative sensitivities or power")
     return np.maximum(values, 0.0)
+
+
+def colour_of_record(path: Path) -> CameraColour:
+    """By the matrix of a record of `coupole calibrate colour`, adapted from D50 to D65.
+
+    Raises InputError for another record, or one that missed its limits.
+    """
+    from coupole.calibration.colour.colorimetry import d65_from_d50
+    from coupole.calibration.colour.colour_workflow import MATRIX
+    from coupole.calibration.earlier import read_accepted
+
+    record = read_accepted(path, "colour")
+    matrix = np.array([[record.value(f"{MATRIX}{axis}{channel}") for channel in "rgb"] for axis in "XYZ"])
+    neutral = np.array([record.value(f"neutral.{channel}") for channel in "RGB"])
+    told = f"XYZ under D65 by the chart of the record {record.name} ({record.sha256[:12]}); white by the chart"
+    return CameraColour(d65_from_d50() @ matrix, lambda led: neutral, told)

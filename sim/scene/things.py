@@ -113,6 +113,7 @@ class Sample(_Thing):
     kind: Literal[
         "spectralon_tile",
         "grey_card",
+        "colour_chart",
         "gilt_step_wedge",
         "paint_wedge",
         "makie_tile",
@@ -127,13 +128,15 @@ class Sample(_Thing):
 
     def bare(self) -> Surface:
         """Without its stickers."""
-        from sim.objects import fabric, shapes, standards, urushi, wedges
+        from sim.objects import colour_chart, fabric, shapes, standards, urushi, wedges
 
         match self.kind:
             case "spectralon_tile":
                 return standards.spectralon_tile()
             case "grey_card":
                 return standards.grey_card()
+            case "colour_chart":
+                return colour_chart.colour_chart()
             case "gilt_step_wedge":
                 return wedges.gilt_step_wedge()
             case "paint_wedge":

@@ -200,7 +200,7 @@ def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
             return _of_led_power
         case "drift":
             return _of_drift
-        case "chromatic" | "dark":
+        case "chromatic" | "dark" | "colour":
             return None
         case _:
             assert_never(kind)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from coupole.appearance.matter import nashiji
 from coupole.appearance.shapes.triangles import flat_normals, welded
 from coupole.errors import InputError
-from sim.objects import fabric, shapes, standards, urushi, wedges
+from sim.objects import colour_chart, fabric, shapes, standards, urushi, wedges
 from sim.objects.charuco import Charuco, charuco_board
 from sim.scene.surface import Surface
 
@@ -24,6 +24,7 @@ BODIES: dict[str, Callable[[], Surface]] = {
     "relief": lambda: shapes.sculpted_relief(triangles=5_000),
     "Spectralon": standards.spectralon_tile,
     "grey card": standards.grey_card,
+    "colour chart": colour_chart.colour_chart,
     "chrome ball": lambda: standards.chrome_ball(triangles=500),
     "glossy sphere": lambda: shapes.glossy_sphere(20.0, triangles=500),
     "gilt wedge": wedges.gilt_step_wedge,

@@ -1,0 +1,173 @@
+"""A colour chart: its description (YAML), its patches' colours, and where its parts are in a picture.
+
+The chart's frame has its origin in the middle of the patches, x along the rows to the right, y up, z out of the
+face, mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.calibration.colour.chart_values import Unit, read_chart_values
+from coupole.calibration.colour.colorimetry import lab_of
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+from coupole.plan import yamlfile
+from coupole.plan.plan import FilePath, Model, Pose
+
+_Length = Annotated[float, Field(gt=0)]
+_NEUTRAL_CHROMA = 5.0
+"""Of patches that count as grey, C*."""
+_LEAST_PATCHES = 8
+_LEAST_GREY_LIGHTNESS = 20.0
+"""L* of the greys that balance the channels: noise and stray light dominate darker ones."""
+
+
+class Edge(Model):
+    """A rectangle of the chart that one straight, slanted edge between light and dark crosses."""
+
+    name: str
+    centre_mm: tuple[float, float]
+    size_mm: tuple[_Length, _Length]
+
+
+class Chart(Model):
+    """A flat chart of patches in rows and columns."""
+
+    schema_version: Literal[1] = 1
+    name: str
+    rows: Annotated[int, Field(ge=1, le=100)]
+    columns: Annotated[int, Field(ge=1, le=100)]
+    pitch_mm: tuple[_Length, _Length]
+    """From the middle of a patch to that of the next, along rows and along columns."""
+    patch_mm: tuple[_Length, _Length]
+    """Width and height of a patch."""
+    used: Annotated[float, Field(gt=0, le=0.95)] = 0.7
+    """Share of a patch's width and height that is read, about its middle."""
+    names: tuple[tuple[str, ...], ...] | None = None
+    """Of the patches in the file of values, row by row from the top; without it A1, A2, ..., B1, ..."""
+    values: FilePath
+    """Spectra, L*a*b* or XYZ of the patches (CGATS or CSV), beside this file."""
+    unit: Unit = "auto"
+    """Of spectra: percent or fraction; auto tells by their size."""
+    u_lab: Annotated[float, Field(ge=0)] = 0.3
+    """Standard uncertainty of each of L*, a*, b* of a patch: instrument, and the patch's own unevenness."""
+    neutral: tuple[str, ...] | None = None
+    """Names of the grey patches; without it those of chroma below 5."""
+    support_from_chart: Pose | None = None
+    """Where the chart lies on the support; without it name its corners in the picture (`--corners`)."""
+    without: tuple[str, ...] = ()
+    """Names of patches that are not used."""
+    edges: tuple[Edge, ...] = ()
+
+    @model_validator(mode="after")
+    def _possible(self) -> Chart:
+        if any(patch > pitch for patch, pitch in zip(self.patch_mm, self.pitch_mm, strict=True)):
+            raise ValueError(f"patches of {self.patch_mm} mm overlap at a pitch of {self.pitch_mm} mm")
+        if self.names is not None and [len(row) for row in self.names] != [self.columns] * self.rows:
+            raise ValueError(f"`names`: expected {self.rows} rows of {self.columns} names")
+        if self.names is None and self.rows > 26:
+            raise ValueError("`names` are needed for more than 26 rows")
+        if len(set(self._all_names)) != len(self._all_names):
+            raise ValueError("`names`: a name is given twice")
+        return self
+
+    @property
+    def patch_names(self) -> tuple[str, ...]:
+        """Of those that are used, row by row from the top."""
+        return tuple(name for name in self._all_names if name not in self.without)
+
+    @property
+    def _all_names(self) -> tuple[str, ...]:
+        if self.names is not None:
+            return tuple(name for row in self.names for name in row)
+        return tuple(f"{chr(65 + row)}{column + 1}" for row in range(self.rows) for column in range(self.columns))
+
+    @property
+    def centres_mm(self) -> Floats:
+        """[patches, 2], in the order of `patch_names`."""
+        kept = np.array([name not in self.without for name in self._all_names])
+        return np.asarray(self._all_centres_mm()[kept])
+
+    def _all_centres_mm(self) -> Floats:
+        x = (np.arange(self.columns) - (self.columns - 1) / 2.0) * self.pitch_mm[0]
+        y = ((self.rows - 1) / 2.0 - np.arange(self.rows)) * self.pitch_mm[1]
+        return np.asarray(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+
+    @property
+    def corners_mm(self) -> Floats:
+        """[4, 2] middles of the corner patches: top left, top right, bottom right, bottom left."""
+        count, last = self.rows * self.columns, self.columns - 1
+        return self._all_centres_mm()[[0, last, count - 1, count - 1 - last]]
+
+    def patch_polygons_mm(self) -> Floats:
+        """[patches, 4, 2] the parts of the patches that are read."""
+        half = 0.5 * self.used * np.array(self.patch_mm)
+        return np.asarray(self.centres_mm[:, None] + half * _AROUND)
+
+    def edge_polygons_mm(self) -> Floats:
+        """[edges, 4, 2]."""
+        centres = np.array([edge.centre_mm for edge in self.edges]).reshape(-1, 1, 2)
+        return np.asarray(
+            centres + 0.5 * np.array([edge.size_mm for edge in self.edges]).reshape(-1, 1, 2) * _AROUND
+        )
+
+
+_AROUND = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+
+
+@dataclass(frozen=True)
+class KnownChart:
+    """A chart with the colours of its patches."""
+
+    chart: Chart
+    xyz: Floats
+    """[patches, 3] under D50, Y = 1 for the perfect white."""
+    files: tuple[Path, ...]
+    """Its description and its values."""
+    from_spectra: bool
+
+    @property
+    def lab(self) -> Floats:
+        return lab_of(self.xyz)
+
+    @property
+    def neutral(self) -> tuple[int, ...]:
+        """Numbers of the grey patches, bright enough to balance the channels."""
+        lab = self.lab
+        if self.chart.neutral is not None:
+            names = self.chart.patch_names
+            return tuple(names.index(name) for name in self.chart.neutral if name in names)
+        grey = np.hypot(lab[:, 1], lab[:, 2]) < _NEUTRAL_CHROMA
+        return tuple(map(int, np.flatnonzero(grey & (lab[:, 0] > _LEAST_GREY_LIGHTNESS))))
+
+
+def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
+    """A chart's description and values, `without` some patches more. Raises InputError with all problems: wrong
+    keys, patches without values, too few patches, no grey one."""
+    document = yamlfile.read(path)
+    whole = document.validate(Chart)
+    if strange := sorted({*whole.without, *without} - set(whole.model_copy(update={"without": ()}).patch_names)):
+        raise InputError(f"{path}: the chart has no patch {', '.join(strange)} to leave out")
+    chart = whole.model_copy(update={"without": (*whole.without, *without)})
+    names = chart.patch_names
+    if len(names) < _LEAST_PATCHES:
+        raise InputError(f"{path}: expected {_LEAST_PATCHES} patches or more, found {len(names)}")
+    if unknown := sorted(set(chart.neutral or ()) - {*names, *chart.without}):
+        raise InputError([document.problem(("neutral",), f"the chart has no patch {', '.join(unknown)}")])
+    values_path = document.resolve(chart.values)
+    values = read_chart_values(values_path, chart.unit)
+    if missing := [name for name in names if name not in values.xyz]:
+        listed = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
+        has = ", ".join(list(values.xyz)[:6])
+        raise InputError(f"{values_path}: has no values of {listed} (it has {has}, ...); set `names` in {path}")
+    known = KnownChart(chart, np.stack([values.xyz[name] for name in names]), (path, values_path), values.spectral)
+    if not known.neutral:
+        raise InputError(f"{path}: expected a grey patch of L* above {_LEAST_GREY_LIGHTNESS:g}; found none")
+    return known

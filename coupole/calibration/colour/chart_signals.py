@@ -1,0 +1,206 @@
+"""Signals of a chart's patches: means over the pixels of each in a picture, then one value from many lights.
+
+Of a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
+known or from a white sheet in the chart's place, g the light's own strength. Medians over patches and lights give
+g and b; a patch that departs from them under a light is in shadow there, or glossy, and is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+COLOUR, MONO = "COLOUR", "MONO"
+_LEAST_PIXELS = 12
+"""Of each colour on a patch."""
+_ODD, _ODD_SIGMA = 0.03, 6.0
+"""Relative departure of a patch under one light, beyond noise, that counts as shadow or gloss."""
+_LEAST_LIGHTS = 3
+"""To tell shadows."""
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class ChartPicture:
+    """One picture of the chart: its light, and where patches and edges are."""
+
+    name: str
+    signal: Floats
+    """[H, W] above dark, linear, over the flat field; of pattern `COLOUR` [H, W, 3]."""
+    full: NDArray[np.bool_]
+    """Saturated; of the shape of `signal`."""
+    pattern: str
+    """Names of the four pixels at the top left, row by row; or `COLOUR`."""
+    patches_px: Floats
+    """[patches, 4, 2] x, y of the corners."""
+    edges_px: Floats
+    """[edges, 4, 2]."""
+    light: Floats
+    """[patches] irradiance in any unit; ones if it is taken as uniform."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The patches in one picture."""
+
+    mean: Floats
+    """[patches, 3] red, green, blue."""
+    u: Floats
+    """[patches, 3] of the means, by noise."""
+    pixel_sd: Floats
+    """[patches, 3] standard deviation of single pixels."""
+    full: NDArray[np.bool_]
+    """[patches]."""
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The patches under all lights."""
+
+    mean: Floats
+    """[patches, 3] of uniform light."""
+    u: Floats
+    """[patches, 3] standard uncertainty, by noise and by what lights disagree."""
+    pixel_sd: Floats
+    """[patches, 3] relative standard deviation of single pixels, in the median of the lights."""
+    remarks: tuple[str, ...]
+
+
+def samples_of(
+    picture: ChartPicture, channel: str, inside: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> NDArray[np.intp]:
+    """Which of some pixels (rows, columns) have a channel, as numbers [k]."""
+    if picture.pattern == COLOUR:
+        return np.arange(len(inside[0]))
+    letters = np.array(list(picture.pattern)).reshape(2, 2)
+    return np.flatnonzero(letters[inside[0] % 2, inside[1] % 2] == channel)
+
+
+def values_at(
+    picture: ChartPicture, channel: int, inside: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Signals and saturation [k] of pixels (rows, columns)."""
+    at = (*inside, channel) if picture.pattern == COLOUR else inside
+    return picture.signal[at], picture.full[at]
+
+
+def pixels_inside(polygon: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
+    """Rows and columns of the pixels inside a convex polygon [4, 2]; None if it leaves the picture."""
+    if (polygon < 0).any() or (polygon > np.array([shape[1], shape[0]]) - 1).any():
+        return None
+    low, high = np.floor(polygon.min(axis=0)).astype(int), np.ceil(polygon.max(axis=0)).astype(int)
+    columns, rows = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
+    away = np.stack([columns, rows], axis=-1)[:, :, None] - polygon
+    along = np.roll(polygon, -1, axis=0) - polygon
+    side = along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0]
+    inside = (side >= 0).all(axis=-1) | (side <= 0).all(axis=-1)
+    return rows[inside], columns[inside]
+
+
+def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
+    """Means of all patches. Raises InputError: patches outside the picture, or too small in it."""
+    if picture.pattern == MONO:
+        raise InputError(f"{picture.name}: the camera has one channel; it has no colours")
+    count = len(names)
+    mean, u, sd = (np.empty((count, 3)) for _ in range(3))
+    full = np.zeros(count, np.bool_)
+    found = [pixels_inside(polygon, picture.signal.shape) for polygon in picture.patches_px]
+    if outside := [name for name, inside in zip(names, found, strict=True) if inside is None]:
+        raise InputError(
+            f"{picture.name}: outside the picture are the patches {_list(outside)}; correct the chart's place, or "
+            "name its corners with --corners"
+        )
+    for p, inside in enumerate(found):
+        assert inside is not None
+        for c, channel in enumerate("RGB"):
+            take = samples_of(picture, channel, inside)
+            if len(take) < _LEAST_PIXELS:
+                raise InputError(
+                    f"{picture.name}: the patch {names[p]} has {len(take)} pixels of {channel}, expected "
+                    f"{_LEAST_PIXELS} or more; go nearer"
+                )
+            values, saturated = values_at(picture, c, (inside[0][take], inside[1][take]))
+            mean[p, c], sd[p, c] = values.mean(), values.std(ddof=1)
+            u[p, c] = sd[p, c] / np.sqrt(len(values))
+            full[p] |= bool(saturated.any())
+    return Reading(mean, u, sd, full)
+
+
+def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, lit: Sequence[str]) -> Signals:
+    """One signal for each patch, from its readings under all lights.
+
+    `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. Raises InputError
+    with the names of patches that are dark, or saturated or in shadow under more than half of them.
+    """
+    light = lights if lights.ndim == 3 else lights[:, :, None]
+    mean, u = (np.stack([getattr(one, what) for one in readings]) / light for what in ("mean", "u"))
+    sd = np.stack([one.pixel_sd / np.maximum(one.mean, 1e-300) for one in readings])
+    good = ~np.stack([one.full for one in readings])
+    bright = [n for n in range(len(names)) if 2 * good[:, n].sum() < len(good)]
+    _refuse(bright, names, "saturated under most lights", "expose less")
+    dark = ~(np.nanmedian(np.where(good[:, :, None], mean, np.nan), axis=0) > 0.0).all(axis=1)
+    unlit = [int(n) for n in np.flatnonzero(dark)]
+    _refuse(unlit, names, "without light", "see to the lights and the chart's place")
+    remarks = []
+    if full := [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(~good[k])])}" for k in _with(~good)]:
+        remarks.append(f"saturated, and left out: {_list(full)}")
+    strength, patch = _split(mean, good)
+    if len(readings) >= _LEAST_LIGHTS:
+        expected = strength[:, None] * patch
+        noise = u / expected
+        odd = (np.abs(mean / expected - 1.0) > np.maximum(_ODD, _ODD_SIGMA * noise)).any(axis=2) & good
+        few = [n for n in range(len(names)) if 2 * odd[:, n].sum() > good[:, n].sum()]
+        _refuse(few, names, "in shadow, or glossy, under most lights", "free the light's way to the chart")
+        if listed := [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(odd[k])])}" for k in _with(odd)]:
+            remarks.append(f"in shadow or glossy, and left out: {_list(listed)}")
+        good &= ~odd
+        strength, patch = _split(mean, good)
+    else:
+        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be told")
+    return _averaged(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
+
+
+def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Strengths [lights, 3], of mean 1, and patches [patches, 3] whose products are the signals, by medians."""
+    masked = np.where(good[:, :, None], mean, np.nan)
+    patch = np.nanmedian(masked, axis=0)
+    strength = np.ones((len(mean), mean.shape[2]))
+    for _ in range(_ROUNDS):
+        usable = [k for k in range(len(mean)) if good[k].any()]
+        strength[usable] = np.nanmedian(masked[usable] / patch, axis=1)
+        strength /= strength[usable].mean(axis=0)
+        patch = np.nanmedian(masked / strength[:, None], axis=0)
+    return strength, patch
+
+
+def _averaged(mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], remarks: tuple[str, ...]) -> Signals:
+    """Means over the lights; their uncertainty is the larger of noise and scatter."""
+    count = good.sum(axis=0)[:, None]
+    masked = np.where(good[:, :, None], mean, np.nan)
+    average = np.nanmean(masked, axis=0)
+    noise = np.sqrt((np.where(good[:, :, None], u, 0.0) ** 2).sum(axis=0)) / count
+    scatter = np.sqrt(np.nansum((masked - average) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
+    typical = np.nanmedian(np.where(good[:, :, None], sd, np.nan), axis=0)
+    return Signals(average, np.maximum(noise, scatter), typical, remarks)
+
+
+def _with(marked: NDArray[np.bool_]) -> list[int]:
+    return [int(k) for k in np.flatnonzero(marked.any(axis=1))]
+
+
+def _refuse(numbers: Sequence[int], names: Sequence[str], what: str, remedy: str) -> None:
+    if len(numbers):
+        raise InputError(
+            f"colour: {what}: the patches {_list([names[n] for n in numbers])}; {remedy}, or leave them out with "
+            "--without"
+        )
+
+
+def _list(words: Sequence[str]) -> str:
+    return ", ".join(words[:8]) + (f" and {len(words) - 8} more" if len(words) > 8 else "")

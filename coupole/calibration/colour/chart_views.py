@@ -1,0 +1,179 @@
+"""The chart in frames of runs: linear signals, its place by its described pose or its corners in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coupole.calibration import optics
+from coupole.calibration.colour.chart import Chart
+from coupole.calibration.colour.chart_signals import MONO, ChartPicture
+from coupole.calibration.light.frames import CHANNELS, LightFrame, LightFrames, channel_mask
+from coupole.calibration.light.irradiance import Emission, irradiance_per_flux
+from coupole.calibration.light.records import dark_signal, linearise, map_beside, record_input
+from coupole.calibration.light.tile_views import Positions
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+_LEAST_COSINE = 0.3
+"""Of incidence on the chart: light nearer to its plane than 17 degrees shows its surface, not its colour."""
+_GLOSS_DEG = 25.0
+"""About the mirrored direction to the camera: light from there is not used (45/0 geometry keeps away from it)."""
+
+
+@dataclass(frozen=True)
+class ChartSetting:
+    """Descriptions and calibrations that the chart's frames are read with."""
+
+    chart: Chart
+    base_from_support: Floats
+    positions: Positions
+    lens: optics.Intrinsics
+    corners_px: Floats | None = None
+    """[4, 2] middles of the corner patches in the picture, from the top left of the chart around it."""
+    dark: Path | None = None
+    response: Path | None = None
+    flat: Path | None = None
+    emission: Emission = "lambertian"
+    files: tuple[Path, ...] = ()
+    """Files of chart, support and LEDs: inputs of the record."""
+
+    @property
+    def inputs(self) -> tuple[tuple[str, str], ...]:
+        """Name and SHA-256 of all these files."""
+        made_with = (*self.files, self.dark, self.response, self.flat)
+        return tuple(pair for path in made_with for pair in record_input(path))
+
+
+class ChartReader:
+    """Pictures of the chart from the lit frames of runs."""
+
+    def __init__(self, frames: LightFrames, setting: ChartSetting) -> None:
+        if frames.pattern == MONO:
+            raise InputError("colour: the camera has one channel; it has no colours")
+        if not frames.lit:
+            raise InputError("colour: no frame with light; acquire configs/plans/colour-chart.yaml")
+        self._frames, self._setting = frames, setting
+        height, width = frames.lit[0].read().shape
+        self._dark = dark_signal(frames, setting.dark)
+        self._straight = {channel: linearise(setting.response, channel, frames) for channel in CHANNELS}
+        self._masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in CHANNELS}
+        self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
+        self._base_from_chart = self._found()
+
+    def pictures(self) -> Iterator[tuple[LightFrame, ChartPicture]]:
+        """Each frame whose light suits, when it is asked for."""
+        for frame in self.suited():
+            yield frame, self.picture(frame, self._light(frame))
+
+    def suited(self) -> list[LightFrame]:
+        """Frames under light that does not graze the chart or shine from it into the camera. Raises InputError if
+        there is none."""
+        chosen = [frame for frame in self._frames.lit if self._suits(frame)]
+        if not chosen:
+            raise InputError(
+                "colour: no light suits: all graze the chart, or are reflected into the camera; expected LEDs at "
+                "about 45 degrees to the chart, seen from above"
+            )
+        return chosen
+
+    def picture(self, frame: LightFrame, light: Floats) -> ChartPicture:
+        """A frame as linear signals, DN/s over the flat field."""
+        raw = frame.read()
+        signal = (raw - self._dark(frame)).astype(np.float64)
+        for channel, mask in self._masks.items():
+            signal[mask] = self._straight[channel](signal[mask])
+        if self._flat is not None:
+            signal = signal / self._flat
+        signal /= frame.exposure_us * 1e-6
+        patches, edges = (
+            self._seen(polygons, frame)
+            for polygons in (self._setting.chart.patch_polygons_mm(), self._setting.chart.edge_polygons_mm())
+        )
+        full = raw >= self._frames.white_dn
+        return ChartPicture(str(frame.shot), signal, full, self._frames.pattern, patches, edges, light)
+
+    def _found(self) -> Floats:
+        """base_from_chart [4, 4], by the description or by the corners of the first view."""
+        setting = self._setting
+        if setting.corners_px is None:
+            if setting.chart.support_from_chart is None:
+                raise InputError(
+                    "colour: where is the chart? Give `support_from_chart` in its description, or --corners with "
+                    "the middles of its corner patches in the picture"
+                )
+            return np.asarray(setting.base_from_support @ setting.chart.support_from_chart.matrix())
+        import cv2
+
+        corners = np.column_stack([setting.chart.corners_mm, np.zeros(4)])
+        found, turn, shift = cv2.solvePnP(
+            corners, setting.corners_px, setting.lens.matrix(), setting.lens.distortion(), flags=cv2.SOLVEPNP_IPPE
+        )
+        camera_from_chart = np.eye(4)
+        camera_from_chart[:3, :3], camera_from_chart[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+        if not found or camera_from_chart[2, 2] > 0.0:
+            raise InputError(
+                "--corners: expected the middles of the top left, top right, bottom right and bottom left patch, "
+                "clockwise on the chart; these show its back"
+            )
+        return np.asarray(self._frames.lit[0].base_from_camera @ camera_from_chart)
+
+    def _seen(self, polygons_mm: Floats, frame: LightFrame) -> Floats:
+        """[n, 4, 2] px of polygons [n, 4, 2] of the chart's face. Raises InputError if it is behind the camera."""
+        flat = np.column_stack([polygons_mm.reshape(-1, 2), np.zeros(4 * len(polygons_mm))])
+        camera_from_chart = np.linalg.inv(frame.base_from_camera) @ self._base_from_chart
+        points = flat @ camera_from_chart[:3, :3].T + camera_from_chart[:3, 3]
+        if len(points) and points[:, 2].min() <= 0.0:
+            raise InputError(f"{frame.shot}: the chart is behind the camera; correct its place in its description")
+        return optics.project(points, self._setting.lens.vector()).pixels.reshape(-1, 4, 2)
+
+    def _points(self) -> tuple[Floats, Floats]:
+        """Middles of the patches [patches, 3] and the chart's normal [3], in the base frame."""
+        centres = self._setting.chart.centres_mm
+        flat = np.column_stack([centres, np.zeros(len(centres))])
+        return flat @ self._base_from_chart[:3, :3].T + self._base_from_chart[:3, 3], self._base_from_chart[:3, 2]
+
+    def _suits(self, frame: LightFrame) -> bool:
+        if frame.led is None:
+            return True
+        points, normal = self._points()
+        centre, _ = self._setting.positions.of(np.array([frame.led]))
+        towards = centre - points
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        away = frame.base_from_camera[:3, 3] - points
+        away /= np.linalg.norm(away, axis=1)[:, None]
+        mirrored = 2.0 * (away @ normal)[:, None] * normal - away
+        off_deg = np.degrees(np.arccos(np.clip((towards * mirrored).sum(axis=1), -1.0, 1.0)))
+        return bool((towards @ normal).min() > _LEAST_COSINE and off_deg.min() > _GLOSS_DEG)
+
+    def _light(self, frame: LightFrame) -> Floats:
+        """[patches] irradiance of the frame's LED over its flux; ones under a panel."""
+        points, normal = self._points()
+        if frame.led is None:
+            return np.ones(len(points))
+        centre, facing = self._setting.positions.of(np.array([frame.led]))
+        return irradiance_per_flux(points, normal, centre, facing, emission=self._setting.emission)
+
+
+def white_of(frames: LightFrames, setting: ChartSetting) -> dict[tuple[str, str], ChartPicture]:
+    """Pictures of a white sheet in the chart's place, by view and light, in place of the known irradiance."""
+    reader = ChartReader(frames, setting)
+    ones = np.ones(len(setting.chart.centres_mm))
+    return {key_of(frame): reader.picture(frame, ones) for frame in reader.suited()}
+
+
+def key_of(frame: LightFrame) -> tuple[str, str]:
+    """View and light, by which frames of the chart and of the white sheet belong together."""
+    return frame.view, str(frame.shot.light)
+
+
+def mean_picture(pictures: Sequence[ChartPicture]) -> ChartPicture:
+    """The mean of pictures of one view; what is saturated in one is so in the mean."""
+    first = pictures[0]
+    signal = np.mean([picture.signal for picture in pictures], axis=0)
+    full = np.any([picture.full for picture in pictures], axis=0)
+    light = np.mean([picture.light for picture in pictures], axis=0)
+    return ChartPicture(first.name, signal, full, first.pattern, first.patches_px, first.edges_px, light)

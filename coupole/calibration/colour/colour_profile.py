@@ -1,0 +1,257 @@
+"""The profile of a camera from a chart: XYZ under D50 from balanced channels, which are 1, 1, 1 of perfect white.
+
+Two forms: a matrix [3, 3], and a root-polynomial of degree 2 (Finlayson, Mackiewicz and Hurlbert, Color correction
+using root-polynomial regression, IEEE Trans. Image Processing 24, 2015), whose terms r, g, b, sqrt(rg), sqrt(rb),
+sqrt(gb) scale with the exposure as a matrix does. Both keep white exactly. They are found by least squares in XYZ,
+weighted by the slope of L*, then for the least sum of squares of CIEDE2000, held weakly to the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from coupole.calibration.colour.colorimetry import D50_WHITE, de00, de00_parts, lab_of, xyz_of
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+Form = Literal["matrix", "root-polynomial"]
+FORMS: tuple[Form, ...] = ("matrix", "root-polynomial")
+_HELD = 0.3
+"""Weight of a coefficient's departure from the first solution: CIEDE2000 for a change of 1."""
+_LAB_STEP, _LOG_STEP = 1e-3, 1e-5
+_WORTH = 0.95
+"""A root-polynomial is taken if its mean error on patches left out is less than this share of the matrix's."""
+_LARGEST_CONDITION = 1e6
+
+
+@dataclass(frozen=True)
+class Balanced:
+    """What the camera saw of the patches, of one scale with their colours."""
+
+    signal: Floats
+    """[patches, 3] red, green, blue above dark under uniform light, in any unit."""
+    u: Floats
+    """[patches, 3] standard uncertainty of each by noise, independent."""
+    xyz: Floats
+    """[patches, 3] under D50."""
+    u_lab: float
+    """Of each of the patches' L*, a*, b*."""
+    neutral: tuple[int, ...]
+    """Numbers of the grey patches."""
+    white: Floats | None = None
+    """[3] signal of the perfect white, if it is known otherwise; None: from the grey patches."""
+
+    def without(self, patch: int) -> Balanced:
+        keep = np.arange(len(self.signal)) != patch
+        grey = tuple(n - (n > patch) for n in self.neutral if n != patch)
+        return Balanced(self.signal[keep], self.u[keep], self.xyz[keep], self.u_lab, grey, self.white)
+
+    def white_signal(self) -> Floats:
+        """[3] signal of the perfect white: that of the greys over their Y, weighted by it."""
+        if self.white is not None:
+            return self.white
+        luminance = self.xyz[list(self.neutral), 1]
+        return np.asarray(luminance @ self.signal[list(self.neutral)] / (luminance @ luminance))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """From signals to XYZ under D50."""
+
+    form: Form
+    coefficients: Floats
+    """[3, terms]; each row sums to the white's X, Y or Z."""
+    white_signal: Floats
+    """[3] of the perfect white."""
+
+    def xyz(self, signal: Floats) -> Floats:
+        """[n, 3] of signals [n, 3]."""
+        return self.xyz_of_balanced(signal / self.white_signal)
+
+    def xyz_of_balanced(self, balanced: Floats) -> Floats:
+        """[n, 3] of channels [n, 3] of which white has 1, 1, 1."""
+        return np.asarray(terms_of(balanced, self.form) @ self.coefficients.T)
+
+
+def terms_of(balanced: Floats, form: Form) -> Floats:
+    """[n, 3] or [n, 6] terms; roots of negative products, which noise makes, are 0."""
+    if form == "matrix":
+        return balanced
+    r, g, b = np.maximum(balanced, 0.0).T
+    return np.column_stack([balanced, np.sqrt(r * g), np.sqrt(r * b), np.sqrt(g * b)])
+
+
+def fit_profile(seen: Balanced, form: Form) -> Profile:
+    """The profile of patches. Raises InputError: no grey patch is left, or the channels do not tell colours
+    apart."""
+    if not seen.neutral and seen.white is None:
+        raise InputError("colour: no grey patch can be used; the channels cannot be balanced. Expose anew")
+    white = seen.white_signal()
+    terms = terms_of(seen.signal / white, form)
+    first = _least_squares(terms, seen.xyz)
+    return Profile(form, _least_de00(terms, lab_of(seen.xyz), first), white)
+
+
+def _free(coefficients: Floats) -> Floats:
+    """The coefficients without the last of each row, which keeps white."""
+    return np.asarray(coefficients[:, :-1])
+
+
+def _whole(free: Floats) -> Floats:
+    return np.column_stack([free, D50_WHITE - free.sum(axis=1)])
+
+
+def _least_squares(terms: Floats, xyz: Floats) -> Floats:
+    """[3, terms] least squares in XYZ with weights that make relative errors of dark patches count, as L* does."""
+    weight = 1.0 / (0.01 + xyz[:, 1]) ** (2.0 / 3.0)
+    design = (terms[:, :-1] - terms[:, -1:]) * weight[:, None]
+    if np.linalg.cond(design) > _LARGEST_CONDITION:
+        raise InputError(
+            "colour: the channels are too much alike on this chart to tell its colours apart; expected a colour "
+            "camera and patches of many hues"
+        )
+    left = (xyz - terms[:, -1:] * D50_WHITE) * weight[:, None]
+    free, *_ = np.linalg.lstsq(design, left)
+    return _whole(np.asarray(free.T))
+
+
+def _least_de00(terms: Floats, lab: Floats, first: Floats) -> Floats:
+    """[3, terms] with the least sum of squares of CIEDE2000."""
+    from scipy.optimize import least_squares
+
+    shape = _free(first).shape
+    found = least_squares(partial(_missed, terms, lab, first, shape), _free(first).ravel(), method="lm")
+    return _whole(found.x.reshape(shape))
+
+
+def _missed(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int], free: Floats) -> Floats:
+    """Residuals: CIEDE2000's parts of all patches, and departures from the first solution."""
+    coefficients = _whole(free.reshape(shape))
+    parts = de00_parts(lab_of(terms @ coefficients.T), lab).ravel()
+    return np.concatenate([parts, _HELD * (coefficients - first).ravel()])
+
+
+# -- how good it is -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """CIEDE2000 of patches, each by a profile that was made without it."""
+
+    de: Floats
+    """[patches]."""
+
+    @property
+    def mean(self) -> float:
+        return float(self.de.mean())
+
+    def quantile(self, share: float) -> float:
+        return float(np.quantile(self.de, share))
+
+    @property
+    def worst(self) -> float:
+        return float(self.de.max())
+
+
+def leave_out(seen: Balanced, form: Form, tell: Callable[[], None] = lambda: None) -> LeftOut:
+    """Each patch by the profile of the others, with their balance. `tell` is called after each. Raises InputError
+    if there is one grey patch only."""
+    de = np.empty(len(seen.signal))
+    lab = lab_of(seen.xyz)
+    for patch in range(len(de)):
+        rest = seen.without(patch)
+        profile = fit_profile(rest, form)
+        de[patch] = de00(lab_of(profile.xyz(seen.signal[[patch]])), lab[[patch]])[0]
+        tell()
+    return LeftOut(de)
+
+
+def better(matrix: LeftOut, roots: LeftOut) -> Form:
+    """The form that misses patches left out less; the matrix, unless the other is clearly better."""
+    return "root-polynomial" if roots.mean < _WORTH * matrix.mean and roots.worst < matrix.worst else "matrix"
+
+
+# -- uncertainty ----------------------------------------------------------------------------------------------
+
+
+def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
+    """Covariances [3 terms, 3 terms] of the coefficients, row by row: by the noise of signals, and by the patches'
+    own uncertainty.
+
+    The misses' derivatives J by the coefficients and K by the data give dm = -(J'J)^-1 J'K dd (the implicit
+    function theorem on the normal equations, with Gauss and Newton's approximation). What the form itself cannot
+    follow (metamerism) is no noise: `leave_out` has it.
+    """
+    lab = lab_of(seen.xyz)
+    balanced = seen.signal / profile.white_signal
+    free = _free(profile.coefficients)
+
+    def parts(balanced: Floats, free: Floats, lab: Floats) -> Floats:
+        coefficients = _whole(free)
+        return de00_parts(lab_of(terms_of(balanced, profile.form) @ coefficients.T), lab)
+
+    rows = []
+    for n in range(free.size):
+        step = np.zeros(free.size)
+        step[n] = _LOG_STEP
+        change = step.reshape(free.shape)
+        rows.append((parts(balanced, free + change, lab) - parts(balanced, free - change, lab)).ravel())
+    design = np.column_stack(rows) / (2.0 * _LOG_STEP)
+    inverse = np.linalg.inv(design.T @ design + _HELD**2 * np.eye(free.size))
+    gain = inverse @ design.T
+    full = np.asarray(np.kron(np.eye(3), np.vstack([np.eye(free.shape[1]), -np.ones(free.shape[1])])), np.float64)
+    by_noise: list[Floats] = [gain @ column for column in _by_noise(seen, profile, balanced, parts, free, lab)]
+    by_chart: list[Floats] = [gain @ column for column in _by_chart(seen, balanced, parts, free, lab)]
+    return _outer(by_noise, full), _outer(by_chart, full)
+
+
+Parts = Callable[[Floats, Floats, Floats], Floats]
+
+
+def _by_noise(
+    seen: Balanced, profile: Profile, balanced: Floats, parts: Parts, free: Floats, lab: Floats
+) -> Sequence[Floats]:
+    """Changes of the misses by one standard uncertainty of each signal, with that of the balance it makes."""
+    columns = []
+    grey = list(seen.neutral)
+    luminance = seen.xyz[grey, 1]
+    share = dict(zip(grey, luminance / (luminance @ luminance), strict=True)) if seen.white is None else {}
+    for patch in range(len(balanced)):
+        for channel in range(3):
+            step = np.zeros_like(balanced)
+            u = seen.u[patch, channel] / profile.white_signal[channel]
+            step[patch, channel] = u
+            step[:, channel] -= balanced[:, channel] * share.get(patch, 0.0) * u
+            columns.append(0.5 * (parts(balanced + step, free, lab) - parts(balanced - step, free, lab)).ravel())
+    return columns
+
+
+def _by_chart(seen: Balanced, balanced: Floats, parts: Parts, free: Floats, lab: Floats) -> Sequence[Floats]:
+    """The same by the patches' L*, a*, b*; a grey's L* moves the balance too."""
+    columns = []
+    grey = list(seen.neutral)
+    for patch in range(len(lab)):
+        for axis in range(3):
+            moved = []
+            for sign in (1.0, -1.0):
+                other = lab.copy()
+                other[patch, axis] += sign * _LAB_STEP
+                here = balanced
+                if seen.white is None and patch in grey:
+                    luminance = xyz_of(other)[grey, 1]
+                    white = luminance @ balanced[grey] / (luminance @ luminance)
+                    first = seen.xyz[grey, 1]
+                    here = balanced * (first @ balanced[grey] / (first @ first)) / white
+                moved.append(parts(here, free, other))
+            columns.append((seen.u_lab / (2.0 * _LAB_STEP)) * (moved[0] - moved[1]).ravel())
+    return columns
+
+
+def _outer(columns: Sequence[Floats], full: Floats) -> Floats:
+    stacked = np.column_stack(columns)
+    return np.asarray(full @ (stacked @ stacked.T) @ full.T)

@@ -1,0 +1,221 @@
+"""From a chart's signals to the record of a colour profile."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from coupole.calibration.acceptance import against_limits
+from coupole.calibration.colour.acceptance import COLOUR
+from coupole.calibration.colour.chart import KnownChart
+from coupole.calibration.colour.chart_signals import ChartPicture, Reading, Signals, combined, read_patches
+from coupole.calibration.colour.chart_views import ChartReader, ChartSetting, key_of, mean_picture, white_of
+from coupole.calibration.colour.colorimetry import de00, lab_of
+from coupole.calibration.colour.colour_profile import (
+    FORMS,
+    Balanced,
+    Form,
+    LeftOut,
+    Profile,
+    better,
+    covariance_of,
+    fit_profile,
+    leave_out,
+)
+from coupole.calibration.colour.drawing import draw_colour
+from coupole.calibration.colour.icc_profile import icc_profile
+from coupole.calibration.colour.image_quality import (
+    Figure,
+    colour_figures,
+    edge_figures,
+    edges_of,
+    noise_figures,
+    said,
+    tone_figures,
+    uniformity_figure,
+)
+from coupole.calibration.colour.slanted_edge import SlantedEdge
+from coupole.calibration.light.frames import CHANNELS, LightFrames
+from coupole.calibration.light.records import Progress, counter, sealed_outcome
+from coupole.calibration.record import Parameter
+from coupole.calibration.report import Outcome
+from coupole.calibration.request import Request
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+MATRIX = "xyz_d50_from_balanced."
+"""Begins the names of the matrix's coefficients: then X, Y or Z, and r, g or b."""
+_TERMS = ("r", "g", "b", "sqrt_rg", "sqrt_rb", "sqrt_gb")
+_MOST_EDGE_PICTURES = 8
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was seen of the chart."""
+
+    signals: Signals
+    edges: Mapping[str, Sequence[SlantedEdge]] = field(default_factory=dict)
+    white: ChartPicture | None = None
+
+
+def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames | None, progress: Progress) -> Seen:
+    """The chart in runs, under all suitable lights; `white` are frames of a white sheet in its place. Raises
+    InputError: frames without their white ones, and as `combined`, `edges_of`."""
+    reader = ChartReader(frames, setting)
+    names = setting.chart.patch_names
+    whites = {} if white is None else white_of(white, setting)
+    tell = counter(progress, len(reader.suited()))
+    readings: list[Reading] = []
+    lights: list[Floats] = []
+    lit: list[str] = []
+    sharp: list[ChartPicture] = []
+    for frame, picture in reader.pictures():
+        if white is None:
+            lights.append(np.repeat(picture.light[:, None], 3, axis=1))
+        elif key_of(frame) not in whites:
+            raise InputError(f"--white: has no frame of {' under '.join(key_of(frame))}; acquire the same plan")
+        else:
+            lights.append(read_patches(replace(whites[key_of(frame)], patches_px=picture.patches_px), names).mean)
+        readings.append(read_patches(picture, names))
+        lit.append(str(frame.shot.light))
+        if setting.chart.edges and len(sharp) < _MOST_EDGE_PICTURES and frame.view == frames.lit[0].view:
+            sharp.append(picture)
+        tell()
+    signals = combined(names, readings, np.stack(lights), lit)
+    found = edges_of(mean_picture(sharp), [edge.name for edge in setting.chart.edges]) if sharp else {}
+    return Seen(signals, found, next(iter(whites.values()), None))
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Both forms of the profile, and which is taken."""
+
+    profiles: Mapping[Form, Profile]
+    left_out: Mapping[Form, LeftOut]
+    form: Form
+
+    @property
+    def chosen(self) -> Profile:
+        return self.profiles[self.form]
+
+    @property
+    def missed(self) -> LeftOut:
+        return self.left_out[self.form]
+
+
+def colour_outcome(
+    seen: Seen, known: KnownChart, setting: ChartSetting, frames: LightFrames, request: Request, progress: Progress
+) -> Outcome:
+    """The record of a profile, with the profile as ICC file and a table of the patches beside it."""
+    made, balanced = make_profiles(seen.signals, known, progress)
+    lab = lab_of(made.chosen.xyz(balanced.signal))
+    figures = figures_of(seen, known, made, balanced, lab)
+    by_noise, by_chart = covariance_of(balanced, made.profiles["matrix"])
+    edges = [(name, colours[1]) for name, colours in seen.edges.items()]
+    return sealed_outcome(
+        "colour",
+        request,
+        frames,
+        frames.size_px,
+        _parameters(made.profiles["matrix"], by_noise, by_chart, len(balanced.signal)),
+        by_noise + by_chart,
+        partial(draw_colour, known, lab, made.missed.de, edges),
+        limits=against_limits(COLOUR, request.limits, {"mean": made.missed.mean, "worst": made.missed.worst}),
+        files={
+            f"{request.name}.icc": icc_profile(made.chosen, made.profiles["matrix"], request.name, request.now),
+            f"{request.name}.csv": _patch_table(known, balanced, made, lab).encode(),
+        },
+        fixed=_fixed(made, figures),
+        remarks=(_chosen(made), *(said(figure) for figure in figures), *seen.signals.remarks),
+        more_inputs=setting.inputs,
+    )
+
+
+def make_profiles(signals: Signals, known: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
+    """Both forms with their errors on patches left out."""
+    balanced = Balanced(signals.mean, signals.u, known.xyz, known.chart.u_lab, known.neutral)
+    tell: Callable[[], None] = counter(progress, len(FORMS) * len(balanced.signal))
+    profiles = {form: fit_profile(balanced, form) for form in FORMS}
+    left = {form: leave_out(balanced, form, tell) for form in FORMS}
+    return _Made(profiles, left, better(left["matrix"], left["root-polynomial"])), balanced
+
+
+def figures_of(seen: Seen, known: KnownChart, made: _Made, balanced: Balanced, lab: Floats) -> list[Figure]:
+    """All figures of image quality that these pictures give."""
+    figures = colour_figures(made.missed.de)
+    figures += tone_figures(lab, known.lab, known.neutral)
+    figures += noise_figures(balanced.signal, seen.signals.pixel_sd, made.chosen, known.neutral)
+    if seen.edges:
+        figures += edge_figures(seen.edges)
+    if seen.white is not None:
+        figures.append(uniformity_figure(seen.white))
+    return figures
+
+
+def _chosen(made: _Made) -> str:
+    errors = "; ".join(
+        f"{form}: mean {left.mean:.2f}, 95 % {left.quantile(0.95):.2f}, largest {left.worst:.2f}"
+        for form, left in made.left_out.items()
+    )
+    return f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {made.form}"
+
+
+def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: int) -> list[Parameter]:
+    """The matrix's coefficients, row by row."""
+    found = []
+    for n, (axis, channel) in enumerate((axis, channel) for axis in "XYZ" for channel in "rgb"):
+        noise, chart = by_noise[n, n], by_chart[n, n]
+        found.append(
+            Parameter(
+                name=f"{MATRIX}{axis}{channel}",
+                value=float(matrix.coefficients[n // 3, n % 3]),
+                u=float(np.sqrt(noise + chart)),
+                degrees_of_freedom=float(3 * patches - 6),
+                dominated_by="noise of signals" if noise > chart else "patches' own values",
+            )
+        )
+    return found
+
+
+def _fixed(made: _Made, figures: Sequence[Figure]) -> dict[str, float]:
+    """Balance, DNG's matrix, the root-polynomial, errors and figures."""
+    matrix, roots = made.profiles["matrix"], made.profiles["root-polynomial"]
+    white = matrix.white_signal
+    fixed = {f"neutral.{channel}": float(w) for channel, w in zip(CHANNELS, white / white.max(), strict=True)}
+    to_camera = (white / white.max())[:, None] * np.linalg.inv(matrix.coefficients)
+    fixed |= {
+        f"dng_color_matrix.{channel}{axis}": float(to_camera[c, a])
+        for c, channel in enumerate("rgb")
+        for a, axis in enumerate("XYZ")
+    }
+    fixed |= {
+        f"root_polynomial.{axis}.{term}": float(roots.coefficients[a, t])
+        for a, axis in enumerate("XYZ")
+        for t, term in enumerate(_TERMS)
+    }
+    for form, left in made.left_out.items():
+        fixed |= {
+            f"left_out.{form}.mean_de00": left.mean,
+            f"left_out.{form}.q95_de00": left.quantile(0.95),
+            f"left_out.{form}.worst_de00": left.worst,
+        }
+    return fixed | {f"figure.{figure.name}": figure.value for figure in figures}
+
+
+def _patch_table(known: KnownChart, balanced: Balanced, made: _Made, lab: Floats) -> str:
+    """CSV: each patch's balanced channels, its L*a*b* on the chart and by the profile, CIEDE2000 with and without
+    it."""
+    text = io.StringIO()
+    text.write("# channels of which the perfect white has 1; L*, a*, b* under D50, 1931 observer\n")
+    text.write("patch,r,g,b,u_r,u_g,u_b,L,a,b_star,L_found,a_found,b_found,de00,de00_left_out\n")
+    white = made.chosen.white_signal
+    table = np.column_stack(
+        [balanced.signal / white, balanced.u / white, known.lab, lab, de00(lab, known.lab), made.missed.de]
+    )
+    for name, row in zip(known.chart.patch_names, table, strict=True):
+        text.write(f"{name}," + ",".join(f"{value:.6g}" for value in row) + "\n")
+    return text.getvalue()

@@ -1,0 +1,51 @@
+"""The picture of a colour profile: the chart, errors of patches, a*b*, tone, edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coupole.calibration.colour.chart import KnownChart
+from coupole.calibration.colour.slanted_edge import SlantedEdge
+from coupole.calibration.report import BLUE, DARK, GREY, RED
+from coupole.calibration.rotations import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from coupole.calibration.record import Record
+
+
+def draw_colour(
+    known: KnownChart,
+    lab: Floats,
+    de: Floats,
+    edges: Sequence[tuple[str, SlantedEdge]],
+    record: Record,
+    figure: Figure,
+) -> None:
+    """Fill the figure; `lab` [patches, 3] is by the profile, `de` [patches] CIEDE2000 of patches left out."""
+    axes = figure.subplots(2, 2)
+    names = known.chart.patch_names
+    axes[0, 0].bar(range(len(de)), de, color=BLUE)
+    axes[0, 0].set_xticks(range(len(de)), names, rotation=90, fontsize=8)
+    axes[0, 0].axhline(float(np.mean(de)), color=GREY)
+    axes[0, 0].set(title="CIEDE2000 of each patch, left out of the profile", ylabel="dE00")
+    for seen, true in zip(lab, known.lab, strict=True):
+        axes[0, 1].plot([true[1], seen[1]], [true[2], seen[2]], color=GREY)
+    axes[0, 1].plot(known.lab[:, 1], known.lab[:, 2], "o", color=DARK, mfc="none", label="chart")
+    axes[0, 1].plot(lab[:, 1], lab[:, 2], ".", color=RED, label="by the profile")
+    axes[0, 1].legend(frameon=False)
+    axes[0, 1].set(title="a*, b*", xlabel="a*", ylabel="b*", aspect="equal")
+    grey = list(known.neutral)
+    axes[1, 0].axhline(0.0, color=GREY)
+    axes[1, 0].plot(known.lab[grey, 0], (lab - known.lab)[grey, 0], "o-", color=BLUE)
+    axes[1, 0].set(title="Tone: greys by the profile less the chart", xlabel="L*", ylabel="difference of L*")
+    for name, edge in edges:
+        axes[1, 1].plot(edge.frequencies, edge.response, label=name)
+    axes[1, 1].axvline(0.5, color=GREY)
+    axes[1, 1].set(title="Spatial frequency response, green", xlabel="cycles per pixel", ylim=(0, 1.2))
+    if edges:
+        axes[1, 1].legend(frameon=False)

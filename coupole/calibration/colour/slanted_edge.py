@@ -1,0 +1,130 @@
+"""Spatial frequency response from a slanted edge, and where the edge is in each colour.
+
+After ISO 12233:2017, annex D (e-SFR), with two differences. The edge's line (a parabola, as lenses bend it) is
+fitted to all pixels at once in place of centroids by rows, so that pixels of one colour of a RAW frame can be used
+where they are, without interpolation; and besides the derivative, the width of the bins is corrected for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coupole.calibration.rotations import Floats
+from coupole.errors import InputError
+
+_BIN_PX = 0.25
+_LEAST_PIXELS = 60
+_REACH_PX = 3.0
+"""The least width of either side of the edge."""
+_LEAST_CONTRAST = 0.2
+"""Of an edge, (light - dark) / (light + dark)."""
+_LEAST_SLANT_DEG = 1.0
+"""From the pixels' rows and columns: below it bins would stay empty or be biased."""
+
+
+@dataclass(frozen=True)
+class SlantedEdge:
+    """An edge in one colour."""
+
+    normal: Floats
+    """[2] unit, from dark to light, x right, y down."""
+    offset_px: float
+    """Of the edge at the middle of the pixels, along the normal, from `middle_px`."""
+    u_offset_px: float
+    middle_px: Floats
+    """[2]."""
+    frequencies: Floats
+    """[n] cycles per pixel."""
+    response: Floats
+    """[n], 1 at frequency 0."""
+
+    def frequency_at(self, share: float) -> float:
+        """The first frequency at which the response falls to a share, cycles per pixel; 0.5 or above it beyond the
+        sampling's limit, infinite if it never falls so far."""
+        below = np.flatnonzero(self.response <= share)
+        if not len(below):
+            return float("inf")
+        n = int(below[0])
+        high, low = self.response[n - 1], self.response[n]
+        step = self.frequencies[n] - self.frequencies[n - 1]
+        return float(self.frequencies[n - 1] + step * (high - share) / (high - low))
+
+
+def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge") -> SlantedEdge:
+    """The edge in pixels at x [n], y [n] with linear values [n].
+
+    Raises InputError, with `where` as its name: too few pixels, no contrast, no room beside the edge, or an edge
+    along the pixels' rows or columns.
+    """
+    from scipy.optimize import least_squares
+
+    if len(values) < _LEAST_PIXELS:
+        raise InputError(f"{where}: expected {_LEAST_PIXELS} pixels or more about the edge, found {len(values)}")
+    middle = np.array([x_px.mean(), y_px.mean()])
+    x, y = x_px - middle[0], y_px - middle[1]
+    dark, light = np.quantile(values, [0.1, 0.9])
+    if light - dark < _LEAST_CONTRAST * (light + dark):
+        raise InputError(f"{where}: expected an edge between light and dark, found {dark:.4g} and {light:.4g}")
+    bright = values > 0.5 * (dark + light)
+    towards = np.array([x[bright].mean() - x[~bright].mean(), y[bright].mean() - y[~bright].mean()])
+    start = [np.arctan2(towards[1], towards[0]), 0.0, 0.0, 0.7, dark, light]
+
+    def left(unknowns: Floats) -> Floats:
+        return np.asarray((_model(unknowns, x, y) - values) / (light - dark))
+
+    found = least_squares(left, start, x_scale=[0.01, 0.1, 1e-4, 0.2, light - dark, light - dark])
+    angle, offset, bend, _, low, high = found.x
+    slant_deg = np.degrees(abs((angle + np.pi / 4.0) % (np.pi / 2.0) - np.pi / 4.0))
+    if slant_deg < _LEAST_SLANT_DEG:
+        raise InputError(
+            f"{where}: the edge is {slant_deg:.2g} degrees from the pixels' rows or columns; turn the chart by 5"
+        )
+    away = _distance(angle, offset, bend, x, y)
+    if min(-away.min(), away.max()) < _REACH_PX:
+        raise InputError(
+            f"{where}: expected {_REACH_PX:g} pixels or more on either side of the edge; correct its place"
+        )
+    noise = float(found.fun @ found.fun) / max(1, len(values) - len(found.x))
+    u_offset = float(np.sqrt(noise * np.linalg.inv(found.jac.T @ found.jac)[1, 1]))
+    frequencies, response = _response(away, (values - low) / (high - low))
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    return SlantedEdge(normal, float(offset), u_offset, middle, frequencies, response)
+
+
+def _distance(angle: float, offset: float, bend: float, x: Floats, y: Floats) -> Floats:
+    """[n] from the edge along its normal, towards the light."""
+    along = -x * np.sin(angle) + y * np.cos(angle)
+    return np.asarray(x * np.cos(angle) + y * np.sin(angle) - offset - bend * along**2)
+
+
+def _model(unknowns: Floats, x: Floats, y: Floats) -> Floats:
+    from scipy.special import ndtr
+
+    angle, offset, bend, spread, low, high = unknowns
+    return np.asarray(low + (high - low) * ndtr(_distance(angle, offset, bend, x, y) / max(abs(spread), 0.05)))
+
+
+def _response(away: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Frequencies and the modulus of the transform of the line spread, from values over distances."""
+    reach = min(-away.min(), away.max())
+    half = int(reach / _BIN_PX)
+    number = np.floor(away / _BIN_PX).astype(int) + half
+    inside = (number >= 0) & (number < 2 * half)
+    count = np.bincount(number[inside], minlength=2 * half)
+    total = np.bincount(number[inside], values[inside], minlength=2 * half)
+    # Where the bin's pixels lie within it matters at high frequencies: each bin stands at their mean.
+    place = np.bincount(number[inside], away[inside], minlength=2 * half)
+    full = count > 0
+    middles = (np.arange(2 * half) - half + 0.5) * _BIN_PX
+    edge = np.interp(middles, place[full] / count[full], total[full] / count[full])
+    line = np.zeros_like(edge)
+    line[1:-1] = 0.5 * (edge[2:] - edge[:-2])
+    window = 0.54 + 0.46 * np.cos(np.pi * (np.arange(2 * half) - half + 0.5) / half)
+    frequencies = np.linspace(0.0, 1.0, 201)
+    waves = np.exp(-2j * np.pi * np.outer(frequencies, middles))
+    spectrum = np.abs(waves @ (line * window))
+    derivative = np.sinc(2.0 * frequencies * _BIN_PX)
+    averaging = np.sinc(frequencies * _BIN_PX)
+    return frequencies, np.asarray(spectrum / spectrum[0] / derivative / averaging)

@@ -1,0 +1,125 @@
+"""`coupole calibrate colour`: colour profile from a chart, and figures of image quality."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from coupole.calibration.colour.acceptance import COLOUR
+from coupole.commands.calibrate_light import (
+    CameraOption,
+    DarkOption,
+    FlatOption,
+    HandEyeOption,
+    LedsOption,
+    ResponseOption,
+    RigOption,
+    Runs,
+    lens_of,
+    posed,
+)
+from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of, rig_of
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.calibration.report import Outcome
+    from coupole.calibration.request import Request
+    from coupole.calibration.rotations import Floats
+
+ChartOption = Annotated[Path, typer.Option("--chart", help="The chart's description (YAML).", show_default=False)]
+CornersOption = Annotated[
+    str | None,
+    typer.Option(
+        "--corners",
+        metavar='"X,Y X,Y X,Y X,Y"',
+        help="Middles of the chart's top left, top right, bottom right and bottom left patch in the first view's "
+        "frames, px; without it the chart lies as its description says.",
+        show_default=False,
+    ),
+]
+WhiteOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--white",
+        help="A run of the same plan with a white sheet in the chart's place, in place of the LEDs' known light.",
+        show_default=False,
+    ),
+]
+WithoutOption = Annotated[
+    str | None, typer.Option("--without", help="Names of patches to leave out, as A1,B2.", show_default=False)
+]
+
+
+@calibration("colour", limits=COLOUR, valid_days=365)
+def colour(
+    runs: Runs,
+    chart: ChartOption,
+    corners: CornersOption = None,
+    white: WhiteOption = None,
+    without: WithoutOption = None,
+    rig: RigOption = None,
+    leds: LedsOption = None,
+    hand_eye: HandEyeOption = None,
+    camera: CameraOption = None,
+    dark_record: DarkOption = None,
+    response_record: ResponseOption = None,
+    flat: FlatOption = None,
+    emission: EmissionOption = "lambertian",
+) -> Work:
+    """Colour profile of the camera under the LEDs, as record and as ICC file, from views of a chart of patches.
+
+    States CIEDE2000 of patches left out, tone, noise, sharpness and registration of colours.
+    """
+    from coupole.calibration.colour.chart import read_chart
+    from coupole.calibration.colour.chart_views import ChartSetting
+    from coupole.calibration.colour.colour_workflow import colour_outcome, see_in_runs
+    from coupole.calibration.light.frames import open_light_frames
+    from coupole.calibration.light.led_power_tile import calibrated_positions
+    from coupole.calibration.light.tile_views import Positions
+    from coupole.plan.cell import read_cell
+
+    def work(console: Console, request: Request) -> Outcome:
+        known = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
+        frames = posed(open_light_frames(runs), hand_eye)
+        whites = None if white is None else posed(open_light_frames([white]), hand_eye)
+        used = rig or rig_of(runs[0])
+        cell = read_cell(used)
+        by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
+        files = (*known.files, used, leds or cell.leds_path, hand_eye, camera)
+        setting = ChartSetting(
+            known.chart,
+            cell.rig.support.base_from_support.matrix(),
+            by_table if leds is None else calibrated_positions(leds),
+            lens_of(camera, frames),
+            corners_of(corners),
+            dark_record,
+            response_record,
+            flat,
+            emission_of(emission),
+            tuple(path for path in files if path is not None),
+        )
+        with bar(console, "frames of the chart") as progress:
+            seen = see_in_runs(frames, setting, whites, progress)
+        with bar(console, "patches left out") as progress:
+            return colour_outcome(seen, known, setting, frames, request, progress)
+
+    return work
+
+
+def corners_of(words: str | None) -> Floats | None:
+    """[4, 2] px of `X,Y X,Y X,Y X,Y`. Raises InputError for anything else."""
+    import numpy as np
+
+    if words is None:
+        return None
+    try:
+        found = np.array([[float(number) for number in pair.split(",")] for pair in words.split()])
+    except ValueError:
+        found = np.empty(0)
+    if found.shape != (4, 2) or not np.isfinite(found).all():
+        raise InputError(f'--corners: expected four pairs of pixels "X,Y X,Y X,Y X,Y", found {words!r}')
+    return found

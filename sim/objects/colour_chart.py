@@ -1,0 +1,113 @@
+"""A colour chart of 24 patches, with spectra that are drawn, not measured: those of no maker's chart.
+
+Each is a floor, edges (steps as of yellows, oranges, reds) and bands (as of blues and greens) over wavelength; the
+last row is nearly grey. `configs/charts/drawn-24.txt` lists the same spectra for `coupole calibrate colour`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from coupole.appearance.shapes.triangles import rectangle, skirt
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from sim.objects import appearance
+from sim.objects.surfaces import joined, of_material
+from sim.scene.surface import Material, Surface
+
+ROWS, COLUMNS = 4, 6
+PITCH_MM, PATCH_MM, MARGIN_MM = 22.0, 18.0, 6.0
+THICKNESS_MM = 2.0
+_CELL_MM = 2.0
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A reflectance over wavelength."""
+
+    floor: float
+    edges: tuple[tuple[float, float, float], ...] = ()
+    """height, wavelength of half height in nm, width in nm: reflects above; below if the height is negative."""
+    bands: tuple[tuple[float, float, float], ...] = ()
+    """height, centre in nm, standard deviation in nm."""
+
+    def at(self, wavelengths_nm: Array) -> Array:
+        """Reflectance [n] at wavelengths [n]."""
+        value = np.full_like(wavelengths_nm, self.floor)
+        for height, half_nm, width_nm in self.edges:
+            value = value + height / (1.0 + np.exp((half_nm - wavelengths_nm) / width_nm))
+        for height, centre_nm, spread_nm in self.bands:
+            value = value + height * np.exp(-0.5 * ((wavelengths_nm - centre_nm) / spread_nm) ** 2)
+        return np.asarray(value)
+
+
+DRAWN = {
+    "A1": Drawn(0.05, ((0.16, 605.0, 22.0),), ((0.05, 520.0, 60.0),)),
+    "A2": Drawn(0.17, ((0.42, 588.0, 16.0),), ((0.09, 470.0, 45.0),)),
+    "A3": Drawn(0.15, ((0.08, 690.0, 14.0),), ((0.22, 460.0, 48.0),)),
+    "A4": Drawn(0.05, ((0.10, 700.0, 18.0),), ((0.15, 550.0, 32.0),)),
+    "A5": Drawn(0.20, ((0.25, 660.0, 28.0),), ((0.28, 445.0, 42.0),)),
+    "A6": Drawn(0.16, ((0.10, 705.0, 20.0),), ((0.43, 510.0, 46.0),)),
+    "B1": Drawn(0.05, ((0.55, 582.0, 15.0),)),
+    "B2": Drawn(0.06, ((0.16, 690.0, 15.0),), ((0.32, 448.0, 34.0),)),
+    "B3": Drawn(0.10, ((0.46, 597.0, 13.0),), ((0.05, 430.0, 40.0),)),
+    "B4": Drawn(0.05, ((0.20, 660.0, 22.0),), ((0.13, 440.0, 30.0),)),
+    "B5": Drawn(0.06, ((0.50, 516.0, 12.0), (-0.28, 595.0, 26.0))),
+    "B6": Drawn(0.06, ((0.66, 558.0, 15.0),)),
+    "C1": Drawn(0.04, ((0.08, 710.0, 16.0),), ((0.28, 452.0, 26.0),)),
+    "C2": Drawn(0.05, ((0.10, 705.0, 18.0),), ((0.30, 528.0, 28.0),)),
+    "C3": Drawn(0.045, ((0.62, 612.0, 11.0),)),
+    "C4": Drawn(0.05, ((0.74, 512.0, 13.0),)),
+    "C5": Drawn(0.12, ((0.55, 606.0, 15.0),), ((0.25, 442.0, 36.0),)),
+    "C6": Drawn(0.07, ((0.08, 710.0, 18.0),), ((0.36, 478.0, 38.0),)),
+    "D1": Drawn(0.88, ((0.012, 470.0, 40.0),)),
+    "D2": Drawn(0.58, ((0.010, 560.0, 60.0),)),
+    "D3": Drawn(0.36, ((-0.006, 600.0, 60.0),)),
+    "D4": Drawn(0.19, ((0.004, 520.0, 50.0),)),
+    "D5": Drawn(0.088, ((-0.002, 560.0, 60.0),)),
+    "D6": Drawn(
+        0.032,
+    ),
+}
+"""By name: rows A to D from the top, columns 1 to 6 from the left."""
+
+
+def colour_chart() -> Surface:
+    """A plate standing on z = 0 whose face is at z = `THICKNESS_MM`: matt patches on black. The origin is below
+    the middle of the patches; x runs along the rows, y up."""
+    width_mm = COLUMNS * PITCH_MM + 2.0 * MARGIN_MM
+    depth_mm = ROWS * PITCH_MM + 2.0 * MARGIN_MM
+    parts = [of_material(skirt(rectangle(width_mm, depth_mm, z_mm=THICKNESS_MM)), appearance.BLACK_PRINT)]
+    cells = round(PATCH_MM / _CELL_MM)
+    for name, drawn in DRAWN.items():
+        row, column = ord(name[0]) - ord("A"), int(name[1]) - 1
+        x_mm = (column - (COLUMNS - 1) / 2.0) * PITCH_MM
+        y_mm = ((ROWS - 1) / 2.0 - row) * PITCH_MM
+        face = rectangle(PATCH_MM, PATCH_MM, cells, cells, z_mm=THICKNESS_MM) + np.array([x_mm, y_mm, 0.0])
+        parts.append(of_material(face, Material(name, appearance.rgb(drawn.at(WAVELENGTHS_NM)))))
+    parts.append(of_material(_between(width_mm, depth_mm), appearance.BLACK_PRINT))
+    return joined(parts)
+
+
+def _between(width_mm: float, depth_mm: float) -> Array:
+    """Corners of the face without the patches: strips between the rows, and pieces between the columns."""
+    half_mm = PATCH_MM / 2.0
+    xs_mm = _lines(COLUMNS, width_mm, half_mm)
+    ys_mm = _lines(ROWS, depth_mm, half_mm)
+    pieces = []
+    for j, (bottom, top) in enumerate(pairwise(ys_mm)):
+        for i, (left, right) in enumerate(pairwise(xs_mm)):
+            if i % 2 == 1 and j % 2 == 1:
+                continue
+            piece = rectangle(right - left, top - bottom, z_mm=THICKNESS_MM)
+            pieces.append(piece + np.array([0.5 * (left + right), 0.5 * (bottom + top), 0.0]))
+    return np.concatenate(pieces)
+
+
+def _lines(count: int, length_mm: float, half_mm: float) -> list[float]:
+    """Edges of the patches along one direction, with the plate's own."""
+    centres = [(k - (count - 1) / 2.0) * PITCH_MM for k in range(count)]
+    inner = [edge for centre in centres for edge in (centre - half_mm, centre + half_mm)]
+    return [-length_mm / 2.0, *inner, length_mm / 2.0]

@@ -114,8 +114,8 @@ def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) ->
 
 
 def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: Path) -> None:
-    names = " and ".join(one.hypothesis.name for one in pair)
-    words = f"Hypotheses {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
+    names = " and ".join(f"hypothesis {one.hypothesis.name}" for one in pair)
+    words = f"Between {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
     width = de00.shape[1]
     lines = labelled_pictures.broken(words, width)
     picture = with_strip(hypotheses_compared.drawn(de00), lines, len(lines))

@@ -109,7 +109,8 @@ def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) ->
         sheet[:, first : first + width] = strip
     path = out / f"side-by-side-{made[0].camera.name}.png"
     hypotheses = [one.hypothesis for one in made]
-    pictures.write_png(path, sheet, f"{len(made)} hypotheses: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
+    names = "; ".join(f"hypothesis {one.name}" for one in hypotheses)
+    pictures.write_png(path, sheet, f"{names}: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
     return path
 
 

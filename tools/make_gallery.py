@@ -123,7 +123,7 @@ _RESTORED = """
 
 ![A bust as bare stone, painted and gilded, and worn, simulated](pictures/gallery/restored-bust.png)
 
-*Simulated.* By `coupole restore` from `configs/restorations/` (400 pixels wide, 18 samples, 21 bands, denoised):
+*Simulated.* By `coupole restore` from `configs/restorations/` (18 samples, 21 bands, denoised):
 nobody's likeness (`tools/make_bust.py`); gold leaf on yellow ochre for the hair, blue cloth, flesh in lead white
 alone, as seed 000 rendered the tomb of Philippe-Dagobert. Paints are assumed shapes, no measured pigments.
 """

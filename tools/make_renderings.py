@@ -55,27 +55,29 @@ def main() -> None:
 
 
 def _bust() -> None:
-    """Three hypotheses side by side, with fewer colours, and all that the picture says of itself."""
+    """Three hypotheses side by side, smaller, with all that the picture says of itself."""
     folder = ROOT / "configs" / "restorations"
     parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
     with tempfile.TemporaryDirectory() as out:
         wanted = restore.read(folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet)
         show_all(wanted, render_all(wanted, Path(out), _quiet), Path(out), _quiet)
         shown = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
-        _with_fewer_colours(Path(out) / "side-by-side-front.png", shown)
+        _smaller(Path(out) / "side-by-side-front.png", shown)
         print(f"{shown.name}: {shown.stat().st_size / 1000:.0f} kB")
 
 
 def _quiet(step: str, done: int, total: int) -> None: ...
 
 
-def _with_fewer_colours(path: Path, to: Path) -> None:
-    """The same picture with 224 colours and the same texts."""
+def _smaller(path: Path, to: Path) -> None:
+    """The same picture at most 1000 pixels wide, with the same texts."""
     chunks = PngInfo()
     with Image.open(path) as picture:
         for keyword, words in picture.text.items():
             chunks.add_itxt(keyword, words)
-        picture.convert("RGB").quantize(224).save(to, "PNG", optimize=True, pnginfo=chunks)
+        small = picture.convert("RGB")
+        small.thumbnail((1000, 1000), Image.Resampling.LANCZOS)
+        small.save(to, "PNG", optimize=True, pnginfo=chunks)
 
 
 def _strip(frames: Path, path: Path) -> None:

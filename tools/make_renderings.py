@@ -70,13 +70,13 @@ def _quiet(step: str, done: int, total: int) -> None: ...
 
 
 def _smaller(path: Path, to: Path) -> None:
-    """The same picture at most 1000 pixels wide, with the same texts."""
+    """The same picture at most 940 pixels wide, with the same texts."""
     chunks = PngInfo()
     with Image.open(path) as picture:
         for keyword, words in picture.text.items():
             chunks.add_itxt(keyword, words)
         small = picture.convert("RGB")
-        small.thumbnail((1000, 1000), Image.Resampling.LANCZOS)
+        small.thumbnail((940, 940), Image.Resampling.LANCZOS)
         small.save(to, "PNG", optimize=True, pnginfo=chunks)
 
 

@@ -13,6 +13,9 @@ import trimesh
 from painted_plate import BLUE, PARTS, RED, RESTORATION, grid, middles, plate_obj, plate_ply
 from PIL import Image
 
+from coupole.appearance.render.materials import Metal
+from coupole.appearance.render.objects import Piece
+from coupole.appearance.render.scene_file import Camera
 from coupole.commands.restore import read
 from coupole.errors import InputError
 from coupole.heritage.restoration.painted_mesh import read_painted
@@ -20,6 +23,7 @@ from coupole.heritage.restoration.part_labels import Parts, parts_of
 from coupole.heritage.restoration.parts_file import read_parts
 from coupole.heritage.restoration.restoration_file import read_restoration
 from coupole.heritage.restoration.restoring import Restoration
+from coupole.heritage.restoration.seen_parts import SeenParts
 
 LEFT = np.array(middles()) < 0
 
@@ -193,3 +197,29 @@ def test_shipped_restorations_are_whole() -> None:
     assert len(wanted.hypotheses) == len(given.hypotheses) == 3
     assert min(wanted.parts.counts().values()) > 100
     assert not wanted.parts.remarks
+
+
+def test_a_camera_sees_a_part_where_it_is_and_not_behind_something_else() -> None:
+    """A triangle in the upper left corner, and one in the lower right behind a sheet."""
+    camera = Camera.model_validate(
+        {"name": "c", "position_mm": [0, -1000, 0], "target_mm": [0, 0, 0], "width_px": 20, "height_px": 20,
+         "optics": {"kind": "field", "degrees": 4}}
+    )  # fmt: skip
+    upper_left = np.array([[[-30.0, 0, 30], [-20, 0, 30], [-20, 0, 20]]])
+    sheet = np.array([[[0.0, -1, 0], [60, -1, 0], [60, -1, -60]], [[0, -1, 0], [60, -1, -60], [0, -1, -60]]])
+    covered = Piece(sheet, Metal(kind="metal"))
+    corners = np.concatenate([upper_left, -upper_left])
+    seen = SeenParts(corners, np.array([0, 1], np.int16), [covered]).seen(camera)
+    rows, columns = np.nonzero(seen == 0)
+    assert set(np.unique(seen)) == {-1, 0}
+    assert (rows.max() <= 5, columns.max() <= 5, rows.min() >= 1) == (True, True, True)
+    assert np.array_equal(np.unique(SeenParts(corners, np.array([0, 1], np.int16), []).seen(camera)), [-1, 0, 1])
+
+
+def test_a_triangle_takes_the_part_of_two_of_its_corners_or_the_first_that_is_known(tmp_path: Path) -> None:
+    points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
+    colours = [RED, BLUE, BLUE, (0, 255, 0)]
+    mixed = trimesh.Trimesh(points, [(0, 1, 2), (3, 1, 0), (3, 0, 1)], vertex_colors=colours, process=False)
+    mixed.export(tmp_path / "mixed.ply")
+    parts = found(tmp_path / "mixed.ply", PARTS, tmp_path)
+    assert [parts.names[label] for label in parts.labels] == ["right", "right", "left"]

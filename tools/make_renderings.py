@@ -11,9 +11,13 @@ import tempfile
 from pathlib import Path
 
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from coupole.appearance.render import studio
+from coupole.commands import restore
 from coupole.commands.render_scene import read_scene, render_scene
+from coupole.heritage.restoration.restoring import render_all
+from coupole.heritage.restoration.shown_hypotheses import show_all
 
 ROOT = Path(__file__).parent.parent
 PICTURES = ROOT / "docs" / "pictures" / "renderings"
@@ -28,11 +32,16 @@ QUICK = {
     "nashiji-stereo": (48, 280, 40),
 }
 """Samples, width in pixels, nm between bands."""
+BUST, BUST_QUICK = "restored-bust", (18, 400, None)
+"""Of configs/restorations/, for docs/pictures/gallery."""
 
 
 def main() -> None:
     PICTURES.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or QUICK:
+    names = sys.argv[1:] or [*QUICK, BUST]
+    if BUST in names:
+        _bust()
+    for name in (name for name in names if name != BUST):
         samples, width_px, step_nm = QUICK[name]
         document, scene = read_scene(ROOT / "configs" / "scenes" / f"{name}.yaml")
         quick = studio.reduced(scene, samples=samples, width_px=width_px, step_nm=step_nm)
@@ -43,6 +52,32 @@ def main() -> None:
             for made in sorted([*Path(folder).glob("*.png"), *Path(folder).glob("*.mp4")]):
                 shutil.copy(made, PICTURES)
                 print(f"{made.name}: {made.stat().st_size / 1000:.0f} kB")
+
+
+def _bust() -> None:
+    """Three hypotheses side by side, smaller, with all that the picture says of itself."""
+    folder = ROOT / "configs" / "restorations"
+    parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
+    with tempfile.TemporaryDirectory() as out:
+        wanted = restore.read(folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet)
+        show_all(wanted, render_all(wanted, Path(out), _quiet), Path(out), _quiet)
+        shown = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
+        _smaller(Path(out) / "side-by-side-front.png", shown)
+        print(f"{shown.name}: {shown.stat().st_size / 1000:.0f} kB")
+
+
+def _quiet(step: str, done: int, total: int) -> None: ...
+
+
+def _smaller(path: Path, to: Path) -> None:
+    """The same picture at most 940 pixels wide, with the same texts."""
+    chunks = PngInfo()
+    with Image.open(path) as picture:
+        for keyword, words in picture.text.items():
+            chunks.add_itxt(keyword, words)
+        small = picture.convert("RGB")
+        small.thumbnail((940, 940), Image.Resampling.LANCZOS)
+        small.save(to, "PNG", optimize=True, pnginfo=chunks)
 
 
 def _strip(frames: Path, path: Path) -> None:

@@ -119,6 +119,34 @@ def read(
     return Restoration(painted, found, document, given, hypotheses)
 
 
+@restore_app.command()
+def pick(
+    mesh: MeshArgument,
+    out: Annotated[Path, typer.Option("--out", help="Write this page (HTML).")] = Path("pick.html"),
+    unit: UnitOption = "mm",
+    as_json: JsonOption = False,
+) -> None:
+    """Write a page, in one file without a network, on which parts are painted; it saves what `--parts` reads."""
+    from coupole.exchange.pick.pick_page import write_pick_page
+    from coupole.heritage.restoration.painted_mesh import read_painted
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        with console.status("reading the mesh"):
+            found = read_painted(mesh, unit)
+            triangles = write_pick_page(found.vertices_mm, found.triangles, mesh.name, out)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    told = {"page": str(out), "triangles_of_the_mesh": len(found.triangles), "triangles_of_the_page": triangles}
+    if as_json:
+        print(json.dumps(told))
+    else:
+        fewer = "" if triangles == len(found.triangles) else f", simplified from {len(found.triangles):,}"
+        console.print(f"{out}: {triangles:,} triangles{fewer}; open it in a browser", markup=False)
+
+
 # -- helpers --------------------------------------------------------------------------------------------------
 
 

@@ -9,9 +9,12 @@ from types import ModuleType
 
 import pytest
 from places import REPO
+from pydantic import BaseModel
 
 from coupole.commands.export_options import OF_RUNS
 from coupole.exchange.of_results import FORMATS as OF_RESULTS
+from coupole.heritage.restoration import parts_file, restoration_file
+from coupole.heritage.restoration.restoration_file import Stage
 from coupole.plan import arm_description, plan, rig
 from coupole.reflectance.new_light import light_kinds
 
@@ -31,6 +34,19 @@ def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     ]
     keys = {f"{model.__name__}.{key}" for model in models for key in model.model_fields}
     assert sorted(key for key in keys if not re.search(rf"\b{key.split('.')[1]}\b", text)) == []
+
+
+def test_the_reference_names_every_key_of_parts_and_restorations() -> None:
+    text = (REFERENCE / "restorations.md").read_text(encoding="utf-8")
+    models = [
+        model
+        for module in (parts_file, restoration_file)
+        for _, model in inspect.getmembers(module, inspect.isclass)
+        if issubclass(model, BaseModel) and model.__module__ == module.__name__ and model is not Stage
+    ]
+    keys = {key for model in models for key in model.model_fields}
+    assert len(keys) > 30
+    assert sorted(key for key in keys if not re.search(rf"\b{key}\b", text)) == []
 
 
 @pytest.mark.parametrize(

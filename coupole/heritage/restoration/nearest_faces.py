@@ -19,33 +19,35 @@ _SAME_SHARE = 1e-6
 def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     """[m] for each triangle of `mesh` the nearest of `triangles` [k, 3] of `vertices_mm` [n, 3], by its middle.
 
-    Among the twelve with the nearest middles, and first among those that face the same way, so that a thin wall
-    keeps two sides. A mesh with the same triangles in the same order is taken one by one.
+    Distances count the difference of unit normals as well, times the median edge: a thin wall keeps its two
+    sides. A mesh with the same triangles in the same order is taken one by one.
     """
-    corners = vertices_mm[triangles]
-    own = mesh.corners_mm
+    corners, own = vertices_mm[triangles], mesh.corners_mm
     size_mm = float(np.ptp(mesh.vertices_mm, axis=0).max())
     if own.shape == corners.shape and np.abs(own - corners).max() <= _SAME_SHARE * size_mm:
         return np.arange(len(own))
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(corners.mean(axis=1))
-    middles, normals, others = own.mean(axis=1), flat_normals(own), flat_normals(corners)
+    edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    others = edge_mm * flat_normals(corners)
+    tree = cKDTree(np.concatenate([corners.mean(axis=1), others], axis=1))
+    middles, turned = own.mean(axis=1), edge_mm * flat_normals(own)
     found = np.empty(len(own), np.int64)
     for first in range(0, len(own), _CHUNK):
         part = slice(first, first + _CHUNK)
-        found[part] = _nearest(tree, corners, others, middles[part], normals[part])
+        found[part] = _nearest(tree, corners, others, middles[part], turned[part])
     return found
 
 
-def _nearest(tree: Any, corners: Floats, others: Floats, points: Floats, normals: Floats) -> NDArray[np.int64]:
+def _nearest(tree: Any, corners: Floats, others: Floats, points: Floats, turned: Floats) -> NDArray[np.int64]:
+    """Of the candidates with the nearest middles, by the distances to their surfaces."""
     from trimesh.triangles import closest_point
 
     count = min(_CANDIDATES, len(corners))
-    near = tree.query(points, k=count)[1].reshape(len(points), count)
-    distance = np.stack(
-        [np.linalg.norm(closest_point(corners[column], points) - points, axis=1) for column in near.T], axis=1
-    )
-    turned = np.einsum("nkc,nc->nk", others[near], normals) <= 0.0
-    distance += np.where(turned, 1.0 + distance.max(), 0.0)
-    return np.asarray(near[np.arange(len(points)), distance.argmin(axis=1)])
+    near = tree.query(np.concatenate([points, turned], axis=1), k=count)[1].reshape(len(points), count)
+    squares = [
+        ((closest_point(corners[column], points) - points) ** 2).sum(axis=1)
+        + ((others[column] - turned) ** 2).sum(axis=1)
+        for column in near.T
+    ]
+    return np.asarray(near[np.arange(len(points)), np.stack(squares, axis=1).argmin(axis=1)])

@@ -109,13 +109,14 @@ def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) ->
         sheet[:, first : first + width] = strip
     path = out / f"side-by-side-{made[0].camera.name}.png"
     hypotheses = [one.hypothesis for one in made]
-    pictures.write_png(path, sheet, f"{len(made)} hypotheses: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
+    names = "; ".join(f"hypothesis {one.name}" for one in hypotheses)
+    pictures.write_png(path, sheet, f"{names}: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
     return path
 
 
 def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: Path) -> None:
-    names = " and ".join(one.hypothesis.name for one in pair)
-    words = f"Hypotheses {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
+    names = " and ".join(f"hypothesis {one.hypothesis.name}" for one in pair)
+    words = f"Between {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
     width = de00.shape[1]
     lines = labelled_pictures.broken(words, width)
     picture = with_strip(hypotheses_compared.drawn(de00), lines, len(lines))

@@ -1,0 +1,1 @@
+"""A page on which the parts of a mesh are painted by hand."""

@@ -1,0 +1,69 @@
+"""The page to paint parts of a mesh: scripts, shaders, style and the mesh, in one HTML file that loads nothing."""
+
+from __future__ import annotations
+
+import base64
+import re
+from html import escape
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, StorageError, reason
+from coupole.exchange.look.look_blocks import in_script
+from coupole.scan.simplify import simplified
+
+MOST_TRIANGLES = 100_000
+"""Of a page; a finer mesh is simplified, and takes its parts from the nearest triangle."""
+SCRIPTS = ("surface.js", "brush.js", "parts.js", "pick.js")
+_SHARED = ("vectors.js", "camera.js")
+"""Of the page to relight."""
+
+
+def write_pick_page(
+    vertices_mm: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    title: str,
+    path: Path,
+    most_triangles: int = MOST_TRIANGLES,
+) -> int:
+    """Write the page of a mesh, vertices [n, 3] and triangles [m, 3]; how many triangles it has.
+
+    Raises InputError for a name that does not end in .html, StorageError if it cannot be written.
+    """
+    if path.suffix.lower() != ".html":
+        raise InputError(f"--out {path}: expected a name that ends in .html")
+    points, faces = simplified(vertices_mm, triangles, most_triangles)
+    if len(faces) == 0:
+        raise InputError(
+            f"{title}: nothing is left of the mesh at {most_triangles} triangles; see to its triangles"
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(page_text(points, faces, title), encoding="utf-8")
+    except OSError as error:
+        raise StorageError(f"{path}: {reason(error)}. Choose another place, or free space.") from error
+    return len(faces)
+
+
+def page_text(points_mm: NDArray[np.float64], triangles: NDArray[np.int64], title: str) -> str:
+    """The HTML."""
+    mesh = {
+        "title": title,
+        "vertices_mm": base64.b64encode(points_mm.astype("<f4").tobytes()).decode(),
+        "triangles": base64.b64encode(triangles.astype("<u4").tobytes()).decode(),
+    }
+    look = resources.files("coupole.exchange.look") / "page"
+    own = resources.files(__package__) / "page"
+    scripts = [(look / name).read_text(encoding="utf-8") for name in _SHARED]
+    scripts += [(own / name).read_text(encoding="utf-8") for name in SCRIPTS]
+    filled = {
+        "TITLE": escape(title),
+        "STYLE": (own / "pick.css").read_text(encoding="utf-8"),
+        "MESH": in_script(mesh),
+        "SCRIPTS": "\n".join(scripts),
+    }
+    page = (own / "pick.html").read_text(encoding="utf-8")
+    return re.sub(f"%({'|'.join(filled)})%", lambda found: filled[found[1]], page)

@@ -27,7 +27,7 @@ QUICK = {
     "arcature": (96, 420, 20),
     "nashiji-stereo": (48, 280, 40),
     "church-candles": (48, 400, 40),
-    "church-window": (64, 400, 40),
+    "church-window": (48, 400, 40),
 }
 """Samples, width in pixels, nm between bands."""
 

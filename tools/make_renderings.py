@@ -30,6 +30,8 @@ QUICK = {
     "sunset-film": (24, 360, 20),
     "arcature": (96, 420, 20),
     "nashiji-stereo": (48, 280, 40),
+    "church-candles": (48, 400, 40),
+    "church-window": (48, 400, 40),
 }
 """Samples, width in pixels, nm between bands."""
 BUST, BUST_QUICK = "restored-bust", (18, 400, None)

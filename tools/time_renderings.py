@@ -2,8 +2,9 @@
 
     uv run python tools/time_renderings.py [NAME[=NOISE] ...] [--size 1200] [--step 5] [--samples 512]
 
-Each scene of `configs/scenes` is rendered, first camera, square, until half of the pixels have the noise (or at most
-`--samples`). Seed 001 took 8 hours for a picture of the gilded portal.
+Each scene of `configs/scenes` is rendered, first camera, square, until half of the pixels have the noise (or at
+most `--samples`).
+Seed 000 took 8 hours for a picture of 1200 x 1200 pixels (figure 12).
 """
 
 from __future__ import annotations

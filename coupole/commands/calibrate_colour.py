@@ -84,8 +84,8 @@ def colour(
 
     def work(console: Console, request: Request) -> Outcome:
         known = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
-        frames = posed(open_light_frames(runs), hand_eye)
-        whites = None if white is None else posed(open_light_frames([white]), hand_eye)
+        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
+        whites = None if white is None else posed(open_light_frames([white]), hand_eye, rig, runs)
         used = rig or rig_of(runs[0])
         cell = read_cell(used)
         by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)

@@ -1,11 +1,11 @@
 """Rendering of 81 bands with a renderer that carries four wavelengths along a path.
 
-Mitsuba's spectral variants draw one wavelength from each quarter of what the film is sensitive to, for every path. A
-film that sees four neighbouring bands has one of them in each quarter. Spectra that are constant over each band are
-then rendered without noise from the choice of wavelengths, and those that Mitsuba knows itself (a map of the
-surroundings) have their mean over the band. With the same seed every group of four has the same random numbers. So
-there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took 5.6 times as long
-here for three times the noise.)
+Mitsuba's spectral variants draw one wavelength from each quarter of what the film is sensitive to, for every
+path. A film that sees four neighbouring bands has one of them in each quarter. Spectra that are constant over
+each band are then rendered without noise from the choice of wavelengths, and those that Mitsuba knows itself (a
+map of the surroundings) have their mean over the band. With the same seed every group of four has the same random
+numbers. So there is luminance noise, but hardly any colour noise. (A film of 81 channels and full spectra took
+5.6 times as long here for three times the noise.)
 
 Lights are known every 5 nm. With coarser steps a rendered band has a light's mean about it, and `weights`
 integrate over the light's own structure; only the reflectances are interpolated (as ASTM E308's tables do).

@@ -14,6 +14,7 @@ from coupole.appearance.render.caustic import Reflectance, Sun
 from coupole.appearance.render.lights import Distant, PlainLight
 from coupole.appearance.render.materials import Diffuse, Gilt, Material, Metal, metal_of
 from coupole.appearance.render.model import unit
+from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.photon_map import Matt, Mirror, Room, seen_by_gold
 from coupole.appearance.render.pieces import Ball
 from coupole.appearance.render.rendering import Spectral, opened
@@ -103,7 +104,7 @@ def _room(scene: PlainScene, folder: Path) -> Room:
     return Room(surfaces)
 
 
-def _surface(material: Material, corners_mm: Array, folder: Path, name: str) -> Mirror | Matt:
+def _surface(material: Material | Pane, corners_mm: Array, folder: Path, name: str) -> Mirror | Matt:
     if isinstance(material, Diffuse):
         return Matt(corners_mm, matt(material.reflectance, folder).values)
     if isinstance(material, Gilt):

@@ -8,17 +8,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coupole.appearance.render import absorption, bands, lights, objects
+from coupole.appearance.render import absorption, bands, candle, lights, objects, panes
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.materials import Glass, Material, bsdf
+from coupole.appearance.render.materials import Diffuse, Glass, Material, bsdf
 from coupole.appearance.render.model import unit
+from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene
+from coupole.appearance.render.spectra import Constant
 from coupole.appearance.shapes.triangles import welded
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
 right-handed circular light."""
+_BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
@@ -26,21 +29,45 @@ _FILTER_MM = 1.0
 def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[Piece] = ()) -> Description:
     """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
+    reach_mm = 0.0
     of_objects = [objects.pieces(thing, folder) for thing in scene.objects]
     for number, pieces in enumerate([*of_objects, more]):
         for row, piece in enumerate(pieces):
             name = f"object{number}_{row}"
             if isinstance(piece, Ball):
+                reach_mm = max(reach_mm, float(np.linalg.norm(piece.centre_mm)) + piece.radius_mm)
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
+                reach_mm = max(reach_mm, float(np.linalg.norm(piece.corners_mm, axis=2).max()))
                 shape = _mesh(piece, meshes / f"{name}.ply")
-            parts[name] = {**shape, "bsdf": bsdf(piece.material, folder), **_inside(piece.material, folder)}
+            parts[name] = {**shape, "bsdf": _surface(piece.material, folder), **_inside(piece.material, folder)}
     step_nm = scene.bands.step_nm
     in_units = lights.radiance_unit(scene.lights, folder, step_nm)
+    setting = lights.Setting(folder, step_nm, in_units, reach_mm)
     for number, light in enumerate(scene.lights):
-        for row, emitter in enumerate(lights.emitters(light, folder, step_nm, in_units, mi)):
-            parts[f"light{number}_{row}"] = emitter
+        found = lights.emitters(light, setting, mi)
+        if isinstance(light, candle.Candle):
+            parts |= _candle(light, found[0], f"light{number}", folder, meshes)
+        else:
+            parts |= {f"light{number}_{row}": emitter for row, emitter in enumerate(found)}
     return parts
+
+
+def _candle(light: candle.Candle, emitter: Description, name: str, folder: Path, meshes: Path) -> Description:
+    """Its flame, and its wax if it has any."""
+    bodies = {f"{name}_flame": objects.Piece(candle.flame(light), _BLACK)}
+    if light.wax_height_mm > 0.0:
+        bodies[f"{name}_wax"] = objects.Piece(candle.stem(light), light.wax)
+    parts = {
+        key: {**_mesh(piece, meshes / f"{key}.ply"), "bsdf": _surface(piece.material, folder)}
+        for key, piece in bodies.items()
+    }
+    parts[f"{name}_flame"]["emitter"] = emitter
+    return parts
+
+
+def _surface(material: Material | Pane, folder: Path) -> Description:
+    return panes.bsdf(material, folder) if isinstance(material, Pane) else bsdf(material, folder)
 
 
 def seen(
@@ -55,7 +82,7 @@ def seen(
         "fov": camera.field_deg(),
         "fov_axis": "x",
         "near_clip": 0.1 * _FILTER_MM,
-        "far_clip": 1e6,
+        "far_clip": 1e8,
         "to_world": look,
         "film": bands.film(camera.width_px, camera.height_px),
         "sampler": {"type": "independent"},
@@ -73,7 +100,7 @@ def seen(
     return description
 
 
-def _inside(material: Material, folder: Path) -> Description:
+def _inside(material: Material | Pane, folder: Path) -> Description:
     """The medium of a body, if it absorbs."""
     if not isinstance(material, Glass) or material.absorption is None:
         return {}
@@ -82,9 +109,13 @@ def _inside(material: Material, folder: Path) -> Description:
 
 
 def _integrator(parts: Description) -> str:
-    """For media, that which weighs a way by all bands of a group: their absorption may differ by far."""
-    has_media = any(isinstance(part, dict) and "interior" in part for part in parts.values())
-    return "volpathmis" if has_media else "path"
+    """For media, that which weighs a way by all bands of a group: their absorption may differ by far. Behind a pane
+    light is found by what looks for it through panes."""
+    bodies = [part for part in parts.values() if isinstance(part, dict)]
+    if any("interior" in part for part in bodies):
+        return "volpathmis"
+    has_panes = any(part.get("bsdf", {}).get("type") == panes.PLUGIN for part in bodies)
+    return "volpath" if has_panes else "path"
 
 
 def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:

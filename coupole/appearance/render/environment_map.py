@@ -1,9 +1,10 @@
-"""Light from a picture of all directions: an equirectangular HDR map, as photographed of a mirror ball or stitched.
+"""Light from a picture of all directions: an equirectangular HDR map, as photographed of a mirror ball or
+stitched.
 
-Pixels are linear, of the primaries of sRGB (ITU-R BT.709) and white D65. A pixel becomes the smooth spectrum that has
-its colour under D65 (Jakob and Hanika, "A Low-Dimensional Function Space for Efficient Spectral Upsampling", Computer
-Graphics Forum 38(2), 2019; Mitsuba's table), times the light's own white. Mitsuba draws directions by the map's
-luminance, the same for all bands.
+Pixels are linear, of the primaries of sRGB (ITU-R BT.709) and white D65. A pixel becomes the smooth spectrum that
+has its colour under D65 (Jakob and Hanika, "A Low-Dimensional Function Space for Efficient Spectral Upsampling",
+Computer Graphics Forum 38(2), 2019; Mitsuba's table), times the light's own white. Mitsuba draws directions by
+the map's luminance, the same for all bands.
 """
 
 from __future__ import annotations
@@ -138,7 +139,8 @@ def emitter(source: EnvironmentMap, folder: Path, mi: Any) -> Any:
 
 
 def _refined(pixels: Array) -> Array:
-    """The map at nodes of Mitsuba's, whose rows go from zenith to nadir, where pixels are half a step from the poles.
+    """The map at nodes of Mitsuba's, whose rows go from zenith to nadir, where pixels are half a step from the
+    poles.
 
     Mitsuba interpolates brightness and colour apart: they are close together, and interpolated here, by their
     products.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 from pydantic import AwareDatetime, Field, model_validator
 
 from coupole.appearance.render.bands import Description, StepNm, around_nodes
+from coupole.appearance.render.candle import Candle
 from coupole.appearance.render.environment_map import EnvironmentMap, emitter, factor
 from coupole.appearance.render.led_squares import read_leds
 from coupole.appearance.render.model import Model, Positive, Share, Vector, unit
@@ -20,8 +22,8 @@ from coupole.appearance.spectra.light_series import read_series
 from coupole.errors import InputError
 
 LED_SIDE_MM = 7.0
-_FAR_MM = 1e5
-"""Distance of the sun's disk in mm, limited by single precision."""
+_FAR_MM, _FAR_REACHES = 1e5, 100.0
+"""Distance of the sun's disk, in mm and in sizes of the scene, at least; limited by single precision."""
 _MM2 = 1e-6
 _SAME_HEIGHT_DEG = 1.0
 
@@ -77,7 +79,7 @@ class Environment(Model):
     spectrum: Power
 
 
-PlainLight = Leds | Distant | Area | Environment | EnvironmentMap
+PlainLight = Leds | Distant | Area | Environment | EnvironmentMap | Candle
 
 
 class Daylight(Model):
@@ -150,12 +152,28 @@ def radiance_unit(lights: Iterable[PlainLight], folder: Path, step_nm: StepNm) -
     return factor(maps[0], folder, step_nm) if maps else np.ones(BANDS)
 
 
-def emitters(light: PlainLight, folder: Path, step_nm: StepNm, radiance_unit: Array, mi: Any) -> list[Description]:
-    """The light for Mitsuba, in `radiance_unit` [81] W/(m^2 sr nm); paths are relative to `folder`. Raises InputError."""
+@dataclass(frozen=True)
+class Setting:
+    """What lights depend on."""
+
+    folder: Path
+    """Of relative paths."""
+    step_nm: StepNm
+    radiance_unit: Array
+    """[81] W/(m^2 sr nm)."""
+    reach_mm: float
+    """Of the scene's objects from the origin."""
+
+
+def emitters(light: PlainLight, setting: Setting, mi: Any) -> list[Description]:
+    """The light for Mitsuba; of a candle, what its flame's body emits. Raises InputError."""
+    folder = setting.folder
     if isinstance(light, EnvironmentMap):
         return [emitter(light, folder, mi)]
     found = power(light.spectrum, folder)
-    shape = around_nodes(found, step_nm) / luminous(found) / radiance_unit
+    shape = around_nodes(found, setting.step_nm) / luminous(found) / setting.radiance_unit
+    if isinstance(light, Candle):
+        return [{"type": "area", "radiance": shape * light.luminance_cd_m2()}]
     if isinstance(light, Environment):
         return [{"type": "constant", "radiance": shape * light.luminance_cd_m2}]
     if isinstance(light, Area):
@@ -169,17 +187,18 @@ def emitters(light: PlainLight, folder: Path, step_nm: StepNm, radiance_unit: Ar
             )
         ]
     if isinstance(light, Distant):
-        return [_distant(light, shape * light.illuminance_lux, mi)]
+        return [_distant(light, shape * light.illuminance_lux, setting.reach_mm, mi)]
     return _leds(light, shape, folder, mi)
 
 
-def _distant(light: Distant, irradiance: Array, mi: Any) -> Description:
+def _distant(light: Distant, irradiance: Array, reach_mm: float, mi: Any) -> Description:
     way = unit(light.direction)
     if light.width_deg == 0.0:
         return {"type": "directional", "direction": list(way), "irradiance": irradiance}
     sine = np.sin(np.radians(light.width_deg / 2))
-    away = [-_FAR_MM * component for component in way]
-    radius_mm = _FAR_MM * np.tan(np.radians(light.width_deg / 2))
+    far_mm = max(_FAR_MM, _FAR_REACHES * reach_mm)
+    away = [-far_mm * component for component in way]
+    radius_mm = far_mm * np.tan(np.radians(light.width_deg / 2))
     return {
         "type": "disk",
         "to_world": _look(mi, away, [0.0, 0.0, 0.0]) @ mi.ScalarTransform4f().scale([radius_mm, radius_mm, 1.0]),

@@ -8,16 +8,17 @@ from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from coupole.appearance.matter import nashiji
 from coupole.appearance.optics import indices
-from coupole.appearance.render import arcature
+from coupole.appearance.render import arcature, church
 from coupole.appearance.render.absorption import Urushi
 from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
 from coupole.appearance.render.model import Pose, Positive, Roughness, Share
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.spectra import Constant, Shape
+from coupole.appearance.render.stained_glass import Glazing, window
 from coupole.appearance.render.urushi import Makie, Nashiji, makie_pieces, nashiji_pieces
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.mesh_file import mesh_corners
@@ -26,6 +27,8 @@ from coupole.appearance.shapes.triangles import rectangle, slab
 
 _PRINT = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.035))
 """The black body of the wedges."""
+_LEAD = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.1))
+_STONE = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.45))
 _NASHIJI_BODY_MM = 6.0
 _DIP_MM = 0.01
 _RELIEF_MM = 18.0
@@ -127,6 +130,48 @@ class Arcature(Pose):
     stone: Material = Diffuse(kind="diffuse", reflectance=Shape(kind="shape", name="dull_yellow_shape"))
 
 
+class StainedGlass(Glazing, Pose):
+    """A window of coloured panes in y = 0, upright: x across, z up from the sill."""
+
+    kind: Literal["stained_glass"]
+    width_mm: Positive
+    height_mm: Positive
+    lead: Material = _LEAD
+
+
+class Church(Pose):
+    """The inside of a small church (`coupole.appearance.render.church`): y along the nave, z up from the floor."""
+
+    kind: Literal["church"]
+    width_mm: Positive = 6000.0
+    length_mm: Positive = 12000.0
+    spring_mm: Positive = 5000.0
+    """From the floor to where the vault begins."""
+    bays: Annotated[int, Field(ge=1, le=20)] = 3
+    wall_mm: Positive = 600.0
+    window_width_mm: Positive = 1000.0
+    window_sill_mm: Positive = 1800.0
+    window_spring_mm: Positive = 3800.0
+    stone: Material = _STONE
+    light_tiles: Material = _STONE
+    dark_tiles: Material = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.12))
+    glazing: Glazing | None = None
+    """Of all windows; without it they are open."""
+    lead: Material = _LEAD
+
+    @model_validator(mode="after")
+    def _fits(self) -> Church:
+        top_mm = self.window_spring_mm + np.sqrt(0.75) * self.window_width_mm
+        bay_mm = min(self.length_mm / self.bays, self.width_mm)
+        if not self.window_sill_mm < self.window_spring_mm or top_mm >= self.spring_mm:
+            raise ValueError(
+                f"windows end {top_mm:.0f} mm high and must begin above their sill and end below `spring_mm`"
+            )
+        if self.window_width_mm >= 0.9 * bay_mm:
+            raise ValueError(f"windows are too wide for bays of {bay_mm:.0f} mm: make them narrower")
+        return self
+
+
 LocalObject = (
     Mesh
     | Plane
@@ -134,10 +179,11 @@ LocalObject = (
     | GiltStepWedge
     | PaintWedge
     | MakieTile
-    | Makie
     | NashijiSlab
     | Nashiji
     | Arcature
+    | StainedGlass
+    | Church
 )
 """Objects of triangles."""
 Object = Annotated[LocalObject | Sphere, Field(discriminator="kind")]
@@ -180,8 +226,33 @@ def _local(thing: LocalObject, folder: Path) -> list[Piece]:
         case Arcature():
             parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
             return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
+        case StainedGlass():
+            return _glazed(thing, thing.lead, thing.width_mm, thing.height_mm)
+        case Church():
+            return _church(thing)
         case _:
             assert_never(thing)
+
+
+def _church(thing: Church) -> list[Piece]:
+    size = church.Size(**{name: getattr(thing, name) for name in church.Size.__dataclass_fields__})
+    parts = church.church(size)
+    pieces = [
+        Piece(parts.stone_mm, thing.stone),
+        Piece(parts.light_tiles_mm, thing.light_tiles),
+        Piece(parts.dark_tiles_mm, thing.dark_tiles),
+    ]
+    for opening in parts.openings if thing.glazing else ():
+        assert thing.glazing is not None
+        glazed = _glazed(thing.glazing, thing.lead, opening.width_mm, opening.height_mm)
+        pieces += [_moved(piece, opening.church_from_window) for piece in glazed]
+    return pieces
+
+
+def _glazed(glazing: Glazing, lead: Material, width_mm: float, height_mm: float) -> list[Piece]:
+    panes, cames = window(glazing, width_mm, height_mm)
+    glass = [Piece(corners, Pane(colour=glazing.panes[letter])) for letter, corners in panes.items()]
+    return [*glass, Piece(cames, lead)]
 
 
 def _gilt_wedge(thing: GiltStepWedge) -> list[Piece]:
@@ -246,8 +317,11 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
 
 def placed(piece: Piece, pose: Pose) -> Piece:
     """A piece of a thing's own frame, in the scene's."""
-    scene_from_thing = pose.scene_from_thing()
-    rotation = scene_from_thing[:3, :3]
-    corners: NDArray[np.float64] = piece.corners_mm @ rotation.T + scene_from_thing[:3, 3]
+    return _moved(piece, pose.scene_from_thing())
+
+
+def _moved(piece: Piece, place: Array) -> Piece:
+    rotation = place[:3, :3]
+    corners: NDArray[np.float64] = piece.corners_mm @ rotation.T + place[:3, 3]
     normals = None if piece.normals is None else np.asarray(piece.normals @ rotation.T)
     return Piece(corners, piece.material, piece.smooth, normals)

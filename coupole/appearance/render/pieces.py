@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from coupole.appearance.render.materials import Material
+from coupole.appearance.render.panes import Pane
 from coupole.appearance.spectra.grid import Array
 
 
@@ -14,7 +15,7 @@ class Piece:
 
     corners_mm: Array
     """[triangles, 3, 3] in the scene's frame, counter-clockwise seen from outside."""
-    material: Material
+    material: Material | Pane
     smooth: bool = False
     """True for smooth shading."""
     normals: Array | None = None

@@ -14,6 +14,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.render import objects
 from coupole.appearance.render.materials import Glass, Lacquer, Material, Metal
 from coupole.appearance.render.objects import MakieTile, NashijiSlab
+from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import PlainScene, Scene, remarks, with_plain_lights
 from coupole.appearance.shapes import samples
@@ -161,6 +162,8 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Ma
 
 
 def _opaque(piece: Piece | Ball, found: _Materials, casts: bool) -> _Part:
+    if isinstance(piece.material, Pane):
+        raise InputError("a page has no light through coloured glass; leave `stained_glass` and glazing out")
     corners_mm = (
         piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS)
         if isinstance(piece, Ball)
@@ -196,7 +199,7 @@ def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[s
                 name = f"gold flake, roughness {metal.roughness:g}, in urushi"
                 flakes = found.add(flake_layers(metal.gold, metal.roughness, longest_mm), name)
             parts.append(_Part(piece.corners_mm, flakes))
-        else:
+        elif not isinstance(piece.material, Pane):
             parts.append(_Part(piece.corners_mm, found.number(piece.material)))
     face = {
         "normal": rotation[:, 2].tolist(),

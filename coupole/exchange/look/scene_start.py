@@ -10,6 +10,7 @@ from typing import Any, assert_never
 
 import numpy as np
 
+from coupole.appearance.render.candle import Candle
 from coupole.appearance.render.environment_map import EnvironmentMap
 from coupole.appearance.render.led_squares import read_leds
 from coupole.appearance.render.lights import Area, Distant, Environment, Leds, PlainLight
@@ -108,6 +109,8 @@ def _lamps(light: PlainLight, folder: Path, target: Array) -> Iterator[_Lamp]:
             raise InputError(
                 f"{light.path}: a page has no light from a map; take `environment` of the same mean luminance"
             )
+        case Candle():
+            raise InputError("a page has no candles; take an `area` of a few cm², or `distant`")
         case _:
             assert_never(light)
 

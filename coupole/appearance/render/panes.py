@@ -1,0 +1,140 @@
+"""Coloured glass of windows: thin sheets that filter light and let it pass straight on.
+
+Transmittance along the normal is exact, with all reflections between the two faces; at other angles the faces
+follow Fresnel, and the absorption stays that along the normal (at 45 degrees the way in glass is 1.13 times as
+long).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from coupole.appearance.optics import fresnel
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.model import Index, Model, Positive
+from coupole.appearance.spectra import measured, resampling
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
+
+PLUGIN = "thindielectric"
+"""Mitsuba's."""
+_SHAPES: dict[str, tuple[tuple[float, float, float], ...]] = {
+    "cobalt_blue_shape": ((1.0, 540.0, 22.0), (1.35, 592.0, 22.0), (1.25, 645.0, 25.0)),
+    "copper_ruby_shape": ((1.6, 562.0, 16.0), (1.5, 480.0, 70.0), (0.8, 395.0, 35.0)),
+    "silver_yellow_shape": ((1.9, 410.0, 42.0),),
+    "manganese_purple_shape": ((1.2, 495.0, 45.0), (0.25, 570.0, 45.0)),
+    "copper_green_shape": ((1.7, 790.0, 105.0), (1.5, 380.0, 42.0)),
+}
+"""Assumed: optical density, centre and width in nm of absorption bands. Centres are where colourants of glass
+absorb (cobalt in tetrahedra, copper and silver colloids, trivalent manganese, bivalent copper); densities are no
+measurement."""
+
+
+class Transmitted(Model):
+    """Measured on a sheet along its normal, reflections at its faces included."""
+
+    kind: Literal["transmittance"]
+    path: Path
+    column: int | None = None
+
+
+class Absorbed(Model):
+    """By the coefficient of absorption of a glass in 1/mm (natural logarithm), and the sheet's thickness."""
+
+    kind: Literal["absorption"]
+    path: Path
+    column: int | None = None
+    thickness_mm: Positive
+
+
+class AssumedGlass(Model):
+    """An assumed spectrum, of `density` times its usual depth of colour."""
+
+    kind: Literal["shape"]
+    name: Literal[
+        "cobalt_blue_shape",
+        "copper_ruby_shape",
+        "silver_yellow_shape",
+        "manganese_purple_shape",
+        "copper_green_shape",
+    ]
+    density: Annotated[float, Field(gt=0, le=10)] = 1.0
+
+
+class Clear(Model):
+    """Glass that absorbs nothing."""
+
+    kind: Literal["clear"]
+
+
+Colour = Annotated[Transmitted | Absorbed | AssumedGlass | Clear, Field(discriminator="kind")]
+
+
+class Pane(Model):
+    """A sheet of glass."""
+
+    kind: Literal["pane"] = "pane"
+    colour: Colour
+    index: Index = 1.52
+
+
+def passage(pane: Pane, folder: Path) -> Array:
+    """[81], what is left of light on one way through the glass itself, along the normal. Raises InputError."""
+    colour = pane.colour
+    if isinstance(colour, Clear):
+        return np.ones_like(WAVELENGTHS_NM)
+    if isinstance(colour, AssumedGlass):
+        bands = sum(
+            d * np.exp(-0.5 * ((WAVELENGTHS_NM - nm) / width) ** 2) for d, nm, width in _SHAPES[colour.name]
+        )
+        return np.asarray(10.0 ** (-colour.density * bands))
+    path = folder / colour.path
+    if isinstance(colour, Absorbed):
+        read = measured.read_spectrum(path, unit="power", column=colour.column)
+        per_mm = resampling.held(resampling.on_grid(read))
+        if per_mm.min() < 0.0:
+            raise InputError(f"{path}: expected 0 or more per mm, found {per_mm.min():.3g}; correct it")
+        return np.asarray(np.exp(-per_mm * colour.thickness_mm))
+    through = resampling.held(resampling.on_grid(measured.read_spectrum(path, column=colour.column)))
+    most = float(sheet(np.ones(1), _face(pane))[1][0])
+    if through.min() < 0.0 or through.max() > most + 0.01:
+        raise InputError(
+            f"{path}: expected transmittances from 0 to {most:.3f}, that of clear glass of index {pane.index:g}, "
+            f"found {through.min():.3g} to {through.max():.3g}; give those of the whole sheet"
+        )
+    return _inside(np.clip(through, 0.0, most), _face(pane))
+
+
+def sheet(left: Array, face: float) -> tuple[Array, Array]:
+    """Reflectance and transmittance of a sheet that leaves `left` of light on each way, and whose faces reflect
+    `face`: the sums over all reflections between them."""
+    through = (1.0 - face) ** 2 * left / (1.0 - (face * left) ** 2)
+    return np.asarray(face + face * left * through), np.asarray(through)
+
+
+def _inside(through: Array, face: float) -> Array:
+    """The inverse of `sheet`'s transmittance, a quadratic equation."""
+    half = 0.5 * (1.0 - face) ** 2
+    return np.asarray(through / (half + np.sqrt(half**2 + (face * through) ** 2)))
+
+
+def _face(pane: Pane) -> float:
+    return float(fresnel.reflectance(1.0, pane.index))
+
+
+def bsdf(pane: Pane, folder: Path) -> Description:
+    """The sheet for Mitsuba, whose own is clear: its parts are multiplied by what colour makes of them."""
+    face = _face(pane)
+    reflected, through = sheet(passage(pane, folder), face)
+    clear_reflected, clear_through = sheet(np.ones(1), face)
+    return {
+        "type": PLUGIN,
+        "int_ior": pane.index,
+        "ext_ior": 1.0,
+        "specular_reflectance": reflected / clear_reflected,
+        "specular_transmittance": through / clear_through,
+    }

@@ -7,16 +7,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coupole.appearance.render import bands, lights, objects
+from coupole.appearance.render import bands, lights, objects, weathered_mesh
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.materials import bsdf
+from coupole.appearance.render.materials import Dusty, Material, Worn, bsdf
+from coupole.appearance.render.materials.weathering import Weathered, needs_mesh
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.scene_file import Camera, PlainScene
+from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import welded
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
 right-handed circular light."""
+_BALL_PARTS = 64
+"""A weathered ball has 20 times their square of triangles."""
 _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
@@ -24,14 +28,20 @@ _FILTER_MM = 1.0
 def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any) -> Description:
     """Objects and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
+    made: dict[Material, Description] = {}
     for number, thing in enumerate(scene.objects):
         for row, piece in enumerate(objects.pieces(thing, folder)):
             name = f"object{number}_{row}"
-            if isinstance(piece, objects.Ball):
+            material = piece.material
+            if isinstance(material, Worn | Dusty) and needs_mesh(material):
+                shape = _weathered(piece, material, meshes / f"{name}.ply")
+            elif isinstance(piece, objects.Ball):
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
                 shape = _mesh(piece, meshes / f"{name}.ply")
-            parts[name] = {**shape, "bsdf": bsdf(piece.material, folder)}
+            if material not in made:
+                made[material] = bsdf(material, folder)
+            parts[name] = {**shape, "bsdf": made[material]}
     for number, light in enumerate(scene.lights):
         for row, emitter in enumerate(lights.emitters(light, folder, scene.bands.step_nm, mi)):
             parts[f"light{number}_{row}"] = emitter
@@ -76,6 +86,15 @@ def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:
     )
     kind: Description = {"type": "circular"} if through == "circular" else {"type": "polarizer", "theta": through}
     return {"type": "rectangle", "to_world": look @ place, "bsdf": kind}
+
+
+def _weathered(piece: objects.Piece | objects.Ball, material: Weathered, path: Path) -> Description:
+    if isinstance(piece, objects.Ball):
+        corners_mm, smooth = piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS), True
+    else:
+        corners_mm, smooth = piece.corners_mm, piece.smooth
+    weathered_mesh.write(corners_mm, material, path, smooth=smooth)
+    return {"type": "ply", "filename": str(path), "face_normals": not smooth}
 
 
 def _mesh(piece: objects.Piece, path: Path) -> Description:

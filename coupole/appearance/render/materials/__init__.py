@@ -19,6 +19,7 @@ from coupole.appearance.render.materials.plain import (
     Metal,
     Paint,
     Plain,
+    diffuse,
     films_of,
     gilt_of,
     lacquer_body,
@@ -28,10 +29,13 @@ from coupole.appearance.render.materials.plain import (
     plain_bsdf,
     under_face,
 )
+from coupole.appearance.render.materials.weathering import Dusty, Weathered, Worn, blended
+from coupole.appearance.render.spectra import matt
 
 __all__ = [
     "THINNEST_NM",
     "Diffuse",
+    "Dusty",
     "Films",
     "FourFlux",
     "Gilt",
@@ -42,6 +46,7 @@ __all__ = [
     "Metal",
     "Paint",
     "Plain",
+    "Worn",
     "bsdf",
     "films_of",
     "gilt_of",
@@ -52,7 +57,7 @@ __all__ = [
     "under_face",
 ]
 
-Material = Annotated[Plain | Coating | Glass, Field(discriminator="kind")]
+Material = Annotated[Plain | Coating | Weathered | Glass, Field(discriminator="kind")]
 
 
 def bsdf(material: Material, folder: Path) -> Description:
@@ -62,7 +67,12 @@ def bsdf(material: Material, folder: Path) -> Description:
     return {"type": "twosided", "material": _one_side(material, folder)}
 
 
-def _one_side(material: Plain | Coating, folder: Path) -> Description:
+def _one_side(material: Plain | Coating | Weathered, folder: Path) -> Description:
+    if isinstance(material, Worn):
+        return blended(material, _one_side(material.over, folder), _one_side(material.under, folder))
+    if isinstance(material, Dusty):
+        dust = diffuse(matt(material.reflectance, folder).values)
+        return blended(material, _one_side(material.over, folder), dust)
     if isinstance(material, Coating):
         return coating_bsdf(material, folder)
     return plain_bsdf(material, folder)

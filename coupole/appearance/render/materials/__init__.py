@@ -9,6 +9,7 @@ from pydantic import Field
 
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials.coatings import Coating, FourFlux, Layers, coating_bsdf
+from coupole.appearance.render.materials.measured_material import MeasuredMaterial, measured_bsdf
 from coupole.appearance.render.materials.plain import (
     THINNEST_NM,
     Diffuse,
@@ -43,6 +44,7 @@ __all__ = [
     "Lacquer",
     "Layers",
     "Material",
+    "MeasuredMaterial",
     "Metal",
     "Paint",
     "Plain",
@@ -57,7 +59,7 @@ __all__ = [
     "under_face",
 ]
 
-Material = Annotated[Plain | Coating | Weathered | Glass, Field(discriminator="kind")]
+Material = Annotated[Plain | Coating | MeasuredMaterial | Weathered | Glass, Field(discriminator="kind")]
 
 
 def bsdf(material: Material, folder: Path) -> Description:
@@ -67,12 +69,14 @@ def bsdf(material: Material, folder: Path) -> Description:
     return {"type": "twosided", "material": _one_side(material, folder)}
 
 
-def _one_side(material: Plain | Coating | Weathered, folder: Path) -> Description:
+def _one_side(material: Plain | Coating | MeasuredMaterial | Weathered, folder: Path) -> Description:
     if isinstance(material, Worn):
         return blended(material, _one_side(material.over, folder), _one_side(material.under, folder))
     if isinstance(material, Dusty):
         dust = diffuse(matt(material.reflectance, folder).values)
         return blended(material, _one_side(material.over, folder), dust)
+    if isinstance(material, MeasuredMaterial):
+        return measured_bsdf(material, folder)
     if isinstance(material, Coating):
         return coating_bsdf(material, folder)
     return plain_bsdf(material, folder)

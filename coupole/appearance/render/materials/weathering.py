@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials.coatings import Coating
+from coupole.appearance.render.materials.measured_material import MeasuredMaterial
 from coupole.appearance.render.materials.plain import Plain
 from coupole.appearance.render.model import Model, Positive, Share
 from coupole.appearance.render.spectra import Constant, Reflectance
@@ -44,7 +45,7 @@ class Edges(Model):
     seed: int = 1
 
 
-Solid = Annotated[Plain | Coating, Field(discriminator="kind")]
+Solid = Annotated[Plain | Coating | MeasuredMaterial, Field(discriminator="kind")]
 
 
 class Worn(Model):
@@ -69,7 +70,7 @@ class Dusty(Model):
     """Dust that lies on a material; grains overlap at random."""
 
     kind: Literal["dusty"]
-    over: Annotated[Plain | Coating | Worn, Field(discriminator="kind")]
+    over: Annotated[Plain | Coating | MeasuredMaterial | Worn, Field(discriminator="kind")]
     grams_per_m2: Annotated[float, Field(ge=0)]
     """On what faces up."""
     settles: Literal["up", "everywhere"] = "up"

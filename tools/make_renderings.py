@@ -26,6 +26,7 @@ QUICK = {
     "sunset-film": (24, 360, 20),
     "arcature": (96, 420, 20),
     "nashiji-stereo": (48, 280, 40),
+    "layers-and-wear": (48, 560, 40),
 }
 """Samples, width in pixels, nm between bands."""
 

@@ -32,6 +32,7 @@ QUICK = {
     "nashiji-stereo": (48, 280, 40),
     "church-candles": (48, 400, 40),
     "church-window": (48, 400, 40),
+    "layers-and-wear": (48, 560, 40),
 }
 """Samples, width in pixels, nm between bands."""
 BUST, BUST_QUICK = "restored-bust", (18, 400, None)

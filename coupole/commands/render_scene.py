@@ -83,7 +83,7 @@ def read_scene(path: Path) -> tuple[Document, Scene]:
     missing = [
         document.problem(at, f"no such file: {document.resolve(named)}")
         for at, named in files(scene)
-        if not document.resolve(named).is_file()
+        if not (document.resolve(named).is_file() or (document.resolve(named) / "result.json").is_file())
     ]
     if missing:
         raise InputError(missing)

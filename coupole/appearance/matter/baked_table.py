@@ -25,6 +25,7 @@ from coupole.appearance.matter.rgl_writing import (
     tensors,
 )
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
+from coupole.errors import InputError
 
 THETAS, SIDE = 32, 64
 _CROWDING = 1.3
@@ -91,9 +92,13 @@ def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, s
 
 def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
     """An isotropic file of the format as it is, with its own grid. Raises InputError."""
-    fields = {
-        name: value for name, value in read_fields(path).items() if name not in {"rgb", "spectra", "wavelengths"}
-    }
+    found = read_fields(path)
+    if "luminance" not in found:
+        raise InputError(f"{path}: expected a field `luminance`, by which directions are drawn; found none")
+    names = ("phi_i", "theta_i", "ndf", "sigma", "vndf", "luminance")
+    fields: dict[str, NDArray[Any]] = {name: np.asarray(found[name], np.float32) for name in names}
+    fields["description"] = np.frombuffer(b"from a file", np.uint8)
+    fields["jacobian"] = np.array([table.jacobian], np.uint8)
     return BakedTable(fields, np.ascontiguousarray(np.moveaxis(table.values, -1, 2)), to_bands)
 
 

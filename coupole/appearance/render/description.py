@@ -8,20 +8,24 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coupole.appearance.render import absorption, bands, candle, lights, objects, panes
+from coupole.appearance.render import absorption, bands, candle, lights, objects, panes, weathered_mesh
 from coupole.appearance.render.bands import Description
-from coupole.appearance.render.materials import Diffuse, Glass, Material, bsdf
+from coupole.appearance.render.materials import Diffuse, Dusty, Glass, Material, Worn, bsdf
+from coupole.appearance.render.materials.weathering import Weathered, needs_mesh
 from coupole.appearance.render.model import unit
 from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.render.spectra import Constant
+from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import welded
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
 right-handed circular light."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
+_BALL_PARTS = 64
+"""A weathered ball has 20 times their square of triangles."""
 _FILTER_MM = 1.0
 """From the projection centre to the polariser."""
 
@@ -30,17 +34,22 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
     """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
     reach_mm = 0.0
+    made: dict[Material | Pane, Description] = {}
     of_objects = [objects.pieces(thing, folder) for thing in scene.objects]
     for number, pieces in enumerate([*of_objects, more]):
         for row, piece in enumerate(pieces):
             name = f"object{number}_{row}"
-            if isinstance(piece, Ball):
-                reach_mm = max(reach_mm, float(np.linalg.norm(piece.centre_mm)) + piece.radius_mm)
+            material = piece.material
+            reach_mm = max(reach_mm, _reach_mm(piece))
+            if isinstance(material, Worn | Dusty) and needs_mesh(material):
+                shape = _weathered(piece, material, meshes / f"{name}.ply")
+            elif isinstance(piece, Ball):
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
-                reach_mm = max(reach_mm, float(np.linalg.norm(piece.corners_mm, axis=2).max()))
                 shape = _mesh(piece, meshes / f"{name}.ply")
-            parts[name] = {**shape, "bsdf": _surface(piece.material, folder), **_inside(piece.material, folder)}
+            if material not in made:
+                made[material] = _surface(material, folder)
+            parts[name] = {**shape, "bsdf": made[material], **_inside(material, folder)}
     step_nm = scene.bands.step_nm
     in_units = lights.radiance_unit(scene.lights, folder, step_nm)
     setting = lights.Setting(folder, step_nm, in_units, reach_mm)
@@ -53,11 +62,18 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
     return parts
 
 
+def _reach_mm(piece: Piece | Ball) -> float:
+    """From the origin to its farthest point."""
+    if isinstance(piece, Ball):
+        return float(np.linalg.norm(piece.centre_mm)) + piece.radius_mm
+    return float(np.linalg.norm(piece.corners_mm, axis=2).max())
+
+
 def _candle(light: candle.Candle, emitter: Description, name: str, folder: Path, meshes: Path) -> Description:
     """Its flame, and its wax if it has any."""
-    bodies = {f"{name}_flame": objects.Piece(candle.flame(light), _BLACK)}
+    bodies = {f"{name}_flame": Piece(candle.flame(light), _BLACK)}
     if light.wax_height_mm > 0.0:
-        bodies[f"{name}_wax"] = objects.Piece(candle.stem(light), light.wax)
+        bodies[f"{name}_wax"] = Piece(candle.stem(light), light.wax)
     parts = {
         key: {**_mesh(piece, meshes / f"{key}.ply"), "bsdf": _surface(piece.material, folder)}
         for key, piece in bodies.items()
@@ -126,6 +142,15 @@ def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:
     )
     kind: Description = {"type": "circular"} if through == "circular" else {"type": "polarizer", "theta": through}
     return {"type": "rectangle", "to_world": look @ place, "bsdf": kind}
+
+
+def _weathered(piece: Piece | Ball, material: Weathered, path: Path) -> Description:
+    if isinstance(piece, Ball):
+        corners_mm, smooth = piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS), True
+    else:
+        corners_mm, smooth = piece.corners_mm, piece.smooth
+    weathered_mesh.write(corners_mm, material, path, smooth=smooth)
+    return {"type": "ply", "filename": str(path), "face_normals": not smooth}
 
 
 def _mesh(piece: Piece, path: Path) -> Description:

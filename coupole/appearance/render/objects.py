@@ -16,6 +16,7 @@ from coupole.appearance.render import arcature, church
 from coupole.appearance.render.absorption import Urushi
 from coupole.appearance.render.materials import Diffuse, Gilt, Glass, Lacquer, Material, Metal, Paint
 from coupole.appearance.render.model import Pose, Positive, Roughness, Share
+from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.spectra import Constant, Shape
 from coupole.appearance.render.stained_glass import Glazing, window

@@ -28,8 +28,9 @@ RED = {"kind": "shape", "name": "red_shape"}
 VARNISH = {"kind": "clear", "absorption": {"kind": "typical_varnish", "age": 1.0}, "thickness_mm": 0.05}
 LIGHT_DEG = 30.0
 """Of the light to the normal, on the side of -x."""
-ELEVATIONS_DEG = (90.0, 60.0, 40.0)
-"""Of cameras on the side of +x: 30 degrees from the mirror direction, in it, and 20 beyond."""
+ELEVATIONS_DEG = (82.0, 57.0, 40.0)
+"""Of cameras on the side of +x: before, near and beyond the mirror direction at 60; there and upright made-up
+tables are not defined."""
 
 
 def reflected(material: dict[str, Any]) -> np.ndarray:

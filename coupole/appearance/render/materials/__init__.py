@@ -9,6 +9,7 @@ from pydantic import Field
 
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials.coatings import Coating, FourFlux, Layers, coating_bsdf
+from coupole.appearance.render.materials.measured_material import MeasuredMaterial, measured_bsdf
 from coupole.appearance.render.materials.plain import (
     THINNEST_NM,
     Diffuse,
@@ -19,6 +20,7 @@ from coupole.appearance.render.materials.plain import (
     Metal,
     Paint,
     Plain,
+    diffuse,
     films_of,
     gilt_of,
     lacquer_body,
@@ -28,10 +30,13 @@ from coupole.appearance.render.materials.plain import (
     plain_bsdf,
     under_face,
 )
+from coupole.appearance.render.materials.weathering import Dusty, Weathered, Worn, blended
+from coupole.appearance.render.spectra import matt
 
 __all__ = [
     "THINNEST_NM",
     "Diffuse",
+    "Dusty",
     "Films",
     "FourFlux",
     "Gilt",
@@ -39,9 +44,11 @@ __all__ = [
     "Lacquer",
     "Layers",
     "Material",
+    "MeasuredMaterial",
     "Metal",
     "Paint",
     "Plain",
+    "Worn",
     "bsdf",
     "films_of",
     "gilt_of",
@@ -52,7 +59,7 @@ __all__ = [
     "under_face",
 ]
 
-Material = Annotated[Plain | Coating | Glass, Field(discriminator="kind")]
+Material = Annotated[Plain | Coating | MeasuredMaterial | Weathered | Glass, Field(discriminator="kind")]
 
 
 def bsdf(material: Material, folder: Path) -> Description:
@@ -62,7 +69,14 @@ def bsdf(material: Material, folder: Path) -> Description:
     return {"type": "twosided", "material": _one_side(material, folder)}
 
 
-def _one_side(material: Plain | Coating, folder: Path) -> Description:
+def _one_side(material: Plain | Coating | MeasuredMaterial | Weathered, folder: Path) -> Description:
+    if isinstance(material, Worn):
+        return blended(material, _one_side(material.over, folder), _one_side(material.under, folder))
+    if isinstance(material, Dusty):
+        dust = diffuse(matt(material.reflectance, folder).values)
+        return blended(material, _one_side(material.over, folder), dust)
+    if isinstance(material, MeasuredMaterial):
+        return measured_bsdf(material, folder)
     if isinstance(material, Coating):
         return coating_bsdf(material, folder)
     return plain_bsdf(material, folder)

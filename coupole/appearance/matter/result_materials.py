@@ -1,0 +1,72 @@
+"""Materials of a result folder of `coupole reflectance` (docs/reference/result-folder.md): f = kd + ks D V by
+channel, GGX's D and the height-correlated V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from coupole.appearance.matter import brdf
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import InputError
+
+_LOBES = 12
+"""Into which the roughnesses of triangles are sorted."""
+
+
+def read_result(
+    folder: Path, fit: str = "ggx", *, cluster: int | None = None, triangles: Sequence[int] | None = None
+) -> Brdf:
+    """[..., 3] of one cluster, or of the mean over triangles by their numbers in the mesh (all if not given).
+
+    A mean is that of the triangles' f, each about its own normal, with the lobes in `_LOBES` groups of alike
+    roughness. Raises InputError.
+    """
+    if cluster is not None:
+        kd, ks, alpha = _read(folder, "clusters")[1:]
+        if not 0 <= cluster < len(kd):
+            raise InputError(f"{folder}: cluster: expected 0 to {len(kd) - 1}, found {cluster}")
+        chosen = np.array([cluster])
+    else:
+        numbers, kd, ks, alpha = _read(folder, fit)
+        known = np.isfinite(alpha) & np.isfinite(kd).all(axis=1) & np.isfinite(ks).all(axis=1)
+        chosen = np.flatnonzero(known if triangles is None else known & np.isin(numbers, triangles))
+        if not len(chosen):
+            raise InputError(f"{folder}: expected triangles with a material, found none; choose other triangles")
+    order = chosen[np.argsort(alpha[chosen])]
+    lobes = [
+        (ks[part].sum(axis=0) / len(order), float(np.average(alpha[part], weights=ks[part].sum(axis=1) + 1e-12)))
+        for part in np.array_split(order, min(_LOBES, len(order)))
+    ]
+    return partial(_mixed, kd=kd[order].mean(axis=0), lobes=lobes)
+
+
+def _mixed(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array, float]]) -> Array:
+    found = brdf.lambert(wi, wo, reflectance=np.pi * kd)
+    for ks, alpha in lobes:
+        found = found + ks * brdf.ggx(wi, wo, roughness=alpha, fresnel=lambda c: np.ones((*np.shape(c), 1)))
+    return found
+
+
+def _read(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:
+    """Numbers [n] of triangles (of `clusters`: of themselves), kd and ks [n, 3], alpha [n]."""
+    path = folder / "fits" / f"{name}.h5"
+    if not path.is_file():
+        does = "cluster" if name == "clusters" else "fit"
+        raise InputError(f"{path}: is not there; `coupole reflectance {does} {folder}` makes it")
+    try:
+        with h5py.File(path, "r") as file:
+            kd, ks, alpha = (file[key][()].astype(float) for key in ("kd", "ks", "alpha"))
+            numbers = np.asarray(file["triangles"][()] if name != "clusters" else range(len(alpha)), float)
+    except (OSError, KeyError) as error:
+        raise InputError(f"{path}: expected kd, ks and alpha of a fit: {error}; make it anew") from error
+    if kd.ndim != 2 or kd.shape[1] not in (1, 3):
+        raise InputError(f"{path}: expected one or three channels, found {kd.shape}")
+    wide = np.ones((1, 3)) if kd.shape[1] == 1 else np.ones(1)
+    return numbers, kd * wide, ks * wide, alpha

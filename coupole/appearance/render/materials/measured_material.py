@@ -1,0 +1,108 @@
+"""Materials that are measured, or were exported, as files: MERL's, RGL's and ALTA's formats, and our own results.
+
+Mitsuba reads them as tables of RGL's format: files of that format as they are, all others resampled. Spectra are
+kept; red, green and blue become smooth spectra by a published method, which are not measured.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.appearance.matter.alta_samples import interpolated, read_alta
+from coupole.appearance.matter.baked_table import BakedTable, bake, from_file, wavelengths_of
+from coupole.appearance.matter.brdf import Brdf
+from coupole.appearance.matter.merl_table import read_merl
+from coupole.appearance.matter.result_materials import read_result
+from coupole.appearance.matter.rgl_table import RglTable, read_bsdf
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.model import Model
+from coupole.appearance.render.variant import needed
+from coupole.appearance.spectra.grid import BANDS, Array
+from coupole.errors import InputError
+
+_THETAS, _SIDE = 48, 96
+_TURNS = 16
+"""Of an anisotropic surface."""
+
+
+class MeasuredMaterial(Model):
+    """A file `.binary` (MERL), `.bsdf` (RGL) or of ALTA's text, or the folder of a result of `coupole
+    reflectance`."""
+
+    kind: Literal["measured"]
+    path: Path
+    fit: Literal["ggx", "ggx_normal"] = "ggx"
+    """Of a result."""
+    cluster: Annotated[int, Field(ge=0)] | None = None
+    """Of a result; if not given, the mean of its triangles."""
+    triangles: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = None
+    """Of a result's mesh, whose mean is taken."""
+
+    @model_validator(mode="after")
+    def _one_region(self) -> MeasuredMaterial:
+        if self.cluster is not None and self.triangles is not None:
+            raise ValueError("give either `cluster` or `triangles`")
+        return self
+
+
+def measured_bsdf(material: MeasuredMaterial, folder: Path) -> Description:
+    """One side of it. Raises InputError."""
+    return {"type": "measured", "table": measured_table(material, folder)}
+
+
+def measured_table(material: MeasuredMaterial, folder: Path) -> BakedTable:
+    """For Mitsuba; paths are relative to `folder`. Raises InputError."""
+    path = folder / material.path
+    if path.suffix.lower() == ".bsdf":
+        table = read_bsdf(path)
+        to_bands = spectra_of_rgb() if table.wavelengths_nm is None else wavelengths_of(table)
+        if table.isotropic:
+            return from_file(path, table, to_bands)
+        return bake(_turned_to_all_sides(table), to_bands, thetas=_THETAS, side=_SIDE)
+    source = measured_brdf(material, folder)
+    up = np.array([[0.0, 0.0, 1.0]])
+    channels = source(up, up).shape[-1]
+    if channels not in (1, 3):
+        raise InputError(f"{path}: expected one or three values in each sample, found {channels}")
+    return bake(source, np.ones((1, BANDS)) if channels == 1 else spectra_of_rgb(), thetas=_THETAS, side=_SIDE)
+
+
+def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
+    """By the file's own channels [..., channels], as its reader has it. Raises InputError."""
+    path = folder / material.path
+    if path.is_dir():
+        return read_result(path, material.fit, cluster=material.cluster, triangles=material.triangles)
+    if material.cluster is not None or material.triangles is not None:
+        raise InputError(f"{path}: `cluster` and `triangles` are of a result's folder; leave them out")
+    match path.suffix.lower():
+        case ".binary":
+            return read_merl(path)
+        case ".bsdf":
+            return read_bsdf(path)
+        case _:
+            return interpolated(read_alta(path))
+
+
+def spectra_of_rgb() -> Array:
+    """[3, 81] spectra of reflectance that red, green and blue of linear sRGB stand for; they sum to 1.
+
+    Mallett and Yuksel, Spectral primary decomposition for rendering with sRGB reflectance, EGSR 2019: smooth
+    ones with the primaries' colours under D65, 2 degrees, none below 0.
+    """
+    functions = needed("colour", "materials").recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+    return np.asarray(functions.values, dtype=float).T
+
+
+def _turned_to_all_sides(table: RglTable) -> Brdf:
+    """The mean over turns of the surface about its normal: meshes have no direction of their own."""
+    angles = 2.0 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
+    turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in angles]
+
+    def mean(wi: Array, wo: Array) -> Array:
+        return np.asarray(sum(table(wi @ turn, wo @ turn) for turn in turns) / len(turns))
+
+    return mean

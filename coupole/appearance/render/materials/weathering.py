@@ -1,0 +1,111 @@
+"""Layers that are worn off or cracked, and dust on them: two materials by shares of the surface."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coupole.appearance.render.bands import Description
+from coupole.appearance.render.materials.coatings import Coating
+from coupole.appearance.render.materials.measured_material import MeasuredMaterial
+from coupole.appearance.render.materials.plain import Plain
+from coupole.appearance.render.model import Model, Positive, Share
+from coupole.appearance.render.spectra import Constant, Reflectance
+from coupole.appearance.spectra.grid import Array
+
+WORN, DUSTY = "worn", "dust"
+"""Numbers of each vertex in a mesh: share of the ground that shows, share that dust covers."""
+
+
+class Uniform(Model):
+    """Finer than can be seen."""
+
+    kind: Literal["uniform"]
+
+
+class Cracks(Model):
+    """Craquelure: cracks of one width between cells."""
+
+    kind: Literal["cracks"]
+    cell_mm: Positive
+    """Of a cell, in the mean of all."""
+    width_mm: Positive | None = None
+    """Of a crack; if not given, the `share` says it."""
+    seed: int = 1
+
+
+class Edges(Model):
+    """Rubbed off where the surface is convex."""
+
+    kind: Literal["edges"]
+    reach_mm: Positive
+    """Over which an edge is one."""
+    seed: int = 1
+
+
+Solid = Annotated[Plain | Coating | MeasuredMaterial, Field(discriminator="kind")]
+
+
+class Worn(Model):
+    """A layer that is off a share of the surface, where another material shows."""
+
+    kind: Literal["worn"]
+    over: Solid
+    under: Solid
+    share: Share | None = None
+    """Of the area where `under` shows."""
+    pattern: Annotated[Uniform | Cracks | Edges, Field(discriminator="kind")] = Uniform(kind="uniform")
+
+    @model_validator(mode="after")
+    def _one_measure(self) -> Worn:
+        by_width = isinstance(self.pattern, Cracks) and self.pattern.width_mm is not None
+        if by_width == (self.share is not None):
+            raise ValueError("give either `share`, or `width_mm` of a pattern of cracks")
+        return self
+
+
+class Dusty(Model):
+    """Dust that lies on a material; grains overlap at random."""
+
+    kind: Literal["dusty"]
+    over: Annotated[Plain | Coating | MeasuredMaterial | Worn, Field(discriminator="kind")]
+    grams_per_m2: Annotated[float, Field(ge=0)]
+    """On what faces up."""
+    settles: Literal["up", "everywhere"] = "up"
+    """`up`: per area of ground plan, z up; nothing on what faces down."""
+    grain_um: Positive = 20.0
+    """Diameter of a grain."""
+    density_g_cm3: Positive = 2.0
+    reflectance: Reflectance = Constant(kind="constant", value=0.35)
+    """Of thick dust."""
+
+    def covered(self, upward: Array) -> Array:
+        """Share of the surface under grains, by the normals' upward parts [n].
+
+        Spheres in random places hide 1 - exp(-N a), with N a = 3 m/(2 density diameter) of the mass m per area.
+        """
+        lying = np.maximum(upward, 0.0) if self.settles == "up" else np.ones_like(upward)
+        return -np.expm1(-1.5 * self.grams_per_m2 * lying / (self.density_g_cm3 * self.grain_um))
+
+
+Weathered = Worn | Dusty
+
+
+def needs_mesh(material: Weathered) -> bool:
+    """Whether shares differ from place to place."""
+    if isinstance(material, Dusty):
+        return material.settles == "up" or (isinstance(material.over, Worn) and needs_mesh(material.over))
+    return not isinstance(material.pattern, Uniform)
+
+
+def blended(material: Weathered, over: Description, under: Description) -> Description:
+    """`under` by its share, one number or the mesh's."""
+    weight: Description | float
+    if isinstance(material, Worn):
+        by_mesh, name, share = needs_mesh(material), WORN, material.share
+    else:
+        by_mesh, name, share = material.settles == "up", DUSTY, float(material.covered(np.ones(1))[0])
+    weight = {"type": "mesh_attribute", "name": f"vertex_{name}"} if by_mesh else float(share or 0.0)
+    return {"type": "blendbsdf", "weight": weight, "over": over, "under": under}

@@ -26,6 +26,8 @@ QUICK = {
     "sunset-film": (24, 360, 20),
     "arcature": (96, 420, 20),
     "nashiji-stereo": (48, 280, 40),
+    "nashiji-bowl": (48, 360, 40),
+    "makie-box": (16, 360, 40),
 }
 """Samples, width in pixels, nm between bands."""
 

@@ -99,7 +99,8 @@ def test_files_with_exif_are_merged_by_the_command_and_read_elsewhere(tmp_path: 
     assert channels["saturated"].pixels[45, 45] == 1.0
     assert channels["contradicting"].pixels[:20, :20].mean() > 0.7
     assert np.isinf(channels["u.R"].pixels[45, 45])
-    assert Image.open(tmp_path / "merged-response.png").size[0] > 300
+    with Image.open(tmp_path / "merged-response.png") as drawn:
+        assert drawn.size[0] > 300
 
 
 def test_linear_values_are_a_straight_line(tmp_path: Path) -> None:

@@ -70,6 +70,45 @@ def bracket(
         console.print(line, markup=False)
 
 
+def sphere_brdf(
+    sample: Annotated[
+        Path, typer.Argument(help="YAML of sphere, lights, white and photographs.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The table, MERL's format (.binary).", show_default=False)],
+    as_json: JsonOption = False,
+) -> None:
+    """The BRDF of a finish from merged photographs of a sphere of it, each under one light from afar."""
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        if out.suffix.lower() != ".binary":
+            raise InputError(f"--out {out}: expected a name that ends in .binary")
+        with console.status("fitting"):
+            from coupole.exchange.bracket import sphere_brdf as fitting
+            from coupole.exchange.bracket.merged_files import read_known
+            from coupole.exchange.of_results.merl import encode_reflectance
+            from coupole.plan import yamlfile
+            from coupole.storage.durable import write_synced
+
+            given = yamlfile.read(sample).validate(fitting.SphereSample)
+            pictures = [read_known(sample.parent / lit.path) for lit in given.photographs]
+            samples = fitting.samples_of(given, pictures)
+            table = fitting.table_of(samples)
+            off = fitting.misses(samples, table)
+        with console.status("writing"):
+            write_synced(out, encode_reflectance(fitting.evaluated(table)))
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    document = {"table": str(out), "samples": len(samples.f), "median_miss": off[0], "miss_of_95_percent": off[1]}
+    if as_json:
+        print(json.dumps(document))
+    else:
+        text = f"{out}: {len(samples.f)} samples; it misses half of them by {off[0]:.1%} or less, 95 % by {off[1]:.1%}"
+        console.print(text, markup=False)
+
+
 def _document(
     found: Photographs, curve: Response, merged: Merged, out: Path, drawn: Path, *, is_linear: bool
 ) -> dict[str, Any]:
@@ -103,9 +142,7 @@ def _document(
 def _lines(document: dict[str, Any]) -> list[str]:
     lines = [f"{document['picture']}: {len(document['photographs'])} photographs merged"]
     if document["median_uncertainty"] is not None:
-        lines[0] += (
-            f"; half of the pixels are known within {document['median_uncertainty']:.2%} (standard) or better"
-        )
+        lines[0] += f"; half of the pixels are known within {document['median_uncertainty']:.2%} (standard)"
     lines.append(f"{document['response_picture']}: the response that they show")
     off = document["departure_from_straight"]
     if document["used_response"] == "linear":

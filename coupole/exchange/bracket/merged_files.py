@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
+from numpy.typing import NDArray
 
-from coupole.errors import StorageError, reason
+from coupole.errors import InputError, StorageError, reason
 from coupole.exchange.bracket.camera_response import NODES, Response
 from coupole.exchange.bracket.exposure_merging import Merged
 
@@ -34,6 +35,21 @@ def write_exr(path: Path, merged: Merged, told: str) -> None:
         raise StorageError(f"{path}: {reason(error)}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def read_known(path: Path) -> NDArray[np.float32]:
+    """[h, w, 3] R, G, B of an OpenEXR, NaN where it says `saturated` or `dark`. Raises InputError."""
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+        picture = np.stack([np.asarray(channels[name].pixels, np.float32) for name in "RGB"], axis=2)
+    except (OSError, RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{path}: expected an OpenEXR with R, G, B, as `coupole bracket` writes it; {error}"
+        ) from error
+    for state in ("saturated", "dark"):
+        if state in channels:
+            picture[np.asarray(channels[state].pixels) > 0.0] = np.nan
+    return picture
 
 
 def draw_response(path: Path, response: Response, title: str) -> None:

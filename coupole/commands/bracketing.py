@@ -105,7 +105,7 @@ def sphere_brdf(
     if as_json:
         print(json.dumps(document))
     else:
-        text = f"{out}: {len(samples.f)} samples, of which it misses half by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
+        text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
         console.print(text, markup=False)
 
 

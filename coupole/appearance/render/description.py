@@ -14,6 +14,7 @@ from coupole.appearance.render.model import unit
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.shapes.triangles import welded
+from coupole.errors import InputError
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
@@ -42,7 +43,7 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any) -> Descript
 def seen(
     scene: PlainScene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None
 ) -> Description:
-    """The whole scene, seen by `camera`, optionally through a polariser."""
+    """The whole scene, seen by `camera`, optionally through a polariser. Raises InputError."""
     look = mi.ScalarTransform4f().look_at(
         origin=list(camera.position_mm), target=list(camera.target_mm), up=list(unit(camera.up))
     )
@@ -60,7 +61,11 @@ def seen(
     depth = scene.depth + 1 + (through is not None)
     description = {
         "type": "scene",
-        "integrator": {"type": _integrator(parts), "max_depth": depth, "rr_depth": depth + 1},
+        "integrator": {
+            "type": _integrator(parts, polarised=scene.polarisation),
+            "max_depth": depth,
+            "rr_depth": depth + 1,
+        },
         "camera": sensor,
         **parts,
     }
@@ -77,10 +82,19 @@ def _inside(material: Material, folder: Path) -> Description:
     return {"interior": {"type": "homogeneous", "sigma_t": taken, "albedo": 0.0}}
 
 
-def _integrator(parts: Description) -> str:
-    """For media, that which weighs a way by all bands of a group: their absorption may differ by far."""
-    has_media = any(isinstance(part, dict) and "interior" in part for part in parts.values())
-    return "volpathmis" if has_media else "path"
+def _integrator(parts: Description, *, polarised: bool) -> str:
+    """For media, that which weighs a way by all bands of a group: their absorption may differ by far.
+
+    Raises InputError for media and polarisation together.
+    """
+    if not any(isinstance(part, dict) and "interior" in part for part in parts.values()):
+        return "path"
+    if polarised:
+        raise InputError(
+            "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba has no "
+            "Stokes vectors; leave out either"
+        )
+    return "volpathmis"
 
 
 def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:

@@ -91,8 +91,8 @@ def _integrator(parts: Description, *, polarised: bool) -> str:
         return "path"
     if polarised:
         raise InputError(
-            "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba has no "
-            "Stokes vectors; leave out either"
+            "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba "
+            "has no Stokes vectors; leave out either"
         )
     return "volpathmis"
 

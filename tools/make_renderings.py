@@ -33,6 +33,8 @@ QUICK = {
     "church-candles": (48, 400, 40),
     "church-window": (48, 400, 40),
     "layers-and-wear": (48, 560, 40),
+    "nashiji-bowl": (48, 360, 40),
+    "makie-box": (16, 360, 40),
 }
 """Samples, width in pixels, nm between bands."""
 BUST, BUST_QUICK = "restored-bust", (18, 400, None)

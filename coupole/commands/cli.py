@@ -13,6 +13,7 @@ import typer
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
 from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
+from coupole.commands.bracketing import bracket, sphere_brdf
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.compare_states import compare
@@ -64,6 +65,8 @@ for command in (
     dose,
     render,
     layer,
+    bracket,
+    sphere_brdf,
     recipe,
     show,
     budget,

@@ -19,6 +19,7 @@ from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.render.spectra import Constant
 from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import welded
+from coupole.errors import InputError
 
 Filter = float | Literal["circular"]
 """Angle in degrees of a polariser before the lens, from the picture's horizontal towards up; or one that passes
@@ -89,7 +90,7 @@ def _surface(material: Material | Pane, folder: Path) -> Description:
 def seen(
     scene: PlainScene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None
 ) -> Description:
-    """The whole scene, seen by `camera`, optionally through a polariser."""
+    """The whole scene, seen by `camera`, optionally through a polariser. Raises InputError."""
     look = mi.ScalarTransform4f().look_at(
         origin=list(camera.position_mm), target=list(camera.target_mm), up=list(unit(camera.up))
     )
@@ -107,7 +108,11 @@ def seen(
     depth = scene.depth + 1 + (through is not None)
     description = {
         "type": "scene",
-        "integrator": {"type": _integrator(parts), "max_depth": depth, "rr_depth": depth + 1},
+        "integrator": {
+            "type": _integrator(parts, polarised=scene.polarisation),
+            "max_depth": depth,
+            "rr_depth": depth + 1,
+        },
         "camera": sensor,
         **parts,
     }
@@ -124,14 +129,22 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
     return {"interior": {"type": "homogeneous", "sigma_t": taken, "albedo": 0.0}}
 
 
-def _integrator(parts: Description) -> str:
+def _integrator(parts: Description, *, polarised: bool) -> str:
     """For media, that which weighs a way by all bands of a group: their absorption may differ by far. Behind a pane
-    light is found by what looks for it through panes."""
+    light is found by what looks for it through panes.
+
+    Raises InputError for media and polarisation together.
+    """
     bodies = [part for part in parts.values() if isinstance(part, dict)]
-    if any("interior" in part for part in bodies):
-        return "volpathmis"
-    has_panes = any(part.get("bsdf", {}).get("type") == panes.PLUGIN for part in bodies)
-    return "volpath" if has_panes else "path"
+    if not any("interior" in part for part in bodies):
+        has_panes = any(part.get("bsdf", {}).get("type") == panes.PLUGIN for part in bodies)
+        return "volpath" if has_panes else "path"
+    if polarised:
+        raise InputError(
+            "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba "
+            "has no Stokes vectors; leave out either"
+        )
+    return "volpathmis"
 
 
 def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:

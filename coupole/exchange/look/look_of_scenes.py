@@ -17,6 +17,7 @@ from coupole.appearance.render.objects import MakieTile, NashijiSlab
 from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import PlainScene, Scene, remarks, with_plain_lights
+from coupole.appearance.render.urushi import Makie, Nashiji
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.solids import unit_sphere
 from coupole.appearance.shapes.triangles import flat_normals
@@ -34,6 +35,7 @@ from coupole.exchange.look.scene_layers import (
     tables,
 )
 from coupole.exchange.look.scene_start import illuminants, start_of
+from coupole.exchange.look.urushi_layers import coarse_grains, lacquered_corners, nashiji_layers
 
 _BALL_PARTS = 48
 """A ball has 20 times their square of triangles."""
@@ -91,6 +93,10 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
                 raise InputError(f"{scene.name}: has several nashiji_slab; a page shows {SHOWN}")
             mine, face = _nashiji(thing, found)
             parts += mine
+        elif isinstance(thing, Makie):
+            parts.append(_sprinkled(thing, found))
+        elif isinstance(thing, Nashiji):
+            parts.append(_lacquered(thing, found))
         else:
             casts = thing.kind != "plane"
             parts += [_opaque(piece, found, casts) for piece in objects.pieces(thing, folder)]
@@ -182,6 +188,22 @@ def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
     face = objects.placed(Piece(tile.face, black), thing).corners_mm
     body = objects.placed(Piece(tile.body, black), thing).corners_mm
     return [_Part(face, drawn, share=tile.share), _Part(body, found.number(black))]
+
+
+def _sprinkled(thing: Makie, found: _Materials) -> _Part:
+    grains = coarse_grains(thing, found.folder)
+    layers = (*layers_of(thing.metal, found.folder), *layers_of(thing.lacquer, found.folder))
+    drawn = found.add([layers], f"{told(thing.metal)}, by its share, over {told(thing.lacquer)}", is_drawn=True)
+    return _Part(
+        objects.placed(Piece(grains.corners_mm, thing.metal), thing).corners_mm, drawn, share=grains.share
+    )
+
+
+def _lacquered(thing: Nashiji, found: _Materials) -> _Part:
+    """Flakes as the mean over many."""
+    number = found.add([nashiji_layers(thing, found.folder)], f"mean of flakes of {told(thing.metal)} in urushi")
+    corners_mm = lacquered_corners(thing, found.folder)
+    return _Part(objects.placed(Piece(corners_mm, thing.metal), thing).corners_mm, number)
 
 
 def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[str, Any]]:

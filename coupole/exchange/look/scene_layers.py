@@ -33,7 +33,7 @@ LAYERS = 2
 COLUMNS = ANGLES + 2
 PATHS = 17
 """Lengths of way through lacquer for which a flake has values, from 0 to the longest."""
-SHOWN = "gilding, metals, films, paints, lacquer, makie, and one nashiji_slab beside opaque things"
+SHOWN = "gilding, metals, films, paints, lacquer, makie, nashiji, and one nashiji_slab beside opaque things"
 
 
 @dataclass(frozen=True)

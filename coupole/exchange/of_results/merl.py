@@ -3,12 +3,13 @@ and others, A data-driven reflectance model, 2003; layout of the database's read
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from coupole.exchange.of_results.material_tables import Material, materials_of
-from coupole.exchange.of_results.measured_surface import MeasuredSurface
+from coupole.exchange.of_results.measured_surface import Floats, MeasuredSurface
 from coupole.storage.durable import write_synced
 
 SIZE = (90, 90, 180)
@@ -27,7 +28,12 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 
 def encode(material: Material) -> bytes:
-    """Values in the middle of each step."""
+    return encode_reflectance(material.reflectance)
+
+
+def encode_reflectance(reflectance: Callable[[Floats, Floats], Floats]) -> bytes:
+    """Of a function of unit directions [n, 3] to light and viewer, 1/sr [n, 3]: its values in the middle of each
+    step."""
     theta_h = 0.5 * np.pi * ((np.arange(SIZE[0]) + 0.5) / SIZE[0]) ** 2
     theta_d = 0.5 * np.pi * (np.arange(SIZE[1]) + 0.5) / SIZE[1]
     phi_d = np.pi * (np.arange(SIZE[2]) + 0.5) / SIZE[2]
@@ -38,7 +44,7 @@ def encode(material: Material) -> bytes:
     for ways in (ways_in, ways_out):
         x, z = ways[:, 0].copy(), ways[:, 2].copy()
         ways[:, 0], ways[:, 2] = x * np.cos(h) + z * np.sin(h), z * np.cos(h) - x * np.sin(h)
-    values = material.reflectance(ways_in, ways_out)
+    values = np.array(reflectance(ways_in, ways_out))
     values[(ways_in[:, 2] <= 0.0) | (ways_out[:, 2] <= 0.0)] = -1.0
     planes = np.where(values < 0.0, values, values / SCALES)
     return np.array(SIZE, "<i4").tobytes() + planes.T.astype("<f8").tobytes()

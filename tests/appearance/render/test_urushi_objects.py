@@ -200,3 +200,10 @@ def test_a_turntable_turns_objects_about_the_scenes_axis() -> None:
     before = one.objects[0].scene_from_thing()[:3, :3]
     assert turned[0].scene_from_thing()[:3, :3] == pytest.approx(quarter @ before)
     assert turned[1] == one.objects[1]
+
+
+def test_polarised_light_through_lacquer_is_refused() -> None:
+    amber = {"kind": "glass", "absorption": {"kind": "urushi"}}
+    one = scene([plane(amber)], [everywhere(illuminant("E"))], bands={"step_nm": 40}, polarisation=True)
+    with pytest.raises(InputError, match="no absorbing body"):
+        rendered(one)

@@ -1,0 +1,161 @@
+"""`coupole bracket`: photographs with several exposure times, merged into one of linear values."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from coupole.exchange.bracket.camera_response import Response
+    from coupole.exchange.bracket.exposure_merging import Merged
+    from coupole.exchange.bracket.photographs import Photographs
+
+_TOLD_FROM = 1e-3
+"""Share of contradicting pixels of a photograph from which it is named."""
+
+
+def bracket(
+    photographs: Annotated[
+        list[Path], typer.Argument(help="JPEG, PNG, TIFF or raw files of one scene.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The merged picture, OpenEXR.", show_default=False)],
+    exposure_s: Annotated[
+        list[float] | None,
+        typer.Option(help="Time of each photograph, in their order; else that of EXIF."),
+    ] = None,
+    linear: Annotated[
+        bool, typer.Option("--linear", help="Values are proportional to exposure, as those of raw files are.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Merge photographs of different exposure times, taken from a tripod with one aperture and ISO number.
+
+    The camera's response is found from them, and drawn; of raw files it is a straight line, and only tested.
+    """
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        if out.suffix.lower() != ".exr":
+            raise InputError(f"--out {out}: expected a name that ends in .exr")
+        with console.status("reading"):
+            from coupole.exchange.bracket import camera_response, exposure_merging, merged_files
+            from coupole.exchange.bracket.photographs import read_photographs
+
+            found = read_photographs(photographs, exposure_s)
+        with console.status("finding the response"):
+            curve = camera_response.found_response(found)
+        used = camera_response.linear_response(curve.noise) if linear or found.raw else curve
+        with console.status("merging"):
+            merged = exposure_merging.merged(found, used)
+            first, last = found.exposure_s[[0, -1]]
+            told = f"merged from {len(found.paths)} photographs, {first:g} to {last:g} s"
+            merged_files.write_exr(out, merged, told)
+            drawn = out.with_name(f"{out.stem}-response.png")
+            merged_files.draw_response(drawn, curve, f"Response found from {len(found.paths)} photographs")
+        document = _document(found, curve, merged, out, drawn, is_linear=linear or found.raw)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        print(json.dumps(document))
+        return
+    for line in _lines(document):
+        console.print(line, markup=False)
+
+
+def sphere_brdf(
+    sample: Annotated[
+        Path, typer.Argument(help="YAML of sphere, lights, white and photographs.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The table, MERL's format (.binary).", show_default=False)],
+    as_json: JsonOption = False,
+) -> None:
+    """The BRDF of a finish from merged photographs of a sphere of it, each under one light from afar."""
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        if out.suffix.lower() != ".binary":
+            raise InputError(f"--out {out}: expected a name that ends in .binary")
+        with console.status("fitting"):
+            from coupole.exchange.bracket import sphere_brdf as fitting
+            from coupole.exchange.bracket.merged_files import read_known
+            from coupole.exchange.of_results.merl import encode_reflectance
+            from coupole.plan import yamlfile
+            from coupole.storage.durable import write_synced
+
+            given = yamlfile.read(sample).validate(fitting.SphereSample)
+            pictures = [read_known(sample.parent / lit.path) for lit in given.photographs]
+            samples = fitting.samples_of(given, pictures)
+            table = fitting.table_of(samples)
+            off = fitting.misses(samples, table)
+        with console.status("writing"):
+            write_synced(out, encode_reflectance(fitting.evaluated(table)))
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    document = {"table": str(out), "samples": len(samples.f), "median_miss": off[0], "miss_of_95_percent": off[1]}
+    if as_json:
+        print(json.dumps(document))
+    else:
+        text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
+        console.print(text, markup=False)
+
+
+def _document(
+    found: Photographs, curve: Response, merged: Merged, out: Path, drawn: Path, *, is_linear: bool
+) -> dict[str, Any]:
+    import numpy as np
+
+    known = np.isfinite(merged.uncertainty)
+    steps = slice(0, None, 15)
+    sigma = curve.uncertainty[steps]
+    return {
+        "picture": str(out),
+        "response_picture": str(drawn),
+        "unit": "relative; 1 shows half of the largest value in one second",
+        "photographs": [
+            {"path": str(path), "exposure_s": float(time), "contradicting": float(off.mean())}
+            for path, time, off in zip(found.paths, found.exposure_s, merged.contradicting, strict=True)
+        ],
+        "used_response": "linear" if is_linear else "found",
+        "departure_from_straight": curve.straightness(),
+        "noise_of_values": curve.noise.tolist(),
+        "response": {
+            "value": np.linspace(0.0, 1.0, len(curve.log_exposure))[steps].tolist(),
+            "ln_exposure": curve.log_exposure[steps].tolist(),
+            "u_ln_exposure": np.where(np.isfinite(sigma), sigma, -1.0).tolist(),
+        },
+        "saturated": float(merged.saturated.any(axis=2).mean()),
+        "dark": float(merged.dark.any(axis=2).mean()),
+        "median_uncertainty": float(np.median(merged.uncertainty[known])) if known.any() else None,
+    }
+
+
+def _lines(document: dict[str, Any]) -> list[str]:
+    lines = [f"{document['picture']}: {len(document['photographs'])} photographs merged"]
+    if document["median_uncertainty"] is not None:
+        lines[0] += f"; half of the pixels are known within {document['median_uncertainty']:.2%} (standard)"
+    lines.append(f"{document['response_picture']}: the response that they show")
+    off = document["departure_from_straight"]
+    if document["used_response"] == "linear":
+        lines.append(f"taken as linear; the response found is straight within {off:.1%} from 10 to 90 % of values")
+        if off > 0.1:
+            lines.append("that is much: processed pictures are not linear; leave out --linear, or give raw files")
+    for state, meaning in (("saturated", "at least as bright as written"), ("dark", "hardly more than noise")):
+        if document[state] > 0.0:
+            lines.append(f"{document[state]:.2%} of the pixels are {state} in all photographs: {meaning}")
+    lines += [
+        f"{one['path']}: {one['contradicting']:.1%} of its pixels contradict the others and are left out; has "
+        "something moved, or the light changed?"
+        for one in document["photographs"]
+        if one["contradicting"] > _TOLD_FROM
+    ]
+    return lines

@@ -1,0 +1,1 @@
+"""Photographs of one scene with several exposure times, merged into one picture of linear values."""

@@ -1,0 +1,111 @@
+"""Photographs of one scene merged: each pixel's mean by the variance that its exposure leads one to expect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.exchange.bracket.camera_response import DARK, SATURATED, Response, hat
+from coupole.exchange.bracket.photographs import Photographs
+
+_CONTRADICTS = 5.0
+"""Standard deviations from the median of photographs."""
+_LEAST_CONTRADICTION = 0.05
+"""Relative."""
+_LEAST_WEIGHT = 0.1
+"""Hat weight of values below which noise is no longer Gaussian; such a value contradicts nobody."""
+_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Relative radiance, in a unit in which half of the largest value is 1 at one second."""
+
+    radiance: NDArray[np.float32]
+    """[h, w, 3]."""
+    uncertainty: NDArray[np.float32]
+    """[h, w, 3], standard, relative, of noise and response."""
+    saturated: NDArray[np.bool_]
+    """[h, w, 3], in all photographs: the radiance is a lower bound."""
+    dark: NDArray[np.bool_]
+    """[h, w, 3], in all photographs: hardly more than noise."""
+    contradicting: NDArray[np.bool_]
+    """[photographs, h, w], left out there, because others say otherwise: something moved."""
+
+
+def merged(photographs: Photographs, response: Response) -> Merged:
+    shape = photographs.values.shape[1:]
+    radiance, uncertain = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    saturated, dark = np.empty(shape, bool), np.empty(shape, bool)
+    contradicting = np.zeros(photographs.values.shape[:3], bool)
+    for channel in range(3):
+        values = photographs.values[..., channel]
+        usable = (values > DARK) & (values < SATURATED)
+        found = response.exposure(values, channel) / photographs.exposure_s[:, None, None]
+        off = _contradicting(found, values, usable, response, channel)
+        contradicting |= off
+        mean, sigma = _mean(found, usable & ~off, photographs.exposure_s, response, channel)
+        saturated[..., channel] = ~usable.any(axis=0) & (values[0] >= SATURATED)
+        dark[..., channel] = ~usable.any(axis=0) & ~saturated[..., channel]
+        bound = np.where(saturated[..., channel], found[0], found[-1])
+        known = usable.any(axis=0)
+        radiance[..., channel] = np.where(known, mean, bound)
+        uncertain[..., channel] = np.where(known, sigma, np.inf)
+    return Merged(radiance, uncertain, saturated, dark, contradicting)
+
+
+def _mean(
+    found: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    exposure_s: NDArray[np.float64],
+    response: Response,
+    channel: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weighted mean and its relative uncertainty. Weights follow from the mean, not from the pixel's own values,
+    whose noise would favour the darker of two."""
+    noise = max(float(response.noise[channel]), 0.29 / 255.0)
+    mean = np.where(usable, found, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    for _ in range(_ROUNDS):
+        total, sums, curve = np.zeros_like(mean), np.zeros_like(mean), np.zeros_like(mean)
+        for one, taken, time in zip(found, usable, exposure_s, strict=True):
+            expected = response.value(mean * time, channel)
+            sigma = response.slope(expected, channel) * noise  # relative
+            weight = np.where(taken, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
+            total, sums = total + weight, sums + weight * one
+            known = np.where(np.isfinite(response.uncertainty[:, channel]), response.uncertainty[:, channel], 0.0)
+            curve += weight * np.interp(expected, np.linspace(0.0, 1.0, len(known)), known)
+        mean = sums / np.maximum(total, 1e-300)
+    relative = 1.0 / (np.sqrt(np.maximum(total, 1e-300)) * np.maximum(mean, 1e-30))
+    return mean, np.hypot(relative, curve / np.maximum(total, 1e-300))
+
+
+def _contradicting(
+    found: NDArray[np.float64],
+    values: NDArray[np.float32],
+    usable: NDArray[np.bool_],
+    response: Response,
+    channel: int,
+) -> NDArray[np.bool_]:
+    """[photographs, h, w] of those that lie beyond `_CONTRADICTS` deviations of the best exposed ones' median."""
+    logs = np.where(usable, np.log(np.maximum(found, 1e-300)), np.nan)
+    lonely = usable.sum(axis=0) < 2
+    weights = np.where(usable, hat(values.astype(float)), 0.0)
+    best = np.take_along_axis(logs, np.argmax(weights, axis=0)[None], axis=0)[0]
+    with np.errstate(invalid="ignore"):
+        middle = np.where(usable.sum(axis=0) > 2, _median(logs), best)
+        sigma = response.slope(values, channel) * max(float(response.noise[channel]), 0.29 / 255.0)
+        off = np.abs(logs - middle) > np.maximum(_CONTRADICTS * np.sqrt(2.0) * sigma, _LEAST_CONTRADICTION)
+    off &= (weights > _LEAST_WEIGHT) & ~lonely
+    nobody = (off | ~usable).all(axis=0)
+    off &= ~(nobody & (weights == weights.max(axis=0)))
+    return np.asarray(off)
+
+
+def _median(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Over photographs, of what is no NaN."""
+    ordered = np.sort(logs, axis=0)  # NaN last
+    last = np.maximum(np.isfinite(logs).sum(axis=0) - 1, 0)
+    low, high = (np.take_along_axis(ordered, index[None], axis=0)[0] for index in (last // 2, (last + 1) // 2))
+    return np.asarray(0.5 * (low + high))

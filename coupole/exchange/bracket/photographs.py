@@ -1,0 +1,144 @@
+"""The photographs of a bracket: values, 0 to 1, with the exposure times that their EXIF or their owner gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+
+_EXIF, _TIME, _APERTURE, _ISO = 34665, 33434, 33437, 34855
+_PLAIN = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_LEAST_RATIO = 1.2
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Of one scene, by rising exposure time."""
+
+    paths: tuple[Path, ...]
+    values: NDArray[np.float32]
+    """[photographs, h, w, 3] red, green, blue as stored, over the largest value that the file can hold."""
+    exposure_s: NDArray[np.float64]
+    """[photographs]."""
+    levels: int
+    """That a value can have."""
+    raw: bool
+    """Whether they are a sensor's values, without a transfer curve: a pixel for each 2 x 2 cells."""
+
+
+def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None = None) -> Photographs:
+    """Raises InputError for files that cannot be read, of several kinds or sizes, or of unknown exposure."""
+    if len(paths) < 2:
+        raise InputError(f"bracket: expected two photographs or more, found {len(paths)}")
+    if exposure_s is not None and len(exposure_s) != len(paths):
+        raise InputError(
+            f"--exposure-s: expected a time for each of {len(paths)} photographs, found {len(exposure_s)}"
+        )
+    read = [_read(path) for path in paths]
+    told = [_exif(path) for path in paths] if exposure_s is None else [{_TIME: time} for time in exposure_s]
+    for number, what in ((_APERTURE, "apertures"), (_ISO, "ISO numbers")):
+        found = {one.get(number) for one in told}
+        if len(found) > 1:
+            raise InputError(f"bracket: expected photographs that differ in time alone; found {what} {found}")
+    if untold := [str(path) for path, one in zip(paths, told, strict=True) if not one.get(_TIME)]:
+        raise InputError(f"{untold[0]}: has no exposure time in its EXIF; give all of them with --exposure-s")
+    shapes = {
+        (values.shape, levels, path.suffix.lower() in _PLAIN)
+        for path, (values, levels) in zip(paths, read, strict=True)
+    }
+    if len(shapes) > 1:
+        raise InputError(f"bracket: expected photographs of one size and kind; found {sorted(map(str, shapes))}")
+    times = np.array([float(one[_TIME]) for one in told])
+    order = np.argsort(times, kind="stable")
+    times = times[order]
+    if np.any(times <= 0.0) or times[-1] / times[0] < _LEAST_RATIO:
+        raise InputError(
+            f"bracket: expected exposure times in steps of 2 to 4, found {times.tolist()} s; take others"
+        )
+    return Photographs(
+        tuple(paths[k] for k in order),
+        np.stack([read[k][0] for k in order]),
+        times,
+        read[0][1],
+        raw=paths[0].suffix.lower() not in _PLAIN,
+    )
+
+
+def _read(path: Path) -> tuple[NDArray[np.float32], int]:
+    """[h, w, 3], and how many levels."""
+    if path.suffix.lower() not in _PLAIN:
+        return _raw(path), 65536
+    import cv2
+
+    try:
+        encoded = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    found = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if encoded.size else None
+    if found is None or found.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+        raise InputError(f"{path}: expected a photograph of 8 or 16 bits (JPEG, PNG, TIFF), or a raw file")
+    most = 255 if found.dtype == np.uint8 else 65535
+    return (found[..., ::-1] / np.float32(most)).astype(np.float32), most + 1
+
+
+def _raw(path: Path) -> NDArray[np.float32]:
+    """The sensor's values less black, over white less black, of each cell; greens are averaged."""
+    import rawpy
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            made: Any = raw.postprocess(
+                half_size=True,
+                gamma=(1.0, 1.0),
+                no_auto_bright=True,
+                adjust_maximum_thr=0.0,
+                output_bps=16,
+                user_wb=[1.0, 1.0, 1.0, 1.0],
+                output_color=rawpy.ColorSpace.raw,
+                user_flip=0,
+            )
+    except (rawpy.LibRawError, OSError) as error:
+        raise InputError(f"{path}: expected JPEG, PNG, TIFF, or a raw file that LibRaw reads; {error}") from error
+    return np.asarray(made, np.float32) / np.float32(65535.0)
+
+
+def _exif(path: Path) -> dict[int, float]:
+    """Time, aperture and ISO, as far as they are there."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as opened:
+            tags = opened.getexif()
+    except (OSError, UnidentifiedImageError):
+        return _exif_of_raw(path)
+    inner = tags.get_ifd(_EXIF)
+    found = {number: inner.get(number, tags.get(number)) for number in (_TIME, _APERTURE, _ISO)}
+    return {number: float(value) for number, value in found.items() if value is not None}
+
+
+def _exif_of_raw(path: Path) -> dict[int, float]:
+    """Of raw files that are built as TIFF."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(path) as opened:
+            inner = opened.pages[0].tags[_EXIF].value  # type: ignore[union-attr]
+    except (OSError, KeyError, ValueError, tifffile.TiffFileError):
+        return {}
+    names = {_TIME: "ExposureTime", _APERTURE: "FNumber", _ISO: "ISOSpeedRatings"}
+    values = {number: inner.get(name) for number, name in names.items()}
+    return {number: _ratio(value) for number, value in values.items() if value is not None}
+
+
+def _ratio(value: Any) -> float:
+    return (
+        float(value[0]) / float(value[1])
+        if isinstance(value, tuple) and len(value) == 2
+        else float(np.ravel(value)[0])
+    )

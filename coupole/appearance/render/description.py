@@ -130,8 +130,8 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
 
 
 def _integrator(parts: Description, *, polarised: bool) -> str:
-    """For media, that which weighs a way by all bands of a group: their absorption may differ by far. Behind a pane
-    light is found by what looks for it through panes.
+    """For media, that which weighs a way by all bands of a group: their absorption may differ by far. Behind a
+    pane light is found by what looks for it through panes.
 
     Raises InputError for media and polarisation together.
     """

@@ -25,6 +25,7 @@ from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.mesh_file import mesh_corners
 from coupole.appearance.shapes.solids import relief
 from coupole.appearance.shapes.triangles import rectangle, slab
+from coupole.appearance.spectra.grid import Array
 
 _PRINT = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.035))
 """The black body of the wedges."""
@@ -180,6 +181,7 @@ LocalObject = (
     | GiltStepWedge
     | PaintWedge
     | MakieTile
+    | Makie
     | NashijiSlab
     | Nashiji
     | Arcature
@@ -218,12 +220,10 @@ def _local(thing: LocalObject, folder: Path) -> list[Piece]:
             black = Lacquer(kind="lacquer")
             gold = Metal(kind="metal", roughness=thing.roughness)
             return [Piece(tile.powder, gold), Piece(tile.ground, black), Piece(tile.body, black)]
-        case Makie():
-            return makie_pieces(thing, folder)
         case NashijiSlab():
             return _nashiji(thing)
-        case Nashiji():
-            return nashiji_pieces(thing, folder)
+        case Makie() | Nashiji():
+            return makie_pieces(thing, folder) if isinstance(thing, Makie) else nashiji_pieces(thing, folder)
         case Arcature():
             parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
             return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]

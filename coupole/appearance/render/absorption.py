@@ -1,25 +1,73 @@
-"""What a transparent body takes from light on its way through it, per mm (Beer and Lambert)."""
+"""What a clear medium takes from light on its way through it, per mm (Beer and Lambert)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal, assert_never
 
+import numpy as np
 from pydantic import Field
 
 from coupole.appearance.matter import lacquer
 from coupole.appearance.render.model import Model, Positive
-from coupole.appearance.spectra.grid import Array
+from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array
 from coupole.appearance.spectra.measured import read_spectrum
 from coupole.appearance.spectra.resampling import held, on_grid
 
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class NumbersFile(Model):
+    """Numbers by wavelength, in columns; those beyond it keep its ends."""
+
+    kind: Literal["file"]
+    path: Path
+    column: int | None = None
+
+
+PerMm = NotNegative | NumbersFile
+"""A coefficient per mm, the same at all wavelengths or by a file."""
+
 
 class Urushi(Model):
-    """Transparent urushi, of an assumed shape (`lacquer.urushi_absorption`)."""
+    """Of transparent urushi, an assumed shape (`lacquer.urushi_absorption`)."""
 
     kind: Literal["urushi"]
-    at_450_nm_per_mm: Positive = 6.0
+    at_450_nm_per_mm: NotNegative = 6.0
     fall_per_nm: Positive = 0.016
+
+
+class TypicalVarnish(Model):
+    """Of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
+
+    age k exp(-fall (w - 450 nm)): strong in the violet, next to nothing in the red.
+    """
+
+    kind: Literal["typical_varnish"]
+    age: NotNegative
+    """0 is fresh and clear, 1 yellowed for long."""
+    at_450_nm_per_mm: NotNegative = 15.0
+    """At age 1."""
+    fall_per_nm: Positive = 0.018
+
+
+class Absorbance(Model):
+    """A film's decadic absorbance by wavelength, measured: that of an aged one less that of a fresh one, or of
+    one whose faces do not count."""
+
+    kind: Literal["absorbance"]
+    path: Path
+    column: int | None = None
+    film_mm: Positive
+    """Of the film that was measured."""
+    age: NotNegative = 1.0
+    """In parts of the one that was measured."""
+
+
+class AbsorptionPerMm(Model):
+    kind: Literal["values"]
+    per_mm: PerMm
+    """Natural, of directed light."""
 
 
 class Transmittance(Model):
@@ -31,16 +79,40 @@ class Transmittance(Model):
     thickness_mm: Positive
 
 
-Absorption = Annotated[Urushi | Transmittance, Field(discriminator="kind")]
+Absorption = Annotated[
+    Urushi | TypicalVarnish | Absorbance | AbsorptionPerMm | Transmittance, Field(discriminator="kind")
+]
 
 
 def per_mm(absorption: Absorption, index: float, folder: Path) -> Array:
-    """[81] per mm in a medium of `index`; paths are relative to `folder`. Raises InputError."""
+    """[81] per mm, natural, of directed light in a medium of `index`; paths are relative to `folder`. Raises
+    InputError."""
     match absorption:
         case Urushi():
             return lacquer.urushi_absorption(absorption.at_450_nm_per_mm, absorption.fall_per_nm)
+        case TypicalVarnish():
+            shape = np.exp(-absorption.fall_per_nm * (WAVELENGTHS_NM - 450.0))
+            return np.asarray(absorption.age * absorption.at_450_nm_per_mm * shape)
+        case Absorbance():
+            decadic = _numbers(folder / absorption.path, absorption.column)
+            return np.asarray(absorption.age * np.log(10.0) * decadic / absorption.film_mm)
+        case AbsorptionPerMm():
+            return coefficient(absorption.per_mm, folder)
         case Transmittance():
             found = read_spectrum(folder / absorption.path, column=absorption.column)
             return lacquer.absorption_from(held(on_grid(found)), absorption.thickness_mm, index)
         case _:
             assert_never(absorption)
+
+
+def coefficient(value: PerMm, folder: Path) -> Array:
+    """[81] per mm. Raises InputError."""
+    if isinstance(value, NumbersFile):
+        return _numbers(folder / value.path, value.column)
+    return np.full(BANDS, value)
+
+
+def _numbers(path: Path, column: int | None) -> Array:
+    """[81], not below 0."""
+    read = read_spectrum(path, unit="power", column=column)
+    return np.asarray(np.maximum(held(on_grid(read)), 0.0))

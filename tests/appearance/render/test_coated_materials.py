@@ -14,8 +14,9 @@ from coupole.appearance.matter import kubelka_munk, typical
 from coupole.appearance.matter.glossy_face import InternalReflectance, face
 from coupole.appearance.matter.layer_stack import stack_brdf
 from coupole.appearance.optics import fresnel, indices
+from coupole.appearance.render.absorption import per_mm
 from coupole.appearance.render.materials import Layers, Material
-from coupole.appearance.render.materials.coatings import absorption_of, stack_of
+from coupole.appearance.render.materials.coatings import stack_of
 from coupole.appearance.render.rendering import opened
 from coupole.appearance.render.spectra import scaled
 from coupole.appearance.spectra import light
@@ -106,7 +107,7 @@ def test_absorbance_of_a_film_gives_its_transmittance_back(tmp_path: Path) -> No
     clear = {"kind": "absorbance", "path": tmp_path / "aged.csv", "film_mm": 0.02, "age": 0.5}
     varnish = {"kind": "layers", "layers": [{"kind": "clear", "absorption": clear, "thickness_mm": 0.02}]}
 
-    k = absorption_of(Layers.model_validate(varnish).layers[0].absorption, HERE)
+    k = per_mm(Layers.model_validate(varnish).layers[0].absorption, 1.5, HERE)
 
     assert np.exp(-k * 0.02)[[0, 40]] == pytest.approx([10.0**-0.45, 10.0**-0.15], rel=1e-6)
 

@@ -12,13 +12,14 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from coupole.appearance.matter import four_flux, gilding, lacquer
+from coupole.appearance.matter import four_flux, gilding
 from coupole.appearance.matter.baked_table import bake
 from coupole.appearance.matter.layer_stack import Binder, Ground, Stack, stack, stack_brdf
 from coupole.appearance.matter.paint_file import read_paint
 from coupole.appearance.matter.pigments import from_opaque
 from coupole.appearance.optics import indices
 from coupole.appearance.optics.thin_film import Film
+from coupole.appearance.render.absorption import Absorption, PerMm, coefficient, per_mm
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.materials.plain import metal_index
 from coupole.appearance.render.model import Model, Positive, Roughness, Share
@@ -31,24 +32,10 @@ from coupole.appearance.render.spectra import (
     coefficients,
     internal,
 )
-from coupole.appearance.spectra import measured, resampling
-from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array, Complex
+from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array, Complex
 from coupole.errors import InputError
 
-NotNegative = Annotated[float, Field(ge=0)]
 _BLACK = Constant(kind="constant", value=0.0)
-
-
-class NumbersFile(Model):
-    """Numbers by wavelength, in columns; those beyond it keep its ends."""
-
-    kind: Literal["file"]
-    path: Path
-    column: int | None = None
-
-
-PerMm = NotNegative | NumbersFile
-"""A coefficient per mm, the same at all wavelengths or by a file."""
 
 
 class Coefficients(Model):
@@ -93,49 +80,6 @@ class GlazeLayer(Model):
     kind: Literal["four_flux"]
     coefficients: FourFluxes
     thickness_mm: Positive
-
-
-class Urushi(Model):
-    """Of clear urushi, an assumed shape (`coupole.appearance.matter.lacquer`)."""
-
-    kind: Literal["urushi"]
-    at_450_nm_per_mm: NotNegative = 6.0
-
-
-class TypicalVarnish(Model):
-    """Of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
-
-    age k exp(-fall (w - 450 nm)): strong in the violet, next to nothing in the red.
-    """
-
-    kind: Literal["typical_varnish"]
-    age: NotNegative
-    """0 is fresh and clear, 1 yellowed for long."""
-    at_450_nm_per_mm: NotNegative = 15.0
-    """At age 1."""
-    fall_per_nm: Positive = 0.018
-
-
-class Absorbance(Model):
-    """A film's decadic absorbance by wavelength, measured: that of an aged one less that of a fresh one, or of
-    one whose faces do not count."""
-
-    kind: Literal["absorbance"]
-    path: Path
-    column: int | None = None
-    film_mm: Positive
-    """Of the film that was measured."""
-    age: NotNegative = 1.0
-    """In parts of the one that was measured."""
-
-
-class AbsorptionPerMm(Model):
-    kind: Literal["values"]
-    per_mm: PerMm
-    """Natural, of directed light."""
-
-
-Absorption = Annotated[Urushi | TypicalVarnish | Absorbance | AbsorptionPerMm, Field(discriminator="kind")]
 
 
 class ClearLayer(Model):
@@ -220,24 +164,9 @@ def _laid(binder: Binder, layer: Layer, below: Ground, folder: Path, index: Arra
         case GlazeLayer():
             return binder.four_flux(below, _glaze(layer, folder))
         case ClearLayer():
-            return binder.clear(below, absorption_of(layer.absorption, folder), layer.thickness_mm)
+            return binder.clear(below, per_mm(layer.absorption, binder.index, folder), layer.thickness_mm)
         case Leaf():
             return binder.leaf(below, [_film(layer, folder)], layer.roughness, layer.uncovered)
-
-
-def absorption_of(absorption: Absorption, folder: Path) -> Array:
-    """[81] per mm, natural, of directed light. Raises InputError."""
-    match absorption:
-        case Urushi():
-            return lacquer.urushi_absorption(absorption.at_450_nm_per_mm)
-        case TypicalVarnish():
-            shape = np.exp(-absorption.fall_per_nm * (WAVELENGTHS_NM - 450.0))
-            return np.asarray(absorption.age * absorption.at_450_nm_per_mm * shape)
-        case Absorbance():
-            decadic = _numbers(folder / absorption.path, absorption.column)
-            return np.asarray(absorption.age * np.log(10.0) * decadic / absorption.film_mm)
-        case AbsorptionPerMm():
-            return _per_mm(absorption.per_mm, folder)
 
 
 def _film(leaf: Leaf, folder: Path) -> Film:
@@ -249,7 +178,7 @@ def _glaze(layer: FourFlux | GlazeLayer, folder: Path) -> four_flux.Layer:
     given = layer.coefficients
     if isinstance(given, Coefficients):
         names = ("absorption", "scattering", "direct_absorption", "forward", "backward")
-        k, s, direct, forward, backward = (_per_mm(getattr(given, name), folder) for name in names)
+        k, s, direct, forward, backward = (coefficient(getattr(given, name), folder) for name in names)
     else:
         diffuse, found = coefficients(given, folder, needs_mm=True), read_paint(folder / given.path)
         if missing := [name for name in ("k", "s_i", "s_j") if name not in found.other]:
@@ -263,15 +192,3 @@ def _glaze(layer: FourFlux | GlazeLayer, folder: Path) -> four_flux.Layer:
             for name in ("k", "s_i", "s_j")
         )
     return four_flux.Layer(k, s, direct, forward, backward, layer.thickness_mm)
-
-
-def _per_mm(value: PerMm, folder: Path) -> Array:
-    if isinstance(value, NumbersFile):
-        return _numbers(folder / value.path, value.column)
-    return np.full(BANDS, value)
-
-
-def _numbers(path: Path, column: int | None) -> Array:
-    """[81], not below 0."""
-    read = measured.read_spectrum(path, unit="power", column=column)
-    return np.asarray(np.maximum(resampling.held(resampling.on_grid(read)), 0.0))

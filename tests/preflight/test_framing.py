@@ -221,7 +221,10 @@ def test_the_table_fits_a_terminal_of_80_columns(cell: CellFolder) -> None:
     assert "100%" in line
 
 
-@pytest.mark.parametrize("plan", sorted((REPO / "configs/plans").glob("*.yaml")), ids=lambda path: path.stem)
+WITH_OBJECT = sorted(path for path in (REPO / "configs/plans").glob("*.yaml") if "object:" in path.read_text())
+
+
+@pytest.mark.parametrize("plan", WITH_OBJECT, ids=lambda path: path.stem)
 def test_shipped_plans_show_their_object_whole_and_sharp(plan: Path) -> None:
     ended = cells.here("check", plan, "--no-paths", "--json")
     found = json.loads(ended.out)

@@ -7,7 +7,6 @@ last row is nearly grey. `configs/charts/drawn-24.txt` lists the same spectra fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -21,6 +20,7 @@ ROWS, COLUMNS = 4, 6
 PITCH_MM, PATCH_MM, MARGIN_MM = 22.0, 18.0, 6.0
 THICKNESS_MM = 2.0
 _CELL_MM = 2.0
+"""Of the face; edges of patches and plate lie on multiples of it."""
 
 
 @dataclass(frozen=True)
@@ -79,35 +79,16 @@ def colour_chart() -> Surface:
     the middle of the patches; x runs along the rows, y up."""
     width_mm = COLUMNS * PITCH_MM + 2.0 * MARGIN_MM
     depth_mm = ROWS * PITCH_MM + 2.0 * MARGIN_MM
-    parts = [of_material(skirt(rectangle(width_mm, depth_mm, z_mm=THICKNESS_MM)), appearance.BLACK_PRINT)]
-    cells = round(PATCH_MM / _CELL_MM)
+    cells = (round(width_mm / _CELL_MM), round(depth_mm / _CELL_MM))
+    face = rectangle(width_mm, depth_mm, *cells, z_mm=THICKNESS_MM)
+    parts = [of_material(skirt(face), appearance.BLACK_PRINT)]
+    black = np.ones(len(face), bool)
+    x_mm, y_mm = face.mean(axis=1)[:, :2].T
     for name, drawn in DRAWN.items():
         row, column = ord(name[0]) - ord("A"), int(name[1]) - 1
-        x_mm = (column - (COLUMNS - 1) / 2.0) * PITCH_MM
-        y_mm = ((ROWS - 1) / 2.0 - row) * PITCH_MM
-        face = rectangle(PATCH_MM, PATCH_MM, cells, cells, z_mm=THICKNESS_MM) + np.array([x_mm, y_mm, 0.0])
-        parts.append(of_material(face, Material(name, appearance.rgb(drawn.at(WAVELENGTHS_NM)))))
-    parts.append(of_material(_between(width_mm, depth_mm), appearance.BLACK_PRINT))
-    return joined(parts)
-
-
-def _between(width_mm: float, depth_mm: float) -> Array:
-    """Corners of the face without the patches: strips between the rows, and pieces between the columns."""
-    half_mm = PATCH_MM / 2.0
-    xs_mm = _lines(COLUMNS, width_mm, half_mm)
-    ys_mm = _lines(ROWS, depth_mm, half_mm)
-    pieces = []
-    for j, (bottom, top) in enumerate(pairwise(ys_mm)):
-        for i, (left, right) in enumerate(pairwise(xs_mm)):
-            if i % 2 == 1 and j % 2 == 1:
-                continue
-            piece = rectangle(right - left, top - bottom, z_mm=THICKNESS_MM)
-            pieces.append(piece + np.array([0.5 * (left + right), 0.5 * (bottom + top), 0.0]))
-    return np.concatenate(pieces)
-
-
-def _lines(count: int, length_mm: float, half_mm: float) -> list[float]:
-    """Edges of the patches along one direction, with the plate's own."""
-    centres = [(k - (count - 1) / 2.0) * PITCH_MM for k in range(count)]
-    inner = [edge for centre in centres for edge in (centre - half_mm, centre + half_mm)]
-    return [-length_mm / 2.0, *inner, length_mm / 2.0]
+        off_x_mm = x_mm - (column - (COLUMNS - 1) / 2.0) * PITCH_MM
+        off_y_mm = y_mm - ((ROWS - 1) / 2.0 - row) * PITCH_MM
+        patch = np.maximum(np.abs(off_x_mm), np.abs(off_y_mm)) < PATCH_MM / 2.0
+        black &= ~patch
+        parts.append(of_material(face[patch], Material(name, appearance.rgb(drawn.at(WAVELENGTHS_NM)))))
+    return joined([*parts, of_material(face[black], appearance.BLACK_PRINT)])

@@ -93,7 +93,7 @@ def _samples(values: NDArray[np.float32]) -> Array:
     if np.count_nonzero(useful) < 50:
         raise InputError(
             "bracket: expected many pixels that two photographs show, neither dark nor saturated; found "
-            f"{np.count_nonzero(useful)}; take photographs in steps of 2 to 4 times the exposure"
+            f"{np.count_nonzero(useful)}; take photographs in steps of 2 times the exposure"
         )
     flat = useful & (steep <= np.quantile(steep[useful], 0.6))
     seen = values[:, flat].T.astype(float)

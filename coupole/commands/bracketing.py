@@ -56,10 +56,13 @@ def bracket(
             merged = exposure_merging.merged(found, used)
             first, last = found.exposure_s[[0, -1]]
             told = f"merged from {len(found.paths)} photographs, {first:g} to {last:g} s"
+            remark = "" if linear or found.raw else camera_response.left_open(found.exposure_s)
+            told = "; ".join(filter(None, (told, remark)))
             merged_files.write_exr(out, merged, told)
             drawn = out.with_name(f"{out.stem}-response.png")
             merged_files.draw_response(drawn, curve, f"Response found from {len(found.paths)} photographs")
         document = _document(found, curve, merged, out, drawn, is_linear=linear or found.raw)
+        document["remarks"] = [remark] if remark else []
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -152,6 +155,7 @@ def _lines(document: dict[str, Any]) -> list[str]:
     for state, meaning in (("saturated", "at least as bright as written"), ("dark", "hardly more than noise")):
         if document[state] > 0.0:
             lines.append(f"{document[state]:.2%} of the pixels are {state} in all photographs: {meaning}")
+    lines += document["remarks"]
     lines += [
         f"{one['path']}: {one['contradicting']:.1%} of its pixels contradict the others and are left out; has "
         "something moved, or the light changed?"

@@ -23,6 +23,8 @@ SATURATED, DARK = 0.98, 0.01
 """Values from which on, and up to which, a pixel says nothing but a bound."""
 _PIXELS = 3000
 _SMOOTH = 0.3
+_WIDE = 2.6
+"""Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""
 _ROUNDS, _OUTLIER = 8, 4.0
 """Of the fit; standard deviations from which on a sample counts for less in the next round."""
 _MIDDLE = NODES // 2
@@ -78,6 +80,20 @@ def found_response(photographs: Photographs) -> Response:
         uncertain.append(sigma)
         noise.append(left)
     return Response(np.stack(curves, axis=1), np.stack(uncertain, axis=1), np.array(noise))
+
+
+def left_open(exposure_s: Array) -> str:
+    """What photographs of these times cannot tell of a response, in words; empty if they can.
+
+    With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts.
+    """
+    factor = float(np.exp(np.diff(np.sort(np.log(exposure_s))).min()))
+    if factor < _WIDE:
+        return ""
+    return (
+        f"no two photographs are nearer than {factor:.1f} times in exposure: the response may have waves of "
+        "several percent, which the uncertainty does not have; take steps of 2, or raw files"
+    )
 
 
 def hat(values: Array) -> Array:

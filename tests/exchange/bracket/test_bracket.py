@@ -101,6 +101,23 @@ def test_files_with_exif_are_merged_by_the_command_and_read_elsewhere(tmp_path: 
     assert np.isinf(channels["u.R"].pixels[45, 45])
     with Image.open(tmp_path / "merged-response.png") as drawn:
         assert drawn.size[0] > 300
+    assert told["remarks"] == []
+
+
+def test_steps_that_leave_waves_of_the_response_open_are_told_and_written(tmp_path: Path) -> None:
+    values = photographed(srgb).astype(np.uint8)
+    words = []
+    for number in range(0, 8, 2):
+        Image.fromarray(values[number]).save(tmp_path / f"{number}.png")
+        words += [str(tmp_path / f"{number}.png"), "--exposure-s", str(TIMES_S[number])]
+
+    done = CliRunner().invoke(app, ["bracket", *words, "--out", str(tmp_path / "merged.exr"), "--json"])
+
+    assert done.exit_code == 0, done.output
+    (remark,) = json.loads(done.stdout)["remarks"]
+    assert "nearer than 4.0 times" in remark
+    header = OpenEXR.File(str(tmp_path / "merged.exr")).header()
+    assert any(remark in str(value) for value in header.values())
 
 
 def test_linear_values_are_a_straight_line(tmp_path: Path) -> None:

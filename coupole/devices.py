@@ -7,6 +7,7 @@ after any exception, a device is safe: lights off, camera disarmed, robot at res
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -85,8 +86,9 @@ class Clock(Protocol):
 
     def now_ns(self) -> int: ...
 
-    def sleep(self, seconds: float) -> None:
-        """Wait `seconds` on this clock; returns early only if the clock's source is gone."""
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
+        """Wait `seconds` on this clock, but no longer than `at_most_s` on the machine's; returns early only if the
+        clock's source is gone."""
 
     def hurry(self, until_ns: int) -> None:
         """Until then the caller only waits, so a simulated clock may run fast; a real clock ignores this."""
@@ -98,8 +100,8 @@ class SystemClock:
     def now_ns(self) -> int:
         return time.monotonic_ns()
 
-    def sleep(self, seconds: float) -> None:
-        time.sleep(seconds)
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
+        time.sleep(min(seconds, at_most_s))
 
     def hurry(self, until_ns: int) -> None:
         """No effect on a real clock."""
@@ -186,6 +188,10 @@ class LedBox(Protocol):
         that call: a box that knows a device clear is dark within 100 ms even while a table is being uploaded.
         Other calls in progress end with a DeviceError, and light nothing after this one has returned.
         """
+
+    def acknowledge(self) -> None:
+        """After a person's word: clear a latched fault (the watchdog's, say), as opening does. All is dark after
+        it, and tables must be loaded anew."""
 
     def panel(self, panel: int, on: bool) -> None:
         """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for any other number."""
@@ -356,10 +362,17 @@ class ArmState:
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""
     condition: ArmCondition = ArmCondition()
+    unattended_s: float = 0.0
+    """The last motion was ended because nobody looked at the arm for this long, machine time; 0 if it was not."""
 
 
 class Robot(Protocol):
-    """The arm that carries the camera."""
+    """The arm that carries the camera.
+
+    A motion must be watched (`coupole.supervision`): the thread that called `move_to` calls `measured` at least
+    every 0.1 s of the machine's time until the arm is at rest, or waits in `wait_settled`, which does so. Without
+    that the axes brake on their path, whatever has become of this process; no fault is latched.
+    """
 
     def identify(self) -> Identity: ...
 
@@ -376,11 +389,12 @@ class Robot(Protocol):
     def wait_settled(self) -> ArmState:
         """Wait until the arm is at rest at the target; the time-out is derived from the commanded motion.
 
-        Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout, and DeviceRefused if
-        another thread commands the arm meanwhile.
+        Raises DeviceFault on a latched fault, DeviceLost if the link is gone, DeviceTimeout, DeviceRefused if
+        another thread commands the arm meanwhile, and ArmUnattended if the motion ended because nobody watched it.
         """
 
-    def measured(self) -> ArmState: ...
+    def measured(self) -> ArmState:
+        """The arm's latest state. Called by the thread that began a motion it counts as a look at it."""
 
     def stop(self) -> None:
         """Stop the arm along its path, as fast as its limits allow; returns when it is at rest.

@@ -12,6 +12,7 @@
     │   ├── DeviceTimeout     4  ... did not answer in time
     │   ├── DeviceLost        4  ... its link is gone
     │   ├── DeviceRefused     4  ... refused a command
+    │   ├── ArmUnattended     4  ... braked, because nobody watched its motion
     │   └── DeviceFault       4  ... is in a latched fault; only an operator may clear it
     ├── UnprovenError         5  frames are missing or unproven after re-shooting
     ├── StorageError          6  the disk
@@ -126,6 +127,23 @@ class DeviceLost(DeviceError):
 
 class DeviceRefused(DeviceError):
     """The device refused a command."""
+
+
+class ArmUnattended(DeviceError):
+    """The arm braked on its path because nobody watched its motion; no fault is latched, and it may move again.
+
+    `silent_s` is for how long nobody looked, on the machine's clock.
+    """
+
+    def __init__(self, silent_s: float) -> None:
+        self.silent_s = silent_s
+        super().__init__(
+            "robot",
+            expected="a look at the arm every 0.1 s while it moves",
+            happened=f"nobody looked for {silent_s:.2f} s (the program stood still, or waited for something), so "
+            "arm braked on its path",
+            remedy="See that the cell is clear, then go on.",
+        )
 
 
 class DeviceFault(DeviceError):

@@ -57,6 +57,7 @@ KRL_STATUS = (
         "Status/@Time": "$ROB_TIMER",
         "Status/@Override": "$OV_PRO",
         "Status/@T1": "T1",
+        "Status/@Lapsed": "CP_LAPSED",
         "Arm/@Model": "$MODEL_NAME[]",
         "Arm/@Serial": "$KR_SERIALNO",
         "Pose/@Valid": "POSE_VALID",
@@ -66,7 +67,7 @@ KRL_STATUS = (
 )
 """Value that the controller sends in each element."""
 WIRE_NUMBERS = (
-    *("MOVE", "ASK", "NO_FAULT", "EMERGENCY_STOP", "DRIVES_OFF"),
+    *("STOP", "MOVE", "ASK", "BEAT", "BEAT_MS", "NO_FAULT", "EMERGENCY_STOP", "DRIVES_OFF"),
     *("STOP_MESSAGE", "PROGRAM_ENDED", "TARGET_REFUSED"),
 )
 """Numbers of the wire protocol used in the programs."""

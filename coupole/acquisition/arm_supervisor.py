@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.acquisition.observer import Control
+from coupole.acquisition.observer import Control, Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.devices import ArmState, Deadline
-from coupole.errors import DeviceFault, DeviceLost, PreflightRefused
+from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, PreflightRefused
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
 from coupole.motion.cell_motion import CellMotion
@@ -24,6 +23,7 @@ from coupole.motion.path_deviation import PATH_TOLERANCE_MM, deviation_at_rest_m
 from coupole.motion.path_planner import Joints
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import ViewPose
+from coupole.supervision import ASKS_FROM_S, LOOK_S
 
 _POLL_S = 0.01
 _SPEED_OVER_NS = 30_000_000
@@ -48,7 +48,19 @@ class SettledPose:
 class ArmSupervisor:
     """One session's motions. Every method that waits can be ended by the operator's stop or a fault of the arm."""
 
-    def __init__(self, rig: Rig, motion: CellMotion, cell: OpenedCell, control: Control) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        motion: CellMotion,
+        cell: OpenedCell,
+        control: Control,
+        *,
+        stand: Callable[[], None] | None = None,
+        tell_lapse: Callable[[str], None] = lambda message: None,
+    ) -> None:
+        """`stand` waits until a person lets a session that is held go on; without it what held a motion is raised.
+        `tell_lapse` is told of a motion that was braked because nobody had looked at it."""
+        self._stand, self._tell_lapse = stand, tell_lapse
         self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
         self._motion, self._paths = rig.motion, motion
         self._arm = arm_of(rig)
@@ -81,22 +93,64 @@ class ArmSupervisor:
 
     def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
         """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
-        raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's speeds."""
+        raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's speeds.
+
+        A motion that was braked because this thread did not look at it, or that is held, goes on from where it
+        stands on its checked line: by itself after a short lapse, by a person's word after all else."""
         self._settled = None
-        self._before = None
         path = (self._from_deg, *visit.leg.waypoints)
-        self._keep_to(path, self._watched(), "before it started")
-        for here_deg, there_deg in pairwise(path):
-            self._control.go_on()
-            self._before = None
-            self._robot.move_to(there_deg, speed)
-            self.hurry(move_duration_s(self._arm, here_deg, there_deg) / speed + self._motion.settle_dwell_s)
-            while (arm := self._watched()).moving:
-                self._keep_to((here_deg, there_deg), arm, "during its motion")
-                meanwhile()
-                self._clock.sleep(_POLL_S)
+        from_deg, allowed, when = path[0], path, "before it started"
+        targets = list(path[1:])
+        while targets:
+            try:
+                self._before = None
+                self._keep_to(allowed, self._watched(), when)
+                self._follow(from_deg, targets[0], meanwhile, speed)
+                if len(targets) == 1:
+                    self._settle()
+            except (ArmUnattended, Held, DeviceError) as error:
+                self._stand_after(error)
+                allowed, when = (from_deg, targets[0]), "while it stood"
+            else:
+                from_deg = targets.pop(0)
+                allowed, when = (from_deg, *targets), "between two motions"
         self._from_deg = path[-1]
-        return self._settle()
+        return self._settled or self._settle()
+
+    def _follow(self, here_deg: Joints, there_deg: Joints, meanwhile: Callable[[], None], speed: float) -> None:
+        """One straight motion, watched until the arm is at rest. Raises ArmUnattended if it was braked."""
+        self._control.go_on()
+        self._robot.move_to(there_deg, speed)
+        self.hurry(move_duration_s(self._arm, here_deg, there_deg) / speed + self._motion.settle_dwell_s)
+        while (arm := self._watched()).moving:
+            self._keep_to((here_deg, there_deg), arm, "during its motion")
+            meanwhile()
+            self._clock.sleep(_POLL_S, LOOK_S)
+        if arm.unattended_s > 0.0:
+            raise ArmUnattended(arm.unattended_s)
+
+    def _stand_after(self, error: Exception) -> None:
+        """The motion was braked, or is to be: come to rest, then wait for a person unless the lapse was short.
+        Raises what has another cause."""
+        lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
+        if self._control.stop.is_set() or not (self._control.stands or lapse_s):
+            raise error
+        self._robot.stop()
+        if lapse_s:
+            self._tell_lapse(str(error))
+        if lapse_s >= ASKS_FROM_S:
+            if self._stand is None:
+                raise error
+            self._control.hold(str(error))
+        if self._control.held.is_set():
+            if self._stand is None:
+                raise error
+            self._stand()
+
+    @property
+    def held(self) -> bool:
+        """See `Control.stands`."""
+        return self._control.stands
 
     def await_return(self, moved: ArmMovedError) -> SettledPose:
         """After a push: wait for the arm to spring back by itself; returns the newly measured pose.

@@ -16,6 +16,7 @@ from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
 from coupole.acquisition.host_burst import HostBurst
+from coupole.acquisition.observer import Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import Verdict
@@ -107,6 +108,12 @@ class BurstRunner:
             upload, self._upload = self._upload, None
             upload.result()
 
+    def forget_upload(self) -> None:
+        """Lights were switched off, which ends an upload: `fire` uploads anew."""
+        upload, self._upload = self._upload, None
+        if upload is not None:
+            futures.wait([upload], timeout=_STALL_S)
+
     def _await_upload(self) -> None:
         """Wait with an eye on the arm until the table is in the box. Raises what the upload raised."""
         while self._upload is not None:
@@ -160,13 +167,13 @@ class BurstRunner:
             self.times_s.append((clock.now_ns() - started_ns) / 1e9)
             if burst.panel:
                 box.panel(burst.panel, False)
-        except ArmMovedError:
-            box.lights_off()
-            self._upload = None  # that has ended it: `fire` uploads anew
-            camera.disarm()
-            self._end(running, camera=None)
-            raise
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, ArmMovedError | Held) or (isinstance(error, DeviceError) and self._arm.held):
+                box.lights_off()
+                self._upload = None  # that has ended it: `fire` uploads anew
+                camera.disarm()
+                self._end(running, camera=None)
+                raise
             self._cell.make_safe()
             with contextlib.suppress(Exception):  # the disk; it must not hide the error that ended the burst
                 self._end(running, camera=None)

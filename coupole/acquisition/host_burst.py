@@ -17,6 +17,7 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
+from coupole.acquisition.observer import Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
@@ -28,6 +29,7 @@ from coupole.devices import (
     FrameFormat,
     StepRecord,
 )
+from coupole.errors import DeviceError
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.step_fields import step_fields
@@ -115,9 +117,9 @@ class HostBurst:
             reason = reason or ("a dark mark was not seen" if marks else "")
             if not reason:
                 self._prove(kept)
-        except ArmMovedError:
-            raise  # `_fire_one` has switched the light off
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, ArmMovedError | Held) or (isinstance(error, DeviceError) and self._arm.held):
+                raise  # `_fire_one` has switched the light off
             self._cell.make_safe()
             raise
         finally:

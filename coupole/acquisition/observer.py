@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from coupole.errors import Interrupted
+from coupole.supervision import ASKS_FROM_S
 from coupole.viewing.progress import Progress
 
 
@@ -33,14 +37,41 @@ class Unwatched:
         """Nobody listens."""
 
 
+class Held(Exception):
+    """The session is to stand at once, until a person says that it goes on: raised where it would command a
+    device."""
+
+
+def frozen(seconds: float) -> str:
+    """Why a session is held whose process did not run."""
+    return f"the program did not run for {seconds:.1f} s: it was stopped, or its machine slept"
+
+
 @dataclass
 class Control:
-    """The operator's stop and pause: set from signal handlers and other threads."""
+    """The operator's stop and pause: set from signal handlers and other threads.
+
+    A *pause* waits for the end of the burst. A *hold* does not: something stopped the program, or the arm, that
+    nobody had asked for, or that cannot wait. Whoever holds a session has lights switched off and the arm stopped
+    (`halting`), and only a person lets it go on.
+    """
 
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)
     paused: threading.Event = field(default_factory=threading.Event)
     """Set while the session stands: lights off, the arm at rest."""
+    can_stand: bool = False
+    """Whether the session can stand and go on; one that cannot is stopped by a hold."""
+    held: threading.Event = field(default_factory=threading.Event)
+    """Set from a hold until the session stands."""
+    halting: threading.Event = field(default_factory=threading.Event)
+    """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
+    held_because: str = ""
+    unsure: Sequence[str] = ()
+    """What a hold could not confirm to be safe: then the session ends."""
+    pulse_s: float = math.inf
+    """When this process last proved that it runs, monotonic s: a thread that does nothing else sets it
+    (`coupole.acquisition.signals`); never, where there is none."""
     signal_number: int = signal.SIGINT
     """The signal that set `stop`."""
 
@@ -52,7 +83,22 @@ class Control:
 
     def toggle_pause(self) -> None:
         """Pause at the next opportunity, or go on."""
-        (self.pause.clear if self.pause.is_set() else self.pause.set)()
+        (self.let_go_on if self.pause.is_set() else self.pause.set)()
+
+    def let_go_on(self) -> None:
+        """A person's word ends a pause, but not one that is still being made safe."""
+        if not self.halting.is_set():
+            self.pause.clear()
+
+    def hold(self, why: str) -> None:
+        """Stand at once, wherever the session is; the first reason counts until it stands."""
+        if not self.can_stand:
+            self.stop_by(signal.SIGINT)
+            return
+        if not self.held.is_set():
+            self.held_because = why
+        self.pause.set()
+        self.held.set()
 
     def interrupted(self) -> Interrupted:
         """The error that ends a stopped session."""
@@ -60,7 +106,19 @@ class Control:
         name = signal.Signals(self.signal_number).name
         return Interrupted(f"{word} ({name}); everything proven so far is kept", self.signal_number)
 
+    @property
+    def stands(self) -> bool:
+        """True while the session is to stand, and does not yet: devices fail then because they were stopped, or
+        because this process was. One that was frozen is held here, whichever thread is the first to run again."""
+        silent_s = time.monotonic() - self.pulse_s
+        if silent_s > ASKS_FROM_S and self.can_stand:
+            self.hold(frozen(silent_s))
+        return self.held.is_set()
+
     def go_on(self) -> None:
-        """Raise Interrupted if the session is to stop: to be called before each command that lights or moves."""
+        """Raise Interrupted if the session is to stop, Held if it is to stand: to be called before each command
+        that lights or moves."""
         if self.stop.is_set():
             raise self.interrupted()
+        if self.held.is_set():
+            raise Held(self.held_because)

@@ -97,7 +97,7 @@ class RunControl:
             case "pause":
                 self._control.pause.set()
             case "go-on":
-                self._control.pause.clear()
+                self._control.let_go_on()
             case "stop":
                 self._control.stop_by(signal.SIGINT)
                 return {**self.state(), "trouble": unsure(self._halt(), _SAFE_WITHIN_S)}

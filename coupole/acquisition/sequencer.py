@@ -15,7 +15,7 @@ from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, Set
 from coupole.acquisition.burst_runner import BurstRunner
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
-from coupole.acquisition.observer import Control, Observer, Unwatched
+from coupole.acquisition.observer import Control, Held, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
@@ -63,7 +63,15 @@ class Sequencer:
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots)
-        self._arm = ArmSupervisor(job.cell.rig, job.motion, cell, self._control)
+        self._control.can_stand = True
+        self._arm = ArmSupervisor(
+            job.cell.rig,
+            job.motion,
+            cell,
+            self._control,
+            stand=self._wait_while_paused,
+            tell_lapse=lambda message: self._note_fault("ArmUnattended", message),
+        )
         self._burst_runner = BurstRunner(
             cell,
             recorder,
@@ -178,20 +186,26 @@ class Sequencer:
         """
         self._ahead_s -= _expected_s(burst)
         todo = burst
-        for attempt in range(self._job.plan.reshoot_limit + 1):
+        attempt = 0
+        while attempt <= self._job.plan.reshoot_limit:
             self._wait_while_paused()
             if attempt:
                 shots = tuple(shot for shot in todo.shots if shot and shot.is_shot)
                 self.outcome.reshot += len(shots)
                 self._recorder.note(ReshootBegun(view=burst.view, attempt=attempt, shots=shots))
             try:
-                verdict = self._burst_runner.fire(todo, following if attempt == 0 else None)
+                verdict = self._burst_runner.fire(todo, following if todo is burst else None)
+                attempt += 1
             except ArmMovedError as moved:
                 self._cell.ledbox.lights_off()
-                self._observer.note(f"{burst.view}: {moved}")
-                self._recorder.note(FaultNoted(kind="ArmMoved", message=f"{burst.view}: {moved}"))
+                self._note_fault("ArmMoved", f"{burst.view}: {moved}")
                 begin(self._arm.await_return(moved))
                 verdict = Verdict(NOTHING_TO_MATCH, [])
+                attempt += 1
+            except (Held, DeviceError):
+                if not self._arm.held or self._control.stop.is_set():
+                    raise
+                verdict = Verdict(NOTHING_TO_MATCH, [])  # what was cut short is no attempt
             done = self._recorder.proven()
             left = [shot for shot in todo.shots if shot and shot not in done]
             if not left:
@@ -199,6 +213,10 @@ class Sequencer:
             self._note_gap(burst, verdict, left)
             self.outcome.bad |= set(verdict.dead)
             todo = burst.only({shot.label for shot in left})
+
+    def _note_fault(self, kind: str, message: str) -> None:
+        self._observer.note(message)
+        self._recorder.note(FaultNoted(kind=kind, message=message))
 
     # -- small things -------------------------------------------------------------------------------------
 
@@ -252,18 +270,39 @@ class Sequencer:
         )
 
     def _wait_while_paused(self) -> None:
-        if not self._control.pause.is_set():
+        control = self._control
+        if not control.pause.is_set():
             return
+        held = control.stands
+        while control.halting.is_set():
+            self._cell.clock.sleep(_PAUSE_NAP_S, _PAUSE_NAP_S)
+        if held:
+            self._note_fault("Held", control.held_because)
+            control.held.clear()
         self._recorder.note(Paused())
         self._recorder.commit(now=True)
         self._observer.note("paused: lights are off, the arm is at rest; the key p or `coupole go-on` continues")
-        self._control.paused.set()
+        control.paused.set()
         try:
-            while self._control.pause.is_set():
+            while control.pause.is_set() or control.halting.is_set():
+                if control.unsure:
+                    raise DeviceError(
+                        "cell",
+                        expected="lights off and the arm at rest while the session stands",
+                        happened="; ".join(control.unsure),
+                        remedy="Look at the cell, then resume the run.",
+                    )
+                if control.held.is_set():  # again, while it stands
+                    self._note_fault("Held", control.held_because)
+                    control.held.clear()
+                    held = True
                 self._arm.attend()
                 self._cell.clock.sleep(_PAUSE_NAP_S)
         finally:
-            self._control.paused.clear()
+            control.paused.clear()
+        if held:  # the box may have switched off by its watchdog, which it keeps as a fault
+            self._burst_runner.forget_upload()
+            self._cell.ledbox.acknowledge()
         self._recorder.note(Continued())
         self._observer.note("continued")
 

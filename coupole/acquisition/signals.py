@@ -1,22 +1,36 @@
-"""Signals that end a session: Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone.
+"""Signals that end a session: Ctrl-C, SIGTERM, and SIGHUP when the terminal is gone; and what stops its process.
 
 Outside a session they raise `SignalReceived` in the main thread. In a session (`obeyed_by`) they are obeyed at
 once from a thread of their own, whatever the main thread waits for, and the main thread learns of it from
 `Control`. While a cell is made safe (`held`) they do nothing, so that a second Ctrl-C does not cut it short.
+
+Ctrl-Z (SIGTSTP) makes the cell safe before the process stops. SIGSTOP cannot be heard, nor a machine that falls
+asleep: when the process runs again, the session is held, and a person is asked (`Control.hold`).
 """
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
+import select
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from coupole.acquisition.observer import Control
+from coupole.acquisition.observer import Control, frozen
+from coupole.acquisition.safeguard import Safeguard, unsure
+from coupole.supervision import ASKS_FROM_S
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+_PULSE_S = 0.25
+_SAFE_WITHIN_S = 4.0
+"""Ctrl-Z stops the process after this time though it is not sure that the cell is safe; that is told."""
 
 
 class SignalReceived(BaseException):
@@ -53,7 +67,8 @@ def held() -> Iterator[None]:
 @contextmanager
 def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
     """A signal that ends the session sets `control.stop` and calls `act` at once, in another thread; SIGUSR1
-    pauses the session or continues it.
+    pauses the session or continues it; Ctrl-Z calls `act`, stops the process, and holds the session. `act` begins
+    to make the cell safe; it may return its `Safeguard`s.
 
     Signals are delivered to Python's main thread only between two of its steps, and a disk or a device may hold it
     for seconds within one. The interpreter writes each signal's number to a pipe without delay; a thread reads it.
@@ -64,22 +79,14 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
     ours, pythons = os.pipe()
     os.set_blocking(pythons, False)
 
-    def obey() -> None:
-        acted = False
-        while numbers := os.read(ours, 64):
-            for number in numbers:
-                if number in ENDING and not acted:  # whether or not the main thread's handler was first
-                    acted = True
-                    control.stop_by(number)
-                    act()
-
-    thread = threading.Thread(target=obey, name="signals", daemon=True)
+    thread = threading.Thread(target=_obey, args=(ours, control, act), name="signals", daemon=True)
     before = signal.set_wakeup_fd(pythons, warn_on_full_buffer=False)
     thread.start()
     try:
         with _handlers(
             {number: lambda number, _: control.stop_by(number) for number in ENDING}
             | {signal.SIGUSR1: lambda *_: control.toggle_pause()}
+            | {number: lambda *_: None for number in (signal.SIGTSTP, signal.SIGCONT)}
         ):
             yield
     finally:
@@ -87,6 +94,70 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
         os.close(pythons)
         thread.join()
         os.close(ours)
+        control.pulse_s = math.inf
+
+
+def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
+    """Obey the signals whose numbers come through a pipe, until it is closed; and prove that the process runs."""
+    acted, stood_s, noticed_s = False, 0.0, 0.0
+    slept_s = _slept_s()
+    control.pulse_s = time.monotonic()
+    while True:
+        ready = select.select([ours], [], [], _PULSE_S)[0]
+        now_s = time.monotonic()
+        silent_s, control.pulse_s = now_s - control.pulse_s, now_s
+        if silent_s > ASKS_FROM_S:  # SIGCONT may be heard a moment later; without it the machine was only busy
+            stood_s, noticed_s = silent_s, now_s
+        if (asleep_s := _slept_s() - slept_s) > ASKS_FROM_S:
+            slept_s += asleep_s
+            _hold(control, act, frozen(asleep_s))
+        if not ready:
+            continue
+        if not (numbers := os.read(ours, 64)):
+            return
+        for number in numbers:
+            if number in ENDING and not acted:  # whether or not the main thread's handler was first
+                acted = True
+                control.stop_by(number)
+                act()
+            elif number == signal.SIGTSTP:
+                _suspend(control, act)
+            elif number == signal.SIGCONT and stood_s and now_s - noticed_s < ASKS_FROM_S:
+                _hold(control, act, frozen(stood_s))
+                stood_s = 0.0
+
+
+def _slept_s() -> float:
+    """For how long this machine has slept since it started."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
+
+
+def _hold(control: Control, act: Callable[[], object], why: str) -> None:
+    """Hold the session, and have lights off and the arm at rest."""
+    control.halting.set()
+    try:
+        control.hold(why)
+        begun = act()
+        safeguards = [one for one in begun if isinstance(one, Safeguard)] if isinstance(begun, list) else []
+        control.unsure = unsure(safeguards, _SAFE_WITHIN_S)
+    finally:
+        control.halting.clear()
+
+
+def _suspend(control: Control, act: Callable[[], object]) -> None:
+    """Ctrl-Z: first the cell is safe, then the process stops; when it goes on, a person is asked."""
+    _hold(control, act, "suspended by Ctrl-Z: the lights were switched off and the arm was stopped first")
+    state = "; ".join(control.unsure) or "lights are off, the arm is at rest"
+    _tell(f"\n{state}; suspended (`fg` continues the program, the run then asks)\n")
+    os.kill(os.getpid(), signal.SIGSTOP)
+    control.pulse_s = time.monotonic()
+
+
+def _tell(text: str) -> None:
+    """On the terminal, if it takes it at once."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        if select.select([], [sys.stderr.fileno()], [], 0)[1]:
+            os.write(sys.stderr.fileno(), text.encode())
 
 
 @contextmanager

@@ -200,6 +200,12 @@ class LedBox:
             self._clock.sleep(_BLOCK_TIMEOUT_S - REPLY_MARGIN_S)
             self._abort()
 
+    def acknowledge(self) -> None:
+        """The box forgets its tables with its faults."""
+        self._running_bank, self._banks = None, [None, None]
+        self._scpi.ask("*RST;*CLS", 0)
+        self._set_up()
+
     def panel(self, panel: int, on: bool) -> None:
         self._scpi.ask(f"OUTP:PAN{panel} {int(on)}", 0)
 

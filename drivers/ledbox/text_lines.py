@@ -232,6 +232,10 @@ class TextLineBox:
             if self._flash is not None and self._flash.off_ns is None:
                 self._flash.off_ns = self._clock.now_ns()
 
+    def acknowledge(self) -> None:
+        """A box of this kind has no faults that it keeps."""
+        self.lights_off()
+
     def panel(self, panel: int, on: bool) -> None:
         self._refuse("a panel that the box has", f"panel {panel} was asked for, it has none", "Leave panels out.")
 

@@ -23,8 +23,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
 from coupole.devices import ArmCondition, ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceLost, DeviceRefused
+from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
+from coupole.supervision import LOOK_S, Attention
 from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refused, wait_for
 from drivers.fair_lock import FairLock
 from drivers.ur.messages import (
@@ -65,8 +66,8 @@ class Settings(BaseModel):
     """Deceleration of `stop`."""
     frequency_hz: float = Field(default=125.0, ge=10, le=500)
     """Rate of the controller's samples."""
-    watchdog_s: float = Field(default=0.5, ge=0.05)
-    """The controller ends all motion after this time without a message from the host."""
+    watchdog_s: float = Field(default=0.1, ge=0.05)
+    """The controller ends all motion after this time without a message from the host's process."""
     link_timeout_s: float = Field(default=1.0, gt=0)
     """The link counts as lost after this time without a sample from the controller."""
     connect_timeout_s: float = Field(default=20.0, gt=0)
@@ -122,6 +123,9 @@ class UrRobot:
         """Held while the process is asked and answers: `stop` may come from any thread."""
         self._stops = 0
         self._motion_s = 0.0
+        self._attention = Attention()
+        self._lapses = 0
+        """Of the process, when the last motion began."""
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
         try:
@@ -168,6 +172,7 @@ class UrRobot:
         stops, speed = self._stops, checked_speed(speed)
         target_deg = checked_target(joints_deg, self.settings.limits_deg)
         state = self._command("move", target_deg, stops, speed)
+        self._lapses = state.lapses
         raise_fault(state)
         if state.speed_fraction <= 0.0:
             raise refused("a speed slider above 0 %", "it is at 0 %: the arm will not move")
@@ -196,6 +201,7 @@ class UrRobot:
             moving=state.still_samples < self.settings.settle_samples,
             fault=state.fault,
             condition=_condition(state),
+            unattended_s=self._attention.longest_gap_s if state.lapses != self._lapses else 0.0,
         )
 
     def stop(self) -> None:
@@ -245,11 +251,13 @@ class UrRobot:
             elif self._stops != stops:  # by another thread, since that call began
                 raise overtaken()
             self._number += 1
+            if verb == "move":
+                self._attention.begin()
             return self._process.ask(Ask(verb, self._number, target_deg, speed))
 
     def _state(self) -> State:
         with self._asking:
-            return self._process.ask(Ask("state"))
+            return self._process.ask(Ask("state", looks=self._attention.look() is not None))
 
     def _wait(
         self, done: Callable[[State], bool], deadline: Deadline, expected: str, *, faults: bool = True
@@ -260,7 +268,7 @@ class UrRobot:
             deadline,
             expected,
             check=raise_fault if faults else None,
-            pause=lambda: self._clock.sleep(_POLL_S),
+            pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
                 f"joints measured at {np.round(state.joints_deg, 3).tolist()} deg, "
                 f"wanted at {np.round(state.wanted_deg, 3).tolist()} deg"
@@ -271,6 +279,8 @@ class UrRobot:
     def _settled(self, state: State, number: int) -> bool:
         if self._number != number:
             raise overtaken()
+        if state.lapses != self._lapses:
+            raise ArmUnattended(self._attention.longest_gap_s)
         return state.command == number and self._is_still(state)
 
     def _is_still(self, state: State) -> bool:

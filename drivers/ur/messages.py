@@ -60,6 +60,8 @@ class Ask:
     target_deg: Six | None = None
     speed: float = 1.0
     """Share of the configured speed."""
+    looks: bool = False
+    """Whoever watches the motion asks: the motion goes on."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ class State:
     """RTDE's safety_status_bits."""
     fault: str = ""
     """Name and reason of the latched fault; empty when there is none."""
+    lapses: int = 0
+    """Motions that ended because nobody watched them (`coupole.supervision`)."""
     lost: bool = False
     """The fault is a lost link; the process has ended."""
 

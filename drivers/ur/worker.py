@@ -25,6 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from coupole.supervision import ATTENTION_S
 from drivers.ur.dashboard import CannotBegin, end_program, ready_controller, why_ended
 from drivers.ur.messages import (
     EMERGENCY_STOP_BITS,
@@ -92,7 +93,7 @@ class Link:
         """A target that waits until the arm is at rest: the effect of movej on a moving arm is not documented."""
         self._quiet_samples = self._astray_samples = self._ended_samples = 0
         self._timestamp_s = -1.0
-        self._changed_s = self._kicked_s = time.monotonic()
+        self._changed_s = self._kicked_s = self._looked_s = time.monotonic()
         zeros = (0.0,) * 6
         self.state = State(
             command=0,
@@ -111,10 +112,11 @@ class Link:
         )
 
     def tick(self) -> None:
-        """Read the controller's state, kick its watchdog, start a pending motion."""
+        """Read the controller's state, kick its watchdog, start a pending motion; end one that nobody watches."""
         self._look()
         if self.state.fault:
             return
+        self._attend()
         now_s = time.monotonic()
         if now_s - self._kicked_s > self.config.watchdog_s / 5.0:
             self._kicked_s = now_s
@@ -124,6 +126,8 @@ class Link:
 
     def obey(self, ask: Ask) -> None:
         """Begin a command; after a fault, nothing. The answer is `state`."""
+        if ask.looks or ask.verb == "move":
+            self._looked_s = time.monotonic()
         if ask.verb == "state" or self.state.fault:
             return
         stands = self._settled()
@@ -134,6 +138,14 @@ class Link:
             return
         self._call(lambda: self._control.stopJ(math.radians(self.config.stop_deg_s2), True))
         self._pending_deg, self._pending_speed = ask.target_deg, ask.speed
+
+    def _attend(self) -> None:
+        """Brake if nobody has looked at a motion for too long (`coupole.supervision`)."""
+        pursues = self._pending_deg is not None or (self._goal_deg is not None and not self._settled())
+        if pursues and time.monotonic() - self._looked_s > ATTENTION_S:
+            self.state = replace(self.state, lapses=self.state.lapses + 1, still_samples=0)
+            self._quiet_samples, self._goal_deg, self._pending_deg = 0, None, None
+            self._call(lambda: self._control.stopJ(math.radians(self.config.stop_deg_s2), True))
 
     def leave(self) -> None:
         """Bring the arm to rest and end the program. A hang here ends the process by SIGALRM."""

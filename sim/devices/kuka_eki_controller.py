@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import select
 import socket
+import time
 from collections.abc import Sequence
 from typing import Literal
 from xml.etree import ElementTree
@@ -17,7 +18,7 @@ from xml.etree import ElementTree
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.geometry import Transform, abc_from_rotation
-from sim.devices.kuka_eki_wire import ASK, MOVE, Command, Messages
+from sim.devices.kuka_eki_wire import ASK, BEAT, MOVE, Command, Messages
 from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
 from sim.devices.kuka_ptp import Motion, braked, point_to_point, standing
 from sim.strangers.arm_stranger import NO_STRANGER, ArmStranger
@@ -28,6 +29,9 @@ Six = tuple[float, float, float, float, float, float]
 
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
+_BEAT_S = 0.1
+"""A motion without a command for this long ends. Counted on the machine's clock: whoever watches lives by that
+one, and a world may run faster."""
 _UNSENT_BYTES = 4096
 """Send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
 _HARD = 100.0
@@ -91,6 +95,10 @@ class KukaEkiController:
         self._end: Timer | None = None
         self._session = self._taken = self._done = self._order = 0
         self._refused = False
+        self._heard_s = 0.0
+        """Machine time of the last command."""
+        self._watched = self._lapsed = 0
+        """Number of the MOVE that is under way, and of the last one that ended because no command came."""
         self._target: tuple[tuple[float, ...], float] | None = None
         """Axes and speed (fraction of the highest) of the motion to begin once the axes are at rest."""
         self._client: socket.socket | None = None
@@ -240,13 +248,15 @@ class KukaEkiController:
 
     def _take(self, command: Command) -> None:
         if command.session != self._session:
-            self._session, self._done, self._refused = command.session, 0, False
+            self._session, self._done, self._refused, self._lapsed = command.session, 0, False, 0
             if not self.moving:  # the present axes become the target of the new session
                 self._motion = standing(self.joints_deg)
                 self._pushes.forget()
         self._taken = command.number
-        if command.verb == ASK:
+        self._heard_s = time.monotonic()
+        if command.verb in (ASK, BEAT):
             return
+        self._watched = command.number if command.verb == MOVE else 0
         self._order, self._target = command.number, None
         if self.fault:
             return
@@ -258,7 +268,15 @@ class KukaEkiController:
         share = command.acceleration_percent / 100.0
         self._acceleration_deg_s2 = share * self._settings.full_acceleration_deg_s2
 
+    def _watch(self) -> None:
+        """End a motion that nobody watches any more."""
+        if not self._watched or time.monotonic() - self._heard_s <= _BEAT_S:
+            return
+        self._lapsed, self._watched, self._target = self._watched, 0, None
+        self._brake(self._acceleration_deg_s2, self._settings.jerk_deg_s3)
+
     def _cycle(self) -> None:
+        self._watch()
         if self._client is not None and not self._cut:
             self._send(self._status())
         self._timer = self._reactor.after(self._settings.status_ms / 1e3, self._cycle)
@@ -281,7 +299,8 @@ class KukaEkiController:
         return (
             f'<Coupole><Status Session="{self._session}" Taken="{self._taken}" Done="{self._done}" '
             f'Moving="{int(self.moving)}" Fault="{fault}" Time="{self._reactor.now_ns // 1_000_000}" '
-            f'Override="{self._settings.override_percent}" T1="0"/>'
+            f'Override="{self._settings.override_percent}" T1="0" '
+            f'Lapsed="{self._lapsed}"/>'
             f'<Arm Model="KR10R1100SIXX simulated" Serial="{self._settings.seed}"/><Axes {axes}/><Pose Valid="1" '
             + " ".join(f'{name}="{value:.4f}"' for name, value in zip("XYZABC", pose, strict=True))
             + "/></Coupole>"
@@ -315,7 +334,7 @@ class KukaEkiController:
         if self.fault:
             return
         if self._target is None:
-            self._done = self._order
+            self._done, self._watched = self._order, 0
             return
         target_deg, speed_share = self._target
         self._target = None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
 
-STOP, MOVE, ASK = range(3)
+STOP, MOVE, ASK, BEAT = range(4)
 _LONGEST_MESSAGE_BYTES = 4096
 
 
@@ -51,12 +51,12 @@ class Command:
         """Raises KeyError for a message that lacks something, ValueError for a number out of its limits."""
         values = {f"{child.tag}/{name}": value for child in message for name, value in child.items()}
         largest = 2**31 - 1
-        asks = values["Command/Verb"] == str(ASK)
+        asks = values["Command/Verb"] in (str(ASK), str(BEAT))
         moves = values["Command/Verb"] == str(MOVE)
         return Command(
             _whole(values["Command/Session"], 0, largest),
             _whole(values["Command/Number"], 0, largest),
-            _whole(values["Command/Verb"], STOP, ASK),
+            _whole(values["Command/Verb"], STOP, BEAT),
             100 if not moves else _whole(values["Command/Velocity"], 1, 100),
             100 if asks else _whole(values["Command/Acceleration"], 1, 100),
             tuple(_angle(values[f"Axes/A{axis}"]) for axis in range(1, 7)) if moves else (),

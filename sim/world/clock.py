@@ -10,6 +10,7 @@ own work then takes as much world time as in a real cell, and only its waiting i
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import select
@@ -155,11 +156,12 @@ class SharedClock:
         self._last_ns = max(self._last_ns, min(pace.world_at(time.monotonic_ns()), horizon_ns))
         return self._last_ns
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         end_ns = self.now_ns() + int(seconds * 1e9)
+        end_s = time.monotonic() + at_most_s
         speed = self._read()[0].speed
-        while (left_ns := end_ns - self.now_ns()) > 0:
-            time.sleep(min(_NAP_S, max(left_ns / 1e9 / speed, 2e-5)))
+        while (left_ns := end_ns - self.now_ns()) > 0 and (left_s := end_s - time.monotonic()) > 0.0:
+            time.sleep(min(_NAP_S, left_s, max(left_ns / 1e9 / speed, 2e-5)))
 
     def hurry(self, until_ns: int) -> None:
         """Let a world with `hurry_only_when_told` run at its speed until then."""

@@ -7,6 +7,7 @@ matter.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -184,7 +185,7 @@ class Cell:
     def now_ns(self) -> int:
         return round(self.now_us * 1e3)
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         assert self.burst_us < 60e6, "the loop does not end"
         self.pass_time(seconds)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -36,7 +37,7 @@ class Arm:
     def now_ns(self) -> int:
         return int(self.now * 1e9)
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         self.now += seconds
 
     def hurry(self, until_ns: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +29,7 @@ class Clock:
     def now_ns(self) -> int:
         return int(self.now_s * 1e9)
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         self.now_s += seconds
 
 

@@ -6,6 +6,7 @@ no world can be made to hit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -72,7 +73,7 @@ class Cell:
     def now_ns(self) -> int:
         return self.now_ns_
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         self.now_ns_ += round(seconds * 1e9)
 
     # box

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -55,7 +56,7 @@ class Drifting:
     def stop(self) -> None:
         self.stopped_s = self.now_s
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         self.now_s += seconds
         assert self.now_s < 20.0, "it was never stopped"
 

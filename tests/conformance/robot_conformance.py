@@ -9,7 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
 
 from coupole.devices import Robot
-from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
+from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
 from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 from sim.devices.kuka_controller import ALIKE, KukaController
@@ -46,6 +46,13 @@ class RobotCell(ABC):
         self._thread.start()
         self.clock = SharedClock(self.clock_path)
         self._drivers = ExitStack()
+        self.robot: Robot | None = None
+        """The driver opened last."""
+
+    def kept(self, robot: Any) -> Any:
+        """A driver that is closed with the cell."""
+        self.robot = self._drivers.enter_context(closing(robot))
+        return robot
 
     @abstractmethod
     def open(self) -> Robot:
@@ -68,6 +75,9 @@ class RobotCell(ABC):
     def wait_until(self, condition: Callable[[], bool]) -> None:
         give_up = time.monotonic() + 30.0
         while not condition():
+            with suppress(DeviceError):  # a motion that nobody looks at is ended
+                if self.robot is not None:
+                    self.robot.measured()
             assert time.monotonic() < give_up
             time.sleep(0.001)
 
@@ -143,7 +153,8 @@ class KukaCell(RobotCell):
         super().__init__(folder / "clock", reactor, arm, cycle_ms)
 
     def open(self, **settings: object) -> KukaRsi:
-        return self._drivers.enter_context(closing(KukaRsi(self.settings.model_copy(update=settings), self.clock)))
+        opened: KukaRsi = self.kept(KukaRsi(self.settings.model_copy(update=settings), self.clock))
+        return opened
 
 
 class RobotConformance:

@@ -75,7 +75,8 @@ class EkiCell(RobotCell):
         super().__init__(folder / "clock", reactor, arm, SAMPLE_MS)
 
     def open(self, **settings: object) -> KukaEki:
-        return self._drivers.enter_context(closing(KukaEki(self.settings.model_copy(update=settings), self.clock)))
+        opened: KukaEki = self.kept(KukaEki(self.settings.model_copy(update=settings), self.clock))
+        return opened
 
     def hold_until_commanded(
         self, command: Callable[[], None], *, once: Callable[[], bool] = lambda: True

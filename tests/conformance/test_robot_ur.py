@@ -53,7 +53,8 @@ class UrCell(RobotCell):
         super().__init__(folder / "clock", reactor, arm, 1e3 * _CYCLE_S)
 
     def open(self) -> UrRobot:
-        return self._drivers.enter_context(closing(UrRobot(self.settings, self.clock)))
+        opened: UrRobot = self.kept(UrRobot(self.settings, self.clock))
+        return opened
 
     @property
     def velocity_deg_s(self) -> NDArray[np.float64]:

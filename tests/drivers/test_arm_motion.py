@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import count
 
 import numpy as np
@@ -23,7 +24,7 @@ class HandTurnedClock:
     def now_ns(self) -> int:
         return self.t_ns
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         self.t_ns += round(seconds * 1e9)
 
 

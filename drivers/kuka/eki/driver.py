@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping
 from ipaddress import IPv4Address
 from typing import Literal, Self
@@ -18,9 +19,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coupole.devices import ArmCondition, ArmState, Clock, Identity
-from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
+from coupole.errors import ArmUnattended, DeviceError, DeviceLost, DeviceTimeout
 from coupole.geometry import transform
 from coupole.kinematics import Arm, forward, move_duration_s, slowed
+from coupole.supervision import ATTENTION_S, Attention
 from drivers.arm_motion import (
     MessageTime,
     checked_speed,
@@ -37,6 +39,7 @@ from drivers.kuka.eki.wire import Command, Six, Status
 
 _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
 """Largest allowed difference between the controller's flange pose and that computed from its axes."""
+_BEAT_EVERY_S = ATTENTION_S / 4.0
 _T1_SLOWER = 10.0
 """In T1, motions take up to this factor longer (for time-outs)."""
 
@@ -127,6 +130,9 @@ class KukaEki:
         """Held while a command is numbered and sent: `stop` may come from any thread."""
         self._stops = 0
         self._motion_s = 0.0
+        self._attention = Attention()
+        self._sent_s = 0.0
+        """Machine time of the last command."""
         self._watch = Watch(
             1 + secrets.randbelow(2**31 - 2),
             Tolerances(settings.settle_deg, settings.settle_deg_s, settings.follow_deg, settings.follow_cycles),
@@ -184,6 +190,7 @@ class KukaEki:
             if self._stops != stops:  # by another thread, since this call began
                 raise overtaken()
             self._motion_s = move_s * _slower(status)
+            self._attention.begin()
             self._order(wire.MOVE, target_deg, percent)
 
     def wait_settled(self) -> ArmState:
@@ -200,6 +207,9 @@ class KukaEki:
         def settled() -> bool:
             if watch.order != order:
                 raise overtaken()
+            self._look()
+            if watch.lapsed and not watch.moving:
+                raise ArmUnattended(self._attention.longest_gap_s)
             return watch.taken_ms is not None and watch.settled_cycles >= settings.settle_cycles
 
         self._wait(settled, limit_s, "the arm at its target and still")
@@ -211,6 +221,7 @@ class KukaEki:
 
     def measured(self) -> ArmState:
         """State in the last status. Raises DeviceLost if the link is lost."""
+        self._look()
         with self._link.changed:
             if self._watch.link_lost:
                 self._raise_fault()
@@ -222,6 +233,7 @@ class KukaEki:
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
                 condition=_condition(status),
+                unattended_s=self._attention.longest_gap_s if self._watch.lapsed else 0.0,
             )
 
     def stop(self) -> None:
@@ -299,19 +311,33 @@ class KukaEki:
             self._watch.ordered(self._number + 1, target_deg)
         self._send(verb, target_deg, percent)
 
+    def _look(self) -> None:
+        """Whoever watches the motion has looked: tell the controller, often enough."""
+        due = time.monotonic() - self._sent_s > _BEAT_EVERY_S
+        if self._attention.look() is None or not due or not self._watch.moving:
+            return
+        if self._sending.acquire(blocking=False):  # else another thread sends a command, which is as good
+            try:
+                self._link.beat(self._command(wire.BEAT))
+            finally:
+                self._sending.release()
+
     def _send(self, verb: int, target_deg: Six | None = None, percent: int | None = None) -> None:
+        self._link.send(self._command(verb, target_deg, percent))
+
+    def _command(self, verb: int, target_deg: Six | None = None, percent: int | None = None) -> Command:
+        """The next command; `_sending` must be held."""
         self._number += 1
+        self._sent_s = time.monotonic()
         settings, status = self.settings, self._watch.status
         here_deg = status.joints_deg if status else (0.0,) * 6
-        self._link.send(
-            Command(
-                session=self._watch.session,
-                number=self._number,
-                verb=verb,
-                velocity_percent=percent or settings.velocity_percent(),
-                acceleration_percent=settings.acceleration_percent(),
-                joints_deg=target_deg or here_deg,
-            )
+        return Command(
+            session=self._watch.session,
+            number=self._number,
+            verb=verb,
+            velocity_percent=percent or settings.velocity_percent(),
+            acceleration_percent=settings.acceleration_percent(),
+            joints_deg=target_deg or here_deg,
         )
 
     def _status(self) -> Status:
@@ -322,7 +348,12 @@ class KukaEki:
 
     def _wait_taken(self) -> None:
         watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # a lost link is noticed before that
-        self._link.wait_for(lambda: watch.link_lost or watch.taken_ms is not None, patience_s)
+
+        def taken() -> bool:
+            self._look()
+            return watch.link_lost or watch.taken_ms is not None
+
+        self._link.wait_for(taken, patience_s)
         if watch.taken_ms is None and not watch.link_lost:
             raise DeviceTimeout(
                 "robot",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import socket
 import threading
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from typing import Literal, TypeVar
 
 from coupole.errors import DeviceLost
+from coupole.supervision import LOOK_S
 from drivers.kuka.eki.watch import Watch
 from drivers.kuka.eki.wire import Command, StatusReader, command_xml
 
@@ -92,15 +94,23 @@ class Link:
         except OSError as error:
             self._lose(f"link lost: a command could not be sent ({error})")
 
+    def beat(self, command: Command) -> None:
+        """Send a command only if it can be sent at once: whoever watches the arm must not wait."""
+        if select.select([], [self._link], [], 0)[1]:
+            self.send(command)
+
     def wait_for(self, outcome: Callable[[], Outcome], patience_s: float | None = None) -> Outcome:
-        """Wait until `outcome` returns anything true, called after every status, and return that.
+        """Wait until `outcome` returns anything true, called after every status and every `LOOK_S`; return that.
 
         After `patience_s` of machine time it returns whatever `outcome` gives then. Without `patience_s` only a
         lost link ends the wait for a silent controller, by latching a fault: `outcome` must check the watch's
         fault.
         """
+        give_up_s = math.inf if patience_s is None else time.monotonic() + patience_s
         with self.changed:
-            return self.changed.wait_for(outcome, patience_s)
+            while not (found := outcome()) and (left_s := give_up_s - time.monotonic()) > 0.0:
+                self.changed.wait(min(LOOK_S, left_s))
+            return found
 
     def close(self) -> None:
         """End the connection and the thread. Safe to call again."""

@@ -55,6 +55,11 @@ class Watch:
         self._asked = self._astray_cycles = 0
 
     @property
+    def lapsed(self) -> bool:
+        """The last order was ended by the controller, because nobody watched it."""
+        return self.status is not None and self.status.lapsed == self.order != 0
+
+    @property
     def moving(self) -> bool:
         """True while an order is pending or the axes turn; after a fault only the axes count."""
         if self.status is None:
@@ -101,7 +106,7 @@ class Watch:
         if self.moving:
             self.settled_cycles = self._astray_cycles = 0
             return
-        if self._rest_deg is None:
+        if self._rest_deg is None or self.lapsed:
             self._rest_deg = status.joints_deg
         error_deg = max(map(abs, map(float.__sub__, status.joints_deg, self._rest_deg)))
         settled = known_speed and error_deg <= self._tolerances.settle_deg

@@ -12,11 +12,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 from xml.etree import ElementTree
 
+from coupole.supervision import ATTENTION_S
+
 Six = tuple[float, float, float, float, float, float]
 
 ROOT = "Coupole"
-STOP, MOVE, ASK = range(3)
-"""Verbs of a command: brake to rest; move the axes point to point; only acknowledge."""
+STOP, MOVE, ASK, BEAT = range(4)
+"""Verbs of a command: brake to rest; move the axes point to point; only acknowledge; whoever watches the motion
+has looked at it."""
+BEAT_MS = round(1e3 * ATTENTION_S)
+"""A motion without a command for this long, of the controller's time, ends (`coupole.supervision`)."""
 
 _AXES = tuple((f"Axes/@A{axis}", "REAL") for axis in range(1, 7))
 COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
@@ -37,6 +42,7 @@ STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Status/@Time", "INT"),
     ("Status/@Override", "INT"),
     ("Status/@T1", "INT"),
+    ("Status/@Lapsed", "INT"),
     ("Arm/@Model", "STRING"),
     ("Arm/@Serial", "INT"),
     *_AXES,
@@ -88,6 +94,8 @@ class Status:
     override_percent: int
     t1: bool
     """In T1, where the controller slows every motion down."""
+    lapsed: int
+    """Number of the last MOVE that was ended because no command came; 0 if none was."""
     model: str
     serial: int
     joints_deg: Six
@@ -152,6 +160,7 @@ def _read_status(message: bytes) -> Status | None:
             time_ms=int(values["Status/@Time"]),
             override_percent=int(values["Status/@Override"]),
             t1=int(values["Status/@T1"]) != 0,
+            lapsed=int(values["Status/@Lapsed"]),
             model=values["Arm/@Model"],
             serial=int(values["Arm/@Serial"]),
             joints_deg=joints_deg,

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceTimeout
+from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
+from coupole.supervision import LOOK_S, Attention
 from drivers.arm_motion import (
     MessageTime,
     checked_speed,
@@ -70,6 +71,9 @@ class KukaRsi:
         self._target_deg: shared_state.Six = (0.0,) * 6
         """Target of the last motion."""
         self._message_time = MessageTime(clock)
+        self._attention = Attention()
+        self._lapses = 0
+        """Of the loop, when the last motion began."""
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()
@@ -115,6 +119,8 @@ class KukaRsi:
             if self._stops != stops:  # by another thread, since this call began
                 raise overtaken()
             self._target_deg, self._motion_s = target_deg, motion_s
+            self._lapses = state.lapses
+            self._block.write_looked(self._attention.begin())
             self._send(shared_state.MOVE, target_deg, speed)
 
     def wait_settled(self) -> ArmState:
@@ -136,6 +142,7 @@ class KukaRsi:
             t_ns=self._message_time.since_ns(state.packets),
             moving=self._moves(state),
             fault=state.fault_text.decode(errors="replace"),
+            unattended_s=self._attention.longest_gap_s if state.lapses != self._lapses else 0.0,
         )
 
     def stop(self) -> None:
@@ -212,6 +219,8 @@ class KukaRsi:
 
     def _state(self) -> shared_state.State:
         """The loop's latest state; raises DeviceLost if the loop has ended."""
+        if looked_ns := self._attention.look():
+            self._block.write_looked(looked_ns)
         try:
             if self._process.poll() is None:
                 return self._block.read_state()
@@ -234,7 +243,7 @@ class KukaRsi:
             deadline,
             expected,
             check=self._raise_fault if faults else None,
-            pause=lambda: self._clock.sleep(_POLL_S),
+            pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
                 f"axes measured at {np.round(state.measured_deg, 3).tolist()} deg, "
                 f"commanded to {np.round(state.commanded_deg, 3).tolist()} deg"
@@ -245,6 +254,8 @@ class KukaRsi:
     def _settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
         if self._command is not command:
             raise overtaken()
+        if state.lapses != self._lapses:
+            raise ArmUnattended(self._attention.longest_gap_s)
         return state.command == command.number and state.settled_cycles >= self.settings.settle_cycles
 
     def _moves(self, state: shared_state.State) -> bool:

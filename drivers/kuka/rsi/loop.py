@@ -41,7 +41,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
     session = RsiSession(config, time.monotonic_ns())
     shared.write_state(session.state(realtime))
     _drop_backlog(link)
-    leaving, look_ns = Leaving(session, config), 0
+    leaving, look_ns, looked_ns = Leaving(session, config), 0, 0
     controller = None
     while not leaving.done:
         try:
@@ -55,6 +55,8 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
             session.obey(command)
             if command.verb == shared_state.LEAVE:
                 leaving.begin()
+        looked_ns = max(looked_ns, shared.looked_ns())  # never backwards, also if a beat is half written
+        session.attend(now_ns - looked_ns)
         late, answer = session.late, None
         if not idle and (controller not in (None, address) or config.controller not in ("", address[0])):
             session.foreign += 1  # another controller's axes must not be taken for this arm's

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from coupole.supervision import ATTENTION_S
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.bounds import StepBounds
 from drivers.kuka.rsi.corrections import NAMES, Corrections
@@ -35,6 +36,8 @@ _HALTED_PACKETS = 5
 """After this many late answers in a row the arm has halted at the last correction that was in time."""
 _QUIET_NS = 500_000_000
 """Without delay counter, a packet after a silence this long counts as the first of a session."""
+
+_ATTENTION_NS = int(ATTENTION_S * 1e9)
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
 """Faults after which nothing is answered, since the controller may have begun a new session, or no answer is
@@ -76,6 +79,8 @@ class RsiSession:
         self.packets = self.answers = self.malformed = self.refused = self.foreign = self.astray = 0
         self.late = self.delay = self.max_gap_ns = self.command = 0
         self.sender = self.other_sender = b""
+        self.lapses = 0
+        """Motions that ended because nobody watched them."""
         self.stop_answers = self.program_ended = 0
         """Answers that end the controller's program; 1 once it has ended on one of them."""
         self.settled_cycles = self._astray_cycles = self._late_before = self._late_in_row = 0
@@ -124,6 +129,12 @@ class RsiSession:
         """Bring the commanded axes to rest, then end the controller's program."""
         self._leaves = True
         self.motion.stop()
+
+    def attend(self, silent_ns: int) -> None:
+        """Brake on the path if nobody has looked at a motion for too long; `silent_ns` since the last look."""
+        if silent_ns > _ATTENTION_NS and self.motion.pursues:
+            self.lapses += 1
+            self.motion.stop()
 
     def answer(self, data: bytes, now_ns: int) -> bytes | None:
         """The answer to a packet, or None if it must not be answered."""
@@ -225,6 +236,7 @@ class RsiSession:
             phase=self.motion.phase,
             settled_cycles=self.settled_cycles,
             fault=self.fault,
+            lapses=self.lapses,
             measured_deg=self._measured_deg,
             velocity_deg_s=self._velocity_deg_s,
             commanded_deg=self.motion.commanded_deg,

@@ -13,11 +13,11 @@ import time
 from typing import Any, NamedTuple
 
 BLOCK_BYTES = 4096
-_COMMAND_AT, _STATE_AT = 0, 1024
+_COMMAND_AT, _LOOKED_AT, _STATE_AT = 0, 512, 1024
 _SEQUENCE = struct.Struct("=Q")
 _COMMAND = struct.Struct("=QQ7d")
-_STATE = struct.Struct("=16Q24d32s32s32s200s")
-_WORDS = 16
+_STATE = struct.Struct("=17Q24d32s32s32s200s")
+_WORDS = 17
 """Integers of a state."""
 _TORN_S = 1.0
 
@@ -71,6 +71,8 @@ class State(NamedTuple):
     settled_cycles: int = 0
     """Packets in a row in which the measured axes were at the commanded ones, within tolerance."""
     fault: int = NO_FAULT
+    lapses: int = 0
+    """Motions that ended because nobody looked at them (`coupole.supervision`)."""
     measured_deg: Six = _ZEROS
     velocity_deg_s: Six = _ZEROS
     """Of the measured axes, over the last cycle."""
@@ -103,6 +105,14 @@ class Block:
         """The number alone, which is quick: 8 aligned bytes, so never torn."""
         number: int = _SEQUENCE.unpack_from(self._memory, _COMMAND_AT + _SEQUENCE.size)[0]
         return number
+
+    def write_looked(self, ns: int) -> None:
+        """The driver's beat: when whoever watches the motion last looked. 8 aligned bytes, written at once."""
+        self._memory[_LOOKED_AT : _LOOKED_AT + _SEQUENCE.size] = _SEQUENCE.pack(ns)
+
+    def looked_ns(self) -> int:
+        looked: int = _SEQUENCE.unpack_from(self._memory, _LOOKED_AT)[0]
+        return looked
 
     def write_state(self, state: State) -> None:
         self._write(

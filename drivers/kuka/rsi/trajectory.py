@@ -36,6 +36,11 @@ class Motion:
         self._next_target_deg: Six | None = None
         self._next_speed = 1.0
 
+    @property
+    def pursues(self) -> bool:
+        """True while there is a target that is not reached yet."""
+        return self.phase == shared_state.MOVING or self._next_target_deg is not None
+
     def stand_at(self, joints_deg: Six) -> None:
         """Set the commanded axes to `joints_deg`, at rest."""
         self.phase, self.commanded_deg, self.velocity_deg_s = shared_state.STANDING, joints_deg, (0.0,) * 6

@@ -141,7 +141,7 @@ class ArmUnattended(DeviceError):
             "robot",
             expected="a look at the arm every 0.1 s while it moves",
             happened=f"nobody looked for {silent_s:.2f} s (the program stood still, or waited for something), so "
-            "arm braked on its path",
+            "the arm braked on its path",
             remedy="See that the cell is clear, then go on.",
         )
 

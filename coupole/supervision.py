@@ -21,8 +21,8 @@ children of a session   their parent's life                    0.05 s           
 ======================  =====================================  ======================  ==========================
 
 All of these are times of the machine's monotonic clock, whatever the rig's clock does. A motion is watched from
-its command until its axes are at rest. After a lapse below `ASKS_FROM_S` (a busy machine) the session goes on along
-the checked path by itself; after a longer one a person is asked. docs/reference/safety.md draws the states.
+its command until its axes are at rest. After a lapse below `ASKS_FROM_S` (a busy machine) the session goes on
+along the checked path by itself; after a longer one a person is asked. docs/reference/safety.md draws the states.
 """
 
 from __future__ import annotations
@@ -36,6 +36,26 @@ LOOK_S = 0.02
 """Whoever watches an arm that moves waits no longer than this, machine time, before looking again."""
 ASKS_FROM_S = 1.0
 """A lapse of attention of this length or more is not a busy machine: a person decides whether to go on."""
+_LISTENED_NS = 100_000_000
+
+
+class Silence:
+    """For how long a process that beats has been silent, counted only while its listener itself runs."""
+
+    def __init__(self) -> None:
+        self._beat = 0
+        self._heard_ns = time.monotonic_ns()
+        self._silent_ns = 0
+
+    def after(self, beat: int) -> float:
+        """Seconds since the last new beat, `beat` being the latest. A gap between two calls counts at most 0.1 s: a
+        listener that was frozen, or whose machine slept, has not listened."""
+        now_ns = time.monotonic_ns()
+        gap_ns, self._heard_ns = now_ns - self._heard_ns, now_ns
+        waits = beat == self._beat != 0  # 0: it has not begun
+        self._silent_ns = self._silent_ns + min(gap_ns, _LISTENED_NS) if waits else 0
+        self._beat = beat
+        return self._silent_ns / 1e9
 
 
 class Attention:

@@ -97,6 +97,7 @@ def our_responder() -> Iterator[tuple[Controller, bool]]:
         arm_model=shipped_arm("kr10_r1100_sixx").arm,
         listen=f"127.0.0.1:{port}",
         delay_limit=10**9,
+        attention_s=0.1,
         link_timeout_s=1e6,
     )
     opened: list[KukaRsi] = []

@@ -25,7 +25,7 @@ from coupole import geometry
 from coupole.devices import ArmCondition, ArmState, Clock, Deadline, Identity
 from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
-from coupole.supervision import LOOK_S, Attention
+from coupole.supervision import ATTENTION_S, LOOK_S, Attention
 from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refused, wait_for
 from drivers.fair_lock import FairLock
 from drivers.ur.messages import (
@@ -68,6 +68,9 @@ class Settings(BaseModel):
     """Rate of the controller's samples."""
     watchdog_s: float = Field(default=0.1, ge=0.05)
     """The controller ends all motion after this time without a message from the host's process."""
+    attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
+    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only for a
+    simulated cell on a machine that is busy with other work."""
     link_timeout_s: float = Field(default=1.0, gt=0)
     """The link counts as lost after this time without a sample from the controller."""
     connect_timeout_s: float = Field(default=20.0, gt=0)

@@ -41,6 +41,7 @@ class Config:
     frequency_hz: float
     link_timeout_s: float
     watchdog_s: float
+    attention_s: float
     speed_deg_s: float
     acceleration_deg_s2: float
     stop_deg_s2: float

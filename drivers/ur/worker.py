@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from coupole.supervision import ATTENTION_S
 from drivers.ur.dashboard import CannotBegin, end_program, ready_controller, why_ended
 from drivers.ur.messages import (
     EMERGENCY_STOP_BITS,
@@ -142,7 +141,7 @@ class Link:
     def _attend(self) -> None:
         """Brake if nobody has looked at a motion for too long (`coupole.supervision`)."""
         pursues = self._pending_deg is not None or (self._goal_deg is not None and not self._settled())
-        if pursues and time.monotonic() - self._looked_s > ATTENTION_S:
+        if pursues and time.monotonic() - self._looked_s > self.config.attention_s:
             self.state = replace(self.state, lapses=self.state.lapses + 1, still_samples=0)
             self._quiet_samples, self._goal_deg, self._pending_deg = 0, None, None
             self._call(lambda: self._control.stopJ(math.radians(self.config.stop_deg_s2), True))

@@ -29,9 +29,6 @@ Six = tuple[float, float, float, float, float, float]
 
 _NO_FAULT, _EMERGENCY_STOP, _TARGET_REFUSED = 0, 1, 5
 _TRY_AGAIN_S = 0.1
-_BEAT_S = 0.1
-"""A motion without a command for this long ends. Counted on the machine's clock: whoever watches lives by that
-one, and a world may run faster."""
 _UNSENT_BYTES = 4096
 """Send buffer. When it is full, the world pauses, so that it does not run ahead of its client."""
 _HARD = 100.0
@@ -48,6 +45,9 @@ class Settings(BaseModel):
     """host:port to listen at, or to connect to; port 0: any free port, see `KukaEkiController.address`."""
     controller_is: Literal["server", "client"] = "server"
     status_ms: int = Field(default=20, ge=4)
+    beat_s: float = Field(default=0.1, gt=0)
+    """A motion without a command for this long ends. Counted on the machine's clock: whoever watches lives by that
+    one, and a world may run faster."""
     ping_s: float = Field(default=0.2, gt=0)
     """World time after which the controller detects a dead link, and brakes."""
     write_limit_s: float = Field(default=2.0, gt=0)
@@ -270,7 +270,7 @@ class KukaEkiController:
 
     def _watch(self) -> None:
         """End a motion that nobody watches any more."""
-        if not self._watched or time.monotonic() - self._heard_s <= _BEAT_S:
+        if not self._watched or time.monotonic() - self._heard_s <= self._settings.beat_s:
             return
         self._lapsed, self._watched, self._target = self._watched, 0, None
         self._brake(self._acceleration_deg_s2, self._settings.jerk_deg_s3)

@@ -162,6 +162,7 @@ class Cell:
             attend=lambda: None,
             hurry=lambda seconds: None,
             heard_at_rest=self.heard_at_rest,
+            held=False,
             await_news=self.await_news,
         )
         dose: Any = SimpleNamespace(begin=lambda burst: None, end=lambda burst, log, **figures: (0.0,))

@@ -143,7 +143,7 @@ class Cell:
         self.done.append("begin")
 
     def fire(self, burst: Burst) -> Verdict:
-        arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None)
+        arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None, held=False)
         robot = SimpleNamespace(measured=lambda: None)
         cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731

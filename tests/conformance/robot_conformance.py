@@ -29,6 +29,8 @@ from sim.world.reactor import Reactor
 
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 AWAY_DEG = np.array([50.0, -50.0, 40.0, 30.0, 60.0, -70.0])
+UNHURRIED_S = 0.5
+"""A motion ends without a look for so long: a test's own thread may wait for its turn on a busy machine."""
 
 
 class RobotCell(ABC):
@@ -146,6 +148,7 @@ class KukaCell(RobotCell):
         theirs = {"sends_to": self.address, "cycle_ms": cycle_ms, "lock_step": lock_step, "answer_limit_s": 0.5}
         arm = KukaController(reactor, ControllerSettings.model_validate(theirs | delay | controller))
         ours = {"listen": self.address, "cycle_ms": cycle_ms, "link_timeout_s": 0.5, "connect_timeout_s": 20.0}
+        ours["attention_s"] = UNHURRIED_S
         alike = {name: value for name, value in controller.items() if name in ALIKE}
         if lock_step:
             ours["declared_cycle_ms"] = cycle_ms

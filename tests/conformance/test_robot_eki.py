@@ -19,7 +19,7 @@ import pytest
 from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell, RobotConformance
 
 from coupole.devices import ArmCondition, Robot
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
@@ -62,7 +62,8 @@ class EkiCell(RobotCell):
     def __init__(self, folder: Path, *, speed: float = 10.0, **controller: Any) -> None:
         reactor = Reactor(ClockWriter(folder / "clock", speed=speed))
         arm = KukaEkiController(
-            reactor, ControllerSettings.model_validate({"address": "127.0.0.1:0", **controller})
+            reactor,
+            ControllerSettings.model_validate({"address": "127.0.0.1:0", "beat_s": UNHURRIED_S, **controller}),
         )
         self.settings = Settings.model_validate(
             {
@@ -97,7 +98,7 @@ class EkiCell(RobotCell):
             come.set()
 
         self.in_world(hold)
-        assert come.wait(30.0)
+        self.wait_until(come.is_set)
         return called_deg[0]
 
     def stop_under_way(self, robot: Robot) -> None:
@@ -295,7 +296,7 @@ def test_a_killed_driver_leaves_the_arm_at_rest_and_another_may_come(cell: EkiCe
         "from sim.world.clock import SharedClock; from drivers.kuka.eki.driver import KukaEki, Settings\n"
         "robot = KukaEki(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
         f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
-        "time.sleep(60)\n"
+        "for _ in range(3000): robot.measured(); time.sleep(0.02)\n"
     )
     arguments = [cell.settings.model_dump_json(), str(cell.clock_path)]
     with subprocess.Popen([sys.executable, "-c", script, *arguments]) as driver:

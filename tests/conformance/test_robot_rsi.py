@@ -125,7 +125,7 @@ class TestKukaRsi(RobotConformance):
             "robot = KukaRsi(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
             f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
             "print(robot._process.pid, flush=True)\n"
-            "time.sleep(60)\n"
+            "for _ in range(3000): robot.measured(); time.sleep(0.02)\n"
         )
         arguments = [cell.settings.model_dump_json(), str(cell.clock_path)]
         with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as parent:

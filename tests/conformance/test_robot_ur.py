@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_conformance import AWAY_DEG, HOME_DEG, RobotCell, RobotConformance
+from robot_conformance import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell, RobotConformance
 from ur import needs_ur_rtde
 
 from coupole.devices import ArmCondition
@@ -48,6 +48,8 @@ class UrCell(RobotCell):
                 "acceleration_deg_s2": 300.0,
                 "stop_deg_s2": 600.0,
                 "link_timeout_s": 1.5,
+                "watchdog_s": UNHURRIED_S,
+                "attention_s": UNHURRIED_S,
             }
         )
         super().__init__(folder / "clock", reactor, arm, 1e3 * _CYCLE_S)
@@ -277,7 +279,7 @@ def test_a_killed_parent_leaves_no_process_and_the_arm_at_rest(cell: UrCell) -> 
         "robot = UrRobot(Settings.model_validate_json(sys.argv[1]), SharedClock(Path(sys.argv[2])))\n"
         f"robot.move_to(numpy.array({AWAY_DEG.tolist()}))\n"
         "print(robot._process.pid, flush=True)\n"
-        "time.sleep(60)\n"
+        "for _ in range(3000): robot.measured(); time.sleep(0.02)\n"
     )
     arguments = [cell.settings.model_dump_json(), str(cell.clock_path)]
     with subprocess.Popen([sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE) as parent:

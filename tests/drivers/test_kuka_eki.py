@@ -30,6 +30,7 @@ STATUS = Status(
     time_ms=1000,
     override_percent=100,
     t1=False,
+    lapsed=0,
     model="KR10R1100SIXX",
     serial=4711,
     joints_deg=HOME_DEG,
@@ -43,7 +44,7 @@ def status_xml(status: Status) -> bytes:
     return (
         f'<Coupole><Status Session="{status.session}" Taken="{status.taken}" Done="{status.done}" '
         f'Moving="{int(status.moving)}" Fault="{status.fault}" Time="{status.time_ms}" '
-        f'Override="{status.override_percent}" T1="{int(status.t1)}"></Status>'
+        f'Override="{status.override_percent}" T1="{int(status.t1)}" Lapsed="{status.lapsed}"></Status>'
         f'<Arm Model="{status.model}" Serial="{status.serial}"/><Axes {axes}/>'
         f'<Pose Valid="{int(status.pose is not None)}" {pose}/></Coupole>'
     ).encode()
@@ -58,6 +59,7 @@ statuses = st.builds(
     done=st.integers(0, 2**31 - 1),
     moving=st.booleans(),
     fault=st.integers(0, 9),
+    lapsed=st.integers(0, 2**31 - 1),
     joints_deg=six,
     pose=st.none() | six,
 )

@@ -38,6 +38,7 @@ CONFIG = Config(
     jerk_deg_s3=(3000.0,) * 6,
     link_timeout_s=0.5,
     delay_limit=50,
+    attention_s=0.1,
     settle_deg=0.003,
     settle_deg_s=0.1,
     follow_deg=1.0,

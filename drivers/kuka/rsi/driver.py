@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from coupole.devices import ArmState, Clock, Deadline, Identity
 from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
-from coupole.supervision import LOOK_S, Attention
+from coupole.supervision import ASKS_FROM_S, LOOK_S, Attention, Silence
 from drivers.arm_motion import (
     MessageTime,
     checked_speed,
@@ -71,7 +71,8 @@ class KukaRsi:
         self._target_deg: shared_state.Six = (0.0,) * 6
         """Target of the last motion."""
         self._message_time = MessageTime(clock)
-        self._attention = Attention()
+        self._attention, self._silence = Attention(), Silence()
+        self._hung = ""
         self._lapses = 0
         """Of the loop, when the last motion began."""
         self._process, self._block = _spawn(settings, self.arm)
@@ -218,21 +219,29 @@ class KukaRsi:
         self._block.write_command(self._command)
 
     def _state(self) -> shared_state.State:
-        """The loop's latest state; raises DeviceLost if the loop has ended."""
+        """The loop's latest state; raises DeviceLost if the loop has ended or does not run: the controller then ends
+        the motion by itself."""
         if looked_ns := self._attention.look():
             self._block.write_looked(looked_ns)
         try:
             if self._process.poll() is None:
-                return self._block.read_state()
+                if self._silence.after(self._block.ran_ns()) < ASKS_FROM_S:
+                    return self._block.read_state()
+                self._hung = f"it stood still for {ASKS_FROM_S:g} s, and was ended"
+                self._end()
         except TimeoutError:
-            self._process.kill()
-            self._process.wait()
+            self._end()
         raise DeviceLost(
             "robot",
             expected="a process that answers the controller",
-            happened=f"it ended with exit code {self._process.returncode}",
+            happened=self._hung or f"it ended with exit code {self._process.returncode}",
             remedy="Open the robot again",
         )
+
+    def _end(self) -> None:
+        """End the process, frozen or not: it must not answer a session of which it has lost count."""
+        self._process.kill()
+        self._process.wait()
 
     def _wait(
         self, done: Callable[[shared_state.State], bool], deadline: Deadline, expected: str, *, faults: bool = True

@@ -50,6 +50,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
         except BlockingIOError:
             idle = True
         now_ns = time.monotonic_ns()
+        shared.write_ran(now_ns)
         if shared.command_number() != session.command:
             command = shared.read_command()
             session.obey(command)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coupole.supervision import ATTENTION_S
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.bounds import StepBounds
 from drivers.kuka.rsi.corrections import NAMES, Corrections
@@ -36,8 +35,6 @@ _HALTED_PACKETS = 5
 """After this many late answers in a row the arm has halted at the last correction that was in time."""
 _QUIET_NS = 500_000_000
 """Without delay counter, a packet after a silence this long counts as the first of a session."""
-
-_ATTENTION_NS = int(ATTENTION_S * 1e9)
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
 """Faults after which nothing is answered, since the controller may have begun a new session, or no answer is
@@ -64,6 +61,7 @@ class Config:
     jerk_deg_s3: tuple[float, ...]
     link_timeout_s: float
     delay_limit: int
+    attention_s: float
     settle_deg: float
     settle_deg_s: float
     follow_deg: float
@@ -132,7 +130,7 @@ class RsiSession:
 
     def attend(self, silent_ns: int) -> None:
         """Brake on the path if nobody has looked at a motion for too long; `silent_ns` since the last look."""
-        if silent_ns > _ATTENTION_NS and self.motion.pursues:
+        if silent_ns > self._config.attention_s * 1e9 and self.motion.pursues:
             self.lapses += 1
             self.motion.stop()
 

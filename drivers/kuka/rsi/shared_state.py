@@ -13,7 +13,7 @@ import time
 from typing import Any, NamedTuple
 
 BLOCK_BYTES = 4096
-_COMMAND_AT, _LOOKED_AT, _STATE_AT = 0, 512, 1024
+_COMMAND_AT, _LOOKED_AT, _RAN_AT, _STATE_AT = 0, 512, 576, 1024
 _SEQUENCE = struct.Struct("=Q")
 _COMMAND = struct.Struct("=QQ7d")
 _STATE = struct.Struct("=17Q24d32s32s32s200s")
@@ -111,8 +111,14 @@ class Block:
         self._memory[_LOOKED_AT : _LOOKED_AT + _SEQUENCE.size] = _SEQUENCE.pack(ns)
 
     def looked_ns(self) -> int:
-        looked: int = _SEQUENCE.unpack_from(self._memory, _LOOKED_AT)[0]
-        return looked
+        return self._read_word(_LOOKED_AT)
+
+    def write_ran(self, ns: int) -> None:
+        """The loop's beat: when it last ran. It does so at least every 50 ms, whether packets come or not."""
+        self._memory[_RAN_AT : _RAN_AT + _SEQUENCE.size] = _SEQUENCE.pack(ns)
+
+    def ran_ns(self) -> int:
+        return self._read_word(_RAN_AT)
 
     def write_state(self, state: State) -> None:
         self._write(
@@ -139,6 +145,10 @@ class Block:
 
     def close(self) -> None:
         self._memory.close()
+
+    def _read_word(self, at: int) -> int:
+        word: int = _SEQUENCE.unpack_from(self._memory, at)[0]
+        return word
 
     def _write(self, at: int, record: bytes) -> None:
         (sequence,) = _SEQUENCE.unpack_from(self._memory, at)

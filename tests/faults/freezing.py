@@ -1,0 +1,187 @@
+"""A run whose processes are frozen (SIGSTOP) in motions and bursts, and what the world saw of it.
+
+The world is kept outside and runs at the pace of life; RSI is not paced by its answers. Used by a test that freezes
+a few times, and by `tools/freeze_at_random.py`, which does so hundreds of times.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cells
+from cells import LOW, SIDE, TOP, CellFolder
+
+from coupole.acquisition.run_control import ask
+from coupole.errors import CoupoleError
+from sim.world.client import World
+
+ARMS = ("rsi", "eki", "ur")
+FROZEN = ("controller", "arm's process")
+"""Whose process: that of the command, or that which answers the arm (RSI, UR)."""
+BRAKES_WITHIN_S = 0.15
+WATCHDOG_S = 2.0
+_FREEZE_S = 1.6
+"""Longer than the lapse after which a person is asked."""
+_LOOK_S = 0.002
+_AT_REST_DEG_S = 0.5
+_SETTINGS: dict[str, dict[str, Any]] = {
+    "rsi": {"driver": "drivers.kuka.rsi:KukaRsi", "settings": {"cycle_ms": 12}},
+    "eki": {"driver": "drivers.kuka.eki:KukaEki"},
+}
+
+
+@dataclass
+class Freeze:
+    """One freeze, in seconds of the machine's clock from the signal on."""
+
+    arm: str
+    frozen: str
+    while_moving: bool
+    brakes_s: float | None = None
+    """Until the fastest axis was at its fastest; None if the arm did not move."""
+    still_s: float | None = None
+    """Until the arm stood."""
+    turned_deg: float = 0.0
+    """Of the axis that turned farthest from the signal on."""
+    dark_s: float | None = None
+    """Until the last lamp went off; None if none shone."""
+    late_s: float = 0.0
+    """Longest time between two looks of this harness: a busy machine cannot measure shorter ones."""
+
+    @property
+    def wrong(self) -> list[str]:
+        """What breaks a promise, beyond what the harness itself may have been late."""
+        found = []
+        if self.brakes_s is not None and self.brakes_s > BRAKES_WITHIN_S + self.late_s:
+            found.append(f"braking began only after {self.brakes_s:.3f} s")
+        if self.while_moving and self.still_s is None:
+            found.append("the arm did not come to rest")
+        if self.dark_s is not None and self.dark_s > WATCHDOG_S + 0.1 + self.late_s:
+            found.append(f"a lamp shone for {self.dark_s:.2f} s")
+        return found
+
+    def line(self) -> dict[str, Any]:
+        return {**asdict(self), "wrong": self.wrong}
+
+
+def cell_in(folder: Path, arm: str) -> CellFolder:
+    """Three views of 54 LEDs, slow motions between them."""
+    cell = CellFolder(folder, speed=1.0)
+    if arm == "ur":
+        cell.moved_by_ur("ur10e")
+    else:
+        cell.rig_data["robot"] = _SETTINGS[arm]
+    cell.rig_data["motion"] |= {"speed_fraction": 0.1}
+    cell.rig_data["ledbox"]["settings"]["watchdog_s"] = WATCHDOG_S
+    cell.join()
+    cell.write(views=[TOP, SIDE, LOW], exposure={"kind": "fixed", "exposure_us": 16000})
+    return cell
+
+
+@contextmanager
+def running(cell: CellFolder, arm: str) -> Iterator[tuple[World, subprocess.Popen[str]]]:
+    """A world and a run in it, ended with the context at the latest."""
+    real_time = {"robot": {"kind": "rsi", "cycle_ms": 12, "lock_step": False}} if arm == "rsi" else {}
+    with ExitStack() as stack:
+        world = stack.enter_context(cell.world(**real_time))
+        process = stack.enter_context(cell.start_acquire())
+        stack.callback(_end, process)
+        yield world, process
+
+
+def freeze(world: World, pid: int, about: Freeze) -> Freeze:
+    """Freeze a process and look at the world; the process goes on when this returns."""
+    os.kill(pid, signal.SIGSTOP)
+    began_s = last_s = time.monotonic()
+    seen: list[tuple[float, float, list[float]]] = []
+    try:
+        while (now_s := time.monotonic()) - began_s < _FREEZE_S + (WATCHDOG_S if not about.while_moving else 0.0):
+            state = world.ask("state")
+            about.late_s = max(about.late_s, time.monotonic() - last_s)
+            last_s = now_s
+            seen.append((now_s - began_s, state["t_s"], state["joints_deg"]))
+            if state["shining"] or state["panels"]:
+                about.dark_s = now_s - began_s
+            time.sleep(_LOOK_S)
+    finally:
+        with suppress(ProcessLookupError):  # ended meanwhile
+            os.kill(pid, signal.SIGCONT)
+    about.turned_deg = max(
+        max(abs(a - b) for a, b in zip(joints, seen[0][2], strict=True)) for _, _, joints in seen
+    )
+    if about.while_moving:
+        about.brakes_s, about.still_s = _braking(seen)
+    return about
+
+
+def _braking(seen: list[tuple[float, float, list[float]]]) -> tuple[float | None, float | None]:
+    """When the fastest axis was at its fastest, and when it stood; by differences over some 20 ms of the world."""
+    speeds = []
+    for (at_s, t_s, joints), (from_s, before_s, before) in zip(seen[8:], seen, strict=False):
+        if t_s - before_s > 1e-3:
+            turned = max(abs(a - b) for a, b in zip(joints, before, strict=True))
+            speeds.append(((at_s + from_s) / 2.0, turned / (t_s - before_s)))
+    if not speeds or max(speed for _, speed in speeds) < _AT_REST_DEG_S:
+        return None, 0.0
+    highest = max(speed for _, speed in speeds)
+    brakes_s = max(at_s for at_s, speed in speeds if speed > 0.98 * highest)
+    still = [at_s for at_s, speed in speeds if speed >= _AT_REST_DEG_S]
+    stands = speeds[-1][1] < _AT_REST_DEG_S
+    return brakes_s, max(still) if stands else None
+
+
+def moment(world: World, process: subprocess.Popen[str], draw: random.Random, *, moving: bool) -> bool:
+    """Wait for a random moment of a motion, or of a burst; False if the run ended before one came."""
+    while process.poll() is None:
+        state = world.ask("state")
+        if (state["arm_moving"] and not state["shining"]) if moving else state["shining"]:
+            time.sleep(draw.uniform(0.0, 0.6))
+            return process.poll() is None
+        time.sleep(0.005)
+    return False
+
+
+def frozen_pid(process: subprocess.Popen[str], which: str) -> int:
+    """The process to freeze; for an arm without one of its own, the command's."""
+    kin = [pid for pid in cells.children(process.pid) if _answers_an_arm(pid)]
+    return kin[0] if kin and which != FROZEN[0] else process.pid
+
+
+def _answers_an_arm(pid: int) -> bool:
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    return any(b"rsi.loop" in word or b"ur.worker" in word for word in words)
+
+
+def go_on(run: Path, process: subprocess.Popen[str]) -> bool:
+    """A person's word, once the run asks for it; False if it ended instead."""
+    while process.poll() is None:
+        try:
+            state = ask(run, "state")["state"]
+            if state == "paused":
+                ask(run, "go-on")
+                return True
+        except CoupoleError:
+            pass
+        time.sleep(0.02)
+    return False
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    if process.poll() is None:
+        process.send_signal(signal.SIGCONT)
+        process.terminate()
+
+
+def lines_in(path: Path) -> list[dict[str, Any]]:
+    """What was kept of freezes already done."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []

@@ -48,8 +48,8 @@ class Silence:
         self._silent_ns = 0
 
     def after(self, beat: int) -> float:
-        """Seconds since the last new beat, `beat` being the latest. A gap between two calls counts at most 0.1 s: a
-        listener that was frozen, or whose machine slept, has not listened."""
+        """Seconds since the last new beat, `beat` being the latest. A gap between two calls counts at most 0.1 s:
+        a listener that was frozen, or whose machine slept, has not listened."""
         now_ns = time.monotonic_ns()
         gap_ns, self._heard_ns = now_ns - self._heard_ns, now_ns
         waits = beat == self._beat != 0  # 0: it has not begun

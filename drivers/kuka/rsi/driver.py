@@ -219,8 +219,8 @@ class KukaRsi:
         self._block.write_command(self._command)
 
     def _state(self) -> shared_state.State:
-        """The loop's latest state; raises DeviceLost if the loop has ended or does not run: the controller then ends
-        the motion by itself."""
+        """The loop's latest state; raises DeviceLost if the loop has ended or does not run: the controller then
+        ends the motion by itself."""
         if looked_ns := self._attention.look():
             self._block.write_looked(looked_ns)
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -35,6 +37,10 @@ class Person(Protocol):
     def press_emergency_stop(self) -> None:
         """Asks for the emergency stop to be pressed; returns at once."""
         ...
+
+
+Say = Callable[[str, int, int], None]
+"""Called with a job's name, how much of it is done, and of how much."""
 
 
 class StepFailedError(Exception):
@@ -72,6 +78,18 @@ class Bench:
     person: Person
     control: Control
     findings: Findings = field(default_factory=Findings)
+    bars: Callable[[], AbstractContextManager[Say]] = lambda: nullcontext(lambda *_: None)
+    """Shows how far a long job is, while the context lasts."""
+
+    def each(self, what: str, numbers: Iterable[int]) -> Iterator[int]:
+        """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
+        stop."""
+        left = list(numbers)
+        with self.bars() as say:
+            for k, number in enumerate(left):
+                self.control.go_on()
+                yield number
+                say(what, k + 1, len(left))
 
     def ask_before(self, announcement: str) -> None:
         """Raises Interrupted unless the person agrees."""

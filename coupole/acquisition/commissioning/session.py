@@ -36,7 +36,7 @@ from coupole.preflight.commissioned import (
 )
 from coupole.storage.arm_faults import ArmFaults
 from coupole.viewing import commissioning_page
-from coupole.viewing.terminal import alarm
+from coupole.viewing.terminal import alarm, step_bars
 
 ACTS: Mapping[Step, Callable[[Bench], None]] = {
     "cycle": arm_steps.cycle,
@@ -72,7 +72,7 @@ def commission(
     record = _record_so_far(cell, console)
     control = Control()
     with open_cell(slow, on_opened=identity_printer(console)) as opened:
-        bench = _bench(slow, opened, bodies, person_at(opened), control)
+        bench = replace(_bench(slow, opened, bodies, person_at(opened), control), bars=lambda: step_bars(console))
         due = [only] if only else _due(cell, record, opened)
         if not due:
             console.print("every step has passed and fits this cell; `--only STEP` repeats one")

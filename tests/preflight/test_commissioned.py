@@ -87,13 +87,13 @@ def test_another_watchdog_time_is_refused(real: CellFolder) -> None:
     assert [why.split()[3] for why in checked(real)] == ["lamps", "trigger", "watchdog"]
 
 
-def test_another_led_table_asks_for_the_lamps(real: CellFolder) -> None:
+def test_another_led_table_asks_for_the_lamps_and_the_domes_place(real: CellFolder) -> None:
     commission(read_cell(real.rig), DEVICES)
     table = Path(real.rig_data["dome"]["leds"]).read_text()
     (real.folder / "other.csv").write_text(table + "\n")
     real.rig_data["dome"]["leds"] = "other.csv"
     real.write()
-    assert [why.split()[3] for why in checked(real)] == ["lamps"]
+    assert [why.split()[3] for why in checked(real)] == ["geometry", "lamps"]
 
 
 def test_another_address_is_no_other_cell(real: CellFolder) -> None:

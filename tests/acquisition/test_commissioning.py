@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cells import Ended, here
-from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, opened_bench, with_devices
+from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, board_cell, opened_bench, with_devices
 from places import REPO
 
 from coupole.acquisition.commissioning import arm_steps, lamp_step, light_timing
@@ -36,8 +36,9 @@ SWAPPED = (180, 720)
 @pytest.fixture(scope="module")
 def right(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended]:
     """The rig of a right cell, and how its whole commissioning ended."""
-    cell = ball_cell(tmp_path_factory.mktemp("right"), speed=8.0)
-    return cell.rig, here("commission", cell.rig, "--name", "A. Person", "--yes", "--json")
+    cell = board_cell(tmp_path_factory.mktemp("right"), speed=8.0)
+    board = ("--board", cell.folder / "board.yaml")
+    return cell.rig, here("commission", cell.rig, "--name", "A. Person", "--yes", "--json", *board)
 
 
 @pytest.fixture(scope="module")

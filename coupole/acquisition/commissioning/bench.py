@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -28,6 +29,10 @@ class Person(Protocol):
 
     def confirms(self, question: str) -> bool:
         """Whether what was seen is what is described."""
+        ...
+
+    def measures(self, what: str, question: str) -> float | None:
+        """A length by ruler, mm; None if it was not measured. `what` is the question's name."""
         ...
 
     def told(self, message: str) -> None:
@@ -63,6 +68,11 @@ class Findings:
         self.limits.append(Limit(what=what, found=round(known, 6), limit=round(float(limit), 6), unit=unit))
         return self.limits[-1].passed
 
+    @property
+    def passed(self) -> bool:
+        """Whether all is well so far."""
+        return all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
+
 
 @dataclass
 class Bench:
@@ -80,6 +90,8 @@ class Bench:
     findings: Findings = field(default_factory=Findings)
     bars: Callable[[], AbstractContextManager[Say]] = lambda: nullcontext(lambda *_: None)
     """Shows how far a long job is, while the context lasts."""
+    board: Path | None = None
+    """The file that describes the board on the support; None: the one of docs/how-to/commission-a-cell.md."""
 
     def each(self, what: str, numbers: Iterable[int]) -> Iterator[int]:
         """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
@@ -104,6 +116,15 @@ class Bench:
         yes = self.person.confirms(question)
         self.findings.answers.append(Answer(question=question, yes=yes))
         return yes
+
+    def measured(self, what: str, question: str) -> float:
+        """A length that the person measures, mm; it is noted. Raises StepFailedError if it was not measured."""
+        self.control.go_on()
+        found_mm = self.person.measures(what, question)
+        if found_mm is None:
+            raise StepFailedError(f"not measured: {question}. Repeat the step with ruler and tape at hand")
+        self.findings.remarks.append(f"measured: {question}: {found_mm:g} mm")
+        return found_mm
 
     def pause(self, seconds: float) -> None:
         """Wait on the rig's clock. Raises Interrupted after the operator's stop."""

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from coupole.plan.registry import WORLD, load_class
-from coupole.viewing.terminal import alarm, ask
+from coupole.viewing.terminal import alarm, ask, ask_number
 
 
 class PersonAtTerminal:
@@ -19,6 +19,9 @@ class PersonAtTerminal:
 
     def confirms(self, question: str) -> bool:
         return ask(question)
+
+    def measures(self, what: str, question: str) -> float | None:
+        return ask_number(f"Measure, in mm: {question}:")
 
     def told(self, message: str) -> None:
         alarm(message)
@@ -40,6 +43,12 @@ class SimulatedPerson:
     def confirms(self, question: str) -> bool:
         self._console.print(f"{question} (not asked: simulated)", markup=False)
         return True
+
+    def measures(self, what: str, question: str) -> float | None:
+        """With a ruler that the simulated cell has: it knows nothing of the rig."""
+        found = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
+        self._console.print(f"{question}: {found} mm (measured in the simulation)", markup=False)
+        return found if found is None else float(found)
 
     def told(self, message: str) -> None:
         self._console.print(message, markup=False)

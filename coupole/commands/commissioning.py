@@ -15,26 +15,30 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 
+_Only = Annotated[
+    str | None,
+    typer.Option(
+        "--only",
+        help="Do this step, though it has passed: cycle, axes, stopping, geometry, lamps, trigger, watchdog, "
+        "presence or emergency-stop.",
+    ),
+]
+_Board = Annotated[
+    Path | None,
+    typer.Option(
+        "--board",
+        help="The board of the step geometry (YAML, as for calibrate camera); 11 x 8 corners of 16 mm, markers of "
+        "9.6 mm, if not given.",
+        show_default=False,
+    ),
+]
+
+
 def commission(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
     name: Annotated[str, typer.Option("--name", help="Who stands at the cell.", show_default=False)],
-    only: Annotated[
-        str | None,
-        typer.Option(
-            "--only",
-            help="Do this step, though it has passed: cycle, axes, stopping, geometry, lamps, trigger, watchdog "
-            "or emergency-stop.",
-        ),
-    ] = None,
-    board: Annotated[
-        Path | None,
-        typer.Option(
-            "--board",
-            help="The board of the step geometry (YAML, as for calibrate camera); 11 x 8 corners of 16 mm, "
-            "markers of 9.6 mm, if not given.",
-            show_default=False,
-        ),
-    ] = None,
+    only: _Only = None,
+    board: _Board = None,
     yes: Annotated[bool, typer.Option("--yes", help="Simulated cells only: nobody is asked.")] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -33,6 +33,7 @@ _DEVICES: Mapping[Step, tuple[str, ...]] = {
     "lamps": ("ledbox",),
     "trigger": ("ledbox", "camera"),
     "watchdog": ("ledbox",),
+    "presence": ("ledbox",),
     "emergency-stop": ("robot",),
 }
 """The devices that a step is about."""

@@ -16,7 +16,9 @@ from coupole.plan.link_meshes import LINKS, link_mesh_path
 from coupole.plan.registry import settings_class
 from coupole.plan.rig_devices import DEVICES, NOWHERE, described_arm, device_for
 
-Step = Literal["cycle", "axes", "stopping", "geometry", "lamps", "trigger", "watchdog", "emergency-stop"]
+Step = Literal[
+    "cycle", "axes", "stopping", "geometry", "lamps", "trigger", "watchdog", "presence", "emergency-stop"
+]
 STEPS: tuple[Step, ...] = get_args(Step)
 """In the order in which they are done."""
 ARM: tuple[Step, ...] = ("cycle", "axes", "stopping", "emergency-stop")
@@ -67,12 +69,13 @@ _STEPS: Mapping[str, tuple[Step, ...]] = {
     "camera.driver": ("trigger", *GEOMETRY),
     "camera.settings.region": ("trigger", *GEOMETRY),
     "camera": ("trigger",),
+    "ledbox.driver": (*LAMPS, "presence"),
     "ledbox": LAMPS,
     "led_limits.rise_us": ("trigger",),
     "led_limits": ("lamps",),
     "dome.leds": ("lamps", *GEOMETRY),
     "dome": ("lamps",),
-    "console": ("emergency-stop",),
+    "console": ("presence",),
 }
 """The steps that a key, and all below it, concerns: the first that fits counts."""
 

@@ -162,6 +162,10 @@ class TextLineBox:
         self.lights_off()
         return {"LEDs": str(self.led_count), "confirms": f"with `{self._settings.expected_reply}`"}
 
+    def presence(self) -> bool | None:
+        """Such a box has no input for an enabling switch."""
+        return None
+
     def flash(self, led: int, on_us: int) -> None:
         """Switch one LED on; returns when the box has confirmed it."""
         if led != NO_LED and not 0 <= led < self.led_count:

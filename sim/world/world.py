@@ -187,6 +187,8 @@ class World:
                 self._flashes.unsteady[fault.led] = fault.rms
             case script.EmergencyStop():
                 self.robot.estop()
+            case script.EnablingSwitch():
+                self._scpi_box.enabling_switch = "held" if fault.held else "released"
             case script.LateRsi():
                 assert isinstance(self.robot, kuka_controller.KukaController)  # `impossible` refuses others
                 self.robot.late(fault.cycles)

@@ -82,6 +82,7 @@ class Onlooker:
     heard: list[str] = field(default_factory=list)
     lengths_mm: dict[str, float] = field(default_factory=dict)
     """What a ruler says, by the question's name."""
+    hold: Callable[[bool], None] = lambda _: None
     press: Callable[[], None] = lambda: None
 
     def is_ready(self, announcement: str) -> bool:
@@ -98,6 +99,9 @@ class Onlooker:
 
     def told(self, message: str) -> None:
         self.heard.append(message)
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        self.hold(held)
 
     def press_emergency_stop(self) -> None:
         self.press()

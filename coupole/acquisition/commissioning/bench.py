@@ -39,6 +39,10 @@ class Person(Protocol):
         """A message without an answer."""
         ...
 
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        """Asks for the enabling switch to be held, or released; returns at once."""
+        ...
+
     def press_emergency_stop(self) -> None:
         """Asks for the emergency stop to be pressed; returns at once."""
         ...

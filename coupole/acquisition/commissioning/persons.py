@@ -26,6 +26,9 @@ class PersonAtTerminal:
     def told(self, message: str) -> None:
         alarm(message)
 
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        alarm("HOLD the enabling switch at the cell now." if held else "RELEASE the enabling switch now.")
+
     def press_emergency_stop(self) -> None:
         alarm("PRESS THE EMERGENCY STOP NOW, while the arm moves.")
 
@@ -52,6 +55,9 @@ class SimulatedPerson:
 
     def told(self, message: str) -> None:
         self._console.print(message, markup=False)
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "enabling_switch", "held": held})
 
     def press_emergency_stop(self) -> None:
         load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "emergency_stop"})

@@ -16,6 +16,7 @@ from coupole.acquisition.commissioning import (
     geometry_step,
     lamp_step,
     light_timing,
+    presence_step,
 )
 from coupole.acquisition.commissioning.bench import Bench, Findings, Person, StepFailedError
 from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
@@ -53,6 +54,7 @@ ACTS: Mapping[Step, Callable[[Bench], None]] = {
     "lamps": lamp_step.lamps,
     "trigger": light_timing.trigger,
     "watchdog": light_timing.watchdog,
+    "presence": presence_step.presence,
     "emergency-stop": emergency_stop.emergency_stop,
 }
 _BEGIN = (

@@ -108,7 +108,7 @@ def test_another_box_is_refused_when_it_is_opened(real: CellFolder) -> None:
     others = DEVICES | {"ledbox": replace(DEVICES["ledbox"], serial="0018")}
     with pytest.raises(PreflightRefused, match=r"LED control box 0018 .*was .* 0017") as refused:
         refuse_uncommissioned(read_cell(real.rig), others)
-    assert [why.split()[3] for why in refused.value.refusals] == ["lamps", "trigger", "watchdog"]
+    assert [why.split()[3] for why in refused.value.refusals] == ["lamps", "trigger", "watchdog", "presence"]
 
 
 def test_a_record_that_was_edited_is_refused(real: CellFolder) -> None:

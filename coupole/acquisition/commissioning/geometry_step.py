@@ -51,8 +51,9 @@ def geometry(bench: Bench) -> None:
         else Board(kind="charuco", corners=(11, 8), marker_mm=9.6, square_mm=16)
     )
     bench.ask_before(
-        "Step geometry: you need a ruler and a tape. The arm stands still while you measure: leave the enabling "
-        "switch released when you reach into the cell. Lay the board flat on the support, in the camera's view."
+        "Step geometry: nothing moves yet. You are asked for lengths that you have measured by ruler and tape, "
+        "the arm standing as it stands now and its drives off. The board lies flat on the support, in the "
+        "camera's view."
     )
     place_mm = np.array([bench.measured(*one) for one in _BOARD])
     _measure_bodies(bench)
@@ -164,9 +165,8 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
     intrinsics = nominal_intrinsics(rig)
     sights = [_sighted(bench, board, home_deg, exposure_us, leds)]
     camera_from_board = _first_pose(sights[0], intrinsics)
-    for joints_deg in _postures_about(
-        bench, home_deg, camera_from_board[:3, :3] @ middle_mm + camera_from_board[:3, 3]
-    ):
+    seen_mm = camera_from_board[:3, :3] @ sights[0].board_mm.mean(axis=0) + camera_from_board[:3, 3]
+    for joints_deg in _postures_about(bench, home_deg, seen_mm):
         bench.ask_before(f"Sight {len(sights) + 1}. {_motion(rig, home_deg, joints_deg)}")
         sights.append(_sighted(bench, board, bench.go_to(joints_deg), exposure_us, leds))
         bench.go_to(home_deg)

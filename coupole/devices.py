@@ -199,6 +199,9 @@ class LedBox(Protocol):
     def board_temperature_c(self, board: int) -> float | None:
         """Of an LED board, C; None if the box does not measure it."""
 
+    def presence(self) -> bool | None:
+        """Whether a person at the cell holds the enabling switch; None if the box has no input for one."""
+
     def close(self) -> None:
         """Lights off if the box still accepts commands; never raises because of a lost link."""
 

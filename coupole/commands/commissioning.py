@@ -15,17 +15,30 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 
+_Only = Annotated[
+    str | None,
+    typer.Option(
+        "--only",
+        help="Do this step, though it has passed: cycle, axes, stopping, geometry, lamps, trigger, watchdog, "
+        "presence or emergency-stop.",
+    ),
+]
+_Board = Annotated[
+    Path | None,
+    typer.Option(
+        "--board",
+        help="The board of the step geometry (YAML, as for calibrate camera); 11 x 8 corners of 16 mm, markers of "
+        "9.6 mm, if not given.",
+        show_default=False,
+    ),
+]
+
+
 def commission(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
     name: Annotated[str, typer.Option("--name", help="Who stands at the cell.", show_default=False)],
-    only: Annotated[
-        str | None,
-        typer.Option(
-            "--only",
-            help="Do this step, though it has passed: cycle, axes, stopping, lamps, trigger, watchdog or "
-            "emergency-stop.",
-        ),
-    ] = None,
+    only: _Only = None,
+    board: _Board = None,
     yes: Annotated[bool, typer.Option("--yes", help="Simulated cells only: nobody is asked.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -36,6 +49,7 @@ def commission(
     """
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell
+    from coupole.calibration.lens.board import read_board
     from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
@@ -47,6 +61,8 @@ def commission(
     step = next((one for one in STEPS if one == only), None)
     if only is not None and step is None:
         raise InputError(f"--only: expected one of {', '.join(STEPS)}; found {only!r}")
+    if board is not None:
+        read_board(board)
     console, cell = make_console(quiet=as_json), read_cell(rig)
     if yes and not in_world(cell.rig, dry_run=False):
         raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
@@ -58,6 +74,7 @@ def commission(
                 console,
                 name=name.strip(),
                 only=step,
+                board=board,
                 person_at=lambda opened: (
                     SimulatedPerson(console, opened.world_endpoints)
                     if yes and opened.world_endpoints is not None

@@ -259,6 +259,8 @@ class Consoles(Model):
     at_the_cell: Annotated[tuple[Words, ...], Field(max_length=100)] = ()
     """Addresses of those whose user sees the arm and reaches its emergency stop: only from these it is moved by
     hand."""
+    enabling_switch: bool = False
+    """The LED box has an input for an enabling switch: without one the arm is not moved from a console."""
 
 
 class WorldSection(Model):

@@ -1,17 +1,16 @@
 """The record of a cell's commissioning: `commissioning.yaml` in its state folder, and whether it fits the cell.
 
-Each step keeps the settings and the devices with which it was done. So a change of the rig, or another box, asks
-for the steps that it concerns and for no others. The file carries a SHA-256 of its own content, as calibrations
-do.
+Each step keeps all of the rig that it covers (`commissioned_rig`) and the devices with which it was done. So a
+change of the rig, or another box, asks for the steps that it concerns and for no others. The file carries a
+SHA-256 of its own content, as calibrations do.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import AwareDatetime, Field, JsonValue
 
@@ -22,22 +21,23 @@ from coupole.errors import InputError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Model, Name
-from coupole.plan.registry import settings_class
-from coupole.plan.rig_devices import NOWHERE, described_arm, device_for, in_world
+from coupole.plan.rig_devices import in_world
+from coupole.preflight.commissioned_rig import STEPS, Step, covered
 
-Step = Literal["cycle", "axes", "stopping", "lamps", "trigger", "watchdog", "emergency-stop"]
-STEPS: tuple[Step, ...] = get_args(Step)
-"""In the order in which they are done."""
+__all__ = ["STEPS", "Step"]
 _DEVICES: Mapping[Step, tuple[str, ...]] = {
     "cycle": ("robot",),
     "axes": ("robot",),
     "stopping": ("robot",),
+    "geometry": ("robot", "camera"),
     "lamps": ("ledbox",),
     "trigger": ("ledbox", "camera"),
     "watchdog": ("ledbox",),
+    "presence": ("ledbox",),
     "emergency-stop": ("robot",),
 }
 """The devices that a step is about."""
+_MOST_TOLD = 8
 _HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, say `coupole commission`."
 
 
@@ -57,7 +57,9 @@ class StepResult(Model):
     devices: dict[str, str]
     """Vendor, model, serial number and firmware of each device of the step."""
     settings: dict[str, JsonValue]
-    """Settings of the rig that the result depends on, by their place in it."""
+    """All of the rig that the result depends on, by its place in it."""
+    covers: Literal["everything"] | None = Field(default=None, exclude_if=lambda value: value is None)
+    """None in records of versions that kept some settings only."""
     limits: tuple[Limit, ...]
     answers: tuple[Answer, ...]
     remarks: tuple[str, ...]
@@ -121,24 +123,8 @@ def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
 
 
 def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:
-    """The settings of the rig that the result of a step depends on. Addresses are not among them."""
-    rig = cell.rig
-    found: dict[str, Any] = {}
-    for kind in _DEVICES[step]:
-        driver, settings = device_for(rig, kind, dry_run=False)
-        found[f"{kind}.driver"] = driver
-        model = settings_class(driver)
-        places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
-        complete = model(**{**settings, **places}).model_dump(mode="json", exclude={*places, "arm_model"})
-        found |= {f"{kind}.settings.{name}": value for name, value in complete.items()}
-    if "robot" in _DEVICES[step]:
-        arm = described_arm(rig)
-        found["arm"] = None if arm is None else hashlib.sha256(arm.model_dump_json().encode()).hexdigest()
-    if "camera" in _DEVICES[step]:
-        found["led_limits.rise_us"] = rig.led_limits.rise_us
-    if step == "lamps":
-        found["dome.leds"] = hashlib.sha256(cell.leds_path.read_bytes()).hexdigest()
-    plain: dict[str, JsonValue] = json.loads(json.dumps(found))
+    """All of the rig that the result of a step depends on."""
+    plain: dict[str, JsonValue] = json.loads(json.dumps(covered(cell, step)))
     return plain
 
 
@@ -155,10 +141,17 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
 
 def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
     """Why a step's result does not fit the rig (and the opened devices) any more; empty if it does."""
-    changes = _changes(result.settings, settings_of(cell, result.step))
+    before, now = result.settings, settings_of(cell, result.step)
+    lacking = []
+    if result.covers is None:
+        if places := _places(key for key in now if key not in before):
+            lacking = [f"it was done by an earlier version, which did not cover {places}"]
+        before, now = ({key: kept[key] for key in before if key in now} for kept in (before, now))
+    changes = _changes(before, now)
     if identities is not None:
         changes += _changes(result.devices, devices_of(result.step, identities))
-    return "; ".join(changes)
+    more = len(changes) - _MOST_TOLD
+    return "; ".join([*changes[:_MOST_TOLD], *([f"and {more} more"] if more > 0 else []), *lacking])
 
 
 def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None = None) -> list[str]:
@@ -179,12 +172,17 @@ def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None
     for step in STEPS:
         result = record.result(step)
         if result is None:
-            refusals.append(f"commissioning: the step {step} was not done. Say `{command}`")
+            why = f"it covers {_places(settings_of(cell, step))}"
+            refusals.append(f"commissioning: the step {step} was not done; {why}. Say `{command}`")
         elif not result.passed:
             refusals.append(f"commissioning: the step {step} did not pass. Say `{command}`")
         elif why := outdated(cell, result, identities):
             refusals.append(f"commissioning: the step {step} does not fit any more: {why}. Say `{command}`")
     return refusals
+
+
+def _places(keys: Iterable[str]) -> str:
+    return ", ".join(sorted({key.partition(".")[0] for key in keys}))
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -98,6 +98,22 @@ def ask(question: str) -> bool:
         return False
 
 
+def ask_number(question: str) -> float | None:
+    """Ask for a number on standard error, again if what was typed is none; None for an empty answer."""
+    while True:
+        print(f"{question} ", end="", file=sys.stderr, flush=True)
+        try:
+            typed = sys.stdin.readline().strip()
+        except OSError:  # no standard input
+            return None
+        if not typed:
+            return None
+        with contextlib.suppress(ValueError):
+            if math.isfinite(number := float(typed.removesuffix("mm").replace(",", "."))):
+                return number
+        print(f"expected a number, found {typed!r}", file=sys.stderr)
+
+
 def duration_text(seconds: float) -> str:
     """`2 h 05 min`, `3 min 20 s`, `12.3 s`."""
     if seconds >= 3600:

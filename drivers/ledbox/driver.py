@@ -34,7 +34,7 @@ _BLOCK_BYTES = 512
 """Largest part of a table in one message: what a box that lacks the device clear lets another command wait for."""
 _BLOCK_OVERHEAD_BYTES, _BLOCK_OVERHEAD_S = 70, 0.003
 _UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
-_UNDEFINED_HEADER = "-113"
+_UNDEFINED_HEADER, _HARDWARE_MISSING = "-113", "-241"
 _FIRST_PROTOCOL = "1.0"
 _CLEARS_AT_ONCE = 5
 """Threads that may switch the lights off at the same time; each clears the box, and ends the others' messages."""
@@ -93,6 +93,7 @@ class LedBox:
         try:
             self._identity = self._greet()
             self._protocol = self._ask_protocol()
+            self._has_enabling_switch = self._ask_enabling_switch()
             self.led_count = self._set_up()
         except BaseException:
             self.close()
@@ -111,6 +112,7 @@ class LedBox:
             "LEDs": str(self.led_count),
             "hottest board": f"{self._scpi.number(celsius)} C",
             "watchdog": f"{self._scpi.number(watchdog_s):g} s",
+            "enabling switch": {None: "no input for one", True: "held", False: "released"}[self.presence()],
             "device clear": "yes" if self._clears else f"no: the box speaks protocol {self._protocol}",
         }
 
@@ -213,6 +215,14 @@ class LedBox:
         (celsius,) = self._scpi.ask(f"MEAS:TEMP? (@{board})", 1)
         return self._scpi.number(celsius)
 
+    def presence(self) -> bool | None:
+        if not self._has_enabling_switch:
+            return None
+        (held,) = self._scpi.ask("INP:ENAB?", 1)
+        if held not in ("0", "1"):
+            self._scpi.unexpected("0 or 1 in the answer to INPut:ENABle?", repr(held))
+        return held == "1"
+
     def close(self) -> None:
         """Lights off if the box still answers; never raises for a lost link."""
         with contextlib.suppress(DeviceError):
@@ -267,6 +277,16 @@ class LedBox:
                 raise
             return _FIRST_PROTOCOL
         return str(version)
+
+    def _ask_enabling_switch(self) -> bool:
+        """Whether the box has an input for one: older firmware does not know the question."""
+        try:
+            self._scpi.ask("INP:ENAB?", 1)
+        except DeviceRefused as refused:
+            if not any(code in refused.happened for code in (_UNDEFINED_HEADER, _HARDWARE_MISSING)):
+                raise
+            return False
+        return True
 
     @property
     def _clears(self) -> bool:

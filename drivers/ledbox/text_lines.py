@@ -160,7 +160,15 @@ class TextLineBox:
     def self_test(self) -> Mapping[str, str]:
         """Number of LEDs and kind of confirmation; raises if the box does not execute a command."""
         self.lights_off()
-        return {"LEDs": str(self.led_count), "confirms": f"with `{self._settings.expected_reply}`"}
+        return {
+            "LEDs": str(self.led_count),
+            "confirms": f"with `{self._settings.expected_reply}`",
+            "enabling switch": "no input for one",
+        }
+
+    def presence(self) -> bool | None:
+        """Such a box has no input for an enabling switch."""
+        return None
 
     def flash(self, led: int, on_us: int) -> None:
         """Switch one LED on; returns when the box has confirmed it."""

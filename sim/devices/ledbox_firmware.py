@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from sim.devices.ledbox_burst import Boards, Burst, Quartz, Wiring
+from sim.devices.ledbox_link import Link
 from sim.devices.ledbox_table import MAX_RECORDS, STEP, check_table, read_table
 from sim.devices.pty_port import PtyPort
 from sim.devices.scpi_parser import (
@@ -47,6 +48,8 @@ class Settings(BaseModel):
     leds_per_board: int = Field(default=6, ge=1)
     """Board of an LED: led // leds_per_board."""
     serial_number: str = "SIM-0001"
+    enabling_switch: Literal["none", "released", "held"] = "none"
+    """At power-on, on the box's input for one."""
     clock_offset_ns: int = Field(default=5_000_000_000, ge=0)
     """Reading of the box's clock at world time 0."""
     clock_ppm: float = Field(default=12.0, ge=-1000, le=1000)
@@ -65,20 +68,6 @@ class Settings(BaseModel):
     board_limit_c: float = 75.0
     block_timeout_s: float = Field(default=2.0, gt=0)
     """An incomplete block is discarded after this time without further bytes."""
-
-
-class Link(Protocol):
-    """Transport of bytes to and from the box: a `PtyPort`, or the far end of a USB cable.
-
-    `on_break` is its device clear: a BREAK, INITIATE_CLEAR, the end of a TCP connection."""
-
-    port: str
-
-    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None: ...
-    def send(self, data: bytes) -> bool: ...
-    def drop_output(self) -> None: ...
-    def mute(self) -> None: ...
-    def close(self) -> None: ...
 
 
 class LedBoxFirmware:
@@ -123,6 +112,7 @@ class LedBoxFirmware:
         self.dead_leds: set[int] = set()
         """LEDs that from their next step on draw no current and give no light."""
         self._panels = dict.fromkeys(_PANELS, False)
+        self.enabling_switch = settings.enabling_switch
         self._burst: Burst | None = None
         self._heard_ns = self._deaf_until_ns = reactor.now_ns
         self._watchdog_timer: Timer | None = None
@@ -209,6 +199,8 @@ class LedBoxFirmware:
             "SYSTem:PROTocol?": Command(lambda: self._settings.protocol),
             "SEQuence:DATA:APPend": Command(self._append_data, 1, 1),
         }
+        if self._settings.enabling_switch != "none":
+            newer["INPut:ENABle?"] = Command(lambda: str(int(self.enabling_switch == "held")))
         return (newer if self._clears else {}) | {
             "*IDN?": Command(lambda: f"Coupole,LED control box,{self._settings.serial_number},1.0"),
             "*RST": Command(self._reset),

@@ -56,11 +56,13 @@ def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
             boards = -(-settings.led_count // settings.leds_per_board)
             if isinstance(fault, faults.OverTemperature) and fault.board >= boards:
                 return f"`{fault.kind}`: the LED box has boards 0 to {boards - 1}, not {fault.board}"
+            if isinstance(fault, faults.EnablingSwitch) and settings.enabling_switch == "none":
+                return f"`{fault.kind}`: the LED box has no input for one; give it `enabling_switch: released`"
             if isinstance(fault, faults.StuckLed):
                 return f"`{fault.kind}` cannot happen to an LED box of kind `scpi`: it switches all current off"
         case text_box.Settings():
-            if isinstance(fault, _EDGE_FAULTS):
-                why = "it sends no edges and feels no heat"
+            if isinstance(fault, (*_EDGE_FAULTS, faults.EnablingSwitch)):
+                why = "it sends no edges, feels no heat and has no inputs"
                 return f"`{fault.kind}` cannot happen to an LED box of kind `text`: {why}"
             if isinstance(fault, faults.When) and fault.at_edge is not None:
                 return "`at_edge`: an LED box of kind `text` sends no edges. Use `at_s`"

@@ -117,6 +117,13 @@ class EmergencyStop(When):
     kind: Literal["emergency_stop"]
 
 
+class EnablingSwitch(When):
+    """The enabling switch at the LED box's input is held, or released."""
+
+    kind: Literal["enabling_switch"]
+    held: bool
+
+
 class LateRsi(When):
     """`cycles` answers in a row come too late for the robot's controller."""
 
@@ -152,6 +159,7 @@ Fault = Annotated[
     | StuckLed
     | FlickeringLed
     | EmergencyStop
+    | EnablingSwitch
     | LateRsi
     | RsiLinkLoss
     | NudgeArm,

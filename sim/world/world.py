@@ -33,6 +33,7 @@ from sim.world.config import CameraConfig, Config
 from sim.world.exposure_log import ExposureLog
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
+from sim.world.ruler import Ruler
 from sim.world.scratch import world_folder
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -54,6 +55,7 @@ class World:
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
+        self._ruler = Ruler(config.scene, settings.things, self._photographer.leds.positions_mm)
         self._cables = tool_capsules(np.array(config.scene.base_from_support), settings.cables)
         tell = _told if config.tells_refusals else untold
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell, settings.strangers.arm)
@@ -185,6 +187,8 @@ class World:
                 self._flashes.unsteady[fault.led] = fault.rms
             case script.EmergencyStop():
                 self.robot.estop()
+            case script.EnablingSwitch():
+                self._scpi_box.enabling_switch = "held" if fault.held else "released"
             case script.LateRsi():
                 assert isinstance(self.robot, kuka_controller.KukaController)  # `impossible` refuses others
                 self.robot.late(fault.cycles)
@@ -244,6 +248,8 @@ class World:
                     "joints_deg": list(self.robot.joints_deg),
                     "camera_armed": self.camera.armed,
                 }
+            case "ruler":
+                return self._ruler.lengths_mm(self.robot.true_base_from_flange())
             case "light":
                 leds_s, panels_s = self.lighting.given_s(self.reactor.now_ns)
                 return {"leds_s": leds_s, "panels_s": panels_s}

@@ -41,6 +41,32 @@ def ball_cell(folder: Path, *, speed: float, **world: Any) -> CellFolder:
     return cell
 
 
+BOARD = """\
+kind: charuco
+corners: [7, 5]
+square_mm: 10.0
+marker_mm: 7.0
+"""
+BOARD_AT = {
+    "kind": "charuco_board",
+    "squares_x": 8,
+    "squares_y": 6,
+    "square_mm": 10.0,
+    "marker_mm": 7.0,
+    "translation_mm": [35.0, 5.0, 0.0],
+}
+BALL_AT = {"kind": "glossy_sphere", "diameter_mm": 50.0, "translation_mm": [-55.0, 0.0, 0.0]}
+
+
+def board_cell(folder: Path, *, speed: float) -> CellFolder:
+    """The same with a ball and a board side by side on the support, and pictures that are fine enough for it."""
+    cell = ball_cell(folder, speed=speed, things=[BALL_AT, BOARD_AT])
+    cell.rig_data["sensor"] |= {"width_px": 512, "height_px": 384, "pixel_pitch_um": 44.0}
+    (folder / "board.yaml").write_text(BOARD)
+    cell.write()
+    return cell
+
+
 def real(cell: CellFolder) -> None:
     """From now on the rig is that of a real cell: it names devices, and no world."""
     del cell.rig_data["world"]
@@ -54,6 +80,9 @@ class Onlooker:
     """A person who agrees to everything and sees everything as described; `heard` is all that was said."""
 
     heard: list[str] = field(default_factory=list)
+    lengths_mm: dict[str, float] = field(default_factory=dict)
+    """What a ruler says, by the question's name."""
+    hold: Callable[[bool], None] = lambda _: None
     press: Callable[[], None] = lambda: None
 
     def is_ready(self, announcement: str) -> bool:
@@ -64,8 +93,15 @@ class Onlooker:
         self.heard.append(question)
         return True
 
+    def measures(self, what: str, question: str) -> float | None:
+        self.heard.append(question)
+        return self.lengths_mm.get(what)
+
     def told(self, message: str) -> None:
         self.heard.append(message)
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        self.hold(held)
 
     def press_emergency_stop(self) -> None:
         self.press()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,13 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from cells import Ended, here
-from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, opened_bench, with_devices
+from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, board_cell, opened_bench, with_devices
 from places import REPO
 
 from coupole.acquisition.commissioning import arm_steps, lamp_step, light_timing
 from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedError
-from coupole.acquisition.commissioning.lamp_step import deviations_deg
+from coupole.acquisition.commissioning.light_directions import deviations_deg
 from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
+from coupole.acquisition.observer import Control
+from coupole.errors import Interrupted
 from coupole.kinematics import link_frames
 from coupole.motion.itinerary import bodies_of
 from coupole.plan.cell import read_cell
@@ -32,8 +36,9 @@ SWAPPED = (180, 720)
 @pytest.fixture(scope="module")
 def right(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Ended]:
     """The rig of a right cell, and how its whole commissioning ended."""
-    cell = ball_cell(tmp_path_factory.mktemp("right"), speed=8.0)
-    return cell.rig, here("commission", cell.rig, "--name", "A. Person", "--yes", "--json")
+    cell = board_cell(tmp_path_factory.mktemp("right"), speed=8.0)
+    board = ("--board", cell.folder / "board.yaml")
+    return cell.rig, here("commission", cell.rig, "--name", "A. Person", "--yes", "--json", *board)
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +158,20 @@ def test_swapped_leds_are_named_and_no_others(wrong: Bench) -> None:
         *(f"LED {led}: from its place in the table" for led in SWAPPED),
         "largest deviation from the LED table",
     ]
+
+
+def test_a_stop_is_heard_between_two_leds_while_their_directions_are_computed(wrong: Bench) -> None:
+    control, shown = Control(), []
+
+    def say(job: str, done: int, of: int) -> None:
+        shown.append((job, done, of))
+        if job.startswith("directions"):
+            control.stop_by(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        lamp_step.lamps(replace(wrong, control=control, bars=lambda: nullcontext(say)))
+    assert shown[11] == ("LEDs", 12, 12)
+    assert shown[12:] == [("directions, round 1 of at most 4", 1, 12)]
 
 
 def test_a_dead_led_is_named(wrong_cell: tuple[Bench, Any], wrong: Bench) -> None:

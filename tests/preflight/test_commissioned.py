@@ -87,13 +87,13 @@ def test_another_watchdog_time_is_refused(real: CellFolder) -> None:
     assert [why.split()[3] for why in checked(real)] == ["lamps", "trigger", "watchdog"]
 
 
-def test_another_led_table_asks_for_the_lamps(real: CellFolder) -> None:
+def test_another_led_table_asks_for_the_lamps_and_the_domes_place(real: CellFolder) -> None:
     commission(read_cell(real.rig), DEVICES)
     table = Path(real.rig_data["dome"]["leds"]).read_text()
     (real.folder / "other.csv").write_text(table + "\n")
     real.rig_data["dome"]["leds"] = "other.csv"
     real.write()
-    assert [why.split()[3] for why in checked(real)] == ["lamps"]
+    assert [why.split()[3] for why in checked(real)] == ["geometry", "lamps"]
 
 
 def test_another_address_is_no_other_cell(real: CellFolder) -> None:
@@ -108,7 +108,7 @@ def test_another_box_is_refused_when_it_is_opened(real: CellFolder) -> None:
     others = DEVICES | {"ledbox": replace(DEVICES["ledbox"], serial="0018")}
     with pytest.raises(PreflightRefused, match=r"LED control box 0018 .*was .* 0017") as refused:
         refuse_uncommissioned(read_cell(real.rig), others)
-    assert [why.split()[3] for why in refused.value.refusals] == ["lamps", "trigger", "watchdog"]
+    assert [why.split()[3] for why in refused.value.refusals] == ["lamps", "trigger", "watchdog", "presence"]
 
 
 def test_a_record_that_was_edited_is_refused(real: CellFolder) -> None:

@@ -16,11 +16,12 @@ from coupole.acquisition.arm_supervisor import ArmSupervisor
 from coupole.acquisition.cell_bench.arm_paths import ArmPaths, ShownPath, links_mm
 from coupole.acquisition.cell_bench.bench_requests import JogAsked, PathAsked
 from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.cell_bench.enabling_switch import EnablingSwitch, ReleasedError
 from coupole.acquisition.cell_bench.jog_steps import jog_step
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.operator import refuse_uncommissioned
-from coupole.errors import DeviceError, DeviceRefused, InputError, PreflightRefused
+from coupole.errors import DeviceError, DeviceRefused, InputError, Interrupted, PreflightRefused
 from coupole.plan.cell import Cell
 from coupole.preflight.job import Job
 from coupole.storage.arm_faults import ArmFaults
@@ -42,6 +43,7 @@ class BenchArm:
         self._cell, self._opened, self._works = cell, opened, works
         self._faults = ArmFaults(cell.state_folder)
         self._paths = ArmPaths(cell, job)
+        self._switch = EnablingSwitch(opened.ledbox, must_exist=cell.rig.console.enabling_switch)
         self._shown: dict[str, ShownPath] = {}
         self._numbers = itertools.count(1)
         self._planning = threading.Lock()
@@ -65,6 +67,7 @@ class BenchArm:
             "emergency_stop": arm.condition.emergency_stop,
             "protective_stop": arm.condition.protective_stop,
             "brakes_released": arm.condition.brakes_released,
+            "enabling_switch": self._switch.exists,
             "heard_s_ago": round((self._opened.clock.now_ns() - arm.t_ns) / 1e9, 3),
         }
 
@@ -87,6 +90,7 @@ class BenchArm:
         if path is None:
             raise InputError(f"path: expected one that `plan_path` has shown, found {number!r}")
         self.refuse_motion()
+        self._switch.refuse_released()
         here_deg = np.array(self._opened.robot.measured().joints_deg)
         off_deg = float(np.abs(here_deg - path.start_deg).max())
         if off_deg > _SAME_PLACE_DEG:
@@ -109,6 +113,7 @@ class BenchArm:
         if asked.hold is not None:
             return self._renew(asked)
         self.refuse_motion()
+        self._switch.refuse_released()
         hold = _Hold(next(self._numbers), asked)
         about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
         work = Work("jog", about, lambda control: self._go_on(hold, control))
@@ -141,9 +146,12 @@ class BenchArm:
 
     def _follow(self, path: ShownPath, control: Control) -> dict[str, Any]:
         supervisor = ArmSupervisor(self._cell.rig, path.motion, self._opened, control)
-        with self._stopped_at_the_end():
-            supervisor.begin_here()
-            supervisor.go(path.visit)
+        try:
+            with self._switch.held() as check, self._stopped_at_the_end():
+                supervisor.begin_here()
+                supervisor.go(path.visit, meanwhile=check)
+        except ReleasedError as end:
+            raise Interrupted(str(end)) from end
         return {}
 
     def _go_on(self, hold: _Hold, control: Control) -> dict[str, Any]:
@@ -153,15 +161,21 @@ class BenchArm:
 
         camera, asked = rig.flange_from_camera.matrix(), hold.asked
         try:
-            with self._stopped_at_the_end():
+            with self._switch.held() as check, self._stopped_at_the_end():
+
+                def go_on() -> None:
+                    hold.check()
+                    check()
+
                 while True:
                     here_deg = supervisor.begin_here()
                     step = jog_step(
                         self._paths.arm, bodies, camera, here_deg, asked.axis, asked.direction, asked.share
                     )
                     hold.check()
-                    supervisor.go(step.visit, meanwhile=hold.check, speed=step.speed)
-        except (HoldLostError, InputError) as end:
+                    self._switch.refuse_released()
+                    supervisor.go(step.visit, meanwhile=go_on, speed=step.speed)
+        except (HoldLostError, ReleasedError, InputError) as end:
             return {"ended": str(end)}
 
     @contextmanager

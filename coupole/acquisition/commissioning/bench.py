@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -28,13 +31,25 @@ class Person(Protocol):
         """Whether what was seen is what is described."""
         ...
 
+    def measures(self, what: str, question: str) -> float | None:
+        """A length by ruler, mm; None if it was not measured. `what` is the question's name."""
+        ...
+
     def told(self, message: str) -> None:
         """A message without an answer."""
+        ...
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        """Asks for the enabling switch to be held, or released; returns at once."""
         ...
 
     def press_emergency_stop(self) -> None:
         """Asks for the emergency stop to be pressed; returns at once."""
         ...
+
+
+Say = Callable[[str, int, int], None]
+"""Called with a job's name, how much of it is done, and of how much."""
 
 
 class StepFailedError(Exception):
@@ -57,6 +72,11 @@ class Findings:
         self.limits.append(Limit(what=what, found=round(known, 6), limit=round(float(limit), 6), unit=unit))
         return self.limits[-1].passed
 
+    @property
+    def passed(self) -> bool:
+        """Whether all is well so far."""
+        return all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
+
 
 @dataclass
 class Bench:
@@ -72,6 +92,20 @@ class Bench:
     person: Person
     control: Control
     findings: Findings = field(default_factory=Findings)
+    bars: Callable[[], AbstractContextManager[Say]] = lambda: nullcontext(lambda *_: None)
+    """Shows how far a long job is, while the context lasts."""
+    board: Path | None = None
+    """The file that describes the board on the support; None: the one of docs/how-to/commission-a-cell.md."""
+
+    def each(self, what: str, numbers: Iterable[int]) -> Iterator[int]:
+        """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
+        stop."""
+        left = list(numbers)
+        with self.bars() as say:
+            for k, number in enumerate(left):
+                self.control.go_on()
+                yield number
+                say(what, k + 1, len(left))
 
     def ask_before(self, announcement: str) -> None:
         """Raises Interrupted unless the person agrees."""
@@ -86,6 +120,15 @@ class Bench:
         yes = self.person.confirms(question)
         self.findings.answers.append(Answer(question=question, yes=yes))
         return yes
+
+    def measured(self, what: str, question: str) -> float:
+        """A length that the person measures, mm; it is noted. Raises StepFailedError if it was not measured."""
+        self.control.go_on()
+        found_mm = self.person.measures(what, question)
+        if found_mm is None:
+            raise StepFailedError(f"not measured: {question}. Repeat the step with ruler and tape at hand")
+        self.findings.remarks.append(f"measured: {question}: {found_mm:g} mm")
+        return found_mm
 
     def pause(self, seconds: float) -> None:
         """Wait on the rig's clock. Raises Interrupted after the operator's stop."""

@@ -1,10 +1,4 @@
-"""The lamps one by one: each draws current, brightens the picture, and lights from where the LED table has it.
-
-Of a matte object with a constant shape, a pixel's value under a far light is `l . b`: l the direction of the light
-times its illuminance, b the pixel's normal times its reflectance (Woodham, "Photometric method for determining
-surface orientation from multiple images", Opt. Eng. 19, 1980). All pictures together give b from the table's
-directions; each picture then gives a direction, to be compared with the table's. No pixel's shape has to be known.
-"""
+"""The lamps one by one: each draws current, brightens the picture, and lights from where the LED table has it."""
 
 from __future__ import annotations
 
@@ -15,13 +9,10 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
 from coupole.acquisition.commissioning.flashes import arm_camera, good_exposure_us, photograph
+from coupole.acquisition.commissioning.light_directions import FEWEST_LEDS, MOST_DEVIATION_DEG, deviations_deg
 from coupole.devices import NO_LED
 from coupole.plan.led_table import LedTable
 
-MOST_DEVIATION_DEG = 25.0
-"""Between the direction in a picture and the table's. Shadows, gloss and the nearness of the LEDs bend it; LEDs
-that are swapped within this angle are found by `coupole calibrate leds`."""
-_FEWEST_LEDS = 8
 _LEAST_SPREAD = 0.05
 """Smallest singular value of the normals in view, as a share of the largest: below it the object is too flat."""
 _LEAST_SIGNAL_SIGMA, _LEAST_SIGNAL_SHARE = 8.0, 0.01
@@ -33,7 +24,6 @@ _LIT_SHARE = 0.1
 _METERED = 5
 _MOST_ASKED = 24
 _SHOWN_US = 2_000_000
-_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -70,13 +60,13 @@ def lamps(bench: Bench) -> None:
     dark = _dark_leds(seen)
     dark_and_on = [led for led in dark if led not in seen.open_leds]
     lit = ~np.isin(seen.ids, dark)
-    if lit.sum() < _FEWEST_LEDS:
+    if lit.sum() < FEWEST_LEDS:
         raise StepFailedError(
             f"only {lit.sum()} of {len(lit)} LEDs brighten the picture: jog the arm so that the camera sees the "
             "matte ball, then repeat"
         )
     rows = table.rows(seen.ids[lit])
-    off_deg, spread_found = deviations_deg(seen.pictures[lit], light_vectors(bench, table)[rows])
+    off_deg, spread_found = deviations_deg(seen.pictures[lit], light_vectors(bench, table)[rows], bench.each)
     if spread_found < _LEAST_SPREAD:
         raise StepFailedError(
             f"what the camera sees is too flat to tell directions of light ({spread_found:.3f}; "
@@ -99,63 +89,13 @@ def light_vectors(bench: Bench, table: LedTable) -> NDArray[np.float64]:
     return vectors
 
 
-def deviations_deg(
-    pictures: NDArray[np.float64], lights: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
-    """Angles [leds] between the directions that pictures [leds, pixels] show and `lights` [leds, 3]; and how well
-    the object in view tells directions: the ratio of the smallest to the largest singular value of its normals.
-
-    Each LED's direction comes from normals that the other pictures give; those whose LED turned out to be
-    elsewhere are left out of them.
-    """
-    lights = lights / np.linalg.norm(lights, axis=1).mean()
-    lit = pictures > _LIT_SHARE * np.maximum(pictures.max(axis=0), 1e-9)
-    good = np.ones(len(lights), bool)
-    angles_deg = np.zeros(len(lights))
-    for _ in range(_ROUNDS):
-        for led in range(len(lights)):
-            normals = _normals(pictures, lights, lit, good & (np.arange(len(lights)) != led))
-            angles_deg[led] = _angle_deg(_direction(pictures[led], normals, lit[led]), lights[led])
-        # The worst only: one wrong LED bends the normals by which its neighbours are judged.
-        worst = np.where(good, angles_deg, 0.0).argmax()
-        if angles_deg[worst] <= MOST_DEVIATION_DEG or good.sum() <= _FEWEST_LEDS:
-            break
-        good = good & (angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst]))
-    spread = np.linalg.svd(_normals(pictures, lights, lit, good), compute_uv=False)
-    return angles_deg, float(spread[-1] / max(spread[0], 1e-12))
-
-
-def _normals(
-    pictures: NDArray[np.float64], lights: NDArray[np.float64], lit: NDArray[np.bool_], used: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """[3, pixels]: for each pixel the least-squares solution of `lights . b = picture` over the lights that reach
-    it. Pixels that fewer than four reach count as black."""
-    weights = (lit & used[:, None]).astype(np.float64)
-    matrices = np.einsum("lp,li,lj->pij", weights, lights, lights) + 1e-6 * np.eye(3)
-    sides = np.einsum("lp,li,lp->pi", weights, lights, pictures)
-    solved = np.linalg.solve(matrices, sides[..., None])[..., 0].T
-    normals: NDArray[np.float64] = np.where(weights.sum(axis=0) < 4, 0.0, solved)
-    return normals
-
-
-def _direction(
-    picture: NDArray[np.float64], normals: NDArray[np.float64], lit: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0], dtype=np.float64)
-
-
-def _angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    cosine = float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
 def _photographed(bench: Bench, exposure_us: int) -> Pictures:
     arm_camera(bench, exposure_us, hardware=bench.opened.ledbox.runs_tables)
     darks = [photograph(bench, NO_LED, exposure_us)[0] for _ in range(2)]
     dark = (darks[0] + darks[1]) / 2.0
     noise_dn = float(np.std(darks[0] - darks[1]))
     pictures, currents_ma, open_leds = [], [], []
-    for led in bench.cell.leds.ids.tolist():
+    for led in bench.each("LEDs", bench.cell.leds.ids.tolist()):
         picture, record = photograph(bench, led, exposure_us)
         pictures.append((picture - dark).ravel()[:: max(1, dark.size // (4 * _MOST_PIXELS))])
         currents_ma.append(record.led_current_ma)

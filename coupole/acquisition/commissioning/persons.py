@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from coupole.plan.registry import WORLD, load_class
-from coupole.viewing.terminal import alarm, ask
+from coupole.viewing.terminal import alarm, ask, ask_number
 
 
 class PersonAtTerminal:
@@ -20,8 +20,14 @@ class PersonAtTerminal:
     def confirms(self, question: str) -> bool:
         return ask(question)
 
+    def measures(self, what: str, question: str) -> float | None:
+        return ask_number(f"Measure, in mm: {question}:")
+
     def told(self, message: str) -> None:
         alarm(message)
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        alarm("HOLD the enabling switch at the cell now." if held else "RELEASE the enabling switch now.")
 
     def press_emergency_stop(self) -> None:
         alarm("PRESS THE EMERGENCY STOP NOW, while the arm moves.")
@@ -41,8 +47,17 @@ class SimulatedPerson:
         self._console.print(f"{question} (not asked: simulated)", markup=False)
         return True
 
+    def measures(self, what: str, question: str) -> float | None:
+        """With a ruler that the simulated cell has: it knows nothing of the rig."""
+        found = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
+        self._console.print(f"{question}: {found} mm (measured in the simulation)", markup=False)
+        return found if found is None else float(found)
+
     def told(self, message: str) -> None:
         self._console.print(message, markup=False)
+
+    def hold_enabling_switch(self, *, held: bool) -> None:
+        load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "enabling_switch", "held": held})
 
     def press_emergency_stop(self) -> None:
         load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "emergency_stop"})

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from coupole.acquisition.commissioning import arm_steps, emergency_stop, lamp_step, light_timing
+from coupole.acquisition.commissioning import (
+    arm_steps,
+    emergency_stop,
+    geometry_step,
+    lamp_step,
+    light_timing,
+    presence_step,
+)
 from coupole.acquisition.commissioning.bench import Bench, Findings, Person, StepFailedError
 from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
 from coupole.acquisition.observer import Control
@@ -36,15 +44,17 @@ from coupole.preflight.commissioned import (
 )
 from coupole.storage.arm_faults import ArmFaults
 from coupole.viewing import commissioning_page
-from coupole.viewing.terminal import alarm
+from coupole.viewing.terminal import alarm, step_bars
 
 ACTS: Mapping[Step, Callable[[Bench], None]] = {
     "cycle": arm_steps.cycle,
     "axes": arm_steps.axes,
     "stopping": arm_steps.stopping,
+    "geometry": geometry_step.geometry,
     "lamps": lamp_step.lamps,
     "trigger": light_timing.trigger,
     "watchdog": light_timing.watchdog,
+    "presence": presence_step.presence,
     "emergency-stop": emergency_stop.emergency_stop,
 }
 _BEGIN = (
@@ -58,13 +68,20 @@ _BEGIN = (
 
 
 def commission(
-    cell: Cell, console: Console, *, name: str, only: Step | None, person_at: Callable[[OpenedCell], Person]
+    cell: Cell,
+    console: Console,
+    *,
+    name: str,
+    only: Step | None,
+    person_at: Callable[[OpenedCell], Person],
+    board: Path | None = None,
 ) -> CommissioningRecord:
     """Do the steps that are due, or `only` one; returns the record.
 
-    `name` is that of the person, whom `person_at` gives for the opened cell. Due is a step that was not done, did
-    not pass, or does not fit the rig and its devices any more. Raises CommissioningFailed after the first step
-    that does not pass, DeviceError if a device fails, Interrupted if the person does not go on.
+    `name` is that of the person, whom `person_at` gives for the opened cell; `board` is the file that describes
+    the board of the step geometry. Due is a step that was not done, did not pass, or does not fit the rig and its
+    devices any more. Raises CommissioningFailed after the first step that does not pass, DeviceError if a device
+    fails, Interrupted if the person does not go on.
     """
     ArmFaults(cell.state_folder).refuse(cell.document.path)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes)
@@ -72,7 +89,11 @@ def commission(
     record = _record_so_far(cell, console)
     control = Control()
     with open_cell(slow, on_opened=identity_printer(console)) as opened:
-        bench = _bench(slow, opened, bodies, person_at(opened), control)
+        bench = replace(
+            _bench(slow, opened, bodies, person_at(opened), control),
+            bars=lambda: step_bars(console),
+            board=board,
+        )
         due = [only] if only else _due(cell, record, opened)
         if not due:
             console.print("every step has passed and fits this cell; `--only STEP` repeats one")
@@ -158,6 +179,7 @@ def _done(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, 
         ended=datetime.now(UTC),
         devices=devices_of(step, bench.opened.identities),
         settings=settings_of(cell, step),
+        covers="everything",
         limits=tuple(findings.limits),
         answers=tuple(findings.answers),
         remarks=tuple(findings.remarks),

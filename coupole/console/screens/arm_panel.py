@@ -18,6 +18,11 @@ from coupole.viewing.terminal import duration_text
 _AXES = ("A1", "A2", "A3", "A4", "A5", "A6")
 _ALONG = {"x": "along x", "y": "along y", "z": "along z", "rx": "about x", "ry": "about y", "rz": "about z"}
 _SHARES = {"0.1": "10 % of 250 mm/s", "0.4": "40 % of 250 mm/s", "1": "250 mm/s at most"}
+_ENABLING = {
+    None: "",
+    True: "The arm moves only while a person at the cell holds the enabling switch there.",
+    False: "This cell has no enabling switch that the console could see: nothing tells whether anybody is there.",
+}
 _HOLD = Path(__file__).parent / "hold.js"
 
 
@@ -44,7 +49,7 @@ class ArmPanel:
 
     def show(self, state: dict[str, Any]) -> None:
         """The bench's state."""
-        self._hand.show()
+        self._hand.show((state["arm"] or {}).get("enabling_switch"))
         if self._plan != self._bench.plan:
             self._plan = self._bench.plan
             ui.timer(0.0, self._offer_views, once=True)
@@ -182,14 +187,17 @@ class _Hand:
             Choice("Speed of the fastest point", _SHARES, name="share", value="0.4")
             self._words = ui.label().classes("hint hand-words")
         self._buttons = ui.html("", sanitize=False).style("width:100%")
+        self._switch = named(ui.label().classes("small"), "enabling-switch")
         self._said = named(ui.label("No button is held."), "hand-said").props("role=status")
         ui.label(
             "Hold a button with pointer, Space or Enter; the arm stops when it is let go, when the page is "
             "hidden, and 300 ms after it was last heard. Watch the arm, with your hand at the emergency stop."
         ).classes("small")
 
-    def show(self) -> None:
+    def show(self, enabling_switch: bool | None) -> None:
+        """`enabling_switch`: whether the cell has one; None if that is not known."""
         visit = self._visit
+        self._switch.text = _ENABLING[enabling_switch]
         here = visit.address in visit.service.cell.rig.console.at_the_cell
         may = visit.may_act and here
         if may == self._may:

@@ -170,6 +170,7 @@ def test_a_button_moves_the_arm_as_long_as_it_is_held(room: Room) -> None:
     ada = room.ada
     ada.goes_to("/devices")
     ada.sees("[data-name=joints]")
+    ada.sees("[data-name=enabling-switch]", "no enabling switch")
     room.holds("A1")
     ada.sees("[data-name=hand-said]", "is held")
     let_go_s = room.world.ask("state")["t_s"]

@@ -1,0 +1,100 @@
+"""The enabling switch that a person at the cell holds while the arm is moved from a console (ISO 10218-1, 5.8.3).
+
+It hangs on an input of the LED box. That is no safety function: a box, its line and this program lie in between.
+It tells that somebody is there who wants the motion, which no address of a console can tell.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from coupole.devices import LedBox
+from coupole.errors import DeviceError, InputError
+from coupole.supervision import ATTENTION_S
+
+_POLL_S = 0.03
+_NEWS_S = 0.3
+"""A switch that was not heard of for so long counts as released."""
+
+
+class ReleasedError(Exception):
+    """The switch was released, or it is not known to be held."""
+
+
+class EnablingSwitch:
+    """The switch of one cell, if it has one."""
+
+    def __init__(self, box: LedBox, *, must_exist: bool) -> None:
+        """`must_exist`: the rig says that the box has an input for one."""
+        self._box, self._must_exist = box, must_exist
+        self.exists = box.presence() is not None
+
+    def refuse_released(self) -> None:
+        """Raise InputError unless it is held; a cell without one is moved without, unless its rig has one. For an
+        arm at rest: it waits for the box."""
+        if not self.exists:
+            if self._must_exist:
+                raise InputError(
+                    "the rig has an enabling switch (`console: enabling_switch:`), but the LED box tells of no "
+                    "input for one: see its wiring and firmware"
+                )
+            return
+        if not self._box.presence():
+            raise InputError(
+                "the enabling switch at the cell is not held: a person there holds it while the arm moves"
+            )
+
+    @contextmanager
+    def held(self) -> Iterator[Callable[[], None]]:
+        """While the context lasts, what it gives raises ReleasedError unless the switch is held. It is to be
+        called all the time while the arm moves: another thread asks the box, but nothing for a caller that hangs,
+        or the box's watchdog would hear it in the caller's place."""
+        if not self.exists:
+            yield lambda: None
+            return
+        watch = _Watch(self._box)
+        try:
+            yield watch.check
+        finally:
+            watch.end()
+
+
+class _Watch:
+    def __init__(self, box: LedBox) -> None:
+        self._box = box
+        self._released = ""
+        self._checked_s = self._heard_s = self._resumed_s = time.monotonic()
+        self._ended = threading.Event()
+        threading.Thread(target=self._ask, name="enabling switch", daemon=True).start()
+
+    def check(self) -> None:
+        """Raises ReleasedError. Once released it stays so: the motion is to be asked for anew."""
+        now_s = time.monotonic()
+        if now_s - self._checked_s > ATTENTION_S:  # the arm rested, and nothing was asked
+            self._resumed_s = now_s
+        self._checked_s = now_s
+        if not self._released and now_s - max(self._heard_s, self._resumed_s) > _NEWS_S:
+            self._released = f"the enabling switch was not heard of for {1e3 * _NEWS_S:g} ms"
+        if self._released:
+            raise ReleasedError(self._released)
+
+    def end(self) -> None:
+        self._ended.set()
+
+    def _ask(self) -> None:
+        while not self._ended.wait(_POLL_S):
+            if time.monotonic() - self._checked_s > ATTENTION_S:
+                continue
+            asked_s = time.monotonic()
+            try:
+                held = self._box.presence()
+            except DeviceError:  # another thread has darkened the box, or it is lost: the news get old
+                continue
+            if held:
+                self._heard_s = asked_s
+            else:
+                self._released = "the enabling switch was released"
+                return

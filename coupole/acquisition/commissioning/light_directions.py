@@ -1,0 +1,115 @@
+"""Directions of light from pictures of a matte body, each LED judged by what all the others show.
+
+Of a matte object with a constant shape, a pixel's value under a far light is `l . b`: l the direction of the light
+times its illuminance, b the pixel's normal times its reflectance (Woodham, "Photometric method for determining
+surface orientation from multiple images", Opt. Eng. 19, 1980). All pictures together give b from the table's
+directions; each picture then gives a direction, to be compared with the table's. No pixel's shape has to be known.
+
+An LED must not vouch for itself, so its direction comes from normals without it. These are not solved for anew:
+taking one light out of a least-squares solution is a change of rank one (`Normals.without`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_DEVIATION_DEG = 25.0
+"""Between the direction in a picture and the table's. Shadows, gloss and the nearness of the LEDs bend it; LEDs
+that are swapped within this angle are found by `coupole calibrate leds`."""
+FEWEST_LEDS = 8
+_LIT_SHARE = 0.1
+_RIDGE = 1e-6
+_FEWEST_LIGHTS = 4
+"""A pixel that fewer lights reach tells no normal."""
+_LEAST_REST = 1e-4
+"""Where less than this share of a direction is left when a light is taken out, the pixel is solved anew: the
+update would lose more than four digits."""
+_ROUNDS = 4
+Floats = NDArray[np.float64]
+Each = Callable[[str, Iterable[int]], Iterable[int]]
+"""Goes through numbers; whoever gives it shows how far that is, and may end it by an exception."""
+
+
+def deviations_deg(
+    pictures: Floats, lights: Floats, each: Each = lambda _, numbers: numbers
+) -> tuple[Floats, float]:
+    """Angles [leds] between the directions that pictures [leds, pixels] show and `lights` [leds, 3]; and how well
+    the object in view tells directions: the ratio of the smallest to the largest singular value of its normals.
+
+    Each LED's direction comes from normals that the other pictures give; those whose LED turned out to be
+    elsewhere are left out of them.
+    """
+    lights = lights / np.linalg.norm(lights, axis=1).mean()
+    lit = pictures > _LIT_SHARE * np.maximum(pictures.max(axis=0), 1e-9)
+    good = np.ones(len(lights), bool)
+    angles_deg = np.zeros(len(lights))
+    for turn in range(_ROUNDS):
+        normals = Normals(pictures, lights, lit, good)
+        for led in each(f"directions, round {turn + 1} of at most {_ROUNDS}", range(len(lights))):
+            angles_deg[led] = _angle_deg(_direction(pictures[led], normals.without(led), lit[led]), lights[led])
+        # The worst only: one wrong LED bends the normals by which its neighbours are judged.
+        worst = np.where(good, angles_deg, 0.0).argmax()
+        if angles_deg[worst] <= MOST_DEVIATION_DEG or good.sum() <= FEWEST_LEDS:
+            break
+        good = good & (angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst]))
+    spread = np.linalg.svd(Normals(pictures, lights, lit, good).all(), compute_uv=False)
+    return angles_deg, float(spread[-1] / max(spread[0], 1e-12))
+
+
+class Normals:
+    """Normals times reflectance [3, pixels]: of each pixel the least-squares solution of `lights . b = picture`
+    over the `good` lights that reach it. Pixels that fewer than four reach count as black."""
+
+    def __init__(self, pictures: Floats, lights: Floats, lit: NDArray[np.bool_], good: NDArray[np.bool_]) -> None:
+        self._pictures, self._lights, self._used = pictures, lights, lit & good[:, None]
+        self._counts = self._used.sum(axis=0)
+        weights = self._used.astype(np.float64)
+        products = np.einsum("li,lj->lij", lights, lights).reshape(-1, 9)
+        self._inverses = np.linalg.inv((weights.T @ products).reshape(-1, 3, 3) + _RIDGE * np.eye(3))
+        sides = (weights * pictures).T @ lights
+        self._solved = np.einsum("pij,pj->ip", self._inverses, sides)
+
+    def all(self) -> Floats:
+        """From all good lights."""
+        return np.where(self._counts < _FEWEST_LIGHTS, 0.0, self._solved)
+
+    def without(self, led: int) -> Floats:
+        """From all good lights but one.
+
+        With b the solution of all, N their inverse normal matrix, y the pixel's value under the light l, u = N l
+        and h = l . u, that without l is b - u (y - l . b) / (1 - h) (Sherman and Morrison, Ann. Math. Stat. 21,
+        1950; Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8).
+        """
+        light = self._lights[led]
+        found = self._solved.copy()
+        at = np.flatnonzero(self._used[led])
+        turned = self._inverses[at] @ light
+        rest = 1.0 - turned @ light
+        residual = self._pictures[led, at] - light @ self._solved[:, at]
+        well = rest > _LEAST_REST
+        found[:, at[well]] -= (turned[well] * (residual[well] / rest[well])[:, None]).T
+        counts = self._counts - self._used[led]
+        for pixel in at[~well & (counts[at] >= _FEWEST_LIGHTS)]:
+            found[:, pixel] = self._anew(int(pixel), led)
+        return np.where(counts < _FEWEST_LIGHTS, 0.0, found)
+
+    def _anew(self, pixel: int, led: int) -> Floats:
+        used = self._used[:, pixel].copy()
+        used[led] = False
+        lights = self._lights[used]
+        solved: Floats = np.linalg.solve(
+            lights.T @ lights + _RIDGE * np.eye(3), lights.T @ self._pictures[used, pixel]
+        )
+        return solved
+
+
+def _direction(picture: Floats, normals: Floats, lit: NDArray[np.bool_]) -> Floats:
+    return np.asarray(np.linalg.lstsq(normals[:, lit].T, picture[lit], rcond=None)[0], dtype=np.float64)
+
+
+def _angle_deg(a: Floats, b: Floats) -> float:
+    cosine = float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

@@ -1,0 +1,47 @@
+"""The enabling switch that a person holds at the cell while a console moves the arm: its being held and released
+are seen."""
+
+from __future__ import annotations
+
+from coupole.acquisition.commissioning.bench import Bench, StepFailedError
+from coupole.devices import Deadline
+
+_WITHIN_S, _POLL_S = 30.0, 0.05
+
+
+def presence(bench: Bench) -> None:
+    """Ask the person to hold and to release it. A cell without one passes, and its record says so, unless its rig
+    has one."""
+    findings, box = bench.findings, bench.opened.ledbox
+    findings.remedy = (
+        "See the enabling switch and its cable to the LED box. Until it works, move the arm from no console."
+    )
+    held = box.presence()
+    if held is None:
+        if bench.cell.rig.console.enabling_switch:
+            raise StepFailedError(
+                "the rig has `console: enabling_switch: true`, but the LED box tells of no input for one: see its "
+                "wiring and firmware"
+            )
+        findings.remarks.append(
+            "the LED box has no input for an enabling switch: nothing tells whether anybody is at the cell when a "
+            "console moves the arm by hand"
+        )
+        return
+    bench.ask_before("Step presence: nothing moves. Do not hold the enabling switch at the cell yet.")
+    findings.at_most("switches that are held although nobody holds them", int(bool(box.presence())), 0, "")
+    for wanted, what in ((True, "held"), (False, "released"), (True, "held"), (False, "released")):
+        if not findings.passed:
+            return
+        bench.person.hold_enabling_switch(held=wanted)
+        seen = _seen(bench, held=wanted)
+        findings.at_most(f"the switch was not seen to be {what} within {_WITHIN_S:g} s", int(not seen), 0, "")
+
+
+def _seen(bench: Bench, *, held: bool) -> bool:
+    deadline = Deadline(bench.opened.clock, _WITHIN_S)
+    while bench.opened.ledbox.presence() is not held:
+        if deadline.expired:
+            return False
+        bench.pause(_POLL_S)
+    return True

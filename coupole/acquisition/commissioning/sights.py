@@ -1,0 +1,128 @@
+"""What sights of one board from several postures say about the geometry of a rig: pure geometry, no devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.optics import Intrinsics, project
+from coupole.geometry import Transform, inverse
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The board, seen once."""
+
+    support_from_camera: Transform
+    """By the rig, from the measured axes."""
+    board_mm: Floats
+    """[n, 3] the corners that are seen, in the board's frame."""
+    pixels: Floats
+    """[n, 2] where they are seen."""
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """Where all sights together have the board, less where it lies; support frame."""
+
+    height_mm: float
+    """Of the board's middle; above 0, it is seen higher."""
+    sideways_mm: float
+    tilt_deg: float
+    """Of the board against the disk."""
+    disagreement_mm: float
+    """Of the worst sight: root mean square distance on the board between where its corners are seen and where they
+    would be, if all sights were right. Errors of the camera's place on the flange, of its lens and of the arm."""
+    cause: str
+    """The one error that explains the sights best, in words."""
+
+
+def deviations(
+    sights: Sequence[Sight], intrinsics: Intrinsics, middle_mm: Floats, expected_mm: Floats, start: Transform
+) -> Deviations:
+    """`middle_mm` [3] of the board in its own frame, `expected_mm` [3] in the support's; `start` is a first
+    `support_from_board`."""
+    sees = _Model(sights, intrinsics)
+    free = _fitted(lambda x: sees.residuals_mm(_moved(start, x), np.zeros(3)), 6)
+    support_from_board = _moved(start, free)
+    off_mm = support_from_board[:3, :3] @ middle_mm + support_from_board[:3, 3] - expected_mm
+    # If the camera alone is wrong, the board lies flat where it was measured; how it is turned there is not known.
+    flat = _laid_flat(support_from_board, middle_mm, expected_mm)
+    shifted = _fitted(lambda x: sees.residuals_mm(_turned(flat, expected_mm, x[3]), x[:3]), 4)
+    left_free = sees.residuals_mm(support_from_board, np.zeros(3))
+    left_shifted = sees.residuals_mm(_turned(flat, expected_mm, shifted[3]), shifted[:3])
+    ends = np.cumsum([2 * len(one.pixels) for one in sights])[:-1]
+    worst_mm = max(float(np.sqrt(2.0 * np.mean(part**2))) for part in np.split(left_free, ends))
+    return Deviations(
+        height_mm=float(off_mm[2]),
+        sideways_mm=float(np.hypot(*off_mm[:2])),
+        tilt_deg=float(np.degrees(np.arccos(np.clip(abs(support_from_board[2, 2]), 0.0, 1.0)))),
+        disagreement_mm=worst_mm,
+        cause=_cause(off_mm, shifted[:3], np.linalg.norm(left_free) <= np.linalg.norm(left_shifted)),
+    )
+
+
+class _Model:
+    def __init__(self, sights: Sequence[Sight], intrinsics: Intrinsics) -> None:
+        self._sights, self._intrinsics = sights, intrinsics
+
+    def residuals_mm(self, support_from_board: Transform, camera_shift_mm: Floats) -> Floats:
+        """[2 corners] predicted less seen, as lengths at the board's distance; the projection centre is shifted in
+        the camera's frame."""
+        found = []
+        for one in self._sights:
+            camera_from_board = inverse(one.support_from_camera) @ support_from_board
+            points = one.board_mm @ camera_from_board[:3, :3].T + camera_from_board[:3, 3] - camera_shift_mm
+            off_px = project(points, self._intrinsics.vector()).pixels - one.pixels
+            found.append((off_px * points[:, 2:] / self._intrinsics.fx).ravel())
+        return np.concatenate(found)
+
+
+def _fitted(residuals: Callable[[Floats], Floats], count: int) -> Floats:
+    from scipy.optimize import least_squares
+
+    return np.asarray(least_squares(residuals, np.zeros(count), x_scale="jac").x, dtype=np.float64)
+
+
+def _moved(start: Transform, change: Floats) -> Transform:
+    from scipy.spatial.transform import Rotation
+
+    pose = start.copy()
+    pose[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ start[:3, :3]
+    pose[:3, 3] = start[:3, 3] + 100.0 * change[3:]  # as large as turns, for the fit
+    return pose
+
+
+def _laid_flat(support_from_board: Transform, middle_mm: Floats, at_mm: Floats) -> Transform:
+    """The board square to the disk, with its middle at a point."""
+    pose = np.eye(4)
+    along = np.array([*support_from_board[:2, 0], 0.0])
+    up = np.array([0.0, 0.0, 1.0 if support_from_board[2, 2] > 0 else -1.0])
+    along /= np.linalg.norm(along)
+    pose[:3, :3] = np.column_stack([along, np.cross(up, along), up])
+    pose[:3, 3] = at_mm - pose[:3, :3] @ middle_mm
+    return pose
+
+
+def _turned(flat: Transform, about_mm: Floats, angle_rad: float) -> Transform:
+    turn = np.eye(4)
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
+    turn[:3, 3] = about_mm - turn[:3, :3] @ about_mm
+    return np.asarray(turn @ flat)
+
+
+def _cause(off_mm: Floats, camera_mm: Floats, sights_agree: bool) -> str:
+    if sights_agree:
+        way = "higher" if off_mm[2] > 0 else "lower"
+        return f"the sights agree with a support that is {abs(off_mm[2]):.0f} mm {way} than the rig says"
+    way = "farther from the flange" if camera_mm[2] > 0 else "nearer to the flange"
+    return (
+        f"the sights agree with a camera whose projection centre is {abs(camera_mm[2]):.0f} mm {way}, along its "
+        "axis, than the rig's `flange_from_camera` says"
+    )

@@ -1,0 +1,146 @@
+"""What of a rig each step of a commissioning covers: everything, but for what is named as harmless here.
+
+A key of the rig, of its arm's description or of a driver's settings is covered as soon as it exists. `_STEPS` says
+which steps a change of it asks for; one that it does not name asks for all of them. Files count by their content.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from coupole.plan.cell import Cell
+from coupole.plan.link_meshes import LINKS, link_mesh_path
+from coupole.plan.registry import settings_class
+from coupole.plan.rig_devices import DEVICES, NOWHERE, described_arm, device_for
+
+Step = Literal[
+    "cycle", "axes", "stopping", "geometry", "lamps", "trigger", "watchdog", "presence", "emergency-stop"
+]
+STEPS: tuple[Step, ...] = get_args(Step)
+"""In the order in which they are done."""
+ARM: tuple[Step, ...] = ("cycle", "axes", "stopping", "emergency-stop")
+GEOMETRY: tuple[Step, ...] = ("geometry",)
+LAMPS: tuple[Step, ...] = ("lamps", "trigger", "watchdog")
+
+HARMLESS: Mapping[str, str] = {
+    "schema_version": "of the format; a file has no other",
+    "arm.schema_version": "of the format",
+    "name": "stands in reports only",
+    "arm.name": "stands in messages only",
+    "licence": "terms for data",
+    "contact": "whom to ask about data",
+    "storage": "where runs are kept and how",
+    "ledger": "where the objects' light is kept",
+    "calibrations": "records carry limits and a checksum of their own, and move neither arm nor lamps",
+    "white_response": "advice about exposures",
+    "lens.f_number": "how bright pictures are",
+    "sensor.bit_depth": "how pixels are coded",
+    "sensor.bayer_pattern": "how pixels are coded",
+    "sensor.black_dn": "how pixels are coded",
+    "motion.home_joints_deg": "a posture among others: paths to it are planned and checked",
+    "motion.park_joints_deg": "a posture among others: paths to it are planned and checked",
+    "ledbox.twin": "opened in dry runs only",
+    "camera.twin": "opened in dry runs only",
+    "robot.twin": "opened in dry runs only",
+    "world": "stand-ins: nothing real is opened in their place",
+}
+"""Keys, with all below them, that no collision and no lamp depends on, and why. The addresses of `NOWHERE` are
+harmless too: what is found there is compared by its serial number when it is opened."""
+
+_STEPS: Mapping[str, tuple[Step, ...]] = {
+    "robot": ARM,
+    "motion": ARM,
+    "arm.joints": ARM + GEOMETRY,
+    "arm.link_6_from_flange": ARM + GEOMETRY,
+    "arm": GEOMETRY,
+    "link_meshes": GEOMETRY,
+    "flange_from_camera": GEOMETRY,
+    "lens": GEOMETRY,
+    "tool": GEOMETRY,
+    "support": GEOMETRY,
+    "keep_out": GEOMETRY,
+    "clearances": GEOMETRY,
+    "sensor.max_frames_per_s": ("trigger",),
+    "sensor.exposure_gap_us": ("trigger",),
+    "sensor": GEOMETRY,
+    "camera.driver": ("trigger", *GEOMETRY),
+    "camera.settings.region": ("trigger", *GEOMETRY),
+    "camera": ("trigger",),
+    "ledbox.driver": (*LAMPS, "presence"),
+    "ledbox": LAMPS,
+    "led_limits.rise_us": ("trigger",),
+    "led_limits": ("lamps",),
+    "dome.leds": ("lamps", *GEOMETRY),
+    "dome": ("lamps",),
+    "console": ("presence",),
+}
+"""The steps that a key, and all below it, concerns: the first that fits counts."""
+
+
+def steps_of(key: str) -> tuple[Step, ...]:
+    """The steps that a change of this key of the rig asks for; none of a harmless one."""
+    if any(_is_at(key, place) for place in HARMLESS) or _is_address(key):
+        return ()
+    return next((steps for place, steps in _STEPS.items() if _is_at(key, place)), STEPS)
+
+
+def covered(cell: Cell, step: Step) -> dict[str, Any]:
+    """All of the rig that the result of a step depends on: values by their key, as in `keep_out.0.min_mm`."""
+    return {key: _value(cell, value) for key, value in everything(cell).items() if step in steps_of(key)}
+
+
+def everything(cell: Cell) -> dict[str, Any]:
+    """All of a rig, harmless or not: its own keys, its arm's, and its drivers' settings with their defaults."""
+    rig = cell.rig
+    plain = rig.model_dump()
+    arm = described_arm(rig)
+    plain["arm"] = None if arm is None else arm.model_dump()
+    for kind in DEVICES:
+        plain[kind] |= {"settings": _complete_settings(cell, kind)}
+    for place in (plain, plain["arm"] or {}):
+        if place.get("link_meshes") is not None:
+            folder = cell.document.resolve(place["link_meshes"])
+            place["link_meshes"] = {path.name: path for path in (link_mesh_path(folder, k) for k in range(LINKS))}
+    return dict(_leaves("", plain))
+
+
+def _complete_settings(cell: Cell, kind: str) -> dict[str, Any]:
+    """Of the driver that a run opens, with its defaults; without the arm, which has keys of its own."""
+    driver, given = device_for(cell.rig, kind, dry_run=False)
+    model = settings_class(driver)
+    places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
+    return model(**{**places, **given}).model_dump(mode="json", exclude={"arm_model"})
+
+
+def _is_at(key: str, place: str) -> bool:
+    return key == place or key.startswith(f"{place}.")
+
+
+def _is_address(key: str) -> bool:
+    kind, _, setting = key.partition(".settings.")
+    return setting in NOWHERE.get(kind, {})
+
+
+def _leaves(at: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Keys and values of a plain document; a list of numbers or words is one value."""
+    if isinstance(value, dict) and value:
+        for key, inner in value.items():
+            yield from _leaves(f"{at}.{key}" if at else str(key), inner)
+    elif isinstance(value, (tuple, list)) and any(isinstance(inner, dict) for inner in value):
+        for k, inner in enumerate(value):
+            yield from _leaves(f"{at}.{k}", inner)
+    else:
+        yield at, value
+
+
+def _value(cell: Cell, value: Any) -> Any:
+    """As JSON has it; a file by the SHA-256 of its content."""
+    if isinstance(value, Path):
+        path = cell.document.resolve(value)
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(value)
+    if isinstance(value, (tuple, list)):
+        return [_value(cell, inner) for inner in value]
+    return value

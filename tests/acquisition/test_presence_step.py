@@ -1,0 +1,116 @@
+"""The step presence: the switch is seen to be held and released, or the record says that there is none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from cells import CellFolder, here
+from commissioned_cells import Onlooker
+
+from coupole.acquisition.cell_bench.enabling_switch import EnablingSwitch, ReleasedError
+from coupole.acquisition.commissioning import presence_step
+from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedError
+from coupole.acquisition.observer import Control
+from coupole.devices import SystemClock
+
+
+class Box:
+    """A box whose switch a person holds."""
+
+    def __init__(self, held: bool | None) -> None:
+        self.held, self.asked = held, 0
+
+    def presence(self) -> bool | None:
+        self.asked += 1
+        return self.held
+
+
+def bench_with(box: Box, person: Onlooker, *, must_exist: bool = False) -> Bench:
+    """Of a cell with nothing but this box."""
+    rig = SimpleNamespace(console=SimpleNamespace(enabling_switch=must_exist))
+    parts: Any = {
+        "cell": SimpleNamespace(rig=rig),
+        "opened": SimpleNamespace(ledbox=box, clock=SystemClock()),
+        "person": person,
+        "control": Control(),
+    }
+    return Bench(bodies=None, velocity_deg_s=None, findings=Findings(), **parts)  # type: ignore[arg-type]
+
+
+def missed(bench: Bench) -> list[str]:
+    return [one.what for one in bench.findings.limits if not one.passed]
+
+
+def test_a_switch_that_follows_the_person_passes() -> None:
+    box = Box(held=False)
+    bench = bench_with(box, Onlooker(hold=lambda held: setattr(box, "held", held)))
+    presence_step.presence(bench)
+    assert missed(bench) == []
+    assert len(bench.findings.limits) == 5
+
+
+@pytest.mark.parametrize(
+    ("held", "what"),
+    [
+        (True, "switches that are held although nobody holds them"),
+        (False, "the switch was not seen to be held within 0.2 s"),
+    ],
+)
+def test_a_switch_that_is_stuck_is_found(monkeypatch: pytest.MonkeyPatch, held: bool, what: str) -> None:
+    monkeypatch.setattr(presence_step, "_WITHIN_S", 0.2)
+    bench = bench_with(Box(held), Onlooker())
+    presence_step.presence(bench)
+    assert missed(bench) == [what]
+
+
+def test_a_cell_without_a_switch_passes_and_its_record_says_so(tmp_path: Path) -> None:
+    bench = bench_with(Box(None), Onlooker())
+    presence_step.presence(bench)
+    assert missed(bench) == []
+    assert "nothing tells whether anybody is at the cell" in bench.findings.remarks[0]
+
+
+def test_a_cell_whose_rig_has_a_switch_needs_one() -> None:
+    with pytest.raises(StepFailedError, match="tells of no input"):
+        presence_step.presence(bench_with(Box(None), Onlooker(), must_exist=True))
+
+
+def test_the_command_sees_the_simulated_switch_held_and_released(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=8.0, write_now=False)
+    cell.world_settings["ledbox"] = {"enabling_switch": "released"}
+    cell.rig_data["console"] = {"enabling_switch": True}
+    cell.write()
+    ended = here("commission", cell.rig, "--name", "A", "--yes", "--json", "--only", "presence")
+    assert ended.code == 0, ended.err
+    assert ended.document["steps"] == {"presence": True}
+    record = Path(ended.document["record"]).read_text()
+    assert "the switch was not seen to be released within 30 s" in record
+
+
+def check_for(check: Callable[[], None], seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        check()
+        time.sleep(0.005)
+
+
+def test_the_box_is_not_asked_for_a_caller_that_hangs_and_the_motion_goes_on_after_a_rest() -> None:
+    box: Any = Box(held=True)
+    with EnablingSwitch(box, must_exist=True).held() as check:
+        check()
+        time.sleep(0.5)
+        before = box.asked
+        time.sleep(0.2)
+        assert box.asked == before, "a helper must not beat for a thread that hangs"
+        check()
+        while box.asked == before:
+            check()
+            time.sleep(0.005)
+        box.held = False
+        with pytest.raises(ReleasedError, match="was released"):
+            check_for(check, 10.0)

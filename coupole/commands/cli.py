@@ -12,6 +12,7 @@ import typer
 
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
+from coupole.bounded import leave
 from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
 from coupole.commands.bracketing import bracket, sphere_brdf
 from coupole.commands.calibrate import calibrate_app
@@ -124,7 +125,7 @@ def main() -> None:
                 traceback.print_exception(error)
                 print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
             code = 1
-    sys.exit(code or 0)
+    leave(code or 0)
 
 
 def _say(error: CoupoleError) -> None:

@@ -56,6 +56,7 @@ class Call:
     work_s: float
     """Time that the work itself may take, if all is well."""
     since_s: float
+    thread: threading.Thread
 
     def end_s(self, stopped_s: float) -> float:
         """When it is given up, monotonic; the session is to end since `stopped_s`."""
@@ -90,7 +91,7 @@ def under_way(of: str, what: str, work_s: float = 0.0) -> Iterator[None]:
     if threading.get_ident() in _BY_OTHERS:
         yield
         return
-    call = Call(of, what, work_s, time.monotonic())
+    call = Call(of, what, work_s, time.monotonic(), threading.current_thread())
     _UNDER_WAY[call] = None
     try:
         yield
@@ -113,6 +114,13 @@ def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
     now_s = time.monotonic()
     late = (call for call in list(_UNDER_WAY) if call.since_s >= since_s and now_s > call.end_s(stopped_s))
     return next(late, None)
+
+
+def refuse_overdue(since_s: float) -> None:
+    """For who waits for something else: raise DeviceTimeout or StorageError for a call that is given up."""
+    if call := overdue(since_s):
+        leave_behind(call.thread)
+        raise call.error()
 
 
 def hangs(of: str) -> str:
@@ -180,14 +188,15 @@ def bounded(
     stop: threading.Event | None = None,
     rescue: Callable[[], object] = lambda: None,
     unwanted: Callable[[T], object] = lambda found: None,
+    since_s: float | None = None,
 ) -> T:
     """Do it in a thread of its own, and wait until it has ended or a call is to be given up; what it raises is
     raised here. `stop` tells that it is to end, `rescue` is called before a call is given up, which may bring that
-    back; what comes after all is passed to `unwanted`.
+    back; what comes after all is passed to `unwanted`. Calls are looked at that begin from now on, or `since_s`.
 
     Raises DeviceTimeout or StorageError for a call that is given up, and what a signal raises.
     """
-    since_s = time.monotonic()
+    since_s = time.monotonic() if since_s is None else since_s
     stopped_s = math.inf
     runner = _Runner(do, unwanted)
     try:
@@ -196,10 +205,11 @@ def bounded(
                 stopped_s = min(stopped_s, time.monotonic())
             call = overdue(since_s, stopped_s)
             if call is None and time.monotonic() > stopped_s + _MOST_S:
-                call = Call("cell", "session", 0.0, stopped_s)
+                call = Call("cell", "session", 0.0, stopped_s, runner.thread)
             if call is not None:
                 rescue()
                 if not runner.ended(_BACK_S) and runner.leave():
+                    leave_behind(call.thread)
                     raise call.error()
     except BaseException:
         if not runner.is_left:  # a signal, here

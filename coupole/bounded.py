@@ -56,7 +56,6 @@ class Call:
     work_s: float
     """Time that the work itself may take, if all is well."""
     since_s: float
-    thread: threading.Thread
 
     def end_s(self, stopped_s: float) -> float:
         """When it is given up, monotonic; the session is to end since `stopped_s`."""
@@ -82,7 +81,7 @@ class Call:
 
 _UNDER_WAY: dict[Call, None] = {}
 _BY_OTHERS: set[int] = set()
-_LEFT: list[threading.Thread] = []
+_LEFT: list[threading.Thread | Call] = []
 
 
 @contextmanager
@@ -91,7 +90,7 @@ def under_way(of: str, what: str, work_s: float = 0.0) -> Iterator[None]:
     if threading.get_ident() in _BY_OTHERS:
         yield
         return
-    call = Call(of, what, work_s, time.monotonic(), threading.current_thread())
+    call = Call(of, what, work_s, time.monotonic())
     _UNDER_WAY[call] = None
     try:
         yield
@@ -119,7 +118,7 @@ def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
 def refuse_overdue(since_s: float) -> None:
     """For who waits for something else: raise DeviceTimeout or StorageError for a call that is given up."""
     if call := overdue(since_s):
-        leave_behind(call.thread)
+        leave_behind(call)
         raise call.error()
 
 
@@ -205,11 +204,11 @@ def bounded(
                 stopped_s = min(stopped_s, time.monotonic())
             call = overdue(since_s, stopped_s)
             if call is None and time.monotonic() > stopped_s + _MOST_S:
-                call = Call("cell", "session", 0.0, stopped_s, runner.thread)
+                call = Call("cell", "session", 0.0, stopped_s)
             if call is not None:
                 rescue()
                 if not runner.ended(_BACK_S) and runner.leave():
-                    leave_behind(call.thread)
+                    leave_behind(call)
                     raise call.error()
     except BaseException:
         if not runner.is_left:  # a signal, here
@@ -273,14 +272,14 @@ class Workers:
 # -- the last way out -----------------------------------------------------------------------------------------
 
 
-def leave_behind(thread: threading.Thread) -> None:
-    """This thread, too, was waited for in vain."""
-    _LEFT.append(thread)
+def leave_behind(waited_for: threading.Thread | Call) -> None:
+    """This, too, was waited for in vain."""
+    _LEFT.append(waited_for)
 
 
 def left_behind() -> bool:
-    """Whether threads that were given up still hang."""
-    return any(thread.is_alive() for thread in _LEFT)
+    """Whether something that was given up still hangs."""
+    return any(one in _UNDER_WAY if isinstance(one, Call) else one.is_alive() for one in _LEFT)
 
 
 def leave(code: int) -> NoReturn:

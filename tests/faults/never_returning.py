@@ -135,10 +135,10 @@ class Session:
         return Ended(self.process.exitcode or 0, (self.folder / "out").read_text(), self.words)
 
 
-def begin(cell: CellFolder, hang: Hang, *options: str, command: str = "acquire") -> Session:
-    """The session of a plan, as a process."""
+def begin(cell: CellFolder, hang: Hang, *arguments: str | Path) -> Session:
+    """A session, as a process: that of a run of the cell's plan, unless other arguments are given."""
     os.mkfifo(cell.folder / "fifo")
-    arguments = [command, str(cell.plan), "--json", "--yes", *options]
-    process = fork_context().Process(target=_session, args=(str(cell.folder), arguments, hang))
+    words = [str(word) for word in arguments or ("acquire", cell.plan, "--json", "--yes")]
+    process = fork_context().Process(target=_session, args=(str(cell.folder), words, hang))
     process.start()
     return Session(cell.folder, process)

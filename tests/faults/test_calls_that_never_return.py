@@ -205,6 +205,31 @@ def test_a_disk_that_hangs_at_the_report_is_told_after_a_whole_run(cell: CellFol
     assert ended.document["missing"] == 0
 
 
+@pytest.mark.parametrize(
+    ("words", "name", "after"),
+    [
+        pytest.param(("live", "PLAN", "--yes"), "camera.next_frame", "", id="live"),
+        pytest.param(("devices", "--rig", "RIG"), "camera.self_test", "", id="devices"),
+        pytest.param(("meter", "PLAN", "--yes"), "robot.measured", IN_MOTION, id="meter", marks=pytest.mark.full),
+        pytest.param(("bench", "RIG", "--yes"), "robot.close", "", id="bench", marks=pytest.mark.full),
+        pytest.param(("commission", "RIG", "--name", "A", "--yes"), "robot.measured", IN_MOTION, id="commission"),
+    ],
+)
+def test_whatever_else_opens_a_cell_ends_too(
+    cell: CellFolder, words: tuple[str, ...], name: str, after: str
+) -> None:
+    paths = {"PLAN": cell.plan, "RIG": cell.rig}
+    with cell.world() as world:
+        session = begin(cell, Hang(name, after), *(paths.get(word, word) for word in words))
+        if words[0] == "bench":
+            cells.wait_until(lambda: "Ctrl-C ends it" in session.words, "the bench")
+            os.kill(session.process.pid or 0, signal.SIGINT)
+        ended = session.ended()
+        cells.wait_until(lambda: dark_and_still(world), "a dark cell and an arm at rest")
+    assert ended.code == 4, ended
+    assert f"an end of the call `{name.partition('.')[2]}`" in ended.err
+
+
 def test_a_camera_call_of_the_watching_thread_that_hangs_in_a_motion_brakes_the_arm(cell: CellFolder) -> None:
     """The thread that watches the arm asks nothing but the arm and a future while it moves; if it is held all the
     same, the arm brakes within its attention, long before the session ends."""

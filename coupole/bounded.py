@@ -49,13 +49,21 @@ T = TypeVar("T")
 
 @dataclass(eq=False, slots=True)
 class Call:
-    """A call of a device (by its name in errors) or of the `DISK`, in a thread."""
+    """A call of a device (by its name in errors) or of the `DISK`; noted while its context lasts."""
 
     of: str
     what: str
-    work_s: float
+    work_s: float = 0.0
     """Time that the work itself may take, if all is well."""
-    since_s: float
+    since_s: float = 0.0
+
+    def __enter__(self) -> None:
+        if threading.get_ident() not in _BY_OTHERS:
+            self.since_s = time.monotonic()
+            _UNDER_WAY[self] = None
+
+    def __exit__(self, *_: object) -> None:
+        _UNDER_WAY.pop(self, None)
 
     def end_s(self, stopped_s: float) -> float:
         """When it is given up, monotonic; the session is to end since `stopped_s`."""
@@ -84,18 +92,8 @@ _BY_OTHERS: set[int] = set()
 _LEFT: list[threading.Thread | Call] = []
 
 
-@contextmanager
-def under_way(of: str, what: str, work_s: float = 0.0) -> Iterator[None]:
-    """Note a call while the context lasts. `work_s`: see `Call`."""
-    if threading.get_ident() in _BY_OTHERS:
-        yield
-        return
-    call = Call(of, what, work_s, time.monotonic())
-    _UNDER_WAY[call] = None
-    try:
-        yield
-    finally:
-        del _UNDER_WAY[call]
+under_way = Call
+"""`with under_way("camera", "arm"):` notes a call while the context lasts."""
 
 
 @contextmanager

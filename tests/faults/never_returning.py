@@ -21,6 +21,7 @@ from forks import fork_context
 
 from coupole import bounded
 from coupole.acquisition import conclusion, opened_cell, safeguard
+from coupole.acquisition.burst_runner import BurstRunner
 from coupole.commands import cli
 
 ENDS_WITHIN_S = 60.0
@@ -32,8 +33,8 @@ DISK_CALLS = ("pwrite", "fdatasync", "fsync", "posix_fallocate", "write")
 
 @dataclass
 class Hang:
-    """The first call of `name` (`camera.arm`, `disk.fdatasync`) after the first of `after` never returns; of the
-    calls of a disk, those that touch a file whose path contains `file`."""
+    """The first call of `name` after the first of `after` never returns: `camera.arm`; `disk.fdatasync`, of a file
+    whose path contains `file`; `motion.file`, by the thread that watches the arm while it moves."""
 
     name: str
     after: str = ""
@@ -90,6 +91,14 @@ def _session(folder: str, arguments: list[str], hang: Hang) -> None:
         return HangingDevice(open_device(rig, kind, *rest, **named), name, hang, here)
 
     opened_cell._open_device = open_hanging
+    look = BurstRunner.look_at_upload
+
+    def look_and_hang(self: BurstRunner) -> None:
+        with bounded.under_way(bounded.DISK, "a file"):
+            hang.called("motion.file", here)
+        look(self)
+
+    BurstRunner.look_at_upload = look_and_hang
     for name in DISK_CALLS:
         setattr(os, name, _hanging_file_call(name, getattr(os, name), hang, here))
     sys.argv = ["coupole", *arguments]

@@ -30,7 +30,12 @@ from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.run_control import RunControl
 from coupole.acquisition.run_description import described_cell
 from coupole.acquisition.sequencer import Sequencer
-from coupole.acquisition.session_failure import note_failure, note_faults_of_the_arm, statistics
+from coupole.acquisition.session_failure import (
+    note_failure,
+    note_faults_of_the_arm,
+    note_what_hangs,
+    statistics,
+)
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
 from coupole.bounded import bounded, left_behind, on_disk
@@ -47,6 +52,7 @@ from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.run import Run
+from coupole.storage.run_inputs import copied_s
 from coupole.viewing.keys import obeyed
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
@@ -54,8 +60,6 @@ from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
-_COPIED_S = 600.0
-"""For a mesh of some gigabytes that is copied into a run."""
 
 
 # -- the run ----------------------------------------------------------------------------------------------
@@ -124,7 +128,7 @@ def _acquire_into(
         if run is None:
             inputs = replace(job.inputs, copy_large=with_mesh)
             create = partial(Run.create, folder, job.plan.name, inputs, about_run(job, cell))
-            run = on_disk(str(folder), create, _COPIED_S)
+            run = on_disk(str(folder), create, copied_s(inputs))
             held.callback(os.close, run.lock())
         on_disk(str(run.folder), partial(open_for_session, run))
         held.callback(conclude, run, console)  # when the devices are closed
@@ -254,9 +258,7 @@ def _acquire(
             failure = control.interrupted() if control.stop.is_set() else error
             ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
             if isinstance(failure, Interrupted):
-                if left_behind():  # the operator's stop ends the session, but this is to be told too
-                    alarm(str(error))
-                    note_failure(error, cell, run, recorder)
+                note_what_hangs(error, cell, run, recorder)
                 raise failure from error
             note_failure(error, cell, run, recorder)
             raise
@@ -265,13 +267,7 @@ def _acquire(
             for trouble in cell.trouble:
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
-            recorder.note(
-                SessionStopped(
-                    outcome=ended,
-                    reason=str(failure or ""),
-                    robot=statistics(cell),
-                )
-            )
+            recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
             if left_behind():
                 sequencer.give_up(recorder.committed)

@@ -8,12 +8,13 @@ from functools import partial
 
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import RunRecorder
-from coupole.bounded import NOW, bounded, hangs, on_disk
+from coupole.bounded import NOW, bounded, hangs, left_behind, on_disk
 from coupole.errors import CoupoleError, DeviceError, StorageError
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
+from coupole.viewing.terminal import alarm
 
 
 def statistics(cell: OpenedCell) -> dict[str, float]:
@@ -36,6 +37,13 @@ def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: Run
         on_disk(str(path), lambda: path.write_text(trace, encoding="utf-8"), stop=NOW)
     safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
     error.add_note(f"{safe}; the trace is in {path}; go on with `{run.go_on_command}`")
+
+
+def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
+    """A stop has ended the session; if something was left behind meanwhile, that is told too."""
+    if left_behind():
+        alarm(str(error))
+        note_failure(error, cell, run, recorder)
 
 
 def note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:

@@ -62,9 +62,23 @@ def test_a_call_that_never_returns_is_given_up_with_its_name(never: threading.Ev
     assert bounded.hangs("robot") == ""
 
 
+def test_who_waits_for_something_else_hears_of_a_call_that_is_given_up(never: threading.Event) -> None:
+    def hang() -> None:
+        with under_way("camera", "next_frame"):
+            never.wait()
+
+    since_s = time.monotonic()
+    threading.Thread(target=hang, daemon=True).start()
+    bounded.refuse_overdue(since_s)
+    time.sleep(0.3)
+    with pytest.raises(DeviceTimeout, match="next_frame"):
+        bounded.refuse_overdue(since_s)
+    assert left_behind()
+
+
 def test_a_file_that_never_answers_is_a_fault_of_the_disk(never: threading.Event) -> None:
     with pytest.raises(StorageError, match=r"journal\.jsonl: the disk has not answered"):
-        on_disk("journal.jsonl", lambda: never.wait())
+        on_disk("journal.jsonl", never.wait)
 
 
 def test_a_call_in_another_thread_of_the_work_is_given_up_too(never: threading.Event) -> None:
@@ -79,7 +93,11 @@ def test_a_call_in_another_thread_of_the_work_is_given_up_too(never: threading.E
 
 
 def test_what_takes_its_time_by_the_work_asked_is_waited_for() -> None:
-    assert on_disk("views/top.h5", lambda: time.sleep(0.5) or "synced", work_s=20.0) == "synced"
+    def sync() -> str:
+        time.sleep(0.5)
+        return "synced"
+
+    assert on_disk("views/top.h5", sync, work_s=20.0) == "synced"
 
 
 def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event) -> None:
@@ -142,11 +160,10 @@ def test_a_signal_ends_the_work_as_it_ends_who_waits_for_it() -> None:
 
 
 def test_workers_do_all_in_turn_and_end() -> None:
-    workers, done = Workers(3, "turn"), []
-    futures = [workers.submit(lambda n=n: done.append(n) or n) for n in range(100)]
-    assert [future.result() for future in futures] == list(range(100))
+    workers = Workers(3, "turn")
+    futures = [workers.submit(str, number) for number in range(100)]
+    assert [future.result() for future in futures] == list(map(str, range(100)))
     workers.end()
-    assert sorted(done) == list(range(100))
     assert not [thread for thread in threading.enumerate() if thread.name == "turn"]
 
 

@@ -24,7 +24,7 @@ from coupole.acquisition import conclusion, opened_cell, safeguard
 from coupole.acquisition.burst_runner import BurstRunner
 from coupole.commands import cli
 
-ENDS_WITHIN_S = 60.0
+ENDS_WITHIN_S = 150.0
 """Limits of a second or two each, on a machine that may be busy; what hangs for ever is far from it."""
 LIMITS_S = 1.5
 _ONE = threading.Lock()
@@ -131,7 +131,8 @@ class Session:
 
     @property
     def words(self) -> str:
-        return (self.folder / "err").read_text()
+        path = self.folder / "err"
+        return path.read_text() if path.exists() else ""
 
     def ended(self) -> Ended:
         """How it ended, by itself."""

@@ -24,6 +24,7 @@ import queue
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -35,7 +36,7 @@ from coupole.errors import CoupoleError, DeviceTimeout, StorageError
 DEVICE_S, DISK_S, STOPPED_S = 30.0, 60.0, 15.0
 _MOST_S = 120.0
 """A session that is to end, and whose calls all return, is left behind after this time all the same."""
-_LOOK_S = 0.1
+_LOOK_S, _STOOD_S = 0.1, 1.0
 _BACK_S = 1.0
 """For a call to come back once the cell was made safe, or once whoever waited for it was interrupted."""
 _FLUSH_S = 2.0
@@ -89,6 +90,7 @@ class Call:
 
 _UNDER_WAY: dict[Call, None] = {}
 _BY_OTHERS: set[int] = set()
+_looked_s = deque([0.0], maxlen=1)
 _LEFT: list[threading.Thread | Call] = []
 
 
@@ -107,8 +109,13 @@ def waited_for() -> Iterator[None]:
 
 
 def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
-    """A call that began since then and is to be given up."""
+    """A call that began since then and is to be given up. While this process stood, no time has passed."""
     now_s = time.monotonic()
+    looked_s = _looked_s[-1]
+    _looked_s.append(now_s)
+    if now_s - looked_s > _STOOD_S:
+        for call in list(_UNDER_WAY):
+            call.since_s = min(now_s, call.since_s + now_s - looked_s)
     late = (call for call in list(_UNDER_WAY) if call.since_s >= since_s and now_s > call.end_s(stopped_s))
     return next(late, None)
 

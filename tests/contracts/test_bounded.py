@@ -188,6 +188,29 @@ def test_a_process_leaves_with_its_code_and_words_whatever_hangs(what: str) -> N
     assert (ended.returncode, ended.stdout) == (4, "all that there is to say\n")
 
 
+STANDS = """
+import time
+from coupole import bounded
+bounded.DEVICE_S = 1.0
+def take():
+    with bounded.under_way("camera", "next_frame"):
+        print("takes", flush=True)
+        for _ in range(12):
+            time.sleep(0.05)
+bounded.bounded(take, rescue=lambda: print("given up"))
+"""
+
+
+def test_time_in_which_the_process_itself_stood_is_no_hang() -> None:
+    with subprocess.Popen([sys.executable, "-c", STANDS], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "takes\n"
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        process.send_signal(signal.SIGCONT)
+        assert process.stdout.read() == ""
+
+
 UNHEARD = """
 from coupole import bounded
 from coupole.acquisition.signals import raise_outside_sessions, unheard_end

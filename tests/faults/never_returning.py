@@ -36,20 +36,25 @@ class Hang:
     """The first call of `name` after the first of `after` never returns: `camera.arm`; `disk.fdatasync`, of a file
     whose path contains `file`; `motion.file`, by the thread that watches the arm while it moves."""
 
-    name: str
+    name: str = ""
     after: str = ""
     file: str = ""
     again: bool = False
     """Later calls hang as well."""
+    k: int = 0
+    """The k-th call of all devices hangs, in place of one with a name."""
+    count: int = 0
     seen: set[str] = field(default_factory=set)
 
-    def called(self, name: str, folder: Path, path: str = "") -> None:
+    def called(self, name: str, folder: Path, path: str = "", *, counts: bool = False) -> None:
         with _ONE:
-            due = name == self.name and (not self.after or self.after in self.seen) and self.file in path
+            self.count += counts
+            named = name == self.name and self.file in path and (not self.after or self.after in self.seen)
+            due = named or (counts and self.count == self.k)
             mine = due and (self.again or f"{name}, hung" not in self.seen)
             self.seen |= {name, f"{name}, hung"} if mine else {name}
         if mine:
-            (folder / "hanging").touch()
+            (folder / "hanging").write_text(name)
             while True:
                 os.open(folder / "fifo", os.O_RDONLY)  # nobody ever writes
 
@@ -66,7 +71,7 @@ class HangingDevice:
             return value
 
         def call(*arguments: Any, **named: Any) -> Any:
-            self._hang.called(f"{self._device}.{name}", self._folder)
+            self._hang.called(f"{self._device}.{name}", self._folder, counts=True)
             return value(*arguments, **named)
 
         return call
@@ -125,9 +130,14 @@ class Session:
     folder: Path
     process: BaseProcess
 
+    def hangs(self) -> str:
+        """Wait until it hangs, or has ended; the name of the call."""
+        told = self.folder / "hanging"
+        cells.wait_until(lambda: told.exists() or not self.process.is_alive(), "the hang")
+        return told.read_text() if told.exists() else ""
+
     def wait_until_it_hangs(self) -> None:
-        cells.wait_until(lambda: (self.folder / "hanging").exists() or not self.process.is_alive(), "the hang")
-        assert (self.folder / "hanging").exists(), self.words
+        assert self.hangs(), self.words
 
     @property
     def words(self) -> str:

@@ -212,21 +212,30 @@ def test_time_in_which_the_process_itself_stood_is_no_hang() -> None:
 
 
 UNHEARD = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from coupole.acquisition import signals
 from coupole import bounded
 from coupole.acquisition.signals import raise_outside_sessions, unheard_end
-bounded.STOPPED_S = 0.3
+bounded.STOPPED_S = signals._LEAVES_WITHIN_S = 0.3
 raise_outside_sessions()
 with unheard_end():
     print("hangs", flush=True)
     import ctypes
     mutex = ctypes.create_string_buffer(64)
-    for _ in range(2):  # the second lock never returns, and no signal ends it, as with a dead disk
-        ctypes.CDLL(None).pthread_mutex_lock(mutex)
+    def hang():
+        for _ in range(2):  # the second lock never returns, and no signal ends it, as with a dead disk
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+    if sys.argv[1] == "main thread":
+        hang()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(hang).result()
 """
 
 
-def test_a_signal_that_the_main_thread_never_hears_ends_the_process() -> None:
-    command = [sys.executable, "-c", UNHEARD]
+@pytest.mark.parametrize("what", ["main thread", "thread that the main thread joins"])
+def test_a_signal_ends_a_process_that_waits_for_what_never_returns(what: str) -> None:
+    command = [sys.executable, "-c", UNHEARD, what]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "hangs\n"

@@ -54,7 +54,8 @@ class Hang:
             mine = due and (self.again or f"{name}, hung" not in self.seen)
             self.seen |= {name, f"{name}, hung"} if mine else {name}
         if mine:
-            (folder / "hanging").write_text(name)
+            (folder / "hangs").write_text(name)
+            (folder / "hangs").rename(folder / "hanging")
             while True:
                 os.open(folder / "fifo", os.O_RDONLY)  # nobody ever writes
 

@@ -1,7 +1,8 @@
 """The device contracts, limited to what the sequencer needs: one Protocol for each kind of device.
 
 Units are in the names. Times are nanoseconds of the clock that is named: the box's, the camera's or the rig's.
-Every blocking call has a time-out; a call that fails raises a `coupole.errors.DeviceError`. After `close()`, and
+Every blocking call has a time-out; a call that fails raises a `coupole.errors.DeviceError`. One that never returns
+is left behind (`coupole.bounded`): session and process end, and the device is not closed. After `close()`, and
 after any exception, a device is safe: lights off, camera disarmed, robot at rest.
 """
 

@@ -18,13 +18,13 @@ import grimp
 
 ROOT = Path(__file__).resolve().parent.parent
 OUTPUT = ROOT / "docs" / "pictures" / "rooms.svg"
-CONTRACTS = ("devices", "errors", "geometry", "joint_chain", "kinematics")
+CONTRACTS = ("bounded", "devices", "errors", "geometry", "joint_chain", "kinematics", "supervision")
 BESIDE = ("drivers", "sim")
 _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 
 
 def rooms_in_order() -> list[str]:
-    """From the top layer down, the four contracts merged, drivers and simulation between plan and appearance."""
+    """From the top layer down, the contracts merged, drivers and simulation between plan and appearance."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = config["tool"]["importlinter"]["contracts"]
     layers = [name for name in contracts[0]["layers"] if name not in CONTRACTS]

@@ -20,6 +20,7 @@ from coupole.acquisition.observer import Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import Verdict
+from coupole.bounded import Workers
 from coupole.devices import (
     NO_LED,
     STEP_RECORD_DTYPE,
@@ -84,7 +85,7 @@ class BurstRunner:
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
         self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose.begin, self._note)
-        self._uploader = futures.ThreadPoolExecutor(1, "upload")
+        self._uploader = Workers(1, "upload")
         self._upload: futures.Future[None] | None = None
         self._buffer_memory_bytes = memory_for_buffers()
         self._buffers = 0

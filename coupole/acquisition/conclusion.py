@@ -7,14 +7,17 @@ from pathlib import Path
 from rich.console import Console
 
 from coupole.acquisition.signals import SignalReceived
+from coupole.bounded import DISK, hangs, left_behind, on_disk
+from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
 from coupole.storage.journal_events import SessionResumed, SessionStopped
 from coupole.storage.run import Run
 from coupole.viewing import report
-from coupole.viewing.terminal import bytes_text
+from coupole.viewing.terminal import alarm, bytes_text
 
 MOST_HASHED_BYTES = 2_000_000_000
 """Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
+_SLOWEST_BYTES_S, _REPORT_S = 10e6, 20.0
 
 
 def open_for_session(run: Run) -> None:
@@ -57,22 +60,34 @@ def close_complete(run: Run, console: Console) -> float:
 
 
 def conclude(run: Run, console: Console) -> None:
-    """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended."""
+    """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended. A disk
+    that hung in the session is not asked again."""
     try:
-        report.write(run, in_use=False)
-        changed = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
-        manifest.enter(run.folder, sorted(changed))
-        listed = manifest.read(run.folder)
-        views = [name for name in complete_views(run) if name not in listed]
-        size = sum((run.folder / name).stat().st_size for name in views)
+        if call := hangs(DISK):
+            raise StorageError(f"{call}: the disk does not answer")
+        views, size = on_disk(str(run.folder), lambda: _report(run), _REPORT_S)
         if size > MOST_HASHED_BYTES:
             console.print(
                 f"  {bytes_text(size)} of frames are not in {manifest.NAME} yet: "
                 f"`coupole verify {run.folder} --manifest` enters them"
             )
         elif views:
-            manifest.enter(run.folder, views)
+            on_disk(str(run.folder), lambda: manifest.enter(run.folder, views), size / _SLOWEST_BYTES_S)
     except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
-        console.print(f"  [yellow]the report or {manifest.NAME} could not be written:[/] {error}")
+        told = f"the report or {manifest.NAME} could not be written:"
+        if left_behind():
+            alarm(f"{told} {error}")
+        else:
+            console.print(f"  [yellow]{told}[/] {error}")
+
+
+def _report(run: Run) -> tuple[list[str], int]:
+    """Write the report, list what is small and complete; complete views that are not listed, and their bytes."""
+    report.write(run, in_use=False)
+    changed = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
+    manifest.enter(run.folder, sorted(changed))
+    listed = manifest.read(run.folder)
+    views = [name for name in complete_views(run) if name not in listed]
+    return views, sum((run.folder / name).stat().st_size for name in views)

@@ -8,12 +8,16 @@ word (kill -9, power cut) leaves the plan of one burst, which is at least what w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
+from coupole.bounded import DISK, under_way
 from coupole.devices import NO_LED
 from coupole.errors import DoseBudgetReached
 from coupole.geometry import apply
@@ -22,7 +26,7 @@ from coupole.plan.rig_devices import longest_light_s, watchdog_s
 from coupole.preflight.job import Job
 from coupole.preflight.preflight import BURST_OVERHEAD_S
 from coupole.storage.journal_events import BurstBegun
-from coupole.storage.ledger import History, ledger_of
+from coupole.storage.ledger import LOCK_S, History, Ledger, ledger_of
 
 LuxHours = NDArray[np.float64]
 """[points] at each of the object's dose points."""
@@ -30,6 +34,7 @@ _CLOCKS_PPM, _START_US = 1000, 1000
 """Allowance for the box's clock, and for its start of a table, where steps are counted that its log lacks."""
 _DIGITS = 9
 _ROUNDING = 1e-9
+T = TypeVar("T")
 
 
 class LightOnObject:
@@ -45,10 +50,10 @@ class LightOnObject:
         cannot be read and written."""
         measured = job.plan.object
         ledger = ledger_of(job.cell, measured.id) if measured else None
-        history = ledger.read() if ledger else History()
+        history = _answered(ledger, ledger.read) if ledger else History()
         self._ledger = None if cell.simulated else ledger
         if self._ledger is not None:
-            self._ledger.prove_writable()
+            _answered(self._ledger, self._ledger.prove_writable)
         self._id, self._what_for = measured.id if measured else "", what_for
         self._budget_lux_h = math.inf
         if measured and measured.dose_budget_lux_h is not None:
@@ -98,17 +103,20 @@ class LightOnObject:
             )
         plan_id = ""
         if self._ledger is not None:
-            plan_id = self._ledger.plan(self._what_for, *self._entry(at_most, w_per_lm))
+            entry = self._entry(at_most, w_per_lm)
+            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry))
         self._planned = at_most, w_per_lm, plan_id
 
     def end(self, given: LuxHours | None) -> LuxHours:
         """The light of the last `begin` is over; `given` None: what was planned stands. Returns what counts."""
         if self._planned is None:
             return np.zeros_like(self._given_lux_h)
-        (at_most, w_per_lm, plan_id), self._planned = self._planned, None
+        at_most, w_per_lm, plan_id = self._planned
         counts = at_most if given is None else given
         if self._ledger is not None and given is not None:
-            self._ledger.correct(plan_id, *self._entry(counts, w_per_lm))
+            entry = self._entry(counts, w_per_lm)
+            _answered(self._ledger, partial(self._ledger.correct, plan_id, *entry))
+        self._planned = None  # not before: if the ledger's disk hangs, `end(None)` counts what was planned
         self.total_lux_h += self.more_lux_h(counts)
         self._given_lux_h = self._given_lux_h + counts
         return counts
@@ -120,6 +128,12 @@ class LightOnObject:
     def _entry(self, lux_h: LuxHours, w_per_lm: float | None) -> tuple[float, float | None]:
         more_lux_h = max(0.0, round(self.more_lux_h(lux_h), _DIGITS))
         return more_lux_h, None if w_per_lm is None else round(more_lux_h * w_per_lm, _DIGITS)
+
+
+def _answered(ledger: Ledger, do: Callable[[], T]) -> T:
+    """Noted, since the ledger's disk may hang; it waits for other writers by itself."""
+    with under_way(DISK, str(ledger.path), LOCK_S):
+        return do()
 
 
 class FlashMeter:
@@ -231,6 +245,11 @@ class DoseMeter:
         unlogged = burst.table[begun & ~np.isin(np.arange(len(begun)), log["step"])]
         given = given + self._of_leds(unlogged["led"], unlogged["on_us"]) + self._of_panel(panel_s)
         return tuple(np.round(self._light.end(given), _DIGITS).tolist())
+
+    def give_up(self) -> None:
+        """Nobody will tell how the burst under way ended: all that was planned counts, as in the ledger."""
+        self._under_way_lux_h = np.zeros(1)
+        self._light.end(None)
 
     def _course(self, leds: NDArray[np.int64], on_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """[steps + 1] of the run, step by step, at the point that has received most when the burst is over."""

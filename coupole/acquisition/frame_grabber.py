@@ -6,11 +6,12 @@ import math
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.bounded import Workers
 from coupole.devices import Camera, Frame
 from coupole.storage.view_writer import WRITERS
 
@@ -40,13 +41,13 @@ class FrameGrabber:
 
     def __init__(self, camera: Camera, keep: Callable[[Frame], int], *, writers: int = WRITERS) -> None:
         self._camera, self._keep = camera, keep
-        self._pool = ThreadPoolExecutor(writers, "keep")
+        self._pool = Workers(writers, "keep")
         self._frame_ids: list[int] = []
         self._timestamps_ns: list[int] = []
         self._slots: list[Future[int]] = []
         self._error: BaseException | None = None
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._take, name="grabber")
+        self._thread = threading.Thread(target=self._take, name="grabber", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
@@ -102,8 +103,9 @@ class FrameGrabber:
         return self._slots[frame].result()
 
     def stop(self) -> None:
-        """Take no more frames; those taken are still written. Never raises."""
+        """Take no more frames; those taken are still written. Never raises; to be called where a hang of camera or
+        disk is noticed (`coupole.bounded`)."""
         self._stopping.set()
         if self._thread.ident is not None:
             self._thread.join()
-        self._pool.shutdown(wait=True)
+        self._pool.end()

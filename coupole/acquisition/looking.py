@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,8 @@ from coupole.acquisition.operator import (
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.single_shots import SingleShots
-from coupole.errors import InputError, PreflightRefused
+from coupole.bounded import NOW, bounded, refuse_overdue
+from coupole.errors import CoupoleError, InputError, PreflightRefused
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
 from coupole.plan.light_selection import leds_of_plan
@@ -40,7 +43,7 @@ from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.ledger import ledger_of
 from coupole.viewing.live import Choice, RunSource, Source, Studio, Wanted, choice_from, run_source
 from coupole.viewing.live_page import serve
-from coupole.viewing.terminal import LiveFigures, RunObserver
+from coupole.viewing.terminal import LiveFigures, RunObserver, alarm
 
 _FIGURES_EVERY_S = 0.2
 
@@ -87,7 +90,8 @@ def metered(
 ) -> exposure_advice.Advice:
     """Advice by the pictures of a metering job. When this raises the cell is safe and cannot be used any more."""
     recorder = MeterRecorder()
-    Sequencer(small, cell, recorder, observer=observer, control=control).acquire()
+    sequencer = bounded(partial(Sequencer, small, cell, recorder, observer=observer, control=control))
+    bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
     return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(small.cell.rig))
 
 
@@ -161,10 +165,12 @@ def _show_live(
     console.print(f"live at {server.url}  (Ctrl-C ends it)", soft_wrap=True)
     said = ""
     with obeyed_by(control, halt):
+        began_s = time.monotonic()
         filling = run_source(source, studio, failures.append)
         try:
             with LiveFigures(console) as figures:
                 while not studio.closing.is_set() and not control.stop.is_set():
+                    refuse_overdue(began_s)
                     figures.show(studio.shown)
                     if studio.remark != said:
                         said = studio.remark
@@ -172,7 +178,11 @@ def _show_live(
                     studio.closing.wait(_FIGURES_EVERY_S)
         finally:
             studio.closing.set()
-            filling.join()
+            try:
+                bounded(filling.join, stop=NOW, since_s=began_s)
+            except CoupoleError as error:
+                failures.append(error)
+                alarm(str(error))
             server.shutdown()
             server.server_close()
     if control.stop.is_set():  # what failed then was ended by `halt`

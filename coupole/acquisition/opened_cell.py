@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from coupole.acquisition.noted_devices import NAMES, NotedDevice
 from coupole.acquisition.runtime_folder import in_use
 from coupole.acquisition.safeguard import Safeguard
 from coupole.acquisition.signals import held
+from coupole.bounded import NOW, bounded, hangs, under_way
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
+from coupole.errors import DeviceTimeout
 from coupole.plan.cell import Cell
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import device_for, in_world
 from coupole.preflight.simulated_world import coarse, world_config
+from coupole.viewing.terminal import alarm
 
 if TYPE_CHECKING:
     from coupole.preflight.job import Job
 
 _LONGEST_WATCHDOG_S = 60.0
+_WORLD_STARTS_S, _OPENS_S = 180.0, 30.0
 
 
 @dataclass
@@ -44,6 +51,8 @@ class OpenedCell:
     """False if the lights were not confirmed to be off at the end."""
     made_safe: bool = False
     """`make_safe` was called: nothing may be lit or moved any more."""
+    _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _done: threading.Event = field(default_factory=threading.Event, repr=False)
 
     def halt(self) -> list[Safeguard]:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
@@ -54,10 +63,19 @@ class OpenedCell:
 
     def make_safe(self) -> None:
         """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails
-        or hangs. Signals wait. Only the first call acts: nothing may be lit or moved after it."""
-        if self.made_safe:
+        or hangs. Signals wait. Only the first call acts, others wait for it: nothing may be lit or moved after
+        it."""
+        with self._first:
+            mine, self.made_safe = not self.made_safe, True
+        if not mine:
+            self._done.wait()  # each safeguard is given up after its time
             return
-        self.made_safe = True
+        try:
+            self._make_safe()
+        finally:
+            self._done.set()
+
+    def _make_safe(self) -> None:
         with held():
             done = self.halt()
             for safeguard in done:
@@ -90,15 +108,18 @@ def open_cell(
         endpoints: Mapping[str, Any] | None = None
         sensor = coarse(cell.rig.sensor) if dry_run else cell.rig.sensor
         if in_world(cell.rig, dry_run=dry_run):
-            world = _get_world(cell, job, sensor, dry_run=dry_run, speed=speed)
+            begin = partial(_get_world, cell, job, sensor, dry_run=dry_run, speed=speed)
+            world = bounded(begin, unwanted=lambda late: late.close())
             stack.callback(world.close)
             clock, endpoints = world.clock, world.endpoints
         opened: dict[str, Any] = {}
         identities: dict[str, Identity] = {}
         for kind in ("ledbox", "camera", "robot"):
-            opened[kind] = _open_device(cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
-            stack.callback(opened[kind].close)
-            identities[kind] = opened[kind].identify()
+            begin = partial(_open_device, cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
+            device = bounded(begin, unwanted=lambda late: late.close())
+            opened[kind] = NotedDevice(device, kind, cell.rig)
+            stack.push(partial(_close, opened[kind], NAMES[kind]))
+            identities[kind] = bounded(opened[kind].identify)
             on_opened(kind, identities[kind])
         opened_cell = OpenedCell(
             clock,
@@ -124,7 +145,23 @@ def _open_device(
     if endpoints is not None:
         known = settings_class(driver).model_fields
         settings |= {name: value for name, value in endpoints[kind].items() if name in known}
-    return load_class(driver)(settings_class(driver)(**settings), clock)
+    chosen = settings_class(driver)(**settings)
+    with under_way(NAMES[kind], "open", _OPENS_S + getattr(chosen, "connect_timeout_s", 0.0)):
+        return load_class(driver)(chosen, clock)
+
+
+def _close(device: Any, name: str, _: object, failing: BaseException | None, __: object) -> None:
+    """Close a device, unless a call of it hangs. Raises what that raises; DeviceTimeout if it does not return,
+    which is only told if something has failed already."""
+    if call := hangs(name):
+        alarm(f"{name}: not closed, because the call `{call}` has not returned; it ends with this process")
+        return
+    try:
+        bounded(device.close, stop=NOW)
+    except DeviceTimeout as error:
+        if failing is None:
+            raise
+        alarm(str(error))
 
 
 def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, speed: float | None) -> Any:
@@ -133,4 +170,5 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
     world_class = load_class(driver)
     if section is not None and section.join is not None and not dry_run:
         return world_class.join(cell.document.resolve(section.join))
-    return world_class.start(world_config(cell, job, sensor, dry_run=dry_run, speed=speed))
+    with under_way("world", "start", _WORLD_STARTS_S):
+        return world_class.start(world_config(cell, job, sensor, dry_run=dry_run, speed=speed))

@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from pathlib import Path
 from typing import Any, Protocol
 
+from coupole.bounded import DISK, NOW, Workers, bounded, hangs, left_behind, on_disk, under_way
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
 from coupole.plan.shot_id import ShotId
 from coupole.storage import journal, run_dose
 from coupole.storage.frame_file_creation import Collections, create
-from coupole.storage.journal import Journal
+from coupole.storage.journal import FRAME_LINE, Journal, append_lines
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
 from coupole.storage.view_writer import ViewWriter
@@ -22,6 +24,8 @@ from coupole.storage.view_writer import ViewWriter
 COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
 """Additional slots for surplus frames, until their burst has been evaluated."""
+_SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
+"""Of disks that still answer: an allocation may be written out."""
 
 
 class Recorder(Protocol):
@@ -94,8 +98,12 @@ class RunRecorder:
         self._file = ""
         self._pose = 0
         self._committed_s = time.monotonic()
-        self._committer = ThreadPoolExecutor(1, "commit")
+        self._committer = Workers(1, "commit")
         self._committing: Future[None] | None = None
+        self._unsynced_bytes = 0
+        self._uncommitted: list[ShotId] = []
+        self.committed = set(self._proven)
+        """Proven shots whose lines are on the disk."""
 
     def light_before_lux_h(self) -> tuple[float, ...]:
         return run_dose.lux_h_of_points(journal.read(self._run.journal_path))
@@ -113,6 +121,14 @@ class RunRecorder:
         collections: Collections,
     ) -> None:
         path = self._run.view_path(view)
+        allocated_bytes = (frames + SPARE_SLOTS) * frame_format.frame_bytes
+        with under_way(DISK, str(path), allocated_bytes / _SLOWEST_ALLOCATION_BYTES_S):
+            self._open_view(path, view, frames, frame_format, collections)
+            self._pose = self._view.add_pose(arm, base_from_camera)
+
+    def _open_view(
+        self, path: Path, view: str, frames: int, frame_format: FrameFormat, collections: Collections
+    ) -> None:
         self._file = str(path.relative_to(self._run.folder))
         if self._writer is None:
             own = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
@@ -129,7 +145,6 @@ class RunRecorder:
                     packed=self._packed,
                 )
             self._writer = ViewWriter(path, own)
-        self._pose = self._writer.add_pose(arm, base_from_camera)
 
     @property
     def _view(self) -> ViewWriter:
@@ -142,9 +157,11 @@ class RunRecorder:
         return self._view.direct
 
     def put(self, frame: Frame, exposure_us: int) -> int:
-        return self._view.put(
-            frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
-        )
+        self._unsynced_bytes += frame.pixels.nbytes
+        with under_way(DISK, self._file):
+            return self._view.put(
+                frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
+            )
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         if shot in self._proven:
@@ -155,6 +172,7 @@ class RunRecorder:
         self._journal.write(
             FrameProven(shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}")
         )
+        self._uncommitted.append(shot)
 
     def free(self, slot: int) -> None:
         self._view.free(slot)
@@ -169,34 +187,66 @@ class RunRecorder:
             committing, self._committing = self._committing, None
             committing.result()
         if now:
-            self._commit(self._writer, self._journal.take())
+            self._commit(self._writer, *self._taken())
         elif self._committing is None and time.monotonic() - self._committed_s > COMMIT_EVERY_S:
             self._committed_s = time.monotonic()
-            self._committing = self._committer.submit(self._commit, self._writer, self._journal.take())
+            self._committing = self._committer.submit(self._commit, self._writer, *self._taken())
 
-    def _commit(self, writer: ViewWriter | None, lines: list[str]) -> None:
+    def _taken(self) -> tuple[list[str], list[ShotId]]:
+        """Lines that are to be written, and the shots that they prove."""
+        shots, self._uncommitted = self._uncommitted, []
+        return self._journal.take(), shots
+
+    def _commit(self, writer: ViewWriter | None, lines: list[str], shots: list[ShotId]) -> None:
         """Frames first, then the journal lines that refer to them."""
-        if writer is not None:
-            writer.sync()
-        self._journal.append(lines)
+        with under_way(DISK, str(self._run.folder), self._unsynced_bytes / _SLOWEST_SYNC_BYTES_S):
+            self._unsynced_bytes = 0
+            if writer is not None:
+                writer.sync()
+            self._journal.append(lines)
+        self.committed.update(shots)
 
     def end_view(self) -> None:
         if self._writer is not None:
             try:
                 self.commit(now=True)
             finally:
+                self._close_view()
+
+    def _close_view(self) -> None:
+        if self._writer is not None:
+            with under_way(DISK, self._file):
                 self._writer.close()
-                self._writer = None
+            self._writer = None
 
     def close_quietly(self) -> None:
-        """Commit the last events if possible; a failure here must not hide the error that ended the run."""
+        """Commit the last events if possible; a failure here must not hide the error that ended the run. A disk
+        that hangs with frames may still take the other lines, which are written then."""
+        lines, shots = self._taken()
+        try:
+            if not hangs(DISK):
+                bounded(lambda: self._commit_last(lines, shots))
+                return
+        except StorageError:
+            pass
+        others = [line for line in lines if not line.startswith(FRAME_LINE)]
         with contextlib.suppress(StorageError):
-            self.commit(now=True)
+            on_disk(str(self._run.journal_path), lambda: append_lines(self._run.journal_path, others), stop=NOW)
+
+    def _commit_last(self, lines: list[str], shots: list[ShotId]) -> None:
+        if self._committing is not None:
+            self._committing.result()
+        self._commit(self._writer, lines, shots)
 
     def close(self) -> None:
-        """Release everything; frames that were not committed remain unproven."""
-        self._committer.shutdown(wait=True)
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-        self._journal.close()
+        """Release everything; frames that were not committed remain unproven. Nothing is released that a thread
+        which was left behind may still use."""
+        if not left_behind():
+            with contextlib.suppress(StorageError):
+                bounded(self._close)
+
+    def _close(self) -> None:
+        self._committer.end()
+        self._close_view()
+        with under_way(DISK, str(self._run.journal_path)):
+            self._journal.close()

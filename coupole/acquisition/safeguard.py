@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from coupole.bounded import leave_behind, waited_for
+
 _SAFE_WITHIN_S = 15.0
 """Longer than any driver's time-outs for switching off and stopping; what hangs longer is given up and told."""
 
@@ -17,15 +19,19 @@ class Safeguard:
         self.what, self._act = what, act
         self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
         """Why it is not sure to be done; empty when it is done."""
+        self._begun_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=what, daemon=True)
         self._thread.start()
 
     def wait(self, at_most_s: float = _SAFE_WITHIN_S) -> None:
         self._thread.join(at_most_s)
+        if self._thread.is_alive() and time.monotonic() - self._begun_s >= _SAFE_WITHIN_S:
+            leave_behind(self._thread)
 
     def _run(self) -> None:
         try:
-            self._act()
+            with waited_for():
+                self._act()
         except BaseException as error:  # noqa: BLE001  whatever it is, the other safeguards go on
             self.trouble = str(error) or type(error).__name__
         else:

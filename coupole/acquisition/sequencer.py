@@ -117,15 +117,25 @@ class Sequencer:
             raise
         finally:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
-            self.outcome.dose_lux_h = self._dose.lux_h
-            done = self._recorder.proven()
-            self.outcome.proven = sum(shot.is_shot for shot in done)
-            expected = [shot for bursts in schedule.bursts for burst in bursts for shot in burst.shots if shot]
-            self.outcome.missing = [shot for shot in expected if shot.is_shot and shot not in done]
-            self.outcome.missing_darks = [shot for shot in expected if not shot.is_shot and shot not in done]
+            self._conclude(self._recorder.proven())
         if self.outcome.missing or self.outcome.missing_darks:
             raise UnprovenError(self._say_missing())
         return self.outcome
+
+    def _conclude(self, done: set[ShotId]) -> None:
+        """The outcome's figures, if these shots are proven."""
+        self.outcome.dose_lux_h = self._dose.lux_h
+        self.outcome.proven = sum(shot.is_shot for shot in done)
+        bursts = (burst for bursts in self._job.schedule.bursts for burst in bursts)
+        expected = [shot for burst in bursts for shot in burst.shots if shot]
+        self.outcome.missing = [shot for shot in expected if shot.is_shot and shot not in done]
+        self.outcome.missing_darks = [shot for shot in expected if not shot.is_shot and shot not in done]
+
+    def give_up(self, done: set[ShotId]) -> None:
+        """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
+        The light of a burst under way counts as planned."""
+        self._dose.give_up()
+        self._conclude(done)
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)

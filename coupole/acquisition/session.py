@@ -6,9 +6,9 @@ import contextlib
 import os
 import signal
 import time
-import traceback
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,23 +30,29 @@ from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.run_control import RunControl
 from coupole.acquisition.run_description import described_cell
 from coupole.acquisition.sequencer import Sequencer
+from coupole.acquisition.session_failure import (
+    note_failure,
+    note_faults_of_the_arm,
+    note_what_hangs,
+    statistics,
+)
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
+from coupole.bounded import bounded, left_behind, on_disk
 from coupole.errors import (
-    CoupoleError,
     DeviceError,
     Interrupted,
     PreflightRefused,
-    StorageError,
 )
 from coupole.plan.schedule import Schedule
+from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
-from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
+from coupole.storage.run_inputs import copied_s
 from coupole.viewing.keys import obeyed
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
@@ -109,7 +115,7 @@ def _acquire_into(
     if run is not None and not preflight.frames:
         dose_lux_h = close_complete(run, console)
         outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
-        found.update({**_figures(run, job, outcome), "unsafe": []})
+        found.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
         _say_outcome(console, run, outcome, "done")
         return
     faults = ArmFaults(job.cell.state_folder)
@@ -117,20 +123,22 @@ def _acquire_into(
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
-        refuse_uncommissioned(job.cell, cell.identities)
-        room_c = _refuse_other_calibrations(job, cell)
+        on_disk("the cell's commissioning record", partial(refuse_uncommissioned, job.cell, cell.identities))
+        room_c = bounded(lambda: _refuse_other_calibrations(job, cell))
         if run is None:
             inputs = replace(job.inputs, copy_large=with_mesh)
-            run = Run.create(folder, job.plan.name, inputs, about_run(job, cell))
+            create = partial(Run.create, folder, job.plan.name, inputs, about_run(job, cell))
+            run = on_disk(str(folder), create, copied_s(inputs))
             held.callback(os.close, run.lock())
-        open_for_session(run)
+        on_disk(str(run.folder), partial(open_for_session, run))
         held.callback(conclude, run, console)  # when the devices are closed
         console.print(f"run {run.folder}")
         packed = job.cell.rig.storage.pixels == "packed12"
-        recorder = RunRecorder(run, metadata_of_views(job, cell), described_cell(job), packed=packed)
+        about = metadata_of_views(job, cell), described_cell(job)
+        recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, packed=packed))
         try:
             begun = SessionResumed if resumed else SessionStarted
-            acknowledged = faults.begin_session(run.folder.name)
+            acknowledged = on_disk(str(faults.path), partial(faults.begin_session, run.folder.name))
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
@@ -223,7 +231,7 @@ def _acquire(
     whatever ended it; then the disk hears of it."""
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
-    sequencer = Sequencer(job, cell, recorder, observer=observer, control=control)
+    sequencer = bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     ended: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
     remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
@@ -241,7 +249,7 @@ def _acquire(
                 if read:
                     console.print("keys: p pauses after the burst, and goes on; q stops")
                 try:
-                    sequencer.acquire()
+                    bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
                 finally:
                     cell.make_safe()
                 _refuse_unsafe_end(cell)
@@ -250,23 +258,20 @@ def _acquire(
             failure = control.interrupted() if control.stop.is_set() else error
             ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
             if isinstance(failure, Interrupted):
+                note_what_hangs(error, cell, run, recorder)
                 raise failure from error
-            _note_failure(error, cell, run, recorder)
+            note_failure(error, cell, run, recorder)
             raise
         finally:
-            _note_faults_of_the_arm(failure, cell, run, faults)
+            note_faults_of_the_arm(failure, cell, run, faults)
             for trouble in cell.trouble:
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
-            recorder.note(
-                SessionStopped(
-                    outcome=ended,
-                    reason=str(failure or ""),
-                    robot=_statistics(cell),
-                )
-            )
+            recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
-            found.update({**_figures(run, job, sequencer.outcome), "unsafe": cell.trouble})
+            if left_behind():
+                sequencer.give_up(recorder.committed)
+            found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, ended)
 
 
@@ -281,46 +286,13 @@ def _refuse_unsafe_end(cell: OpenedCell) -> None:
         )
 
 
-def _statistics(cell: OpenedCell) -> dict[str, float]:
-    """Of the arm's link; empty if its driver has none to give any more."""
-    try:
-        return dict(cell.robot.statistics())
-    except Exception:  # noqa: BLE001  the session's end is told without them
-        return {}
-
-
-def _note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """The journal's line; an unexpected error also leaves its trace in the run's folder and says so."""
-    device = error.device if isinstance(error, DeviceError) else ""
-    recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
-    if isinstance(error, CoupoleError):
-        return
-    path = run.folder / f"trace-{utc_now().replace(':', '')}.txt"
-    with contextlib.suppress(OSError):
-        path.write_text("".join(traceback.format_exception(error)), encoding="utf-8")
-    safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
-    error.add_note(f"{safe}; the trace is in {path}; go on with `{run.go_on_command}`")
-
-
-def _note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
-    """They stay with the cell until a person confirms that the arm may move again."""
-    found = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
-    if not found and not cell.arm_confirmed:
-        found = "; ".join(cell.trouble)
-    if found:
-        try:
-            faults.note(found, run.folder.name)
-        except StorageError as error:
-            cell.trouble.append(f"the arm's fault could not be recorded: {error}")
-
-
-def _figures(run: Run, job: Job, outcome: Outcome) -> dict[str, Any]:
-    """The figures of `--json`."""
-    frames = len(run.proven())
+def _figures(run: Run, job: Job, outcome: Outcome, proven: Collection[ShotId]) -> dict[str, Any]:
+    """The figures of `--json`; `proven` are shots whose lines are on the disk."""
+    frames = len(proven)
     return {
         "run": str(run.folder),
         "shots": outcome.shots,
-        "proven": sum(shot.is_shot for shot in run.proven()),
+        "proven": sum(shot.is_shot for shot in proven),
         "missing": len(outcome.missing),
         "missing_darks": len(outcome.missing_darks),
         "reshot": outcome.reshot,
@@ -361,7 +333,7 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
         started_s = time.monotonic()
         try:
             with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
-                sequencer.acquire()
+                bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
         finally:
             machine_s = time.monotonic() - started_s
             found.update(

@@ -18,17 +18,23 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from coupole import bounded
 from coupole.acquisition.observer import Control, frozen
 from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.supervision import ASKS_FROM_S
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_heard_s = deque([-math.inf], maxlen=1)
+"""When the main thread last heard of one, outside sessions."""
 
 _PULSE_S = 0.25
+_LEAVES_WITHIN_S = 300.0
+"""Longer than devices that hang when they are closed, and a report."""
 _SAFE_WITHIN_S = 4.0
 """Ctrl-Z stops the process after this time though it is not sure that the cell is safe; that is told."""
 
@@ -54,13 +60,53 @@ def _stays_ignored(number: int) -> bool:
 
 
 def _raise(number: int, _: Any) -> None:
+    _heard_s.append(time.monotonic())
     raise SignalReceived(number)
+
+
+def _drop(number: int, _: Any) -> None:
+    _heard_s.append(time.monotonic())
+
+
+@contextmanager
+def unheard_end() -> Iterator[None]:
+    """Outside sessions nothing shines or moves. If the main thread then does not hear of a signal for `STOPPED_S`,
+    because it waits in a call that never returns (a dead network disk), the process ends without it; also if it
+    has heard, and is still there after `_LEAVES_WITHIN_S`, because it waits for a thread that hangs."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ours, pythons = os.pipe()
+    os.set_blocking(pythons, False)
+    before = signal.set_wakeup_fd(pythons, warn_on_full_buffer=False)
+    threading.Thread(target=_end_unheard, args=(ours,), name="unheard signals", daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(pythons)
+
+
+def _end_unheard(ours: int) -> None:
+    number, since_s, heard_s = 0, math.inf, math.inf
+    while True:
+        if select.select([ours], [], [], _PULSE_S)[0]:
+            if not (numbers := os.read(ours, 64)):
+                os.close(ours)
+                return
+            if since_s == math.inf and (ending := [one for one in numbers if one in ENDING]):
+                number, since_s = ending[0], time.monotonic()
+        if _heard_s[-1] > since_s - ASKS_FROM_S:  # the handler may have been faster than this thread
+            heard_s, since_s = min(heard_s, since_s), math.inf
+        if time.monotonic() > heard_s + _LEAVES_WITHIN_S or time.monotonic() > since_s + bounded.STOPPED_S:
+            _tell("the program waits in a call that does not return (of a disk?), and was ended\n")
+            os._exit(128 + number)
 
 
 @contextmanager
 def held() -> Iterator[None]:
     """What arrives within is dropped: whoever uses this is ending the session already."""
-    with _handlers(dict.fromkeys(ENDING, lambda *_: None)):
+    with _handlers(dict.fromkeys(ENDING, _drop)):
         yield
 
 

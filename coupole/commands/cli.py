@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 
 import coupole
-from coupole.acquisition.signals import SignalReceived, raise_outside_sessions
+from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
+from coupole.bounded import leave
 from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
 from coupole.commands.bracketing import bracket, sphere_brdf
 from coupole.commands.calibrate import calibrate_app
@@ -104,6 +105,13 @@ def _commands() -> Any:
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
     raise_outside_sessions()
+    with unheard_end():
+        code = _ended()
+    leave(code)
+
+
+def _ended() -> int:
+    """Run the command; its exit code."""
     try:
         code = _commands()(standalone_mode=False)
     except CoupoleError as error:
@@ -124,7 +132,7 @@ def main() -> None:
                 traceback.print_exception(error)
                 print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
             code = 1
-    sys.exit(code or 0)
+    return int(code or 0)
 
 
 def _say(error: CoupoleError) -> None:

@@ -30,6 +30,8 @@ RunningRun = Annotated[
     ),
 ]
 _LOOK_EVERY_S = 0.2
+_ENDS_WITHIN_S = 600.0
+"""Longer than a session whose every call hangs (`coupole.bounded`), and than a slow report."""
 _PLAIN_LINE_EVERY_S = 5.0
 
 
@@ -57,7 +59,15 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     for trouble in sent["trouble"]:
         alarm(trouble)
     stopped = Run(Path(sent["run"]))
+    end_s = time.monotonic() + _ENDS_WITHIN_S
     while stopped.in_use:
+        if time.monotonic() > end_s:
+            raise DeviceError(
+                "cell",
+                expected=f"the process {sent['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
+                happened="it still acquires into the run",
+                remedy="Look at the cell, then end the process (`kill -9`); the run can be resumed.",
+            )
         time.sleep(_LOOK_EVERY_S)
     found = status(stopped)
     if as_json:

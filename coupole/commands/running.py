@@ -82,6 +82,7 @@ def devices(
     from rich.table import Table
 
     from coupole.acquisition.opened_cell import open_cell
+    from coupole.bounded import bounded
     from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
@@ -92,7 +93,7 @@ def devices(
     table = Table("device", "identity", "self-test", box=None)
     with borrowed(cell, "devices"), open_cell(cell) as opened:
         for kind in ("ledbox", "camera", "robot"):
-            identity, tested = opened.identities[kind], getattr(opened, kind).self_test()
+            identity, tested = opened.identities[kind], bounded(getattr(opened, kind).self_test)
             found[kind] = {**vars(identity), "self_test": dict(tested)}
             who = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
             table.add_row(

@@ -17,6 +17,8 @@ from coupole.errors import StorageError
 from coupole.storage.journal_events import JOURNAL_VERSION, Event, JournalBegun
 from coupole.storage.line_file import LineFile
 
+FRAME_LINE = '{"event":"frame"'
+"""How the line of a proven frame begins."""
 _EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="event")])
 
 
@@ -51,6 +53,16 @@ class Journal:
 
     def close(self) -> None:
         self._file.close()
+
+
+def append_lines(path: Path, lines: list[str]) -> None:
+    """Write and sync lines of `Journal.take` after whatever the journal has; raises DiskFull or StorageError."""
+    file = LineFile(path)
+    try:
+        begin = [event_line(JournalBegun())] if file.was_empty else []
+        file.append([*begin, *lines])
+    finally:
+        file.close()
 
 
 def event_line(event: Event) -> str:

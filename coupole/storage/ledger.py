@@ -27,7 +27,7 @@ from coupole.storage.line_file import LineFile, utc_now
 
 BY_HAND = "by hand"
 """In place of a run's name, for light that was entered with `coupole dose --add`."""
-_LOCK_S = 10.0
+LOCK_S = 10.0
 """Other writers hold the lock for one line each."""
 _NAP_S = 0.01
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
@@ -212,14 +212,14 @@ class Ledger:
 
     def _take(self, lock: int) -> None:
         """Wait for the lock on the open file `lock`, which is released when that is closed."""
-        end_s = time.monotonic() + _LOCK_S
+        end_s = time.monotonic() + LOCK_S
         while True:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 if time.monotonic() > end_s:
                     raise StorageError(
-                        f"{self.path}: another process has held the lock of the dose ledger for {_LOCK_S:g} s. "
+                        f"{self.path}: another process has held the lock of the dose ledger for {LOCK_S:g} s. "
                         "End it, then try again."
                     ) from error
                 time.sleep(_NAP_S)

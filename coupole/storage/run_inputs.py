@@ -41,6 +41,7 @@ PLAN, RIG = f"{FOLDER}/plan.yaml", f"{FOLDER}/rig.yaml"
 MOST_COPIED_BYTES = 100_000_000
 """A larger file is named by its hash, and copied on request."""
 _CHUNK_BYTES = 2**20
+_SLOWEST_BYTES_S = 5e6
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ class Inputs:
     """The arm in force, whatever names it."""
     copy_large: bool = False
     """Copy files of more than MOST_COPIED_BYTES, too."""
+
+
+def copied_s(inputs: Inputs) -> float:
+    """Time for the copies of a new run on a disk that is slow."""
+    return sum(path.stat().st_size for path in inputs.others if path.is_file()) / _SLOWEST_BYTES_S
 
 
 def keep(inputs: Inputs, run: Path) -> dict[str, Any]:

@@ -226,6 +226,6 @@ def run_source(source: Source, studio: Studio, failed: Callable[[Exception], Non
             failed(error)
             studio.closing.set()
 
-    thread = threading.Thread(target=work, name="live")
+    thread = threading.Thread(target=work, name="live", daemon=True)
     thread.start()
     return thread

@@ -21,6 +21,7 @@ from unittest import mock
 import cells
 from cells import SIDE, TOP, CellFolder, Ended
 from expected_pictures import mislabelled
+from never_returning import LIMITS_S, Hang, begin
 from places import REPO
 from real_cells import true_dose_lux_h
 
@@ -35,11 +36,14 @@ SPEED = 2.0
 HANG_S = 2.5
 """Of the world's time; longer than any driver waits for an answer by default."""
 SIGNALS = {"sigint": signal.SIGINT, "sigterm": signal.SIGTERM, "sighup": signal.SIGHUP}
-KINDS = ("error", "unexpected", "hang", *SIGNALS, "sigkill", "world")
+KINDS = ("error", "unexpected", "hang", "never", *SIGNALS, "sigkill", "world")
+LASTS_S = {"hang": HANG_S, "never": (LIMITS_S + 2.0) * SPEED}
+"""Of the world's time, until a call that hangs is given up."""
 CODES = {
     "error": {0, 4},
     "unexpected": {1, 4},
     "hang": {0, 4},
+    "never": {0, 4},
     "sigint": {0, 130},
     "sigterm": {0, 143},
     "sighup": {0, 129},
@@ -193,6 +197,12 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
         failure = Failure(k, kind, world_pid=world.endpoints["pid"], on_event=watch.begin)
         if kind == "sigkill":
             ended = _killed(cell, k, watch)
+        elif kind == "never":
+            session = begin(cell, Hang(k=k))
+            if call := session.hangs():
+                case.call = call
+                watch.begin()
+            ended = session.ended()
         else:
             ended = acquire(cell, failure)
             case.call = failure.calls[k - 1] if len(failure.calls) >= k else ""
@@ -288,13 +298,14 @@ def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
     if case.code == 0:  # the failure was borne: there was nothing to end
         return wrong
     listens = case.kind != "sigkill" and not case.call.startswith("led box")
-    limit_s = (DARK_WITHIN_S if listens else WATCHDOG_S * SPEED) + (HANG_S if case.kind == "hang" else 0.0)
+    lasts_s = LASTS_S.get(case.kind, 0.0)
+    limit_s = (DARK_WITHIN_S if listens else WATCHDOG_S * SPEED) + lasts_s
     if case.dark_s is not None and case.dark_s > limit_s + 0.1 * SPEED:
         wrong.append(f"dark {case.dark_s:.3f} s after the event, {limit_s:g} s promised")
-    stop_limit_s = STOP_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0)
+    stop_limit_s = STOP_WITHIN_S + lasts_s
     if case.stop_s is not None and case.stop_s > stop_limit_s + 0.25 * SPEED:  # of a busy machine
         wrong.append(f"told the arm to stop {case.stop_s:.3f} s after the event, {stop_limit_s:g} s promised")
-    if case.still_s is not None and case.still_s > STILL_WITHIN_S + (HANG_S if case.kind == "hang" else 0.0):
+    if case.still_s is not None and case.still_s > STILL_WITHIN_S + lasts_s:
         wrong.append(f"the arm stood {case.still_s:.3f} s after the event")
     return wrong
 

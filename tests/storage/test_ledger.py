@@ -111,7 +111,7 @@ def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
 def test_a_line_is_appended_only_under_the_files_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import fcntl
 
-    monkeypatch.setattr(ledger_module, "_LOCK_S", 0.05)
+    monkeypatch.setattr(ledger_module, "LOCK_S", 0.05)
     ledger = Ledger(tmp_path, "shroud")
     ledger.enter(1.0, "before")
     with ledger.path.open() as held:

@@ -48,7 +48,8 @@ from coupole.acquisition.runtime_folder import is_in_use
 from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.user_socket import UserSocket
-from coupole.errors import CoupoleError, DeviceError, InputError
+from coupole.bounded import NOW, on_disk, refuse_overdue
+from coupole.errors import CoupoleError, DeviceError, InputError, StorageError
 from coupole.plan.cell import Cell
 from coupole.preflight import exposure_advice
 from coupole.preflight.job import Job
@@ -202,7 +203,8 @@ class BenchService:
         self.closing.set()
         self._stop()
         self._opened.make_safe()
-        self._frames.end()
+        with contextlib.suppress(StorageError):  # what was planned then stands
+            on_disk("the dose ledger", self._frames.end, stop=NOW)
 
 
 @contextmanager
@@ -247,7 +249,9 @@ def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_afte
         console.print(f"bench at {path}  (Ctrl-C ends it)", soft_wrap=True)
         if as_json:
             print(json.dumps({"version": VERSION, "socket": str(path), "pid": os.getpid()}), flush=True)
+        began_s = time.monotonic()
         while not (control.stop.wait(_LOOK_EVERY_S) or service.closing.is_set()):
+            refuse_overdue(began_s)
             if service.is_spent:
                 raise DeviceError(
                     "cell",

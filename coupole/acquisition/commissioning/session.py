@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import identity_printer
 from coupole.acquisition.signals import obeyed_by
+from coupole.bounded import bounded
 from coupole.errors import CommissioningFailed, DeviceError, InputError
 from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import bodies_of
@@ -90,7 +92,7 @@ def commission(
     control = Control()
     with open_cell(slow, on_opened=identity_printer(console)) as opened:
         bench = replace(
-            _bench(slow, opened, bodies, person_at(opened), control),
+            bounded(lambda: _bench(slow, opened, bodies, person_at(opened), control)),
             bars=lambda: step_bars(console),
             board=board,
         )
@@ -102,7 +104,8 @@ def commission(
                 if due:
                     bench.ask_before(_BEGIN)
                 for step in due:
-                    result, failure = _done(step, bench, cell, name)
+                    do = partial(_done, step, bench, cell, name)
+                    result, failure = bounded(do, stop=control.stop, rescue=opened.make_safe)
                     record = record.with_result(result)
                     write_commissioning(cell, record)
                     commissioning_page.write(record_path(cell), record)

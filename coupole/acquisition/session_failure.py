@@ -1,0 +1,58 @@
+"""What a session's end writes of that which went wrong: each file call on the way out is bounded."""
+
+from __future__ import annotations
+
+import contextlib
+import traceback
+from functools import partial
+
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.recorder import RunRecorder
+from coupole.bounded import NOW, bounded, hangs, left_behind, on_disk
+from coupole.errors import CoupoleError, DeviceError, StorageError
+from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.journal_events import FaultNoted
+from coupole.storage.line_file import utc_now
+from coupole.storage.run import Run
+from coupole.viewing.terminal import alarm
+
+
+def statistics(cell: OpenedCell) -> dict[str, float]:
+    """Of the arm's link; empty if its driver has none to give any more."""
+    try:
+        return {} if hangs("robot") else dict(bounded(cell.robot.statistics, stop=NOW))
+    except Exception:  # noqa: BLE001  the session's end is told without them
+        return {}
+
+
+def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
+    """The journal's line; an unexpected error also leaves its trace in the run's folder and says so."""
+    device = error.device if isinstance(error, DeviceError) else ""
+    recorder.note(FaultNoted(kind=type(error).__name__, message=str(error), device=device))
+    if isinstance(error, CoupoleError):
+        return
+    path = run.folder / f"trace-{utc_now().replace(':', '')}.txt"
+    trace = "".join(traceback.format_exception(error))
+    with contextlib.suppress(OSError, StorageError):
+        on_disk(str(path), lambda: path.write_text(trace, encoding="utf-8"), stop=NOW)
+    safe = "; ".join(cell.trouble) or "lights are off, the arm is at rest, the camera is disarmed"
+    error.add_note(f"{safe}; the trace is in {path}; go on with `{run.go_on_command}`")
+
+
+def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
+    """A stop has ended the session; if something was left behind meanwhile, that is told too."""
+    if left_behind():
+        alarm(str(error))
+        note_failure(error, cell, run, recorder)
+
+
+def note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
+    """They stay with the cell until a person confirms that the arm may move again."""
+    found = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
+    if not found and not cell.arm_confirmed:
+        found = "; ".join(cell.trouble)
+    if found:
+        try:
+            on_disk(str(faults.path), partial(faults.note, found, run.folder.name), stop=NOW)
+        except StorageError as error:
+            cell.trouble.append(f"the arm's fault could not be recorded: {error}")

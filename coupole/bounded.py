@@ -1,0 +1,303 @@
+"""Every wait ends: a call that never returns is given up, told, and left behind.
+
+A library may hang in a call, a network disk may be dead: no thread that waits in there can be ended, by a signal
+as little as by another thread. So whoever may hang is a thread that nobody needs (`bounded`), and each call of a
+device or a disk notes that it is under way (`under_way`), which costs a microsecond and hands nothing over. The
+waiting side looks at these notes and gives up a call that is under way for longer than its work asks plus
+
+==================  =========================================
+`DEVICE_S`          a call of a device
+`DISK_S`            a call of a disk
+`STOPPED_S`         either, once the session is to end
+==================  =========================================
+
+on the machine's clock: longer than what drivers and kernels grant themselves, whose words are better. Whatever is
+left behind (`left_behind`) cannot be ended: its process leaves by `os._exit` (`leave`), once all has been said.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import queue
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, Generic, NoReturn, TypeVar
+
+from coupole.errors import CoupoleError, DeviceTimeout, StorageError
+
+DEVICE_S, DISK_S, STOPPED_S = 30.0, 60.0, 15.0
+_MOST_S = 120.0
+"""A session that is to end, and whose calls all return, is left behind after this time all the same."""
+_LOOK_S, _STOOD_S = 0.1, 1.0
+_BACK_S = 1.0
+"""For a call to come back once the cell was made safe, or once whoever waited for it was interrupted."""
+_FLUSH_S = 2.0
+DISK = "disk"
+
+T = TypeVar("T")
+
+
+# -- calls under way ------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False, slots=True)
+class Call:
+    """A call of a device (by its name in errors) or of the `DISK`; noted while its context lasts."""
+
+    of: str
+    what: str
+    work_s: float = 0.0
+    """Time that the work itself may take, if all is well."""
+    since_s: float = 0.0
+
+    def __enter__(self) -> None:
+        if threading.get_ident() not in _BY_OTHERS:
+            self.since_s = time.monotonic()
+            _UNDER_WAY[self] = None
+
+    def __exit__(self, *_: object) -> None:
+        _UNDER_WAY.pop(self, None)
+
+    def end_s(self, stopped_s: float) -> float:
+        """When it is given up, monotonic; the session is to end since `stopped_s`."""
+        disk = self.of == DISK
+        end_s = self.since_s + self.work_s + (DISK_S if disk else DEVICE_S)
+        return min(end_s, max(self.since_s, stopped_s) + STOPPED_S + (min(self.work_s, DISK_S) if disk else 0.0))
+
+    def error(self) -> CoupoleError:
+        lasts_s = time.monotonic() - self.since_s
+        if self.of == DISK:
+            return StorageError(
+                f"{self.what}: the disk has not answered for {lasts_s:.0f} s. Check it (a network disk: its "
+                "server and the network), then resume the run."
+            )
+        return DeviceTimeout(
+            self.of,
+            expected=f"an end of the call `{self.what}`",
+            happened=f"it has not returned for {lasts_s:.0f} s, and was left behind",
+            remedy="Switch the device off and on, then resume the run; if it comes back, report it with the "
+            "versions of the device's library and firmware.",
+        )
+
+
+_UNDER_WAY: dict[Call, None] = {}
+_BY_OTHERS: set[int] = set()
+_looked_s = deque([0.0], maxlen=1)
+_LEFT: list[threading.Thread | Call] = []
+
+
+under_way = Call
+"""`with under_way("camera", "arm"):` notes a call while the context lasts."""
+
+
+@contextmanager
+def waited_for() -> Iterator[None]:
+    """Calls of this thread are not noted: somebody waits for it with a limit of its own."""
+    _BY_OTHERS.add(threading.get_ident())
+    try:
+        yield
+    finally:
+        _BY_OTHERS.discard(threading.get_ident())
+
+
+def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
+    """A call that began since then and is to be given up. While this process stood, no time has passed."""
+    now_s = time.monotonic()
+    looked_s = _looked_s[-1]
+    _looked_s.append(now_s)
+    if now_s - looked_s > _STOOD_S:
+        for call in list(_UNDER_WAY):
+            call.since_s = min(now_s, call.since_s + now_s - looked_s)
+    late = (call for call in list(_UNDER_WAY) if call.since_s >= since_s and now_s > call.end_s(stopped_s))
+    return next(late, None)
+
+
+def refuse_overdue(since_s: float) -> None:
+    """For who waits for something else: raise DeviceTimeout or StorageError for a call that is given up."""
+    if call := overdue(since_s):
+        leave_behind(call)
+        raise call.error()
+
+
+def hangs(of: str) -> str:
+    """The call of this device, or of the `DISK`, that was left behind and is still under way; empty if none is."""
+    return next((call.what for call in list(_UNDER_WAY) if call.of == of), "") if left_behind() else ""
+
+
+# -- whoever may hang -----------------------------------------------------------------------------------------
+
+
+class _GivenUp(BaseException):
+    """Raised in a thread for which nobody waits any more."""
+
+
+class _Runner(Generic[T]):
+    """Does something in a thread of its own."""
+
+    def __init__(self, do: Callable[[], T], unwanted: Callable[[T], object]) -> None:
+        self._do, self._unwanted = do, unwanted
+        self._done: Future[T] = Future()
+        self._lock = threading.Lock()
+        self.is_left = False
+        self.thread = threading.Thread(target=self._run, name="bounded", daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            found = self._do()
+        except BaseException as error:  # noqa: BLE001  raised again in the thread that waits
+            self._done.set_exception(error)
+            return
+        with self._lock:
+            if not self.is_left:
+                self._done.set_result(found)
+                return
+        with suppress(Exception):
+            self._unwanted(found)
+
+    def ended(self, within_s: float) -> bool:
+        with suppress(TimeoutError):
+            self._done.exception(within_s)
+        return self._done.done()
+
+    def leave(self) -> bool:
+        """Nobody waits for it from now on; False if it has just ended."""
+        with self._lock:
+            self.is_left = not self._done.done()
+        if self.is_left:
+            _LEFT.append(self.thread)
+        return self.is_left
+
+    def interrupt(self) -> None:
+        """End it as a signal would end the thread that waits for it, at its next step of Python."""
+        ident = self.thread.ident
+        if ident is not None and not self._done.done():
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(_GivenUp))
+
+    def result(self) -> T:
+        return self._done.result()
+
+
+def bounded(
+    do: Callable[[], T],
+    *,
+    stop: threading.Event | None = None,
+    rescue: Callable[[], object] = lambda: None,
+    unwanted: Callable[[T], object] = lambda found: None,
+    since_s: float | None = None,
+) -> T:
+    """Do it in a thread of its own, and wait until it has ended or a call is to be given up; what it raises is
+    raised here. `stop` tells that it is to end, `rescue` is called before a call is given up, which may bring that
+    back; what comes after all is passed to `unwanted`. Calls are looked at that begin from now on, or `since_s`.
+
+    Raises DeviceTimeout or StorageError for a call that is given up, and what a signal raises.
+    """
+    since_s = time.monotonic() if since_s is None else since_s
+    stopped_s = math.inf
+    runner = _Runner(do, unwanted)
+    try:
+        while not runner.ended(_LOOK_S):
+            if stop is not None and stop.is_set():
+                stopped_s = min(stopped_s, time.monotonic())
+            call = overdue(since_s, stopped_s)
+            if call is None and time.monotonic() > stopped_s + _MOST_S:
+                call = Call("cell", "session", 0.0, stopped_s)
+            if call is not None:
+                rescue()
+                if not runner.ended(_BACK_S) and runner.leave():
+                    leave_behind(call)
+                    raise call.error()
+    except BaseException:
+        if not runner.is_left:  # a signal, here
+            runner.interrupt()
+            if not runner.ended(_BACK_S):
+                runner.leave()
+        raise
+    return runner.result()
+
+
+NOW = threading.Event()
+"""For `stop` of what is done at the end of a session."""
+NOW.set()
+
+
+def on_disk(what: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threading.Event | None = None) -> T:
+    """`bounded`, for work with files."""
+
+    def work() -> T:
+        with under_way(DISK, what, work_s):
+            return do()
+
+    return bounded(work, stop=stop)
+
+
+class Workers:
+    """Threads that take work in turn. They keep no process alive, as those of concurrent.futures do."""
+
+    def __init__(self, count: int, name: str) -> None:
+        self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]] | None]
+        self._queue = queue.SimpleQueue()
+        self._count, self._name = count, name
+        self._threads: list[threading.Thread] = []
+
+    def submit(self, do: Callable[..., T], *arguments: Any) -> Future[T]:
+        if len(self._threads) < self._count:
+            self._threads.append(threading.Thread(target=self._work, name=self._name, daemon=True))
+            self._threads[-1].start()
+        future: Future[T] = Future()
+        self._queue.put((future, do, arguments))
+        return future
+
+    def _work(self) -> None:
+        while (task := self._queue.get()) is not None:
+            future, do, arguments = task
+            try:
+                future.set_result(do(*arguments))
+            except BaseException as error:  # noqa: BLE001  raised again where the result is asked for
+                future.set_exception(error)
+            del task, future, do, arguments  # they may hold a frame's memory
+
+    def end(self) -> None:
+        """Wait until all is done, and end the threads: within a `bounded` call, if their work may hang."""
+        for _ in self._threads:
+            self._queue.put(None)
+        for thread in self._threads:
+            thread.join()
+        self._threads = []
+
+
+# -- the last way out -----------------------------------------------------------------------------------------
+
+
+def leave_behind(waited_for: threading.Thread | Call) -> None:
+    """This, too, was waited for in vain."""
+    _LEFT.append(waited_for)
+
+
+def left_behind() -> bool:
+    """Whether something that was given up still hangs."""
+    return any(one in _UNDER_WAY if isinstance(one, Call) else one.is_alive() for one in _LEFT)
+
+
+def leave(code: int) -> NoReturn:
+    """End the process: in order if nothing was left behind; else at once, when all was said that is read."""
+    if left_behind():
+        saying = threading.Thread(target=_flush, daemon=True)
+        saying.start()
+        saying.join(_FLUSH_S)
+        os._exit(code)
+    sys.exit(code)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()

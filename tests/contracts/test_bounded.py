@@ -1,0 +1,246 @@
+"""Waits that end, though what they wait for never does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import cells
+import pytest
+
+from coupole import bounded
+from coupole.bounded import DISK, NOW, Workers, left_behind, on_disk, under_way
+from coupole.errors import DeviceTimeout, StorageError
+
+
+class EndedError(Exception):
+    """What the work itself raises."""
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded, "DEVICE_S", 0.2)
+    monkeypatch.setattr(bounded, "DISK_S", 0.2)
+    monkeypatch.setattr(bounded, "STOPPED_S", 0.2)
+    monkeypatch.setattr(bounded, "_BACK_S", 0.1)
+
+
+@pytest.fixture
+def never() -> Iterator[threading.Event]:
+    """An event that comes when the test is over."""
+    event = threading.Event()
+    yield event
+    event.set()
+    cells.wait_until(lambda: not left_behind(), "the end of what hung")
+
+
+def test_what_ends_is_returned_and_what_it_raises_is_raised() -> None:
+    def fail() -> None:
+        raise EndedError
+
+    assert bounded.bounded(lambda: 7) == 7
+    with pytest.raises(EndedError):
+        bounded.bounded(fail)
+    assert not left_behind()
+
+
+def test_a_call_that_never_returns_is_given_up_with_its_name(never: threading.Event) -> None:
+    def hang() -> None:
+        with under_way("camera", "arm"):
+            never.wait()
+
+    with pytest.raises(DeviceTimeout, match="camera: expected an end of the call `arm`") as raised:
+        bounded.bounded(hang)
+    assert raised.value.device == "camera"
+    assert left_behind()
+    assert bounded.hangs("camera") == "arm"
+    assert bounded.hangs("robot") == ""
+
+
+def test_who_waits_for_something_else_hears_of_a_call_that_is_given_up(never: threading.Event) -> None:
+    def hang() -> None:
+        with under_way("camera", "next_frame"):
+            never.wait()
+
+    since_s = time.monotonic()
+    threading.Thread(target=hang, daemon=True).start()
+    bounded.refuse_overdue(since_s)
+    time.sleep(0.3)
+    with pytest.raises(DeviceTimeout, match="next_frame"):
+        bounded.refuse_overdue(since_s)
+    assert left_behind()
+
+
+def test_a_file_that_never_answers_is_a_fault_of_the_disk(never: threading.Event) -> None:
+    with pytest.raises(StorageError, match=r"journal\.jsonl: the disk has not answered"):
+        on_disk("journal.jsonl", never.wait)
+
+
+def test_a_call_in_another_thread_of_the_work_is_given_up_too(never: threading.Event) -> None:
+    workers = Workers(1, "keep")
+
+    def write() -> None:
+        with under_way(DISK, "views/top.h5"):
+            never.wait()
+
+    with pytest.raises(StorageError, match="views/top"):
+        bounded.bounded(lambda: workers.submit(write).result())
+
+
+def test_what_takes_its_time_by_the_work_asked_is_waited_for() -> None:
+    def sync() -> str:
+        time.sleep(0.5)
+        return "synced"
+
+    assert on_disk("views/top.h5", sync, work_s=20.0) == "synced"
+
+
+def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event) -> None:
+    def hang() -> None:
+        with under_way("robot", "wait_settled", work_s=1000.0):
+            never.wait()
+
+    with pytest.raises(DeviceTimeout, match="wait_settled"):
+        bounded.bounded(hang, stop=NOW)
+
+
+def test_a_rescue_may_bring_a_call_back() -> None:
+    back = threading.Event()
+
+    def hang() -> str:
+        with under_way("camera", "next_frame"):
+            back.wait()
+        return "came back"
+
+    assert bounded.bounded(hang, rescue=back.set) == "came back"
+    assert not left_behind()
+
+
+def test_what_comes_after_all_is_passed_to_whoever_does_away_with_it(never: threading.Event) -> None:
+    late: list[str] = []
+
+    def hang() -> str:
+        with under_way("camera", "open"):
+            never.wait()
+        return "an opened camera"
+
+    with pytest.raises(DeviceTimeout):
+        bounded.bounded(hang, unwanted=late.append)
+    never.set()
+    cells.wait_until(lambda: late, "what came after all")
+    assert late == ["an opened camera"]
+
+
+def test_a_signal_ends_the_work_as_it_ends_who_waits_for_it() -> None:
+    cleaned = threading.Event()
+
+    def work() -> None:
+        try:
+            while True:
+                time.sleep(0.01)
+        finally:
+            cleaned.set()
+
+    def handler(*_: object) -> None:
+        raise EndedError
+
+    before = signal.signal(signal.SIGUSR2, handler)
+    try:
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGUSR2)).start()
+        with pytest.raises(EndedError):
+            bounded.bounded(work)
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert cleaned.is_set()
+
+
+def test_workers_do_all_in_turn_and_end() -> None:
+    workers = Workers(3, "turn")
+    futures = [workers.submit(str, number) for number in range(100)]
+    assert [future.result() for future in futures] == list(map(str, range(100)))
+    workers.end()
+    assert not [thread for thread in threading.enumerate() if thread.name == "turn"]
+
+
+LEAVES = """
+import sys, threading
+from coupole import bounded
+def hang():
+    threading.Event().wait()
+if sys.argv[1] == "hung":
+    thread = threading.Thread(target=hang)  # not a daemon: the interpreter would wait for it
+    thread.start()
+    bounded.leave_behind(thread)
+print("all that there is to say")
+bounded.leave(4)
+"""
+
+
+@pytest.mark.parametrize("what", ["hung", "whole"])
+def test_a_process_leaves_with_its_code_and_words_whatever_hangs(what: str) -> None:
+    command = [sys.executable, "-c", LEAVES, what]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (4, "all that there is to say\n")
+
+
+STANDS = """
+import time
+from coupole import bounded
+bounded.DEVICE_S = 1.0
+def take():
+    with bounded.under_way("camera", "next_frame"):
+        print("takes", flush=True)
+        for _ in range(12):
+            time.sleep(0.05)
+bounded.bounded(take, rescue=lambda: print("given up"))
+"""
+
+
+def test_time_in_which_the_process_itself_stood_is_no_hang() -> None:
+    with subprocess.Popen([sys.executable, "-c", STANDS], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "takes\n"
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        process.send_signal(signal.SIGCONT)
+        assert process.stdout.read() == ""
+
+
+UNHEARD = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from coupole.acquisition import signals
+from coupole import bounded
+from coupole.acquisition.signals import raise_outside_sessions, unheard_end
+bounded.STOPPED_S = signals._LEAVES_WITHIN_S = 0.3
+raise_outside_sessions()
+with unheard_end():
+    print("hangs", flush=True)
+    import ctypes
+    mutex = ctypes.create_string_buffer(64)
+    def hang():
+        for _ in range(2):  # the second lock never returns, and no signal ends it, as with a dead disk
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+    if sys.argv[1] == "main thread":
+        hang()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(hang).result()
+"""
+
+
+@pytest.mark.parametrize("what", ["main thread", "thread that the main thread joins"])
+def test_a_signal_ends_a_process_that_waits_for_what_never_returns(what: str) -> None:
+    command = [sys.executable, "-c", UNHEARD, what]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "hangs\n"
+        time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 128 + signal.SIGTERM
+        assert process.stderr is not None
+        assert "waits in a call that does not return" in process.stderr.read()

@@ -216,13 +216,14 @@ def sim(
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job
-    from coupole.preflight.simulated_world import world_config
+    from coupole.preflight.simulated_world import frozen, world_config
 
     job = read_job(plan, rig) if plan else None
     cell = job.cell if job else read_cell(rig)
     driver = cell.rig.world.driver if cell.rig.world else WORLD
     config = world_config(cell, job, cell.rig.sensor, speed=speed) | {"tells_refusals": True}
-    world = load_class(driver).start(config)
+    with frozen(config, cell.files) as frozen_config:
+        world = load_class(driver).start(frozen_config)
     try:
         print(json.dumps(world.endpoints), flush=True)
         world.wait()

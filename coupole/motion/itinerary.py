@@ -20,6 +20,7 @@ from coupole.motion.ordering import shortest_tour
 from coupole.motion.path_deviation import PATH_TOLERANCE_MM
 from coupole.motion.path_planner import Joints, Leg, PathPlanner
 from coupole.motion.sphere_tree import surface_points
+from coupole.plan.input_files import InputFiles
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
 from coupole.plan.rig_devices import described_arm, planning_arm
@@ -68,12 +69,16 @@ def undescribed(rig: Rig) -> InputError:
 
 
 def bodies_of(
-    rig: Rig, leds: LedTable, object_corners_support_mm: NDArray[np.float64], link_meshes: Path | None = None
+    rig: Rig,
+    leds: LedTable,
+    object_corners_support_mm: NDArray[np.float64],
+    link_meshes: Path | None = None,
+    files: InputFiles | None = None,
 ) -> CellBodies:
     """The rig's arm, tool and obstacles, with the object's mesh ([triangles, 3, 3], support frame).
 
-    `link_meshes` is a folder of meshes that replace the capsules of the arm's links; InputError
-    if they cannot be read, or if the arm has no description.
+    `link_meshes` is a folder of meshes that replace the capsules of the arm's links, read from `files` if they are
+    given; InputError if they cannot be read, or if the arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -99,6 +104,7 @@ def bodies_of(
             keep.object_mm, keep.support_mm, keep.dome_mm, keep.self_mm, keep.keep_out_mm, PATH_TOLERANCE_MM
         ),
         link_meshes,
+        files,
     )
 
 

@@ -137,7 +137,7 @@ def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:
     if "camera" in _DEVICES[step]:
         found["led_limits.rise_us"] = rig.led_limits.rise_us
     if step == "lamps":
-        found["dome.leds"] = hashlib.sha256(cell.leds_path.read_bytes()).hexdigest()
+        found["dome.leds"] = cell.files.sha256(cell.leds_path)
     plain: dict[str, JsonValue] = json.loads(json.dumps(found))
     return plain
 

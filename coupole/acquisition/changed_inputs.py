@@ -1,4 +1,4 @@
-"""Tells what happened to a job's files on the disk since they were read. The run uses, and keeps, what was read."""
+"""Tells what happened to a job's files on the disk since they were read; the run uses and keeps what was read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from rich.console import Console
 
 from coupole.acquisition.recorder import Recorder
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 from coupole.storage.journal_events import InputsChanged
 
 _LONGEST_S = 5.0

@@ -261,13 +261,7 @@ def _acquire(
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
             tell_changes(job.cell.files, recorder, console)
-            recorder.note(
-                SessionStopped(
-                    outcome=ended,
-                    reason=str(failure or ""),
-                    robot=_statistics(cell),
-                )
-            )
+            recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=_statistics(cell)))
             recorder.close_quietly()
             found.update({**_figures(run, job, sequencer.outcome), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, ended)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from coupole.calibration.record import Record, read_record
 from coupole.errors import InputError, Problem
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 
 NEEDED = ("camera", "hand-eye")
 """Kinds that are needed to compute the ray of a pixel in the robot's base."""
@@ -46,7 +46,8 @@ class InForce:
 
 
 def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tuple[InForce, ...]:
-    """The records that a plan names, read from `files` if they are given. Raises InputError with the problems of all files."""
+    """The records that a plan names, read from `files` if they are given. Raises InputError with the problems of
+    all files."""
     found: list[InForce] = []
     problems: list[Problem] = []
     others: list[str] = []

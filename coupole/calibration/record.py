@@ -22,8 +22,8 @@ from pydantic import AwareDatetime, Field
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, StorageError, reason
 from coupole.geometry import abc_from_rotation
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
-from coupole.plan.input_files import InputFiles
 from coupole.plan.plan import Model, Name, Pose
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -233,8 +233,8 @@ def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
 
 
 def read_record(path: Path, files: InputFiles | None = None) -> Record:
-    """Read a record back, with the files beside it, from `files` if they are given. Raises InputError with all problems: wrong keys, an edited record, an invalid
-    covariance."""
+    """Read a record back, with the files beside it, from `files` if they are given. Raises InputError with all
+    problems: wrong keys, an edited record, an invalid covariance."""
     files = InputFiles() if files is None else files
     document = yamlfile.read(path, files)
     record = document.validate(Record)

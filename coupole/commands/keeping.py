@@ -92,7 +92,14 @@ def verify(
     _show_verified(console, opened, found)
     if as_json:
         document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames, "listed": found.listed}
-        print(json.dumps({**document, **{key: getattr(found, key) for key in ("bad", "missing", "unlisted", "not_compared")}}))
+        print(
+            json.dumps(
+                {
+                    **document,
+                    **{key: getattr(found, key) for key in ("bad", "missing", "unlisted", "not_compared")},
+                }
+            )
+        )
     if found.bad:
         raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames and {found.listed} files are not right")
     if found.missing:

@@ -13,11 +13,11 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.geometry import apply
+from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import FLANGE
 from coupole.kinematics import Arm, link_frames
 from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
 from coupole.plan.arm_description import ArmDescription
-from coupole.plan.input_files import InputFiles
 from coupole.plan.link_meshes import LINKS, link_mesh_path
 
 LINK_MESH_STEP_MM = 12.0

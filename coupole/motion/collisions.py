@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, inverse
+from coupole.intake.input_files import InputFiles
 from coupole.motion.bodies import (
     Body,
     Capsule,
@@ -31,7 +32,6 @@ from coupole.motion.bodies import (
 )
 from coupole.motion.sphere_tree import MESH_STEP_MM, Floats, Spheres, sphere_trees_of
 from coupole.plan.arm_description import TOOL, ArmDescription
-from coupole.plan.input_files import InputFiles
 
 _NEIGHBOURLY_MM = 25.0
 """Parts of a body that stay farther than this in the postures `near_by_design_deg` are checked all the same."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coupole import kinematics
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
+from coupole.intake.input_files import InputFiles
 from coupole.motion import singularities
 from coupole.motion.bodies import Capsule
 from coupole.motion.collisions import CellBodies, Clearances, Surroundings
@@ -20,7 +21,6 @@ from coupole.motion.ordering import shortest_tour
 from coupole.motion.path_deviation import PATH_TOLERANCE_MM
 from coupole.motion.path_planner import Joints, Leg, PathPlanner
 from coupole.motion.sphere_tree import surface_points
-from coupole.plan.input_files import InputFiles
 from coupole.plan.led_table import LedTable
 from coupole.plan.rig import KeepOutBox, KeepOutSphere, Rig
 from coupole.plan.rig_devices import described_arm, planning_arm

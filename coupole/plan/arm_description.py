@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import Axis, JointChain
 from coupole.kinematics import Arm, structure_of
 from coupole.plan import yamlfile
-from coupole.plan.input_files import InputFiles
 from coupole.plan.plan import Degrees, FilePath, Length, Model, Pose, Vector
 from coupole.plan.registry import ARMS_OF_DRIVERS, UR
 from coupole.plan.validation_messages import KeyPath
@@ -147,7 +147,8 @@ class ArmDescription(Model):
 
 
 def read_arm(path: Path, files: InputFiles | None = None) -> ArmDescription:
-    """Read an arm's file, from `files` if they are given. Raises InputError with all problems, each at its line and column."""
+    """Read an arm's file, from `files` if they are given. Raises InputError with all problems, each at its line
+    and column."""
     document = yamlfile.read(path, files)
     description, problems = document.problems(ArmDescription)
     if description is not None:

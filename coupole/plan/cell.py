@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from coupole.errors import InputError, Problem, reason
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
-from coupole.plan.input_files import InputFiles
 from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.link_meshes import missing_link_meshes
 from coupole.plan.rig import Rig

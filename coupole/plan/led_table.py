@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.errors import InputError, Problem
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 
 COLUMNS = ("id", "board", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "flux_lm")
 
@@ -50,7 +50,8 @@ class LedTable:
 
 
 def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
-    """Read a dome's CSV, from `files` if they are given (`#` comments, then a header, then one LED a line); InputError with all its problems."""
+    """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given;
+    InputError with all its problems."""
     problems: list[Problem] = []
     rows: list[list[float]] = []
     first_line_of_id: dict[int, int] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 
 LINKS = 7
 """The base and six links."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell, read_cell
-from coupole.plan.input_files import InputFiles
 from coupole.plan.light_selection import missing_lights
 from coupole.plan.plan import Plan, possible_path
 from coupole.plan.rig import Rig

@@ -27,7 +27,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from coupole.errors import InputError, Problem
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 from coupole.plan.validation_messages import KeyPath, Mistake, key_text, mistakes_of
 
 M = TypeVar("M", bound=BaseModel)
@@ -68,8 +68,8 @@ class Document:
     _resolved: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def resolve(self, path: Path) -> Path:
-        """`path` made absolute; a relative one is relative to this document's folder. Links are followed once: they
-        lead to the same place as long as the document is used."""
+        """`path` made absolute; a relative one is relative to this document's folder. Links are followed once:
+        they lead to the same place as long as the document is used."""
         if path not in self._resolved:
             self._resolved[path] = (self.path.parent / path.expanduser()).resolve()
         return self._resolved[path]
@@ -141,7 +141,8 @@ def read(path: Path, files: InputFiles | None = None) -> Document:
 def parse(path: Path, text: str) -> Document:
     """The same of a file's text; `path` is where it is, or was."""
     try:
-        return Document(path, *pickle.loads(_parsed(text)), text)
+        data, value_places, key_places = pickle.loads(_parsed(text))
+        return Document(path, data, value_places, key_places, text)
     except InputError as error:
         raise InputError([replace(problem, file=str(path)) for problem in error.problems]) from error
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.record import Record
 from coupole.errors import InputError
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 from coupole.plan.light_selection import leds_of_plan
 
 if TYPE_CHECKING:

@@ -53,9 +53,7 @@ class Job:
         others = [self.cell.leds_path] + ([self.shape.mesh_path] if self.shape.mesh_path else [])
         others += [item.path for item in self.calibrations or ()]
         rig = self.cell.document.path
-        return Inputs(
-            self.document.path, rig, tuple(others), described_arm(self.cell.rig), files=self.cell.files
-        )
+        return Inputs(self.document.path, rig, tuple(others), described_arm(self.cell.rig), files=self.cell.files)
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, reason
 from coupole.geometry import apply
-from coupole.plan.input_files import InputFiles
+from coupole.intake.input_files import InputFiles
 from coupole.plan.plan import MeasuredObject
 from coupole.plan.reading import PlanFiles
 from coupole.scan.mesh_files import read_mesh

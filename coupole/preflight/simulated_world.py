@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan.cell import Cell
-from coupole.plan.input_files import InputFiles
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import camera_kind, device_for, ledbox_stand_in, stand_in_for, world_problems
 from coupole.preflight.exposure_scale import exposure_scale, white_share
@@ -89,8 +89,8 @@ def world_config(
 
 @contextmanager
 def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]]:
-    """The same world of copies of the bytes that were read, for as long as it starts: it reads its files itself, in
-    another process, and must read what was checked."""
+    """The same world of copies of the bytes that were read, for as long as it starts: it reads its files itself,
+    in another process, and must read what was checked."""
     scene = config["scene"]
     with tempfile.TemporaryDirectory(prefix="coupole-inputs-") as folder:
 

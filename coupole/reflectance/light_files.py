@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.intake.plain_data import json_of
 
 Floats = NDArray[np.float64]
 
@@ -111,10 +112,7 @@ def _is_number(value: object) -> bool:
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
-        refuse(path, f"is no JSON: {error}")
+    document = json_of(_text(path), str(path))
     if not isinstance(document, dict):
         refuse(path, "expected a JSON object")
     return document

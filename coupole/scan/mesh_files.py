@@ -12,7 +12,7 @@ from pathlib import Path
 
 from coupole.errors import InputError
 from coupole.scan.mesh import MOST_VERTICES, Mesh
-from coupole.scan.mesh_file import MeshFile
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_obj import read_obj
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.mesh_stl import read_stl

@@ -8,7 +8,7 @@ import numpy as np
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import Mesh, expect_finite, expect_text
-from coupole.scan.mesh_file import MeshFile
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_corners, expect_finite, expect_records, expect_room, expect_text
-from coupole.scan.mesh_file import MeshFile, read_records
+from coupole.scan.mesh_bytes import MeshFile, read_records
 from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK, TOO_FEW
 
 _PLY_TYPES = {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_finite, expect_text
-from coupole.scan.mesh_file import MeshFile, read_records
+from coupole.scan.mesh_bytes import MeshFile, read_records
 from coupole.scan.mesh_text import NOT_A_NUMBER, OK
 
 _STL_RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -1,8 +1,8 @@
-"""Whether frames are what the run's own plan asked for: light, exposure and pose, by the plan and the rig that the run
-keeps in `inputs/`.
+"""Whether frames are what the run's own plan asked for: light, exposure and pose, by the plan and the rig that the
+run keeps in `inputs/`.
 
-A frame's LED is as the box logged it, its exposure as it was commanded, its pose as the arm's joints were measured.
-The object's mesh is not needed for it.
+A frame's LED is as the box logged it, its exposure as it was commanded, its pose by the arm's joints as they were
+measured. The object's mesh is not needed for it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from coupole.devices import NO_LED
 from coupole.errors import InputError
 from coupole.geometry import inverse, rotation_angle_deg
+from coupole.intake.input_files import InputFiles
 from coupole.kinematics import Arm, forward
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
-from coupole.plan.input_files import InputFiles
 from coupole.plan.led_table import read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
@@ -60,7 +60,7 @@ class AsPlanned:
                 yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
 
     def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
-        """How a frame's record (FRAME_DTYPE) and its pose (POSE_DTYPE) differ from the plan; empty if they do not."""
+        """How a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do not."""
         asked = self._asked(shot.view).get(shot.label)
         if asked is None:
             return f"{shot}: the run's plan has no such shot" if shot.is_shot else ""

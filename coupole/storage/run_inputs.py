@@ -24,9 +24,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import ArmDescription
-from coupole.plan.input_files import InputFiles
 from coupole.plan.link_meshes import LINKS, link_mesh_path
 from coupole.plan.plan import Plan
 from coupole.plan.rewriting import differences, named_paths, rewritten
@@ -54,11 +54,12 @@ class Inputs:
     copy_large: bool = False
     """Copy files of more than MOST_COPIED_BYTES, too."""
     files: InputFiles = field(default_factory=InputFiles)
-    """Their bytes, as the job was made of them: these are hashed, compared and kept, whatever is on the disk now."""
+    """Their bytes, as the job was made of them: these are hashed, compared and kept, whatever the disk has now."""
 
 
 def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
-    """Write the inputs, as they were read, into a run's folder; returns what `run.json` says of them. All is on the disk afterwards."""
+    """Write the inputs, as they were read, into a run's folder; returns what `run.json` says of them. All is on
+    the disk afterwards."""
     keeper = _Keeper(run, inputs.files, inputs.copy_large)
     make_folder(run / FOLDER)
     described = {
@@ -153,9 +154,9 @@ class _Keeper:
         """Copy a file into a folder of `inputs`; None if it is too large, or not there."""
         path = path.absolute()
         if path not in self.stored:
-            if not self.files.there(path):
-                self.stored[path] = None
-            elif len(self.files.read(path)) > MOST_COPIED_BYTES and not self.copy_large:
+            if not self.files.there(path) or (
+                len(self.files.read(path)) > MOST_COPIED_BYTES and not self.copy_large
+            ):
                 self.stored[path] = None
             else:
                 name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)
@@ -235,9 +236,7 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
     before = {entry["sha256"] for entry in about["files"]}
     kept = InputFiles()
     copies = [(run / entry["stored"], entry["sha256"]) for entry in about["files"] if entry.get("stored")]
-    before |= {
-        _meaning(path, kept) for path, digest in copies if path.is_file() and kept.sha256(path) == digest
-    }
+    before |= {_meaning(path, kept) for path, digest in copies if path.is_file() and kept.sha256(path) == digest}
     found += [
         f"{path} is another file"
         for path in now.others

@@ -1,8 +1,8 @@
 """The files that a job depends on, each read once.
 
 Plan, rig, LED table, mesh, records and the files beside them are read into memory by the first reader, and hashed.
-Whoever asks again gets the same bytes: what is checked, what is run and what a run keeps in `inputs/` cannot differ,
-whatever happens to a file on the disk meanwhile. `changes` says what did.
+Whoever asks again gets the same bytes: what is checked, what is run and what a run keeps in `inputs/` cannot
+differ, whatever happens to a file on the disk meanwhile. `changes` says what did.
 """
 
 from __future__ import annotations
@@ -83,10 +83,11 @@ def _change(path: Path, read: _Read) -> str:
             return "is no file any more"
         if about.st_size == read.stamp[2]:
             with path.open("rb") as file:
-                if hashlib.file_digest(file, "sha256").hexdigest() == read.sha256:
-                    return ""
-        return "was changed"
+                same = hashlib.file_digest(file, "sha256").hexdigest() == read.sha256
+        else:
+            same = False
     except FileNotFoundError:
         return "is not there any more"
     except OSError as error:
         return f"cannot be read any more ({reason(error)})"
+    return "" if same else "was changed"

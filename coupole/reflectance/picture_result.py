@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, reason
 from coupole.intake.plain_data import read_json
 
 Floats = NDArray[np.float32]
@@ -52,7 +52,8 @@ class PictureResult:
         try:
             about = read_json(path, allow_nan=True)
         except (OSError, InputError) as error:
-            problem = Problem(str(path), 0, 0, "", "expected the result of `coupole reflectance --pictures`")
+            what = "expected the result of `coupole reflectance --pictures`"
+            problem = Problem(str(path), 0, 0, "", f"{what}; {reason(error)}")
             raise InputError([problem]) from error
         if not isinstance(about, dict) or about.get("schema") != SCHEMA:
             raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])

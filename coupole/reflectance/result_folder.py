@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.intake.plain_data import read_json
 from coupole.storage.durable import make_folder, sync_folder
 
@@ -42,9 +42,9 @@ def read_settings(out: Path) -> dict[str, Any]:
     try:
         settings = read_json(path, allow_nan=True)
         if not isinstance(settings, dict) or "view_names" not in settings:
-            raise ValueError
+            raise ValueError("found others")
     except (OSError, InputError, ValueError) as error:
-        raise InputError(f"{path}: expected the settings of a result of runs") from error
+        raise InputError(f"{path}: expected the settings of a result of runs; {reason(error)}") from error
     if not {"subtracted", "refined"} <= set(settings):
         raise InputError(f"{path}: was begun by an earlier version; make the result anew, with another --out")
     return settings

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, reason
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.cluster_file import Clusters, read_clusters
 from coupole.reflectance.ggx import UNKNOWNS
@@ -357,7 +357,7 @@ def read_about(folder: Path) -> dict[str, Any]:
     try:
         about = read_json(path, allow_nan=True)
     except (OSError, InputError) as error:
-        problem = Problem(str(path), 0, 0, "", "expected the result of `coupole reflectance`")
+        problem = Problem(str(path), 0, 0, "", f"expected the result of `coupole reflectance`; {reason(error)}")
         raise InputError([problem]) from error
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])

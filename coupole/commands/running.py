@@ -134,7 +134,7 @@ def meter(
         with borrowed(job.cell, f"meter {plan.name}"):
             advice = meter_plan(job, console, Request(saturated, snr, share), confirm=not yes)
         if write is not None:
-            write_plan(plan, write, advice.exposure)
+            write_plan(job.document, write, advice.exposure)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise

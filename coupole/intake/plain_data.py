@@ -57,8 +57,8 @@ def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = Fal
     text = _decoded(raw, name, line)
 
     def whole(token: str) -> int:
-        if len(token) > MAX_DIGITS:
-            raise _Refused(token, f"a number of {len(token)} digits; expected {MAX_DIGITS} at most")
+        if (digits := len(token.removeprefix("-"))) > MAX_DIGITS:
+            raise _Refused(token, f"a number of {digits} digits; expected {MAX_DIGITS} at most")
         return int(token)
 
     def constant(token: str) -> float:

@@ -52,6 +52,7 @@ class LedTable:
 def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
     """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given;
     InputError with all its problems."""
+    files = InputFiles() if files is None else files
     problems: list[Problem] = []
     rows: list[list[float]] = []
     first_line_of_id: dict[int, int] = {}
@@ -60,10 +61,9 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
         problems.append(Problem(str(path), line, 1 if line else 0, key, message))
 
     try:
-        raw = (files or InputFiles()).read(path)
-        if len(raw) > _MOST_BYTES:
-            raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {len(raw)}")
-        lines = raw.decode("utf-8").splitlines()
+        if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
+            raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
+        lines = files.read(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
     numbered = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]

@@ -65,6 +65,8 @@ def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -
         data = files.read(mesh_path)
     except OSError as error:
         raise InputError(f"{mesh_path}: {reason(error)}") from error
+    except MemoryError as error:
+        raise InputError(f"{mesh_path}: it does not fit into this machine's memory") from error
     mesh = read_mesh(mesh_path, data)
     corners = mesh.vertices.astype(np.float64)[mesh.triangles] * MM_PER_UNIT[measured.mesh_unit]
     return apply(measured.support_from_object.matrix(), corners)

@@ -173,3 +173,12 @@ def test_a_kept_plan_that_is_not_understood_is_said_not_to_be_compared(done: Pat
     verified = cells.here("verify", run, "--json")
     assert verified.code == 0
     assert "coupole.csv" in verified.document["not_compared"]
+
+
+def test_a_resume_refuses_the_runs_own_copy_if_it_was_edited(done: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(done, tmp_path / "run"))
+    kept = run / "inputs/plan.yaml"
+    kept.write_text(kept.read_text().replace("8000", "16000"))
+    resumed = cells.here("acquire", "--resume", run, "--json", "--yes")
+    assert resumed.code == 2
+    assert without_blanks("exposure_us was 8000, is 16000") in without_blanks(resumed.document["error"])

@@ -132,7 +132,12 @@ def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
     """The head, the number of the line of names, and the lines from there."""
     lines = text.splitlines()
     end = next((at for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
-    head: Any = yaml_of("\n".join(line[1:].strip(" ") for line in lines[1:end]), str(path), line=2)
+    told = "\n".join(line[1:].strip(" ") for line in lines[1:end])
+    try:
+        head: Any = yaml_of(told, str(path), line=2)
+    except InputError as error:
+        first = error.problems[0]
+        raise _wrong(path, first.line, f"expected YAML in the lines that begin with #: {first.message}") from error
     if not isinstance(head, dict):
         raise _wrong(path, 2, "expected `name`, `unit` and `binder_index` in lines that begin with #")
     if end == len(lines):

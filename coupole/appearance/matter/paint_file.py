@@ -137,7 +137,7 @@ def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
         head: Any = yaml_of(told, str(path), line=2)
     except InputError as error:
         first = error.problems[0]
-        raise _wrong(path, first.line, f"expected YAML in the lines that begin with #: {first.message}") from error
+        raise _wrong(path, 2, f"expected YAML in the lines that begin with #: {first.message}") from error
     if not isinstance(head, dict):
         raise _wrong(path, 2, "expected `name`, `unit` and `binder_index` in lines that begin with #")
     if end == len(lines):

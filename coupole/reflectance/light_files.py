@@ -112,7 +112,10 @@ def _is_number(value: object) -> bool:
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    document = json_of(_text(path), str(path))
+    try:
+        document = json_of(_text(path), str(path))
+    except InputError as error:
+        refuse(path, f"is no JSON: {error}")
     if not isinstance(document, dict):
         refuse(path, "expected a JSON object")
     return document

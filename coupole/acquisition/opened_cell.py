@@ -21,7 +21,7 @@ from coupole.plan.cell import Cell
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import device_for, in_world
-from coupole.preflight.simulated_world import coarse, world_config
+from coupole.preflight.simulated_world import coarse, frozen, world_config
 from coupole.viewing.terminal import alarm
 
 if TYPE_CHECKING:
@@ -170,5 +170,8 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
     world_class = load_class(driver)
     if section is not None and section.join is not None and not dry_run:
         return world_class.join(cell.document.resolve(section.join))
-    with under_way("world", "start", _WORLD_STARTS_S):
-        return world_class.start(world_config(cell, job, sensor, dry_run=dry_run, speed=speed))
+    with (
+        frozen(world_config(cell, job, sensor, dry_run=dry_run, speed=speed), cell.files) as config,
+        under_way("world", "start", _WORLD_STARTS_S),
+    ):
+        return world_class.start(config)

@@ -14,7 +14,6 @@ and the arm was told to stop, or after 4 s with what is not sure (`trouble`); wh
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ from coupole.acquisition.runtime_folder import named_after, runtime_folder
 from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.acquisition.user_socket import PATIENCE_S, UserSocket, exchange
 from coupole.errors import InputError, reason
+from coupole.intake.plain_data import json_of
 from coupole.viewing.progress import Progress
 
 VERSION = 1
@@ -85,9 +85,9 @@ class RunControl:
 
     def _answer(self, line: bytes) -> State:
         try:
-            request = json.loads(line)
+            request = json_of(line, "request")
             version, command = request["version"], request["command"]
-        except (ValueError, TypeError, KeyError):
+        except (InputError, TypeError, KeyError):
             return {"version": VERSION, "error": "expected one line of JSON with `version` and `command`"}
         if version != VERSION:
             return {"version": VERSION, "error": f"expected version {VERSION}, found {version!r}"}

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
+from coupole.acquisition.changed_inputs import tell_changes
 from coupole.acquisition.conclusion import close_complete, conclude, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
@@ -140,6 +141,7 @@ def _acquire_into(
             begun = SessionResumed if resumed else SessionStarted
             acknowledged = on_disk(str(faults.path), partial(faults.begin_session, run.folder.name))
             recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
+            tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, found=found)
@@ -267,6 +269,7 @@ def _acquire(
             for trouble in cell.trouble:
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
+            tell_changes(job.cell.files, recorder, console)
             recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
             if left_behind():

@@ -16,6 +16,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from coupole.errors import InputError
+from coupole.intake.plain_data import json_of
+
 LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
@@ -80,7 +83,11 @@ def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENC
         connection.settimeout(patience_s)
         connection.connect(str(path))
         connection.sendall(json.dumps(request).encode() + b"\n")
-        found: dict[str, Any] = json.loads(_line(connection, _LONGEST_ANSWER_BYTES))
+        answer = _line(connection, _LONGEST_ANSWER_BYTES)
+    try:
+        found: dict[str, Any] = json_of(answer, str(path), allow_nan=True)
+    except InputError as error:
+        raise ValueError(str(error)) from error
     return found
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from coupole.calibration.record import Record, read_record
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 
 NEEDED = ("camera", "hand-eye")
 """Kinds that are needed to compute the ray of a pixel in the robot's base."""
@@ -44,14 +45,15 @@ class InForce:
     record: Record
 
 
-def read_in_force(paths: Sequence[Path]) -> tuple[InForce, ...]:
-    """The records that a plan names. Raises InputError with the problems of all files."""
+def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tuple[InForce, ...]:
+    """The records that a plan names, read from `files` if they are given. Raises InputError with the problems of
+    all files."""
     found: list[InForce] = []
     problems: list[Problem] = []
     others: list[str] = []
     for path in paths:
         try:
-            found.append(InForce(path, read_record(path)))
+            found.append(InForce(path, read_record(path, files)))
         except InputError as error:
             problems += error.problems
             others += [] if error.problems else [str(error)]

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from pydantic import AwareDatetime, Field
 
 from coupole.calibration.optics import NAMES, Intrinsics
-from coupole.errors import InputError, StorageError
+from coupole.errors import InputError, StorageError, reason
 from coupole.geometry import abc_from_rotation
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.plan import Model, Name, Pose
 
@@ -231,17 +232,18 @@ def write_sealed(path: Path, plain: dict[str, Any], head: str) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_record(path: Path) -> Record:
-    """Read a record back. Raises InputError with all problems: wrong keys, an edited record, an invalid
-    covariance."""
-    document = yamlfile.read(path)
+def read_record(path: Path, files: InputFiles | None = None) -> Record:
+    """Read a record back, with the files beside it, from `files` if they are given. Raises InputError with all
+    problems: wrong keys, an edited record, an invalid covariance."""
+    files = InputFiles() if files is None else files
+    document = yamlfile.read(path, files)
     record = document.validate(Record)
     plain = json.loads(record.model_dump_json())
     if content_sha256(plain) != record.sha256:
         message = "the record was edited after it was made: its content has another checksum. Calibrate anew."
         raise InputError([document.problem(("sha256",), message)])
     problems = [document.problem(("covariance",), message) for message in _covariance_problems(record)]
-    problems += [document.problem(("files",), message) for message in _file_problems(record, path.parent)]
+    problems += [document.problem(("files",), message) for message in _file_problems(record, path.parent, files)]
     if problems:
         raise InputError(problems)
     return record
@@ -280,12 +282,12 @@ def _covariance_problems(record: Record) -> Iterator[str]:
         yield "expected a matrix without negative eigenvalues"
 
 
-def _file_problems(record: Record, folder: Path) -> Iterator[str]:
+def _file_problems(record: Record, folder: Path, files: InputFiles) -> Iterator[str]:
     for file in record.files:
         try:
-            found = hashlib.sha256((folder / file.name).read_bytes()).hexdigest()
+            found = files.sha256(folder / file.name)
         except OSError as error:
-            yield f"expected {file.name} beside the record: {error.strerror}"
+            yield f"expected {file.name} beside the record: {reason(error)}"
             continue
         if found != file.sha256:
             yield f"{file.name} beside the record was changed after it was made: it has another checksum"

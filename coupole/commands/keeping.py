@@ -67,7 +67,8 @@ def verify(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Read a run back: every frame, its completeness and checksums, and every file that the manifest lists."""
+    """Read a run back: every frame, its completeness and checksums, whether its light, exposure and pose are those
+    of the run's plan, and every file that the manifest lists."""
     from rich.progress import Progress
 
     from coupole.storage import manifest
@@ -91,7 +92,14 @@ def verify(
     _show_verified(console, opened, found)
     if as_json:
         document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames, "listed": found.listed}
-        print(json.dumps({**document, **{key: getattr(found, key) for key in ("bad", "missing", "unlisted")}}))
+        print(
+            json.dumps(
+                {
+                    **document,
+                    **{key: getattr(found, key) for key in ("bad", "missing", "unlisted", "not_compared")},
+                }
+            )
+        )
     if found.bad:
         raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames and {found.listed} files are not right")
     if found.missing:
@@ -101,12 +109,16 @@ def verify(
 
 
 def _show_verified(console: Console, run: Run, found: Verification) -> None:
+    from rich.markup import escape
+
     for problem in found.bad:
         console.print("[red]bad:[/]", problem)
     if found.missing:
         console.print(f"[yellow]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
     if found.ok:
         console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {run.proof}")
+    if found.not_compared:
+        console.print(f"[yellow]not compared with the plan:[/] {escape(found.not_compared)}")
     if found.listed and not found.bad:
         console.print(f"{found.listed} files are as manifest.sha256 lists them")
     if found.unlisted:

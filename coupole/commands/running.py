@@ -135,7 +135,7 @@ def meter(
         with borrowed(job.cell, f"meter {plan.name}"):
             advice = meter_plan(job, console, Request(saturated, snr, share), confirm=not yes)
         if write is not None:
-            write_plan(plan, write, advice.exposure)
+            write_plan(job.document, write, advice.exposure)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -217,13 +217,14 @@ def sim(
     from coupole.plan.cell import read_cell
     from coupole.plan.registry import WORLD, load_class
     from coupole.preflight.job import read_job
-    from coupole.preflight.simulated_world import world_config
+    from coupole.preflight.simulated_world import frozen, world_config
 
     job = read_job(plan, rig) if plan else None
     cell = job.cell if job else read_cell(rig)
     driver = cell.rig.world.driver if cell.rig.world else WORLD
     config = world_config(cell, job, cell.rig.sensor, speed=speed) | {"tells_refusals": True}
-    world = load_class(driver).start(config)
+    with frozen(config, cell.files) as frozen_config:
+        world = load_class(driver).start(frozen_config)
     try:
         print(json.dumps(world.endpoints), flush=True)
         world.wait()

@@ -41,7 +41,7 @@ def with_things(rig_path: Path, things: Sequence[Mapping[str, Any]], path: Path,
     changes = {at: str(document.resolve(value)) for at, value in written}
     yaml = YAML()
     yaml.width = 4096
-    content = yaml.load(rewritten(document, yamlfile.text_of(rig_path), changes))
+    content = yaml.load(rewritten(document, document.text, changes))
     if runs is not None:
         content["storage"]["folder"] = str(runs)
     settings = content["world"].setdefault("settings", {})

@@ -3,6 +3,7 @@ axes."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.geometry import apply
+from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import FLANGE
 from coupole.kinematics import Arm, link_frames
 from coupole.motion.sphere_tree import Floats, Spheres, spheres_of, surface_points
@@ -65,26 +67,27 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
     return bodies
 
 
-def bodies_of_meshes(folder: Path, arm: ArmDescription) -> list[Body]:
+def bodies_of_meshes(folder: Path, arm: ArmDescription, files: InputFiles | None = None) -> list[Body]:
     """The base and the six links from `base_link.stl` and `link_1.stl` to `link_6.stl`, in the links' frames, in
         metres or mm, with the names of the arm's description. Raises InputError if one of them cannot
     be read."""
     names = {link.link: link.name for link in arm.links}
     bodies = []
     for link in range(LINKS):
-        points = surface_points(link_corners(folder, link), LINK_MESH_STEP_MM)
+        points = surface_points(link_corners(folder, link, files), LINK_MESH_STEP_MM)
         spheres = Spheres(points, np.full(len(points), LINK_MESH_STEP_MM))
         bodies.append(Body(names.get(link, "base"), link, spheres))
     return bodies
 
 
-def link_corners(folder: Path, link: int) -> Floats:
-    """Triangles [n, 3, 3] of a link's mesh, mm. Raises InputError."""
+def link_corners(folder: Path, link: int, files: InputFiles | None = None) -> Floats:
+    """Triangles [n, 3, 3] of a link's mesh, mm, read from `files` if they are given. Raises InputError."""
     import trimesh
 
     path = link_mesh_path(folder, link)
     try:
-        mesh: Any = trimesh.load(path, process=False, force="mesh")
+        data = io.BytesIO((files or InputFiles()).read(path))
+        mesh: Any = trimesh.load(data, file_type="stl", process=False, force="mesh")
     except Exception as error:  # any exception of trimesh means that the file is not a readable mesh
         raise InputError(f"{path}: expected the mesh of link {link}; {error}") from error
     corners: Floats = np.asarray(mesh.vertices, dtype=np.float64)[np.asarray(mesh.faces)]

@@ -38,7 +38,7 @@ class CellMotion:
     def bodies(self) -> CellBodies:
         """Arm, tool and all obstacles."""
         cell = self._cell
-        return bodies_of(cell.rig, cell.leds, self._object_corners_mm, cell.link_meshes)
+        return bodies_of(cell.rig, cell.leds, self._object_corners_mm, cell.link_meshes, cell.files)
 
     @cached_property
     def occlusions(self) -> Occlusions:

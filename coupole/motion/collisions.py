@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.geometry import Transform, inverse
+from coupole.intake.input_files import InputFiles
 from coupole.motion.bodies import (
     Body,
     Capsule,
@@ -111,11 +112,13 @@ class CellBodies:
         tool: Sequence[Capsule],
         clearances: Clearances | None = None,
         link_meshes: Path | None = None,
+        files: InputFiles | None = None,
     ) -> None:
         self._described, self._arm = arm, arm.arm
         self._around, self._keep = surroundings, clearances or Clearances()
         self._has_meshes = link_meshes is not None
-        self._links = bodies_of_meshes(link_meshes, arm) if link_meshes else bodies_of_capsules(capsules_of(arm))
+        meshes = bodies_of_meshes(link_meshes, arm, files) if link_meshes else None
+        self._links = meshes or bodies_of_capsules(capsules_of(arm))
         self._tools = bodies_of_capsules(tool)
         self._pairs = [*self._pairs_with_surroundings(), *self._pairs_of_the_arm()]
 

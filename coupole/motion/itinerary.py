@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coupole import kinematics
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
+from coupole.intake.input_files import InputFiles
 from coupole.motion import singularities
 from coupole.motion.bodies import Capsule
 from coupole.motion.collisions import CellBodies, Clearances, Surroundings
@@ -68,12 +69,16 @@ def undescribed(rig: Rig) -> InputError:
 
 
 def bodies_of(
-    rig: Rig, leds: LedTable, object_corners_support_mm: NDArray[np.float64], link_meshes: Path | None = None
+    rig: Rig,
+    leds: LedTable,
+    object_corners_support_mm: NDArray[np.float64],
+    link_meshes: Path | None = None,
+    files: InputFiles | None = None,
 ) -> CellBodies:
     """The rig's arm, tool and obstacles, with the object's mesh ([triangles, 3, 3], support frame).
 
-    `link_meshes` is a folder of meshes that replace the capsules of the arm's links; InputError
-    if they cannot be read, or if the arm has no description.
+    `link_meshes` is a folder of meshes that replace the capsules of the arm's links, read from `files` if they are
+    given; InputError if they cannot be read, or if the arm has no description.
     """
     arm = described_arm(rig)
     if arm is None:
@@ -99,6 +104,7 @@ def bodies_of(
             keep.object_mm, keep.support_mm, keep.dome_mm, keep.self_mm, keep.keep_out_mm, PATH_TOLERANCE_MM
         ),
         link_meshes,
+        files,
     )
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import Axis, JointChain
 from coupole.kinematics import Arm, structure_of
 from coupole.plan import yamlfile
@@ -145,9 +146,10 @@ class ArmDescription(Model):
         return tuple(joint.posture_limits_deg or joint.limits_deg for joint in self.joints)
 
 
-def read_arm(path: Path) -> ArmDescription:
-    """Read an arm's file. Raises InputError with all problems, each at its line and column."""
-    document = yamlfile.read(path)
+def read_arm(path: Path, files: InputFiles | None = None) -> ArmDescription:
+    """Read an arm's file, from `files` if they are given. Raises InputError with all problems, each at its line
+    and column."""
+    document = yamlfile.read(path, files)
     description, problems = document.problems(ArmDescription)
     if description is not None:
         problems = description_problems(document, description)
@@ -211,7 +213,11 @@ def shipped_arm(name: str) -> ArmDescription:
 
 
 def arm_named(
-    document: Document, named: Path | ArmDescription | None, driver: str, settings: Mapping[str, Any]
+    document: Document,
+    named: Path | ArmDescription | None,
+    driver: str,
+    settings: Mapping[str, Any],
+    files: InputFiles,
 ) -> tuple[ArmDescription | None, list[Problem]]:
     """The arm under `arm:` in a rig's document, or else its driver's, and the problems found in it."""
     if isinstance(named, ArmDescription):
@@ -224,10 +230,10 @@ def arm_named(
         except InputError as error:
             return None, list(error.problems) or [document.problem(("robot", "settings", "model"), str(error))]
     path = document.resolve(named)
-    if not path.is_file():
+    if not files.there(path):
         return None, [document.problem(("arm",), f"expected the arm's file; there is no {path}")]
     try:
-        return read_arm(path), []
+        return read_arm(path, files), []
     except InputError as error:
         return None, list(error.problems)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from coupole.errors import InputError, Problem, reason
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
 from coupole.plan.led_table import LedTable, read_led_table
@@ -29,6 +30,8 @@ class Cell:
     """Damaging power of the LEDs' light (`coupole.appearance.spectra.damage`); None if their spectrum is not
     known."""
     panel_damage_w_per_lm: float | None = None
+    files: InputFiles = field(default_factory=InputFiles, repr=False, compare=False)
+    """What was read; whoever needs one of these files again gets the same bytes."""
 
     @property
     def leds_path(self) -> Path:
@@ -70,50 +73,53 @@ def users_ledger_folder() -> Path:
     return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole/ledger"
 
 
-def read_cell(path: Path) -> Cell:
-    """Read a rig and its dome. Raises InputError with all problems."""
-    document = yamlfile.read(path)
+def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
+    """Read a rig and its dome, into `files` if they are given. Raises InputError with all problems."""
+    files = InputFiles() if files is None else files
+    document = yamlfile.read(path, files)
     rig, problems = document.problems(Rig)
     if rig is None:
         raise InputError(problems)
-    arm, problems = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings)
+    arm, problems = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)
     if problems:
         raise InputError(problems)
     rig = rig.model_copy(update={"arm": arm})
     problems = driver_problems(document, rig)
     leds: LedTable | None = None
     leds_path = document.resolve(rig.dome.leds)
-    if not leds_path.is_file():
+    if not files.there(leds_path):
         problems.append(document.problem(("dome", "leds"), f"expected the dome's CSV; there is no {leds_path}"))
     else:
         try:
-            leds = read_led_table(leds_path)
+            leds = read_led_table(leds_path, files)
         except InputError as error:
             problems += error.problems
     if rig.storage.pixels == "packed12" and (rig.sensor.bit_depth > 12 or rig.sensor.width_px % 2):
         why = f"expected an even width and 12 bits at most, found {rig.sensor.width_px} and {rig.sensor.bit_depth}"
         problems.append(document.problem(("storage", "pixels"), f"frames cannot be packed: {why}"))
-    led_w_per_lm = _damage_w_per_lm(document, "spectrum", rig.dome.spectrum, problems)
-    panel_w_per_lm = _damage_w_per_lm(document, "panel_spectrum", rig.dome.panel_spectrum, problems)
+    led_w_per_lm = _damage_w_per_lm(document, "spectrum", rig.dome.spectrum, files, problems)
+    panel_w_per_lm = _damage_w_per_lm(document, "panel_spectrum", rig.dome.panel_spectrum, files, problems)
     if problems or leds is None:
         raise InputError(problems)
-    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)), led_w_per_lm, panel_w_per_lm)
-    if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes)):
+    cell = Cell(rig, document, leds, tuple(renamed_drivers(document)), led_w_per_lm, panel_w_per_lm, files)
+    if cell.link_meshes is not None and (missing := missing_link_meshes(cell.link_meshes, files)):
         at = ("link_meshes",) if rig.link_meshes else ("arm",)
         raise InputError([document.problem(at, f"expected the links' meshes; there is no {missing[0]}")])
     return cell
 
 
-def _damage_w_per_lm(document: Document, key: str, given: Path | None, problems: list[Problem]) -> float | None:
+def _damage_w_per_lm(
+    document: Document, key: str, given: Path | None, files: InputFiles, problems: list[Problem]
+) -> float | None:
     """Of the lamps whose spectrum is in this file; None if none is given, or it adds to `problems`."""
     if given is None:
         return None
     from coupole.appearance.spectra.damage import damage_w_per_lm
-    from coupole.appearance.spectra.measured import read_spectrum
+    from coupole.appearance.spectra.measured import decoded, parse_spectrum
 
     path = document.resolve(given)
     try:
-        return damage_w_per_lm(read_spectrum(path, unit="power"))
+        return damage_w_per_lm(parse_spectrum(decoded(files.read(path)), str(path), name=path.stem, unit="power"))
     except (OSError, UnicodeDecodeError) as error:
         problems.append(document.problem(("dome", key), f"cannot read the spectrum {path}: {reason(error)}"))
     except InputError as error:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 
 COLUMNS = ("id", "board", "x_mm", "y_mm", "z_mm", "nx", "ny", "nz", "flux_lm")
 
@@ -48,8 +49,10 @@ class LedTable:
         return np.array([row_of_id[int(led)] for led in np.asarray(ids).ravel()], np.int64)
 
 
-def read_led_table(path: Path) -> LedTable:
-    """Read a dome's CSV (`#` comments, then a header, then one LED a line); InputError with all its problems."""
+def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
+    """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given;
+    InputError with all its problems."""
+    files = InputFiles() if files is None else files
     problems: list[Problem] = []
     rows: list[list[float]] = []
     first_line_of_id: dict[int, int] = {}
@@ -58,9 +61,9 @@ def read_led_table(path: Path) -> LedTable:
         problems.append(Problem(str(path), line, 1 if line else 0, key, message))
 
     try:
-        if (size_bytes := path.stat().st_size) > _MOST_BYTES:
+        if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
             raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = files.read(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
     numbered = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from coupole.intake.input_files import InputFiles
+
 LINKS = 7
 """The base and six links."""
 
@@ -13,6 +15,6 @@ def link_mesh_path(folder: Path, link: int) -> Path:
     return folder / (f"link_{link}.stl" if link else "base_link.stl")
 
 
-def missing_link_meshes(folder: Path) -> list[Path]:
+def missing_link_meshes(folder: Path, files: InputFiles) -> list[Path]:
     """Files that a folder of link meshes lacks."""
-    return [path for link in range(LINKS) if not (path := link_mesh_path(folder, link)).is_file()]
+    return [path for link in range(LINKS) if not files.there(path := link_mesh_path(folder, link))]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.light_selection import missing_lights
@@ -31,7 +32,8 @@ class PlanFiles:
 def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> PlanFiles:
     """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Raises InputError
     with all problems of all files."""
-    document = yamlfile.read(plan_path) if text is None else yamlfile.parse(plan_path, text)
+    files = InputFiles()
+    document = yamlfile.read(plan_path, files) if text is None else yamlfile.parse(plan_path, text)
     plan, problems = document.problems(Plan)
     cell: Cell | None = None
     rig_path = rig_path or _named_rig(document)
@@ -39,7 +41,7 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
         problems.append(document.problem(("rig",), f"expected a rig file; there is no {rig_path}"))
     elif rig_path is not None:
         try:
-            cell = read_cell(rig_path)
+            cell = read_cell(rig_path, files)
         except InputError as error:
             problems += error.problems
     if plan is None or cell is None:
@@ -54,7 +56,7 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
     wrong += too_large(plan, cell.leds)
     problems += [document.problem(key, message) for key, message in wrong]
     mesh_path = document.resolve(plan.object.mesh) if plan.object and plan.object.mesh else None
-    if mesh_path is not None and not mesh_path.is_file():
+    if mesh_path is not None and not files.there(mesh_path):
         message = f"expected a mesh file (PLY, STL, OBJ); there is no {mesh_path}"
         problems.append(document.problem(("object", "mesh"), message))
     record_paths, missing = _named_records(document, plan, cell)
@@ -84,7 +86,7 @@ def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Pa
     return paths, [
         document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
         for i, path in enumerate(paths)
-        if not path.is_file()
+        if not cell.files.there(path)
     ]
 
 

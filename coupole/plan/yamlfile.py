@@ -27,6 +27,7 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from coupole.errors import InputError, Problem
+from coupole.intake.input_files import InputFiles
 from coupole.plan.validation_messages import KeyPath, Mistake, key_text, mistakes_of
 
 M = TypeVar("M", bound=BaseModel)
@@ -62,10 +63,16 @@ class Document:
     data: dict[str, Any]
     value_places: dict[KeyPath, Place] = field(repr=False)
     key_places: dict[KeyPath, Place] = field(repr=False)
+    text: str = field(repr=False)
+    """What was parsed: without byte order mark, with LF line ends."""
+    _resolved: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def resolve(self, path: Path) -> Path:
-        """`path` made absolute; a relative one is relative to this document's folder."""
-        return (self.path.parent / path.expanduser()).resolve()
+        """`path` made absolute; a relative one is relative to this document's folder. Links are followed once:
+        they lead to the same place as long as the document is used."""
+        if path not in self._resolved:
+            self._resolved[path] = (self.path.parent / path.expanduser()).resolve()
+        return self._resolved[path]
 
     def problem(self, key_path: KeyPath, message: str) -> Problem:
         """A problem at the value of `key_path`, or at the nearest parent key that exists."""
@@ -122,19 +129,20 @@ class Document:
         return Problem(str(self.path), *place, key_text(key_path), message)
 
 
-def read(path: Path) -> Document:
+def read(path: Path, files: InputFiles | None = None) -> Document:
     """Read a YAML file whose root is a mapping.
 
     Raises InputError: no file, not UTF-8, tabs as indentation, YAML syntax, duplicate keys, unknown
     tags, empty file, root not a mapping.
     """
-    return parse(path, text_of(path))
+    return parse(path, text_of(path, files))
 
 
 def parse(path: Path, text: str) -> Document:
     """The same of a file's text; `path` is where it is, or was."""
     try:
-        return Document(path, *pickle.loads(_parsed(text)))
+        data, value_places, key_places = pickle.loads(_parsed(text))
+        return Document(path, data, value_places, key_places, text)
     except InputError as error:
         raise InputError([replace(problem, file=str(path)) for problem in error.problems]) from error
 
@@ -163,9 +171,12 @@ def _parsed(text: str) -> bytes:
     return pickle.dumps((data, builder.value_places, builder.key_places))
 
 
-def text_of(path: Path) -> str:
-    """The file as text, without byte order mark, with LF line ends."""
+def text_of(path: Path, files: InputFiles | None = None) -> str:
+    """The file as text, without byte order mark, with LF line ends; read from `files` if these are given."""
+    files = InputFiles() if files is None else files
     try:
+        if path in files:
+            return _decoded(path, files.read(path))
         if not path.exists():
             raise InputError([Problem(str(path), 0, 0, "", "no such file")])
         if not path.is_file():
@@ -173,9 +184,13 @@ def text_of(path: Path) -> str:
         if (size_bytes := path.stat().st_size) > MAX_FILE_BYTES:
             message = f"{size_bytes} bytes; a YAML file of this kind has {MAX_FILE_BYTES} at most"
             raise InputError([Problem(str(path), 0, 0, "", message)])
-        raw = path.read_bytes()
+        raw = files.read(path)
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
         raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
+    return _decoded(path, raw)
+
+
+def _decoded(path: Path, raw: bytes) -> str:
     try:
         return raw.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:

@@ -23,6 +23,7 @@ from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
 from coupole.plan.shot_id import Light
+from coupole.plan.yamlfile import Document
 
 METERING_LIGHTS = 12
 SHORTER = (16, 4, 1)
@@ -238,17 +239,18 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
     return Advice(noise, found, bracket, tuple(remarks))
 
 
-def write_plan(plan_path: Path, out: Path, exposure: FixedExposure | BracketExposure) -> None:
-    """Copy a plan including comments, with another exposure. `out` must be in the plan's folder, because the paths
-    in a plan are relative to it; raises InputError if it is not, or exists already."""
+def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExposure) -> None:
+    """Copy a plan as it was read, including comments, with another exposure. `out` must be in the plan's folder,
+    because the paths in a plan are relative to it; raises InputError if it is not, or exists already."""
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
 
-    if out.resolve().parent != plan_path.resolve().parent:
-        raise InputError(f"{out}: expected a file in the plan's folder, {plan_path.resolve().parent}")
+    folder = plan.path.resolve().parent
+    if out.resolve().parent != folder:
+        raise InputError(f"{out}: expected a file in the plan's folder, {folder}")
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, 4096
-    document = yaml.load(plan_path.read_text(encoding="utf-8"))
+    document = yaml.load(plan.text)
     written = CommentedMap(exposure.model_dump(mode="json"))
     written.fa.set_flow_style()
     document["exposure"] = written

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from coupole.calibration.light.irradiance import irradiance_per_flux
 from coupole.calibration.record import Record
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan.light_selection import leds_of_plan
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def exposure_scale(job: Job) -> ExposureScale | None:
     for item in job.calibrations or ():
         record = item.record
         if record.kind == "led-power" and "gain_db" in record.fixed and record.validity.f_number is not None:
-            power = _power(item.path, record, leds.ids) * 10.0 ** (-record.fixed["gain_db"] / 20.0)
+            power = _power(item.path, record, job.cell.files, leds.ids) * 10.0 ** (-record.fixed["gain_db"] / 20.0)
             return ExposureScale(power * per_flux / np.pi, str(item.path))
     told = rig.white_response
     if told is None or abs(told.f_number - rig.lens.f_number) > 1e-3 * told.f_number:
@@ -98,11 +99,11 @@ def white_share(job: Job, scale: ExposureScale, exposure_us: int) -> float:
     return float(np.median(scale.dn_per_s)) * exposure_us * 1e-6 / (sensor.white_dn - sensor.black_dn)
 
 
-def _power(path: Path, record: Record, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+def _power(path: Path, record: Record, files: InputFiles, ids: NDArray[np.int64]) -> NDArray[np.float64]:
     """[ids] power in the channel that has most of it, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in it."""
     table = path.parent / record.files[0].name
     try:
-        lines = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+        lines = [line for line in files.read(table).decode("utf-8").splitlines() if not line.startswith("#")]
         rows = list(csv.DictReader(lines))
         channels = [name for name in rows[0] if name.startswith("power_")]
         of_led = {int(row["id"]): max(float(row[channel]) for channel in channels) for row in rows}

@@ -52,7 +52,8 @@ class Job:
         """Files that a run of this job depends on."""
         others = [self.cell.leds_path] + ([self.shape.mesh_path] if self.shape.mesh_path else [])
         others += [item.path for item in self.calibrations or ()]
-        return Inputs(self.document.path, self.cell.document.path, tuple(others), described_arm(self.cell.rig))
+        rig = self.cell.document.path
+        return Inputs(self.document.path, rig, tuple(others), described_arm(self.cell.rig), files=self.cell.files)
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:
@@ -64,7 +65,7 @@ def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None 
     if files.record_paths is not None:
         from coupole.calibration.in_force import read_in_force
 
-        calibrations = read_in_force(files.record_paths)
+        calibrations = read_in_force(files.record_paths, files.cell.files)
     schedule = schedule_of(files.plan, files.cell)
     motion = motion_of(files.plan, files.cell, shape, schedule)
     return Job(files.plan, files.document, files.cell, shape, schedule, motion, calibrations)

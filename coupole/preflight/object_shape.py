@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
 from coupole.geometry import apply
+from coupole.intake.input_files import InputFiles
 from coupole.plan.plan import MeasuredObject
 from coupole.plan.reading import PlanFiles
 from coupole.scan.mesh_files import read_mesh
@@ -44,7 +45,7 @@ def read_object(files: PlanFiles) -> ObjectShape:
     if files.mesh_path is not None:
         assert files.plan.object is not None
         try:
-            corners = load_corners(files.mesh_path, files.plan.object)
+            corners = load_corners(files.mesh_path, files.plan.object, files.cell.files)
         except InputError as error:
             message = f"cannot read the mesh {error}"
             raise InputError([files.document.problem(("object", "mesh"), message)]) from error
@@ -58,9 +59,15 @@ def read_object(files: PlanFiles) -> ObjectShape:
     return ObjectShape(files.mesh_path, corners, _dose_points(corners, targets), tuple(remarks))
 
 
-def load_corners(mesh_path: Path, measured: MeasuredObject) -> NDArray[np.float64]:
+def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -> NDArray[np.float64]:
     """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in it."""
-    mesh = read_mesh(mesh_path)
+    try:
+        data = files.read(mesh_path)
+    except OSError as error:
+        raise InputError(f"{mesh_path}: {reason(error)}") from error
+    except MemoryError as error:
+        raise InputError(f"{mesh_path}: it does not fit into this machine's memory") from error
+    mesh = read_mesh(mesh_path, data)
     corners = mesh.vertices.astype(np.float64)[mesh.triangles] * MM_PER_UNIT[measured.mesh_unit]
     return apply(measured.support_from_object.matrix(), corners)
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan.cell import Cell
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import camera_kind, device_for, ledbox_stand_in, stand_in_for, world_problems
@@ -81,6 +85,26 @@ def world_config(
             **({"white_share": white_share(job, scale, nominal_us)} if job is not None and scale else {}),
         },
     }
+
+
+@contextmanager
+def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]]:
+    """The same world of copies of the bytes that were read, for as long as it starts: it reads its files itself,
+    in another process, and must read what was checked."""
+    scene = config["scene"]
+    with tempfile.TemporaryDirectory(prefix="coupole-inputs-") as folder:
+
+        def copied(path: str, place: str) -> str:
+            copy = Path(folder, place, Path(path).name)
+            copy.parent.mkdir()
+            copy.write_bytes(files.read(Path(path)))
+            return str(copy)
+
+        objects = [
+            {**one, "path": copied(one["path"], f"object{number}"), "pictures_beside": one["path"]}
+            for number, one in enumerate(scene["objects"])
+        ]
+        yield {**config, "scene": {**scene, "leds": copied(scene["leds"], "dome"), "objects": objects}}
 
 
 def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:

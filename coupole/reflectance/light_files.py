@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError, Problem
+from coupole.intake.plain_data import json_of
 
 Floats = NDArray[np.float64]
 
@@ -112,8 +113,8 @@ def _is_number(value: object) -> bool:
 
 def _json_object(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
+        document = json_of(_text(path), str(path))
+    except InputError as error:
         refuse(path, f"is no JSON: {error}")
     if not isinstance(document, dict):
         refuse(path, "expected a JSON object")

@@ -5,7 +5,6 @@ Everything large is HDF5, with shapes, units and axes in attributes; docs/refere
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, reason
+from coupole.intake.plain_data import read_json
 
 Floats = NDArray[np.float32]
 
@@ -50,9 +50,10 @@ class PictureResult:
         """result.json. Raises InputError if the folder has none, or one of another kind."""
         path = self.folder / ABOUT
         try:
-            about = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            problem = Problem(str(path), 0, 0, "", "expected the result of `coupole reflectance --pictures`")
+            about = read_json(path, allow_nan=True)
+        except (OSError, InputError) as error:
+            what = "expected the result of `coupole reflectance --pictures`"
+            problem = Problem(str(path), 0, 0, "", f"{what}; {reason(error)}")
             raise InputError([problem]) from error
         if not isinstance(about, dict) or about.get("schema") != SCHEMA:
             raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])

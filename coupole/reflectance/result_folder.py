@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from coupole.errors import InputError
+from coupole.errors import InputError, reason
+from coupole.intake.plain_data import read_json
 from coupole.storage.durable import make_folder, sync_folder
 
 SETTINGS = "settings.json"
@@ -39,11 +40,11 @@ def read_settings(out: Path) -> dict[str, Any]:
     """What a result was begun with. Raises InputError if there is none."""
     path = out / SETTINGS
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
+        settings = read_json(path, allow_nan=True)
         if not isinstance(settings, dict) or "view_names" not in settings:
-            raise ValueError
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected the settings of a result of runs") from error
+            raise ValueError("found others")
+    except (OSError, InputError, ValueError) as error:
+        raise InputError(f"{path}: expected the settings of a result of runs; {reason(error)}") from error
     if not {"subtracted", "refined"} <= set(settings):
         raise InputError(f"{path}: was begun by an earlier version; make the result anew, with another --out")
     return settings

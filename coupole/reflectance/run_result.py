@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError, Problem
+from coupole.errors import InputError, Problem, reason
+from coupole.intake.plain_data import read_json
 from coupole.reflectance.cluster_file import Clusters, read_clusters
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
@@ -156,7 +156,7 @@ class RunResult:
     def summaries(self) -> list[dict[str, Any]]:
         """What extraction said of each view."""
         files = sorted((self.folder / "samples").glob("*.json"))
-        told = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+        told = [read_json(path, allow_nan=True) for path in files]
         return [
             {
                 **summary,
@@ -355,9 +355,9 @@ def read_about(folder: Path) -> dict[str, Any]:
     """result.json of a result of runs. Raises InputError if there is none, or one without what results have."""
     path = folder / ABOUT
     try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        problem = Problem(str(path), 0, 0, "", "expected the result of `coupole reflectance`")
+        about = read_json(path, allow_nan=True)
+    except (OSError, InputError) as error:
+        problem = Problem(str(path), 0, 0, "", f"expected the result of `coupole reflectance`; {reason(error)}")
         raise InputError([problem]) from error
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])

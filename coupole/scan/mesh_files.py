@@ -12,22 +12,24 @@ from pathlib import Path
 
 from coupole.errors import InputError
 from coupole.scan.mesh import MOST_VERTICES, Mesh
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_obj import read_obj
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.mesh_stl import read_stl
 
 
-def read_mesh(path: Path) -> Mesh:
+def read_mesh(path: Path, data: bytes | None = None) -> Mesh:
     """Read a mesh, its format by the suffix: .ply, .stl or .obj. Raises InputError with the place of the error.
 
-    An STL repeats vertices for each triangle; those with bitwise equal coordinates become one.
+    `data` are the file's bytes, if they were read already; the file is then left alone. An STL repeats vertices
+    for each triangle; those with bitwise equal coordinates become one.
     """
-    readers: dict[str, Callable[[Path], Mesh]] = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj}
+    readers: dict[str, Callable[[MeshFile], Mesh]] = {".ply": read_ply, ".stl": read_stl, ".obj": read_obj}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: expected a mesh with the ending .ply, .stl or .obj")
-    if not path.is_file():
+    if data is None and not path.is_file():
         raise InputError(f"{path}: expected a mesh file; there is none")
-    mesh = readers[path.suffix.lower()](path)
+    mesh = readers[path.suffix.lower()](MeshFile(path, data))
     if len(mesh.triangles) == 0:
         raise InputError(
             f"{path}: expected triangles; the file holds {len(mesh.vertices)} vertices and none of them"

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numba
 import numpy as np
 
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import Mesh, expect_finite, expect_text
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK
 
 
-def read_obj(path: Path) -> Mesh:
+def read_obj(source: MeshFile) -> Mesh:
     """Read an OBJ. Raises InputError with the line of the error."""
-    data = mesh_text.mapped(path)
+    path, data = source.path, source.mapped()
     count, triangles_count, bad_line = _count_obj(data)
     if bad_line:
         raise InputError(f"{path}:{bad_line}: expected a face with three corners or more")

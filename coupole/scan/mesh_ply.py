@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_corners, expect_finite, expect_records, expect_room, expect_text
+from coupole.scan.mesh_bytes import MeshFile, read_records
 from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK, TOO_FEW
 
 _PLY_TYPES = {
@@ -35,16 +36,17 @@ class _Element:
     properties: tuple[tuple[str, ...], ...]
 
 
-def read_ply(path: Path) -> Mesh:
+def read_ply(source: MeshFile) -> Mesh:
     """Read a PLY. Raises InputError with the place of the error."""
-    file_format, elements, at, line = _ply_header(path)
+    path = source.path
+    file_format, elements, at, line = _ply_header(source)
     for element in elements:
-        _expect_possible(path, element, ascii_text=file_format == "ascii")
+        _expect_possible(source, element, ascii_text=file_format == "ascii")
     if file_format == "ascii":
-        return _read_ascii_ply(path, elements, at, line)
+        return _read_ascii_ply(source, elements, at, line)
     order = "<" if file_format == "binary_little_endian" else ">"
     vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
-    with path.open("rb") as file:
+    with source.opened() as file:
         file.seek(at)
         for element in elements:
             if element.name == "vertex":
@@ -57,23 +59,23 @@ def read_ply(path: Path) -> Mesh:
     return Mesh(vertices, triangles)
 
 
-def _expect_possible(path: Path, element: _Element, *, ascii_text: bool) -> None:
+def _expect_possible(source: MeshFile, element: _Element, *, ascii_text: bool) -> None:
     """Raise InputError if the file is too short for an element, or a property stands twice."""
-    names = [described[0] for described in element.properties]
+    path, names = source.path, [described[0] for described in element.properties]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(
             f"{path}: element `{element.name}` has property `{twice[0]}` twice; expected each name once"
         )
     kinds = [_PLY_TYPES.get(described[1], "u1") for described in element.properties]  # of a list, its count
     least_bytes = 2 * len(kinds) if ascii_text else sum(np.dtype(kind).itemsize for kind in kinds)
-    expect_room(path, f"`{element.name}`", element.count, max(1, least_bytes), path.stat().st_size + 1)
+    expect_room(path, f"`{element.name}`", element.count, max(1, least_bytes), source.size_bytes + 1)
 
 
-def _ply_header(path: Path) -> tuple[str, list[_Element], int, int]:
+def _ply_header(source: MeshFile) -> tuple[str, list[_Element], int, int]:
     """Format, elements, and the byte and line at which the data begin."""
     elements: list[_Element] = []
-    file_format = ""
-    with path.open("rb") as file:
+    path, file_format = source.path, ""
+    with source.opened() as file:
         for number in range(1, 10_000):
             words = file.readline(4096).decode("ascii", "replace").split()
             if number == 1 and words != ["ply"]:
@@ -118,7 +120,7 @@ def _binary_vertices(path: Path, file, element: _Element, order: str) -> NDArray
         expect_records(path, "vertex", element.count, read // 12)
     else:
         for first in range(0, element.count, CHUNK):
-            part = np.fromfile(file, record, min(CHUNK, element.count - first))
+            part = read_records(file, record, min(CHUNK, element.count - first))
             expect_records(
                 path, "vertex", element.count, first + len(part), min(CHUNK, element.count - first) + first
             )
@@ -154,7 +156,7 @@ def _binary_triangles(path: Path, file, element: _Element, order: str, vertices:
     triangles = np.empty((element.count, 3), np.uint32)
     for first in range(0, element.count, CHUNK):
         wanted = min(CHUNK, element.count - first)
-        part = np.fromfile(file, record, wanted)
+        part = read_records(file, record, wanted)
         corners = part["corners"]
         if (wrong := np.flatnonzero(corners != 3)).size:
             found = int(corners[wrong[0]])
@@ -165,8 +167,8 @@ def _binary_triangles(path: Path, file, element: _Element, order: str, vertices:
     return triangles
 
 
-def _read_ascii_ply(path: Path, elements: list[_Element], at: int, line: int) -> Mesh:
-    data = mesh_text.mapped(path)
+def _read_ascii_ply(source: MeshFile, elements: list[_Element], at: int, line: int) -> Mesh:
+    path, data = source.path, source.mapped()
     vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
     for element in elements:
         names = [described[0] for described in element.properties]

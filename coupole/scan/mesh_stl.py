@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -12,22 +11,23 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.scan import mesh_text
 from coupole.scan.mesh import CHUNK, Mesh, expect_finite, expect_text
+from coupole.scan.mesh_bytes import MeshFile, read_records
 from coupole.scan.mesh_text import NOT_A_NUMBER, OK
 
 _STL_RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _STL_HEADER_BYTES = 80
 
 
-def read_stl(path: Path) -> Mesh:
+def read_stl(source: MeshFile) -> Mesh:
     """Read an STL: as binary if its size agrees with its count of triangles, whatever its header; else as text."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
+    path, size = source.path, source.size_bytes
+    with source.opened() as file:
         header = file.read(_STL_HEADER_BYTES)
         count = int.from_bytes(file.read(4), "little")
     expected = _STL_HEADER_BYTES + 4 + count * _STL_RECORD.itemsize
     if size != expected:
         if header.lstrip()[:5] == b"solid":
-            return _read_ascii_stl(path)
+            return _read_ascii_stl(source)
         if size < _STL_HEADER_BYTES + 4:
             raise InputError(f"{path}: expected a header of 84 bytes; the file has {size}")
         at = (size - _STL_HEADER_BYTES - 4) // _STL_RECORD.itemsize
@@ -35,17 +35,17 @@ def read_stl(path: Path) -> Mesh:
             f"{path}: the file ends in triangle {at} of {count}, or is not an STL: {size} bytes, not {expected}"
         )
     welder = _Welder(count)
-    with path.open("rb") as file:
+    with source.opened() as file:
         file.seek(_STL_HEADER_BYTES + 4)
         for first in range(0, count, CHUNK):
-            part = np.ascontiguousarray(np.fromfile(file, _STL_RECORD, min(CHUNK, count - first))["corners"])
+            part = np.ascontiguousarray(read_records(file, _STL_RECORD, min(CHUNK, count - first))["corners"])
             expect_finite(path, part, f"corner {{}} counted from triangle {first}")
             welder.add(part)
     return welder.mesh()
 
 
-def _read_ascii_stl(path: Path) -> Mesh:
-    data = mesh_text.mapped(path)
+def _read_ascii_stl(source: MeshFile) -> Mesh:
+    path, data = source.path, source.mapped()
     count, line = _count_lines_with(data, np.frombuffer(b"vertex", np.uint8))
     if count % 3 or not re.search(rb"endsolid[^\n]*\s*\Z", bytes(data[-4096:])):
         raise InputError(f"{path}:{line}: expected `endsolid` after whole triangles: the file was cut off")

@@ -1,29 +1,17 @@
 """Numbers in text files of gigabytes: lines, tokens and decimal numbers of a byte array, in compiled code.
 
-A file is mapped, not loaded; it is read once to count and once to fill arrays of the right size.
+They are read once to count and once to fill arrays of the right size.
 """
 
 from __future__ import annotations
 
-import mmap
-from pathlib import Path
-
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 OK, NOT_A_NUMBER, TOO_FEW, BAD_CORNER = 0, 1, 2, 3
 _NEWLINE, _SPACE, _TAB, _RETURN = 10, 32, 9, 13
 _DIGITS = 18
 """More do not fit into a 64-bit integer; further digits are below the resolution of float64."""
-
-
-def mapped(path: Path) -> NDArray[np.uint8]:
-    """A file's bytes, mapped into memory."""
-    if path.stat().st_size == 0:
-        return np.zeros(0, np.uint8)
-    with path.open("rb") as file:
-        return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), np.uint8)
 
 
 @numba.njit(cache=True, nogil=True)

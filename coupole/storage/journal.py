@@ -13,7 +13,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from coupole.errors import StorageError
+from coupole.errors import InputError, StorageError
+from coupole.intake.plain_data import NotDataError, json_of
 from coupole.storage.journal_events import JOURNAL_VERSION, Event, JournalBegun
 from coupole.storage.line_file import LineFile
 
@@ -132,9 +133,11 @@ def version(path: Path) -> int:
 def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
     for number, line in enumerate(lines, 1):
         try:
-            fields = json.loads(line)
-        except (json.JSONDecodeError, UnicodeDecodeError):
+            fields = json_of(line, str(path), line=number, allow_nan=True)
+        except NotDataError:
             continue
+        except InputError as error:
+            raise StorageError(f"{error}. Was the journal changed?") from error
         try:
             event = _EVENT.validate_python(_of_today(fields))
         except ValidationError as error:

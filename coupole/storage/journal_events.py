@@ -174,6 +174,14 @@ class FaultNoted(JournalEvent):
     """The device that failed, by its kind in the rig; empty if none did."""
 
 
+class InputsChanged(JournalEvent):
+    """Files of the run were changed on the disk after they were read; the run goes on with what was read."""
+
+    event: Literal["changed"] = "changed"
+    files: tuple[str, ...]
+    """Path and what happened, a sentence each."""
+
+
 class Paused(JournalEvent):
     """The operator paused the session; lights are off."""
 
@@ -217,6 +225,7 @@ Event: TypeAlias = (
     | GapFound
     | ReshootBegun
     | FaultNoted
+    | InputsChanged
     | Paused
     | Continued
     | ViewSealed

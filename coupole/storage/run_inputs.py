@@ -15,9 +15,7 @@ unchanged text of plan and rig, and the hash of every other file.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +24,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import ArmDescription
 from coupole.plan.link_meshes import LINKS, link_mesh_path
@@ -34,13 +33,12 @@ from coupole.plan.rewriting import differences, named_paths, rewritten
 from coupole.plan.rig import Rig
 from coupole.plan.validation_messages import KeyPath
 from coupole.plan.yamlfile import Document
-from coupole.storage.durable import make_folder, sha256, sync_folder, write_synced
+from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 FOLDER = "inputs"
 PLAN, RIG = f"{FOLDER}/plan.yaml", f"{FOLDER}/rig.yaml"
 MOST_COPIED_BYTES = 100_000_000
 """A larger file is named by its hash, and copied on request."""
-_CHUNK_BYTES = 2**20
 _SLOWEST_BYTES_S = 5e6
 
 
@@ -56,6 +54,8 @@ class Inputs:
     """The arm in force, whatever names it."""
     copy_large: bool = False
     """Copy files of more than MOST_COPIED_BYTES, too."""
+    files: InputFiles = field(default_factory=InputFiles)
+    """Their bytes, as the job was made of them: these are hashed, compared and kept, whatever the disk has now."""
 
 
 def copied_s(inputs: Inputs) -> float:
@@ -64,21 +64,22 @@ def copied_s(inputs: Inputs) -> float:
 
 
 def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
-    """Copy the inputs into a run's folder; returns what `run.json` says of them. All is on the disk afterwards."""
-    keeper = _Keeper(run, inputs.copy_large)
+    """Write the inputs, as they were read, into a run's folder; returns what `run.json` says of them. All is on
+    the disk afterwards."""
+    keeper = _Keeper(run, inputs.files, inputs.copy_large)
     make_folder(run / FOLDER)
     described = {
-        "plan": {**_described(inputs.plan), "text": _text(inputs.plan), "stored": PLAN},
-        "rig": {**_described(inputs.rig), "text": _text(inputs.rig), "stored": RIG},
+        what: {**_described(path, inputs.files), "text": _text(path, inputs.files), "stored": stored}
+        for what, path, stored in (("plan", inputs.plan, PLAN), ("rig", inputs.rig, RIG))
     }
     write_synced(run / PLAN, keeper.plan_text(inputs))
     write_synced(run / RIG, keeper.rig_text(inputs))
-    others = {path.resolve() for path in inputs.others}
-    files = [{**_described(path), "stored": keeper.file(path, "others")} for path in inputs.others]
+    others = {path.absolute() for path in inputs.others}
+    files = [{**_described(path, inputs.files), "stored": keeper.file(path, "others")} for path in inputs.others]
     files += [
-        {**_described(path), "stored": stored}
+        {**_described(path, inputs.files), "stored": stored}
         for path, stored in keeper.stored.items()
-        if path not in others and path.is_file()
+        if path not in others and path in inputs.files
     ]
     for folder in {run / FOLDER, *((run / stored).parent for stored in keeper.stored.values() if stored)}:
         sync_folder(folder)
@@ -91,18 +92,18 @@ def _arm_sha256(arm: ArmDescription) -> str:
     return hashlib.sha256(arm.model_dump_json(exclude={"link_meshes"}).encode()).hexdigest()
 
 
-def _described(path: Path) -> dict[str, str]:
-    return {"path": str(path), "sha256": sha256(path)}
+def _described(path: Path, files: InputFiles) -> dict[str, str]:
+    return {"path": str(path), "sha256": files.sha256(path)}
 
 
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
+def _text(path: Path, files: InputFiles) -> str:
+    return files.read(path).decode("utf-8").replace("\r\n", "\n")
 
 
-def _read(path: Path, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
+def _read(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
     """A plan or rig and its model; None if it is none."""
     try:
-        document = yamlfile.read(path)
+        document = yamlfile.read(path, files)
         return document, document.validate(model)
     except InputError:
         return None
@@ -110,23 +111,24 @@ def _read(path: Path, model: type[Plan] | type[Rig]) -> tuple[Document, BaseMode
 
 @dataclass
 class _Keeper:
-    """Copies files into a run, each once."""
+    """Writes the bytes that were read into a run, each file's once."""
 
     run: Path
+    files: InputFiles
     copy_large: bool
     stored: dict[Path, str | None] = field(default_factory=dict)
-    """Place in the run, by resolved path; None for a file that is too large."""
+    """Place in the run, by absolute path; None for a file that is too large."""
 
     def plan_text(self, inputs: Inputs) -> str:
-        read = _read(inputs.plan, Plan)
+        read = _read(inputs.plan, self.files, Plan)
         if read is None:
-            return _text(inputs.plan)
+            return _text(inputs.plan, self.files)
         return self._with_copies(*read, {("rig",): Path(RIG).name})
 
     def rig_text(self, inputs: Inputs) -> str:
-        read = _read(inputs.rig, Rig)
+        read = _read(inputs.rig, self.files, Rig)
         if read is None:
-            return _text(inputs.rig)
+            return _text(inputs.rig, self.files)
         changes: dict[KeyPath, str] = {}
         document, rig = read
         if inputs.arm is not None and not isinstance(document.data.get("arm"), dict):
@@ -139,7 +141,7 @@ class _Keeper:
                 path = document.resolve(written)
                 stored = self._copy(at, path)
                 changes[at] = str(path) if stored is None else str(Path(stored).relative_to(FOLDER))
-        return rewritten(document, yamlfile.text_of(document.path), changes)
+        return rewritten(document, document.text, changes)
 
     def _copy(self, at: KeyPath, path: Path) -> str | None:
         """Place of the copy of what stands at this key path; None if it is not copied."""
@@ -156,15 +158,21 @@ class _Keeper:
 
     def file(self, path: Path, folder: str) -> str | None:
         """Copy a file into a folder of `inputs`; None if it is too large, or not there."""
-        path = path.resolve()
+        path = path.absolute()
         if path not in self.stored:
-            if not path.is_file() or (path.stat().st_size > MOST_COPIED_BYTES and not self.copy_large):
+            if not self.files.there(path) or (
+                len(self.files.read(path)) > MOST_COPIED_BYTES and not self.copy_large
+            ):
                 self.stored[path] = None
             else:
                 name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)
                 self.stored[path] = self._new_place(f"{FOLDER}/{folder}", name)
-                _copy_synced(path, self.run / str(self.stored[path]))
+                self._write(path, str(self.stored[path]))
         return self.stored[path]
+
+    def _write(self, path: Path, stored: str) -> None:
+        make_folder((self.run / stored).parent)
+        write_synced(self.run / stored, self.files.read(path))
 
     def _new_place(self, folder: str, name: str) -> str:
         taken = set(self.stored.values())
@@ -176,11 +184,11 @@ class _Keeper:
         folder = f"calibrations/{re.sub(r'[^A-Za-z0-9._-]', '_', path.stem)}"
         stored = self.file(path, folder)
         if stored is not None:
-            for name in _files_of_record(path):
+            for name in _files_of_record(path, self.files):
                 beside = self.run / Path(stored).with_name(name)
                 if not beside.exists():
-                    self.stored[(path.parent / name).resolve()] = str(Path(stored).with_name(name))
-                    _copy_synced(path.parent / name, beside)
+                    self.stored[(path.parent / name).absolute()] = str(Path(stored).with_name(name))
+                    self._write(path.parent / name, str(Path(stored).with_name(name)))
         return stored
 
     def _link_meshes(self, folder: Path) -> str | None:
@@ -195,11 +203,11 @@ class _Keeper:
         beside = None if meshes is None else str(Path(meshes).relative_to(f"{FOLDER}/arm"))
         make_folder(self.run / FOLDER / "arm")
         if named:
-            source = yamlfile.read(document.resolve(Path(named)))
+            source = yamlfile.read(document.resolve(Path(named)), self.files)
             link_meshes = beside or (str(arm.link_meshes) if arm.link_meshes else None)
             changes: dict[KeyPath, str] = {("link_meshes",): link_meshes} if link_meshes else {}
-            text = rewritten(source, yamlfile.text_of(source.path), changes)
-            self.stored[source.path.resolve()] = place
+            text = rewritten(source, source.text, changes)
+            self.stored[source.path.absolute()] = place
         else:
             shipped = arm.model_copy(update={"link_meshes": Path(beside) if beside else arm.link_meshes})
             text = shipped.model_dump_json(indent=1, exclude_none=True) + "\n"
@@ -207,24 +215,15 @@ class _Keeper:
         return str(Path(place).relative_to(FOLDER))
 
 
-def _files_of_record(path: Path) -> Iterator[str]:
+def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
     try:
-        listed = yamlfile.read(path).data.get("files", [])
+        listed = yamlfile.read(path, files).data.get("files", [])
     except InputError:
         return
     for entry in listed if isinstance(listed, list) else []:
         name = entry.get("name") if isinstance(entry, dict) else None
-        if isinstance(name, str) and Path(name).name == name and (path.parent / name).is_file():
+        if isinstance(name, str) and Path(name).name == name and files.there(path.parent / name):
             yield name
-
-
-def _copy_synced(path: Path, to: Path) -> None:
-    make_folder(to.parent)
-    with path.open("rb") as source, to.open("wb") as copy:
-        while chunk := source.read(_CHUNK_BYTES):
-            copy.write(chunk)
-        copy.flush()
-        os.fsync(copy.fileno())
 
 
 # -- what may not change --------------------------------------------------------------------------------------
@@ -237,14 +236,17 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
     """
     arm_known = now.arm is not None and "arm_sha256" in about
     found = [
-        *_changes_of(about["plan"], now.plan, Plan, "plan"),
-        *_changes_of(about["rig"], now.rig, Rig, "rig", {"arm"} if arm_known else set()),
+        *_changes_of(about["plan"], now.plan, now.files, Plan, "plan"),
+        *_changes_of(about["rig"], now.rig, now.files, Rig, "rig", {"arm"} if arm_known else set()),
     ]
-    before = Counter(entry["sha256"] for entry in about["files"])
-    kept = [run / entry["stored"] for entry in about["files"] if entry.get("stored")]
-    before.update(_meaning(path) for path in kept if path.is_file())
+    before = {entry["sha256"] for entry in about["files"]}
+    kept = InputFiles()
+    copies = [(run / entry["stored"], entry["sha256"]) for entry in about["files"] if entry.get("stored")]
+    before |= {_meaning(path, kept) for path, digest in copies if path.is_file() and kept.sha256(path) == digest}
     found += [
-        f"{path} is another file" for path in now.others if not (before[sha256(path)] or before[_meaning(path)])
+        f"{path} is another file"
+        for path in now.others
+        if now.files.sha256(path) not in before and _meaning(path, now.files) not in before
     ]
     if now.arm is not None and arm_known and about["arm_sha256"] != _arm_sha256(now.arm):
         found.append("the description of the arm")
@@ -254,18 +256,19 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
 def _changes_of(
     before: Mapping[str, str],
     path: Path,
+    files: InputFiles,
     model: type[Plan] | type[Rig],
     what: str,
     apart: Set[str] = frozenset(),
 ) -> Iterator[str]:
-    if sha256(path) == before["sha256"]:
+    if files.sha256(path) == before["sha256"]:
         return
     try:
         then = yamlfile.parse(Path(before["path"]), _plain(before["text"])).validate(model)
     except InputError:
         yield f"the {what} {path} is another file, and the old one is not understood any more"
         return
-    now = yamlfile.read(path).validate(model)
+    now = yamlfile.read(path, files).validate(model)
     if found := differences(then, now, apart):
         yield f"the {what} {path}: {'; '.join(found)}"
 
@@ -274,9 +277,9 @@ def _plain(text: str) -> str:
     return text.removeprefix("\ufeff").replace("\r\n", "\n")
 
 
-def _meaning(path: Path) -> str:
+def _meaning(path: Path, files: InputFiles) -> str:
     """Hash of what counts in a file: of a table's lines without comments, and of all bytes of another file."""
     if path.suffix.lower() != ".csv":
-        return sha256(path)
-    lines = [line.strip() for line in path.read_bytes().splitlines()]
+        return files.sha256(path)
+    lines = [line.strip() for line in files.read(path).splitlines()]
     return hashlib.sha256(b"\n".join(line for line in lines if line and not line.startswith(b"#"))).hexdigest()

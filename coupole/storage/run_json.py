@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coupole.errors import InputError, reason
+from coupole.intake.plain_data import read_json
 from coupole.plan.shot_id import ShotLabel
 from coupole.storage.inner_path import InnerPath
 
@@ -89,10 +89,10 @@ def read_description(folder: Path) -> dict[str, Any]:
     """The content of a run's run.json. Raises InputError if the folder is no run, or something in it is wrong."""
     path = folder / RUN_JSON
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, allow_nan=True)
     except FileNotFoundError as error:
         raise InputError(f"{folder}: not a run folder: it has no {RUN_JSON}") from error
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
         raise InputError(f"{path}: not a run folder: {reason(error)}") from error
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:

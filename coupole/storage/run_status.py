@@ -17,6 +17,7 @@ from coupole.storage.journal_events import (
     FaultNoted,
     FrameProven,
     GapFound,
+    InputsChanged,
     JournalBegun,
     MoveBegun,
     Paused,
@@ -151,7 +152,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.light_s += event.on_s
         case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
-        case BurstBegun() | GapFound() | ViewSealed():
+        case BurstBegun() | GapFound() | ViewSealed() | InputsChanged():
             pass
         case _:
             assert_never(event)

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coupole.errors import StorageError
+from coupole.errors import InputError, StorageError
 from coupole.storage import frame_file, journal, manifest
+from coupole.storage.as_planned import AsPlanned, as_planned
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
 
@@ -26,6 +27,8 @@ class Verification:
     """Files of the manifest, each read and compared."""
     unlisted: list[str] = field(default_factory=list)
     """Files that the manifest does not cover yet."""
+    not_compared: str = ""
+    """Why frames were not compared with the run's plan; empty if they were."""
 
     @property
     def ok(self) -> bool:
@@ -34,7 +37,7 @@ class Verification:
 
 def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Verification:
     """Read every proven frame back: each shot of the plan exactly once, each record and checksum right. Compare
-    every file that the manifest lists."""
+    its light, exposure and pose with the plan that the run keeps, and every file that the manifest lists."""
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
@@ -43,11 +46,13 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         by_file.setdefault(frame.file, []).append(frame)
     lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
+    planned = _planned(run, result)
     done = 0
     for name, frames in sorted(by_file.items()):
         path = run.folder / name
         try:
             layout, table = frame_file.read_layout(path), frame_file.read_frames(path)
+            poses, _ = frame_file.read_poses_and_attributes(path)
         except StorageError as error:
             result.bad.append(str(error))
             continue
@@ -56,7 +61,9 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         twice = [shot for shot in sorted(shots) if claimed[shot] > 1]
         result.bad += [f"{name}: {shot.decode()} is in {claimed[shot]} slots" for shot in twice]
         for frame in sorted(frames, key=lambda f: f.index):
-            if problem := _frame_problem(path, layout, table, frame):
+            if problem := _frame_problem(path, layout, table, frame) or _other_than_planned(
+                planned, table[frame.index], poses, frame
+            ):
                 result.bad.append(problem)
             result.frames += 1
             done += 1
@@ -66,6 +73,24 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     result.listed = len(manifest.read(run.folder))
     result.unlisted = manifest.unlisted(run.folder)
     return result
+
+
+def _planned(run: Run, result: Verification) -> AsPlanned | None:
+    try:
+        planned = as_planned(run)
+    except InputError as error:
+        result.not_compared = str(error)
+        return None
+    result.bad += planned.problems_of_the_list(run)
+    return planned
+
+
+def _other_than_planned(planned: AsPlanned | None, record: Any, poses: Any, frame: FrameProven) -> str:
+    if planned is None:
+        return ""
+    if record["pose"] >= len(poses):
+        return f"{frame.shot}: its record names a pose that the file does not have"
+    return planned.problem(frame.shot, record, poses[record["pose"]])
 
 
 def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 
 from coupole.calibration.report import HEAD
 from coupole.errors import InputError, StorageError
+from coupole.intake.plain_data import read_json
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED
 from coupole.storage.durable import write_synced
 from coupole.viewing.raw_preview import png
@@ -31,8 +31,8 @@ def write(folder: Path) -> Path:
     """Write the report of a refinement into its folder. Raises InputError, StorageError."""
     path = folder / REPORT
     try:
-        about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        about = read_json(folder / ABOUT, allow_nan=True)
+    except (OSError, InputError) as error:
         raise InputError(f"{folder / ABOUT}: expected the result of `coupole reflectance refine`") from error
     try:
         write_synced(path, "".join(_page(folder, about)))

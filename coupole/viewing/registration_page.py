@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import look_at
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration.merging import Merged
 from coupole.scan.registration.registering import Registered
@@ -43,7 +44,7 @@ def write(found: Registered, merged: Merged | None, folder: Path) -> None:
 def _pictures(found: Registered, merged: Merged | None, folder: Path) -> str:
     shown = _image(scans_drawn(found), "Each scan in its place in a colour of its own, from three sides")
     if merged is not None:
-        mesh = read_ply(folder / "mesh.ply")
+        mesh = read_ply(MeshFile(folder / "mesh.ply"))
         vertices = mesh.vertices.astype(np.float64)
         solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
         shown += _image(solid_drawn(solid, _STONE), "The merged mesh, from three sides")

@@ -23,7 +23,7 @@ from coupole.plan.bursts import Burst
 from coupole.plan.registry import STILLS, load_class
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
-from coupole.preflight.simulated_world import world_config
+from coupole.preflight.simulated_world import frozen, world_config
 from coupole.viewing.raw_preview import Coding, develop, figures
 
 _THUMBNAIL_PX, _LABEL_PX, _COLUMNS = 320, 22, 4
@@ -56,7 +56,8 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
             update={"width_px": width_px // 2 * 2, "height_px": height_px, "pixel_pitch_um": pitch_um}
         )
     coding = Coding(sensor.bayer_pattern, sensor.black_dn, sensor.white_dn)
-    stills = load_class(STILLS)(world_config(job.cell, job, sensor))
+    with frozen(world_config(job.cell, job, sensor), job.cell.files) as config:
+        stills = load_class(STILLS)(config)
     chosen = list(_spread(job, count))
     if not chosen:
         raise InputError(f"{job.document.path}: expected shots with light; the plan has none")

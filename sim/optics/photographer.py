@@ -383,7 +383,7 @@ def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
             material = _measured(given)
         case MaterialConfig():
             material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness)
-    surface = load_surface(mesh.path, mesh.unit, material, settings.detail)
+    surface = load_surface(mesh.path, mesh.unit, material, settings.detail, mesh.pictures_beside)
     return settings.stickers.on(surface) if settings.stickers else surface
 
 

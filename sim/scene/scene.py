@@ -61,7 +61,11 @@ class Scene:
 
 
 def load_surface(
-    path: Path, unit: str, material: Material | None = None, detail: tuple[Layer, ...] = ()
+    path: Path,
+    unit: str,
+    material: Material | None = None,
+    detail: tuple[Layer, ...] = (),
+    pictures_beside: Path | None = None,
 ) -> Surface:
     """Any mesh that trimesh reads (PLY, STL, OBJ, ...), in mm; no vertex is merged or dropped.
 
@@ -70,9 +74,11 @@ def load_surface(
     Raises InputError.
     """
     import trimesh
+    from trimesh.resolvers import FilePathResolver
 
     try:
-        mesh: Any = trimesh.load(path, process=False, force="mesh")
+        beside = FilePathResolver(str(pictures_beside or path))
+        mesh: Any = trimesh.load(path, process=False, force="mesh", resolver=beside)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a mesh of triangles (PLY, STL, OBJ); {error}") from error
     faces = np.asarray(mesh.faces)

@@ -87,6 +87,8 @@ class MeshConfig(_Model):
     """One object: its mesh and its pose on the support (row-major 4x4)."""
 
     path: Path
+    pictures_beside: Path | None = None
+    """The textures that the mesh names are beside this file; None: beside `path`."""
     unit: Literal["mm", "m", "um"]
     support_from_object: list[list[float]]
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None

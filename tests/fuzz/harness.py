@@ -27,7 +27,7 @@ from typing import Any
 if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
 
-from fuzz.mutation import mutated
+from fuzz.mutation import mutated, with_hostile
 from fuzz.target import Target
 from fuzz.targets import CONFIGS, TARGETS
 
@@ -35,6 +35,8 @@ MEMORY_BYTES = 4 * 1024**3
 CASE_S = 20.0
 _START_S = 120.0
 """For imports, and for code that is compiled for the first time."""
+HOSTILE_SEED = "hostile"
+"""Seeds that begin with it put one of `mutation.HOSTILE` into the file."""
 _OF_NAME = {target.name: target for target in TARGETS}
 
 
@@ -42,6 +44,8 @@ def case_of(target: Target, seed: str, number: int) -> bytes:
     """The mutated file of one case. Number 0 is the first seed as it is: it must be read."""
     random = Random(f"{target.name}/{seed}/{number}")
     seeds = target.seeds()
+    if seed.startswith(HOSTILE_SEED):
+        return with_hostile(random.choice(seeds), random, number)
     return mutated(random.choice(seeds), random) if number else seeds[0]
 
 

@@ -16,6 +16,14 @@ WORDS = (
     b"../../../../etc/passwd",
     b"/dev/zero", b"~nobody-at-all/x", b"x" * 5000, b"%s%n{0}", b",,,,", b"#",
 )  # fmt: skip
+HOSTILE = (
+    b"9" * 5000, b"-" + b"9" * 50, b"1." + b"9" * 5000, b"1e" + b"9" * 5000, b"NaN", b"-Infinity", b"1e999",
+    b"[" * 10_000, b"[" * 10_000 + b"]" * 10_000, b'{"a":' * 3000 + b"1" + b"}" * 3000, b"[" * 120 + b"]" * 120,
+    b"[&a [1, 1], &b [*a, *a, *a, *a], " + b", ".join(
+        b"&%c [%s]" % (name, b", ".join([b"*%c" % (name - 1)] * 9)) for name in range(ord("c"), ord("z"))
+    ) + b"]", b"&x [*x]", b"\xff\xfe", b"\xef\xbb\xbf1", b"\"\\ud800\"",
+)  # fmt: skip
+"""Values that readers of JSON and YAML may end in a traceback of their own for, or in endless work."""
 _NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
@@ -25,6 +33,13 @@ def mutated(seed: bytes, random: Random) -> bytes:
     for _ in range(random.choice((1, 1, 1, 2, 3, 8))):
         data = random.choice(_CHANGES)(data, random)
     return data
+
+
+def with_hostile(seed: bytes, random: Random, number: int) -> bytes:
+    """The seed with one of HOSTILE in the place of one of its numbers; they come by turns."""
+    found = list(_NUMBER.finditer(seed[:100_000]))
+    first, last = random.choice(found).span() if found else (len(seed), len(seed))
+    return seed[:first] + HOSTILE[number % len(HOSTILE)] + seed[last:]
 
 
 def _flip(data: bytes, random: Random) -> bytes:

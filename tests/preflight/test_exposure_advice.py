@@ -131,7 +131,7 @@ PLAN = "schema_version: 1  # this stays\nname: x\nexposure: {kind: fixed, exposu
 def test_the_plan_is_written_with_its_comments_and_the_new_exposure(tmp_path: Path) -> None:
     plan, out = tmp_path / "plan.yaml", tmp_path / "metered.yaml"
     plan.write_text(PLAN)
-    write_plan(plan, out, FixedExposure(kind="fixed", exposure_us=1234))
+    write_plan(read(plan), out, FixedExposure(kind="fixed", exposure_us=1234))
     assert out.read_text() == PLAN.replace("8000", "1234")
     assert read(out).data["exposure"]["exposure_us"] == 1234
 
@@ -142,5 +142,5 @@ def test_a_plan_is_written_neither_elsewhere_nor_over_another(tmp_path: Path, ou
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN)
     with pytest.raises(InputError, match=r"plan\.yaml: "):
-        write_plan(plan, tmp_path / out, FixedExposure(kind="fixed", exposure_us=1234))
+        write_plan(read(plan), tmp_path / out, FixedExposure(kind="fixed", exposure_us=1234))
     assert plan.read_text() == PLAN

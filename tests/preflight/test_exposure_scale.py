@@ -75,6 +75,7 @@ def test_check_warns_of_exposures_that_cannot_be_right(cell: CellFolder, dn_per_
 
 def test_a_damaged_table_of_led_powers_is_refused_with_its_name(tmp_path: Path) -> None:
     from coupole.errors import InputError
+    from coupole.intake.input_files import InputFiles
     from coupole.preflight import exposure_scale as module
 
     class Named:
@@ -85,4 +86,4 @@ def test_a_damaged_table_of_led_powers_is_refused_with_its_name(tmp_path: Path) 
 
     (tmp_path / "power.csv").write_text("id,board_c,power_G\n0,24,bright\n")
     with pytest.raises(InputError, match=r"power\.csv: expected the table of LED powers"):
-        module._power(tmp_path / "power.yaml", Found(), np.array([0]))  # type: ignore[arg-type]
+        module._power(tmp_path / "power.yaml", Found(), InputFiles(), np.array([0]))  # type: ignore[arg-type]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from view_files import frame, write_view
 
 from coupole.errors import InputError
+from coupole.intake.input_files import InputFiles
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage.journal import Journal
@@ -133,9 +135,27 @@ def test_unchanged_files_are_not_refused(finished: Run, inputs: Inputs) -> None:
 def test_a_changed_file_is_refused_by_name(finished: Run, inputs: Inputs, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("something else\n")
     with pytest.raises(InputError) as refused:
-        finished.refuse_changes(inputs)
+        finished.refuse_changes(replace(inputs, files=InputFiles()))
     assert name in str(refused.value)
     assert [n for n in ("plan.yaml", "rig.yaml", "dome.csv") if n in str(refused.value)] == [name]
+
+
+def test_what_a_job_was_made_of_is_compared_not_what_is_on_the_disk_now(
+    finished: Run, inputs: Inputs, tmp_path: Path
+) -> None:
+    for name in ("plan.yaml", "rig.yaml", "dome.csv"):
+        (tmp_path / name).write_text("something else\n")
+    finished.refuse_changes(inputs)
+
+
+def test_a_kept_table_that_was_edited_is_no_pattern_for_todays(
+    finished: Run, inputs: Inputs, tmp_path: Path
+) -> None:
+    stored = next(entry["stored"] for entry in finished.about["files"] if entry["path"].endswith("dome.csv"))
+    for path in (finished.folder / stored, tmp_path / "dome.csv"):
+        path.write_text("something else\n")
+    with pytest.raises(InputError, match=r"dome\.csv is another file"):
+        finished.refuse_changes(replace(inputs, files=InputFiles()))
 
 
 def test_a_run_that_is_locked_is_refused_to_another(finished: Run) -> None:

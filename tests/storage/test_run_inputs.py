@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
 
 import pytest
+import trimesh
 from cells import CellFolder
 from places import REPO
 
 from coupole.plan.arm_description import read_arm
 from coupole.plan.cell import read_cell
+from coupole.plan.link_meshes import LINKS, link_mesh_path
 from coupole.plan.plan import Plan
 from coupole.plan.rewriting import rewritten
 from coupole.plan.yamlfile import parse, read
+from coupole.preflight.job import read_job
 from coupole.storage import run_inputs
 from coupole.storage.run_inputs import Inputs, changes_since, keep
 
@@ -53,6 +57,41 @@ def test_a_mesh_of_more_than_the_limit_is_named_by_hash_and_copied_on_request(
     keep(inputs_of(cell, copy_large=True), tmp_path / "with")
     assert read(tmp_path / "with/inputs/plan.yaml").data["object"]["mesh"] == "object/relief.ply"
     assert (tmp_path / "with/inputs/object/relief.ply").read_bytes() == mesh.read_bytes()
+
+
+def test_the_hash_of_a_large_mesh_is_that_of_the_bytes_that_were_parsed(
+    cell: CellFolder, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    mesh = Path(shutil.copy(cell.plan_data["object"]["mesh"], tmp_path / "relief.ply"))
+    cell.plan_data["object"]["mesh"] = str(mesh)
+    cell.write()
+    monkeypatch.setattr(run_inputs, "MOST_COPIED_BYTES", mesh.stat().st_size - 1)
+    job, parsed = read_job(cell.plan), mesh.read_bytes()
+    mesh.write_bytes(parsed[:-1] + b"!")
+    about = keep(job.inputs, tmp_path / "run")
+    entry = next(entry for entry in about["files"] if entry["path"] == str(mesh))
+    assert (entry["sha256"], entry["stored"]) == (hashlib.sha256(parsed).hexdigest(), None)
+
+
+def test_what_was_read_is_kept_and_not_what_is_there_now(cell: CellFolder, tmp_path: Path) -> None:
+    shutil.copytree(REPO / "configs", tmp_path / "configs")
+    rig = tmp_path / "configs/rigs/sim.yaml"
+    (tmp_path / "configs/meshes").mkdir()
+    for link in range(LINKS):
+        box = trimesh.creation.box((0.1, 0.1, 0.1 + 0.01 * link))
+        box.export(link_mesh_path(tmp_path / "configs/meshes", link))
+    rig.write_text(f"link_meshes: ../meshes\n{rig.read_text()}")
+    job = read_job(tmp_path / "configs/plans/demo.yaml", rig)
+    _ = job.motion.bodies
+    was = {path: path.read_bytes() for path in (tmp_path / "configs").rglob("*") if path.is_file()}
+    shutil.rmtree(tmp_path / "configs")
+    about = keep(job.inputs, tmp_path / "run")
+    for entry in about["files"]:
+        if Path(entry["path"]) in was and "robots" not in entry["path"]:
+            kept = (tmp_path / "run" / entry["stored"]).read_bytes()
+            assert kept == was[Path(entry["path"])]
+            assert entry["sha256"] == hashlib.sha256(kept).hexdigest()
+    assert read_job(tmp_path / "run/inputs/plan.yaml").schedule.frames == job.schedule.frames
 
 
 def test_records_are_copied_with_the_files_beside_them(cell: CellFolder, tmp_path: Path) -> None:

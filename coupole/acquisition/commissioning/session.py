@@ -86,7 +86,7 @@ def commission(
     fails, Interrupted if the person does not go on.
     """
     ArmFaults(cell.state_folder).refuse(cell.document.path)
-    bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes)
+    bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes, cell.files)
     slow = replace(cell, rig=at_reduced_speed(cell.rig, bodies))
     record = _record_so_far(cell, console)
     control = Control()

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from coupole.appearance.matter.pigments import Pigment
 from coupole.appearance.spectra.grid import STEP_NM, WAVELENGTHS_NM, Array
 from coupole.errors import InputError, Problem, reason
+from coupole.intake.plain_data import yaml_of
 
 FIRST_LINE = "# coupole: paint 1"
 ENDING = ".paint.csv"
@@ -129,15 +130,14 @@ def read_paint(path: Path) -> PaintFile:
 
 def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
     """The head, the number of the line of names, and the lines from there."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     lines = text.splitlines()
     end = next((at for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
+    told = "\n".join(line[1:].strip(" ") for line in lines[1:end])
     try:
-        head: Any = YAML(typ="safe", pure=True).load("\n".join(line[1:].strip(" ") for line in lines[1:end]))
-    except YAMLError as error:
-        raise _wrong(path, 2, f"expected YAML in the lines that begin with #: {reason(error)}") from error
+        head: Any = yaml_of(told, str(path), line=2)
+    except InputError as error:
+        first = error.problems[0]
+        raise _wrong(path, 2, f"expected YAML in the lines that begin with #: {first.message}") from error
     if not isinstance(head, dict):
         raise _wrong(path, 2, "expected `name`, `unit` and `binder_index` in lines that begin with #")
     if end == len(lines):

@@ -17,6 +17,7 @@ import numpy as np
 from coupole.appearance.optics import indices
 from coupole.appearance.spectra.grid import FIRST_NM, LAST_NM, WAVELENGTHS_NM, Array, Complex
 from coupole.errors import InputError, Problem, reason
+from coupole.intake.plain_data import yaml_of
 
 _YAML = {".yml", ".yaml"}
 _MICROMETRES_BELOW = 30.0
@@ -46,13 +47,7 @@ def read_index(path: Path) -> Complex:
 
 
 def _of_yaml(text: str, path: Path) -> Complex:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        document: Any = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        raise InputError(f"{path}: is no YAML: {reason(error)}") from error
+    document: Any = yaml_of(text, str(path))
     parts = document.get("DATA") if isinstance(document, dict) else None
     if not isinstance(parts, list) or not all(isinstance(part, dict) for part in parts):
         raise InputError(f"{path}: expected a list `DATA` as in the files of refractiveindex.info; found none")

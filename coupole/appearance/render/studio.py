@@ -15,6 +15,7 @@ from coupole.appearance.render.film import write_film
 from coupole.appearance.render.rendering import Renderer, Spectral, opened
 from coupole.appearance.render.scene_file import Camera, Scene, remarks
 from coupole.appearance.render.spectra import power
+from coupole.intake.plain_data import read_json
 
 Progress = Callable[[str, int, int], None]
 """Camera, passes done, passes in all."""
@@ -140,7 +141,7 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
     summary_path = stem.with_suffix(".json")
     digest = sha256(f"{scene.model_dump_json()} {variant_of(scene)}".encode()).hexdigest()
     if summary_path.exists():
-        known: dict[str, Any] = json.loads(summary_path.read_text())
+        known: dict[str, Any] = read_json(summary_path, allow_nan=True)
         if known["of"] == digest:
             return known
     with opened(scene, folder) as renderer:

@@ -8,7 +8,6 @@ number of its process in the queue.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from coupole.console.cell.lending import Lending
 from coupole.console.plans.plan_queue import Entry, PlanQueue
 from coupole.console.processes.growing_file import end_of_file
 from coupole.errors import CoupoleError, InputError
+from coupole.intake.plain_data import json_of
 from coupole.plan.cell import Cell
 from coupole.storage.line_file import utc_now
 
@@ -237,8 +237,8 @@ class Acquisitions:
 def _last_document(path: Path) -> dict[str, Any]:
     """The last line of JSON; empty if there is none."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])
-    except (OSError, ValueError, IndexError):
+        found = json_of(path.read_bytes().strip().splitlines()[-1], str(path), allow_nan=True)
+    except (OSError, InputError, IndexError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from coupole.acquisition.runtime_folder import named_after
 from coupole.errors import InputError
+from coupole.intake.plain_data import json_of
 from coupole.plan.cell import Cell
 
 _PATIENCE_S = 30.0
@@ -52,13 +53,13 @@ def call(
         body = None if asked is None else json.dumps(asked)
         connection.request(method, path, body, {"Content-Type": "application/json"} if body else {})
         reply = connection.getresponse()
-        found = json.loads(reply.read())
+        found = json_of(reply.read(), "its answer", allow_nan=True)
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise NotServed(
             f"{cell.document.path}: no console of this cell is served on this machine by this user; "
             f"`coupole serve {cell.document.path}` does"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, InputError) as error:
         raise InputError(f"{cell.document.path}: its console does not answer: {error}") from error
     finally:
         connection.close()

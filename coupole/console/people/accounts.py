@@ -17,6 +17,7 @@ from typing import Any
 import argon2
 
 from coupole.errors import InputError, StorageError
+from coupole.intake.plain_data import read_json
 from coupole.storage.durable import make_folder, write_synced
 
 SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
@@ -73,8 +74,8 @@ class Accounts:
         self._checking = threading.Lock()
         self._failures: list[tuple[float, bool, str]] = []
         try:
-            self._stored: dict[str, dict[str, Any]] = json.loads(path.read_bytes()) if path.exists() else {}
-        except (OSError, ValueError) as error:
+            self._stored: dict[str, dict[str, Any]] = read_json(path) if path.exists() else {}
+        except (OSError, InputError) as error:
             raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
         self.first_token = "" if _has_engineer(self._stored) else secrets.token_urlsafe(24)
         """With which an engineer signs in while no engineer has an account; empty if it does not hold."""

@@ -3,7 +3,6 @@ in a process of its own, whose output is kept while the service lives."""
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import signal
@@ -21,6 +20,7 @@ from typing import Any, BinaryIO
 from coupole.console.processes.growing_file import GrowingFile
 from coupole.console.processes.keeping_newest import keep_newest
 from coupole.errors import InputError
+from coupole.intake.plain_data import json_of
 from coupole.storage.durable import make_folder
 from coupole.storage.line_file import utc_now
 
@@ -79,8 +79,9 @@ class Task:
             return {}
         if self._found is None:
             try:
-                found = json.loads((self.folder / f"{self.id}.json").read_text(encoding="utf-8").splitlines()[-1])
-            except (OSError, ValueError, IndexError):
+                path = self.folder / f"{self.id}.json"
+                found = json_of(path.read_bytes().splitlines()[-1], str(path), allow_nan=True)
+            except (OSError, InputError, IndexError):
                 found = {}
             self._found = found if isinstance(found, dict) else {}
         return self._found

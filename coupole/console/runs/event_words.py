@@ -13,6 +13,7 @@ from coupole.storage.journal_events import (
     FaultNoted,
     FrameProven,
     GapFound,
+    InputsChanged,
     JournalBegun,
     MoveBegun,
     Paused,
@@ -52,6 +53,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return f"{event.view}: {len(event.shots)} shots are taken again"
         case FaultNoted():
             return f"fault: {event.message}"
+        case InputsChanged():
+            return f"changed on the disk, the run uses what was read: {'; '.join(event.files)}"
         case Paused():
             return "paused: lights off, arm still"
         case Continued():

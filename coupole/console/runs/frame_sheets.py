@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coupole.console.runs.run_files import RunFiles
 from coupole.errors import CoupoleError, InputError
+from coupole.intake.plain_data import read_json
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.shot_id import Dark, Led, ShotId
 from coupole.storage.durable import make_folder
@@ -107,8 +108,8 @@ class FrameSheets:
         """Means by the frames' checksums."""
         self._runs.run(name)
         try:
-            found: dict[str, float] = json.loads((self._folder / f"{name}.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            found: dict[str, float] = read_json(self._folder / f"{name}.json", allow_nan=True)
+        except (OSError, InputError):
             return {}
         return found
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import coupole
 from coupole.errors import InputError, StorageError
+from coupole.intake.plain_data import json_of
 from coupole.plan.cell import Cell
 from coupole.storage.durable import make_folder
 from coupole.storage.run_json import RUN_JSON
@@ -80,8 +81,8 @@ def without_secrets(text: str) -> str:
 def _json_without(text: str) -> str | None:
     """None if it is no document of JSON; unchanged if no key in it names a secret."""
     try:
-        document = json.loads(text)
-    except ValueError:
+        document = json_of(text, "a text", allow_nan=True)
+    except InputError:
         return None
     found = _value_without(document)
     if found == document:

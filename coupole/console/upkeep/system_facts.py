@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Sequence
@@ -12,7 +11,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from coupole.console.runs.run_files import RunRow
-from coupole.errors import CoupoleError
+from coupole.errors import CoupoleError, InputError
+from coupole.intake.plain_data import json_of
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 
@@ -85,8 +85,8 @@ def log_lines(path: Path) -> list[dict[str, Any]]:
     found = []
     for line in reversed(lines):
         try:
-            found.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
+            found.append(dict(json_of(line, str(path), allow_nan=True)))
+        except (InputError, ValueError, TypeError):
             continue
     return found
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +17,7 @@ from pydantic import Field, field_validator, model_validator
 
 from coupole.appearance.render.model import Model, Vector
 from coupole.errors import InputError
+from coupole.intake.plain_data import read_json
 from coupole.plan import yamlfile
 from coupole.plan.yamlfile import Document
 
@@ -164,14 +164,12 @@ def _read_json(path: Path) -> Document:
             raise InputError(f"{path}: no such file")
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path}: expected at most {_MOST_BYTES} bytes")
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno}:{error.colno}: not valid JSON: {error.msg}") from error
-    except (OSError, UnicodeDecodeError, RecursionError) as error:
+        data: Any = read_json(path, allow_nan=True)
+    except OSError as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from error
     if not isinstance(data, dict):
         raise InputError(f"{path}:1:1: expected an object of keys and values")
-    return Document(path, data, {(): (1, 1)}, {})
+    return Document(path, data, {(): (1, 1)}, {}, "")
 
 
 def _numbers(path: Path, key: str, text: str, kind: str, columns: int = 3) -> NDArray[Any]:

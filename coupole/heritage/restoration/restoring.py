@@ -32,6 +32,7 @@ from coupole.heritage.restoration.restoration_file import (
     named_files,
 )
 from coupole.heritage.restoration.seen_parts import SeenParts
+from coupole.intake.plain_data import read_json
 from coupole.plan.yamlfile import Document
 
 Say = Callable[[str, int, int], None]
@@ -217,8 +218,8 @@ def _known(
     if not path.is_file() or not path.with_suffix(".exr").is_file():
         return None
     try:
-        about: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+        about: dict[str, Any] = read_json(path, allow_nan=True)
+    except (OSError, InputError):
         return None
     return about if about.get("of") == restoration.digest(hypothesis, camera) else None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, reason
+from coupole.intake.plain_data import read_json
 from coupole.reflectance.alignment.refinement import Refined
 from coupole.reflectance.alignment.unknowns import renumbered
 from coupole.reflectance.extraction.measured_run import MeasuredRun
@@ -178,8 +178,8 @@ def _told(folder: Path, name: str) -> Any:
     """What `refined.json` says under a name."""
     path = folder / ABOUT
     try:
-        return json.loads(path.read_text(encoding="utf-8"))[name]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return read_json(path, allow_nan=True)[name]
+    except (OSError, InputError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected the result of `coupole reflectance refine`") from error
 
 

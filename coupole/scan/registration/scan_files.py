@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, reason
 from coupole.scan.mesh import Mesh
+from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_files import read_mesh
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration import e57_scans
@@ -68,7 +69,7 @@ def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanCo
     elif suffix in TEXT_SUFFIXES:
         found = read_plain(source.path)
     elif suffix == ".ply":
-        mesh = read_ply(source.path)
+        mesh = read_ply(MeshFile(source.path))
         found = ScanContent(mesh, _ply_colours(source.path, len(mesh.vertices)) if colours else None)
     else:
         found = ScanContent(read_mesh(source.path))

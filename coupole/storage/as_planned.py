@@ -1,0 +1,130 @@
+"""Whether frames are what the run's own plan asked for: light, exposure and pose, by the plan and the rig that the
+run keeps in `inputs/`.
+
+A frame's LED is as the box logged it, its exposure as it was commanded, its pose by the arm's joints as they were
+measured. The object's mesh is not needed for it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from coupole.devices import NO_LED
+from coupole.errors import InputError
+from coupole.geometry import inverse, rotation_angle_deg
+from coupole.intake.input_files import InputFiles
+from coupole.kinematics import Arm, forward
+from coupole.plan import yamlfile
+from coupole.plan.arm_description import arm_named
+from coupole.plan.led_table import read_led_table
+from coupole.plan.plan import Plan
+from coupole.plan.rig import Rig
+from coupole.plan.schedule import Schedule, build_schedule
+from coupole.plan.shot_id import ShotId, ShotLabel
+from coupole.storage.run import Run
+from coupole.storage.step_fields import STORED_NO_LED
+
+_SETTLED_DEG = 0.1
+"""Of each axis from where it was sent, beside what an arm may move in a burst (the rig's `still_deg`)."""
+_REACH_MM = 2000.0
+"""Of an arm: an axis that is off by an angle moves the camera by this radius at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class AsPlanned:
+    """The run's plan as a schedule."""
+
+    rig: Rig
+    schedule: Schedule
+    arm: Arm | None
+    """None if nothing describes it; then poses are not compared."""
+
+    def problems_of_the_list(self, run: Run) -> Iterator[str]:
+        """Shots under a light that are in `run.json` but not in the plan, and the other way round."""
+        planned = {
+            ShotId(view.name, label)
+            for view, labels in zip(self.schedule.views, self.schedule.labels, strict=True)
+            for label in labels
+            if label.is_shot and getattr(label.light, "id", None) not in run.hidden_leds.get(view.name, ())
+        }
+        listed = {shot for shot in run.expected_shots() if shot.is_shot}
+        for shots, have, lack in ((listed - planned, "run.json", "plan"), (planned - listed, "plan", "run.json")):
+            if shots:
+                first = min(map(str, shots))
+                yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
+
+    def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
+        """How a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do not."""
+        asked = self._asked(shot.view).get(shot.label)
+        if asked is None:
+            return f"{shot}: the run's plan has no such shot" if shot.is_shot else ""
+        led, exposure_us = asked
+        if int(record["exposure_us"]) != exposure_us:
+            found = int(record["exposure_us"])
+            return f"{shot}: exposed for {found} us, where the run's plan has {exposure_us} us"
+        if int(record["led"]) != led:
+            return f"{shot}: lit by {_words(int(record['led']))}, where the run's plan has {_words(led)}"
+        return f"{shot}: {off}" if (off := self._off(shot.view, pose["joints_deg"].tobytes())) else ""
+
+    @lru_cache(maxsize=1)  # noqa: B019  an object of one `verify`
+    def _asked(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
+        """LED and exposure, us, of each frame of a view."""
+        found: dict[ShotLabel, tuple[int, int]] = {}
+        for pose, bursts in zip(self.schedule.views, self.schedule.bursts, strict=True):
+            for burst in bursts if pose.name == view else ():
+                for label, led in zip(burst.labels, burst.table["led"], strict=True):
+                    if label is not None:
+                        stored = STORED_NO_LED if led == NO_LED else int(led)
+                        found[label] = (stored, burst.timing.exposure_us)
+        return found
+
+    @lru_cache(maxsize=16)  # noqa: B019
+    def _off(self, view: str, joints: bytes) -> str:
+        """How far the arm was from a view; empty if it was there."""
+        joints_deg = np.frombuffer(joints)
+        planned = next(pose for pose in self.schedule.views if pose.name == view)
+        allowed_deg = _SETTLED_DEG + self.rig.motion.still_deg
+        if planned.joints_deg is not None:
+            off_deg = float(np.abs(joints_deg - planned.joints_deg).max())
+            return f"an axis was {off_deg:.2f} deg from the plan's posture" if off_deg > allowed_deg else ""
+        if self.arm is None or planned.support_from_camera is None:
+            return ""
+        support_from_base = inverse(self.rig.support.base_from_support.matrix())
+        flange_from_camera = self.rig.flange_from_camera.matrix()
+        found = support_from_base @ forward(self.arm, joints_deg) @ flange_from_camera
+        off_mm = float(np.linalg.norm(found[:3, 3] - planned.support_from_camera[:3, 3]))
+        off_deg = rotation_angle_deg(found, planned.support_from_camera)
+        if off_mm <= math.radians(allowed_deg) * _REACH_MM and off_deg <= 3 * allowed_deg:
+            return ""
+        return f"the camera was {off_mm:.1f} mm and {off_deg:.2f} deg from where the run's plan has it"
+
+
+def as_planned(run: Run) -> AsPlanned:
+    """The plan that the run keeps. Raises InputError if it keeps none, or it is not understood any more."""
+    if "stored" not in run.about["plan"] or "stored" not in run.about["rig"]:
+        raise InputError("the run keeps no copy of its plan and rig")
+    files = InputFiles()
+    plan = yamlfile.read(run.plan_path, files).validate(Plan)
+    document = yamlfile.read(run.rig_path, files)
+    rig = document.validate(Rig)
+    leds = read_led_table(document.resolve(rig.dome.leds), files)
+    described, _ = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)
+    schedule = build_schedule(
+        plan,
+        leds,
+        rig.support.base_from_support.matrix(),
+        rise_us=rig.led_limits.rise_us,
+        readout_us=1e6 / rig.sensor.max_frames_per_s,
+        exposure_gap_us=rig.sensor.exposure_gap_us,
+    )
+    return AsPlanned(rig, schedule, described.arm if described else None)
+
+
+def _words(led: int) -> str:
+    return "no LED" if led == STORED_NO_LED else f"LED {led}"

@@ -62,7 +62,7 @@ class Sequencer:
         """Expected duration of all that follows the burst under way."""
         self._view_number = 0
         self._view_name = ""
-        self.outcome = Outcome(shots=job.schedule.shots)
+        self.outcome = Outcome(shots=job.schedule.shots, dose_lux_h=self._dose.lux_h_in_all)
         self._control.can_stand = True
         self._arm = ArmSupervisor(
             job.cell.rig,
@@ -117,7 +117,7 @@ class Sequencer:
             raise
         finally:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
-            self.outcome.dose_lux_h = self._dose.lux_h
+            self.outcome.dose_lux_h = self._dose.lux_h_in_all
             done = self._recorder.proven()
             self.outcome.proven = sum(shot.is_shot for shot in done)
             expected = [shot for bursts in schedule.bursts for burst in bursts for shot in burst.shots if shot]

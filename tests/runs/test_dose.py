@@ -22,7 +22,8 @@ from forks import fork_context
 from real_cells import HOME, real_cell, true_dose_lux_h
 
 from coupole.acquisition import burst_runner, looking
-from coupole.storage.ledger import History, Ledger
+from coupole.storage.ledger import Ledger
+from coupole.storage.ledger_lines import History
 from coupole.viewing import live
 from sim.world.client import World
 

@@ -118,7 +118,7 @@ class Entering:
             bytes=found["bytes"],
             frames=found["frames"],
             object=thing.id if thing else None,
-            dose_budget_lux_h=thing.dose_budget_lux_h if thing else None,
+            dose_budget_lux_h=found["dose_budget_lux_h"],
             folder=fields["resume"] or fields["output"] or str(self._cell.storage_folder.resolve()),
             warnings=tuple(found["warnings"]),
         )

@@ -8,11 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from coupole.acquisition.runtime_folder import in_use
+from coupole.acquisition.cell_marks import in_use
 from coupole.acquisition.safeguard import Safeguard
 from coupole.acquisition.signals import held
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
 from coupole.plan.cell import Cell
+from coupole.plan.controller_places import remember_controller
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import device_for, in_world
@@ -85,7 +86,7 @@ def open_cell(
     """
     with contextlib.ExitStack() as stack:
         if not dry_run:
-            stack.enter_context(in_use(cell.state_folder))
+            stack.enter_context(in_use(cell))
         clock: Clock = SystemClock()
         endpoints: Mapping[str, Any] | None = None
         sensor = coarse(cell.rig.sensor) if dry_run else cell.rig.sensor
@@ -100,6 +101,8 @@ def open_cell(
             stack.callback(opened[kind].close)
             identities[kind] = opened[kind].identify()
             on_opened(kind, identities[kind])
+        if not dry_run:
+            remember_controller(cell, identities["robot"])
         opened_cell = OpenedCell(
             clock,
             **opened,

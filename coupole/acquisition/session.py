@@ -43,7 +43,7 @@ from coupole.plan.schedule import Schedule
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
@@ -112,11 +112,12 @@ def _acquire_into(
         found.update({**_figures(run, job, outcome), "unsafe": []})
         _say_outcome(console, run, outcome, "done")
         return
-    faults = ArmFaults(job.cell.state_folder)
-    faults.refuse(job.cell.document.path)
+    faults_of(job.cell).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
+        faults = faults_of(job.cell, cell.identities["robot"])  # by its serial number too
+        faults.refuse(job.cell.document.path)
         refuse_uncommissioned(job.cell, cell.identities)
         room_c = _refuse_other_calibrations(job, cell)
         if run is None:
@@ -130,8 +131,11 @@ def _acquire_into(
         recorder = RunRecorder(run, metadata_of_views(job, cell), described_cell(job), packed=packed)
         try:
             begun = SessionResumed if resumed else SessionStarted
-            acknowledged = faults.begin_session(run.folder.name)
-            recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
+            heard = faults.begin_session(run.folder.name)
+            budget = preflight.dose_budget_lux_h
+            recorder.note(
+                begun(simulated=cell.simulated, room_c=room_c, acknowledged=heard, dose_budget_lux_h=budget)
+            )
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, found=found)

@@ -22,7 +22,7 @@ from coupole.preflight.commissioned import (
     record_path,
     write_commissioning,
 )
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 
 DEVICES = {
     "ledbox": Identity("Coupole", "LED control box", "0017", "1.0"),
@@ -151,7 +151,7 @@ def test_what_cannot_be_commissioned_is_told_with_two(
 def test_a_cell_with_a_fault_of_the_arm_is_not_commissioned_before_a_persons_word(
     real: CellFolder,
 ) -> None:
-    ArmFaults(read_cell(real.rig).state_folder).note("it fell")
+    faults_of(read_cell(real.rig)).note("it fell")
     ended = cells.here("commission", real.rig, "--name", "A")
     assert ended.code == 4
     assert "coupole confirm" in ended.err

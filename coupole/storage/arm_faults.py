@@ -103,10 +103,14 @@ class ArmFaults:
     def begin_session(self, run: str) -> str:
         """A session of this run begins; returns the words that no earlier session has begun with, empty if there
         are none."""
-        found = [words for path in self._paths if (words := _new_words(_lines(path)))]
-        if found:
-            self._append(SessionOfArm(run=run))
-        return found[0] if found else ""
+        files = [_lines(path) for path in self._paths]
+        words = next((found for lines in files if (found := _new_words(lines)) is not None), None)
+        if words is None:
+            return ""
+        self._append(SessionOfArm(run=run))
+        faults = [line for lines in files for line in lines if isinstance(line, ArmFault)]
+        last = max(faults, key=lambda fault: fault.t).message if faults else "no fault"
+        return f"{last} (confirmed by {words.name}, {words.t})"
 
     def _append(self, line: _Line) -> None:
         """To all places, also if one of them does not take it."""
@@ -131,13 +135,10 @@ def _unconfirmed(lines: list[Line]) -> list[ArmFault]:
     return found
 
 
-def _new_words(lines: list[Line]) -> str:
+def _new_words(lines: list[Line]) -> Confirmation | None:
+    """The last with which no session has begun yet."""
     since = max((i for i, line in enumerate(lines) if isinstance(line, SessionOfArm)), default=-1) + 1
-    faults = [line.message for line in lines if isinstance(line, ArmFault)]
-    words = [line for line in lines[since:] if isinstance(line, Confirmation)]
-    if not words:
-        return ""
-    return f"{faults[-1] if faults else 'no fault'} (confirmed by {words[-1].name}, {words[-1].t})"
+    return next((line for line in reversed(lines[since:]) if isinstance(line, Confirmation)), None)
 
 
 def _append_to(path: Path, line: _Line) -> StorageError | None:

@@ -223,3 +223,68 @@ def test_flashes_with_different_highest_points_count_as_the_highest_of_their_sum
         flashes.settle()
         assert told == pytest.approx(flashes.total_lux_h) == pytest.approx(total(job))
     assert told == pytest.approx(1.8e-3)
+
+
+# -- what others enter meanwhile ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_light_that_comes_by_hand_between_two_bursts_is_asked_for_before_the_second(
+    job: Job, burst: Burst, simulated: bool
+) -> None:
+    dose = foreseen(job, burst)
+    ledger_of(job.cell, "relief").set_budget(3 * dose, "A. Keeper")
+    found = meter(job, simulated=simulated)
+    found.begin(burst)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    ledger_of(job.cell, "relief").enter(1.5 * dose, "studio")
+    with pytest.raises(DoseBudgetReached):
+        found.begin(burst)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_light_that_comes_by_hand_during_a_burst_of_the_host_is_asked_for_before_each_light(
+    job: Job, burst: Burst, simulated: bool
+) -> None:
+    dose = foreseen(job, burst)
+    ledger_of(job.cell, "relief").set_budget(1.5 * dose, "A. Keeper")
+    found, steps = meter(job, simulated=simulated), lit(burst)
+    by_host = replace(burst, hardware=False)
+    found.begin(by_host)
+    found.ask_again(by_host, int(steps[-1]))
+    ledger_of(job.cell, "relief").enter(dose, "studio")
+    found.ask_again(by_host, int(steps[len(steps) // 4]))
+    with pytest.raises(DoseBudgetReached):
+        found.ask_again(by_host, int(steps[-1]))
+
+
+def test_light_that_comes_by_hand_is_asked_for_before_the_next_flash_and_those_before_it_are_entered(
+    job: Job,
+) -> None:
+    ledger_of(job.cell, "relief").set_budget(1.0, "A. Keeper")
+    flash = np.full(len(job.shape.dose_points_mm), 0.05)
+    flashes = FlashMeter(job, SimpleNamespace(simulated=False, lights_confirmed=True), "live", 10.0)  # type: ignore[arg-type]
+    for _ in range(3):
+        flashes.begin(flash, flash)
+    ledger_of(job.cell, "relief").enter(0.84, "studio")
+    assert flashes.left_lux_h == pytest.approx(0.16)
+    with pytest.raises(DoseBudgetReached):
+        flashes.begin(flash, flash)
+    history = ledger_of(job.cell, "relief").read()
+    assert (history.total_lux_h, history.unsettled_lux_h) == (pytest.approx(0.99), 0.0)
+
+
+def test_a_burst_that_nobody_could_count_counts_as_planned_in_what_is_told(job: Job, burst: Burst) -> None:
+    found = meter(job)
+    found.begin(burst)
+    assert found.lux_h == 0.0
+    assert found.lux_h_in_all == pytest.approx(total(job), abs=1e-8)
+    assert found.lux_h_in_all > 0
+
+
+def foreseen(job: Job, burst: Burst) -> float:
+    """What the burst gives."""
+    found = meter(job, simulated=True)
+    found.begin(burst)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    return found.lux_h

@@ -46,6 +46,7 @@ class RealCell:
         self.cell.write(
             **{"views": [HOME], "lights": cells.SOME_LIGHTS, "exposure": BRACKET, "object": RELIEF, **plan}
         )
+        Ledger(Path(self.cell.rig_data["ledger"]), "relief").set_budget(1e6, "an operator")
         self.before_lux_h = self.history.total_lux_h
         self.true_before_lux_h = true_dose_lux_h(self.cell, self.world)
 

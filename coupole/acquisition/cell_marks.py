@@ -4,7 +4,7 @@ A mark is a lock of an open file (`F_OFD_SETLK` of Linux): it ends with its proc
 asks looks at the lock (`F_OFD_GETLK`) and never takes it, so that a session is marked whoever asks meanwhile.
 
 There is one for each place of the cell's arm (`coupole.plan.controller_places`): rigs that name the same
-controller exclude each other. Where each session has a simulated world of its own they share no device, and do not.
+controller exclude each other. Sessions that have a simulated world each share no device, and do not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Folders for what is true of the controller of a cell's arm, whatever its rig is called and wherever runs are kept.
+"""Folders for what is true of the controller of a cell's arm, whatever its rig is called and wherever runs are.
 
 A standing fault and a commissioning belong to the arm. So they are kept by the address at which its controller is
 reached, which is known before a device is opened, by its serial number, which is known afterwards, and in the

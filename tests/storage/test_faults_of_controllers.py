@@ -1,4 +1,4 @@
-"""A fault of the arm is found by the arm's controller, however the rig is called and wherever it keeps its runs."""
+"""A fault of the arm is found by its controller, however the rig is called and wherever it keeps its runs."""
 
 from __future__ import annotations
 

@@ -3,8 +3,10 @@ light."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
+import threading
 from pathlib import Path
 
 import cells
@@ -14,7 +16,7 @@ from forks import fork_context
 
 from coupole.errors import DoseBudgetReached, InputError
 from coupole.storage.ledger import Ledger
-from coupole.storage.ledger_lines import Asked
+from coupole.storage.ledger_lines import Asked, LightEntered
 
 EACH = 40
 
@@ -32,7 +34,9 @@ def test_a_plan_beyond_the_budget_is_not_entered(tmp_path: Path) -> None:
     ledger.set_budget(1.0, "A. Keeper")
     give(ledger, 0.4)
     give(ledger, 0.6)
-    with pytest.raises(DoseBudgetReached, match="object shroud: .*its budget of 1 lux.h. If it may receive more"):
+    with pytest.raises(
+        DoseBudgetReached, match=r"object shroud: .*its budget of 1 lux\.h\. If it may receive more"
+    ):
         give(ledger, 0.01)
     assert ledger.read().total_lux_h == 1.0
 
@@ -136,7 +140,36 @@ def test_of_two_sessions_and_a_person_who_enter_at_once_the_sum_never_exceeds_th
     assert history.unsettled_lux_h == 0
 
 
-# -- what others write is read without reading all of it anew ------------------------------------------------------
+def test_what_others_entered_while_it_waited_for_the_lock_counts(tmp_path: Path) -> None:
+    ledger, waits = Ledger(tmp_path, "shroud"), threading.Event()
+    ledger.set_budget(1.0, "A. Keeper")
+    take = ledger._take
+
+    def told(lock: int) -> None:
+        waits.set()
+        take(lock)
+
+    ledger._take = told  # type: ignore[method-assign]
+    ended: list[BaseException] = []
+
+    def gives() -> None:
+        try:
+            give(ledger, 0.6)
+        except DoseBudgetReached as error:
+            ended.append(error)
+
+    session = threading.Thread(target=gives)
+    with ledger.path.open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        session.start()
+        assert waits.wait(cells.PATIENCE_S)
+        held.write(LightEntered(dose_lux_h=0.5, note="studio").model_dump_json().encode() + b"\n")
+    session.join()
+    assert len(ended) == 1
+    assert ledger.read().total_lux_h == 0.5
+
+
+# -- what others write is read without reading all of it anew -----------------------------------------------------
 
 
 def test_a_ledger_that_grows_is_read_on_and_says_what_one_read_anew_says(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ class CellFolder:
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
         rig["ledger"] = str(self.folder / "ledger")
+        rig["controllers"] = str(self.folder / "controllers")
         settings = {**PLAIN, "speed": self.speed}
         rig["world"] = {"serves": "always", "settings": settings}
         self.rig_data = rig

@@ -31,7 +31,7 @@ from coupole.devices import (
     StepRecord,
     table_box,
 )
-from coupole.errors import DeviceError, DeviceTimeout
+from coupole.errors import DeviceError, DeviceTimeout, StorageError
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.journal_events import BurstEnded, Joints
@@ -84,7 +84,7 @@ class BurstRunner:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
-        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose.begin, self._note)
+        self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose, self._note)
         self._uploader = Workers(1, "upload")
         self._upload: futures.Future[None] | None = None
         self._buffer_memory_bytes = memory_for_buffers()
@@ -294,8 +294,8 @@ class BurstRunner:
         panel_s: float,
         **figures: Any,
     ) -> None:
-        """Count the burst's light, and write its line in the journal."""
-        given_lux_h = self._dose.end(burst, log, table_ran_s=table_ran_s, panel_s=panel_s)
+        """Count the burst's light, and write its line in the journal before the ledger has it."""
+        given_lux_h = self._dose.count(burst, log, table_ran_s=table_ran_s, panel_s=panel_s)
         self._recorder.note(
             BurstEnded(
                 view=burst.view,
@@ -307,7 +307,13 @@ class BurstRunner:
                 **figures,
             )
         )
-        self._recorder.commit(now=True)
+        try:
+            self._recorder.commit(now=True)
+        except StorageError:
+            if not any(given_lux_h):  # the disk refused already its plan: nothing was lit
+                self._dose.end(given_lux_h)
+            raise
+        self._dose.end(given_lux_h)
 
 
 def _since_s(begun_ns: int | None, ended_ns: int) -> float:

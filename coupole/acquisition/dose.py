@@ -1,14 +1,16 @@
 """The light that a session gives the object: entered in its ledger before it is given, corrected afterwards.
 
-Whoever gives light asks here first, burst by burst (`DoseMeter`) or second by second (the live view): the object's
-budget is checked, and what is planned is on the disk before the first lamp is lit. A session that ends without a
-word (kill -9, power cut) leaves the plan of one burst, which is at least what was given.
+Whoever gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`): the object's
+budget is asked, after all that its ledger has at that moment, and what is planned is on the disk before the first
+lamp is lit. Lights that the host switches are asked for once more each. A session that ends without a word (kill
+-9, power cut) leaves the plan of one burst, which is at least what was given.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -26,15 +28,26 @@ from coupole.plan.rig_devices import longest_light_s, watchdog_s
 from coupole.preflight.job import Job
 from coupole.preflight.preflight import BURST_OVERHEAD_S
 from coupole.storage.journal_events import BurstBegun
-from coupole.storage.ledger import LOCK_S, History, Ledger, ledger_of
+from coupole.storage.ledger import LOCK_S, Ledger, ledger_of
+from coupole.storage.ledger_lines import Asked, History
+from coupole.storage.run import user_name
 
 LuxHours = NDArray[np.float64]
 """[points] at each of the object's dose points."""
 _CLOCKS_PPM, _START_US = 1000, 1000
 """Allowance for the box's clock, and for its start of a table, where steps are counted that its log lacks."""
 _DIGITS = 9
-_ROUNDING = 1e-9
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """Light that is entered, and perhaps being given."""
+
+    at_most: LuxHours
+    w_per_lm: float | None
+    """Its damaging power, if known."""
+    plan_id: str
 
 
 class LightOnObject:
@@ -49,21 +62,21 @@ class LightOnObject:
         """`before_lux_h` [points] was given by earlier sessions of the same run. Raises StorageError if the ledger
         cannot be read and written."""
         measured = job.plan.object
-        ledger = ledger_of(job.cell, measured.id) if measured else None
-        history = _answered(ledger, ledger.read) if ledger else History()
-        self._ledger = None if cell.simulated else ledger
-        if self._ledger is not None:
+        self._ledger = ledger_of(job.cell, measured.id) if measured else None
+        self._enters = self._ledger is not None and not cell.simulated
+        if self._ledger is not None and self._enters:
             _answered(self._ledger, self._ledger.prove_writable)
         self._id, self._what_for = measured.id if measured else "", what_for
-        self._budget_lux_h = math.inf
-        if measured and measured.dose_budget_lux_h is not None:
-            self._budget_lux_h = measured.dose_budget_lux_h * (1.0 + _ROUNDING)
-        self._warn_above_lux_h = history.warn_above_lux_h
-        self.total_lux_h = history.total_lux_h
-        """Of the object's life, by the ledger, and of this session."""
+        self._asked = Asked(
+            0.0, measured.dose_budget_lux_h if measured else None, plan=job.plan.name, name=user_name()
+        )
         points = len(job.shape.dose_points_mm)
         self._given_lux_h = np.array(before_lux_h) if len(before_lux_h) else np.zeros(points)
-        self._planned: tuple[LuxHours, float | None, str] | None = None
+        self._planned: _Planned | None = None
+        self._unentered_lux_h = 0.0
+        """Of this session, in a simulated cell."""
+        if self._ledger is not None:
+            self._ledger.newest()
 
     @property
     def lux_h(self) -> float:
@@ -71,22 +84,38 @@ class LightOnObject:
         return float(self._given_lux_h.max())
 
     @property
+    def lux_h_at_most(self) -> float:
+        """The same with all that is planned and of which nobody has said what was given."""
+        return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
+
+    @property
     def given_lux_h(self) -> LuxHours:
         """[points] of the run so far, or of the live view."""
         return self._given_lux_h
 
     @property
+    def total_lux_h(self) -> float:
+        """Of the object's life, by its ledger as it is now, without what is being given."""
+        planned_lux_h = self._history.planned_lux_h(self._planned.plan_id) if self._planned else 0.0
+        return self._history.total_lux_h - planned_lux_h + self._unentered_lux_h
+
+    @property
     def left_lux_h(self) -> float:
-        """Until the budget is reached; infinite without one."""
-        return self._budget_lux_h - self.total_lux_h
+        """Until the budget is reached, by the ledger as it is now; infinite without one."""
+        allowed_lux_h = self._history.allowed_lux_h(self._asked.budget_lux_h)
+        return math.inf if allowed_lux_h is None else allowed_lux_h - self.total_lux_h
 
     @property
     def warning(self) -> str:
         """Why the object's light is to be watched; empty if it is not."""
-        limit = self._warn_above_lux_h
+        limit = self._history.warn_above_lux_h
         if limit is None or self.total_lux_h <= limit:
             return ""
         return f"object {self._id}: {self.total_lux_h:.3f} lux.h in all; its ledger warns above {limit:g}"
+
+    @property
+    def _history(self) -> History:
+        return self._ledger.newest() if self._ledger is not None else History()
 
     def begin(self, at_most: LuxHours, expected: LuxHours | None = None, w_per_lm: float | None = None) -> None:
         """Light is about to be given, `at_most` this; the budget is asked for what is `expected` (default: the
@@ -94,32 +123,46 @@ class LightOnObject:
 
         Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
         """
-        more_lux_h = self.more_lux_h(at_most if expected is None else expected)
-        if more_lux_h > self.left_lux_h:
-            raise DoseBudgetReached(
-                f"object {self._id}: the next {more_lux_h:.3g} lux.h after {self.total_lux_h:.3f} lux.h would "
-                f"exceed its budget of {self._budget_lux_h:g} lux.h. Raise `dose_budget_lux_h` in the plan if the "
-                "object may receive it"
-            )
+        asked = replace(self._asked, lux_h=self.more_lux_h(at_most if expected is None else expected))
         plan_id = ""
-        if self._ledger is not None:
+        if self._ledger is not None and self._enters:
             entry = self._entry(at_most, w_per_lm)
-            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry))
-        self._planned = at_most, w_per_lm, plan_id
+            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry, asked))
+        elif self._ledger is not None:
+            newest = _answered(self._ledger, self._ledger.newest)
+            asked.refuse_beyond(self._id, newest, self._unentered_lux_h)
+        self._planned = _Planned(at_most, w_per_lm, plan_id)
+
+    def ask_again(self, so_far: LuxHours) -> None:
+        """Ask the budget once more, for what has been given of the last `begin` and what is given next together.
+        Raises DoseBudgetReached, StorageError."""
+        if self._ledger is None or self._planned is None:
+            return
+        asked = replace(self._asked, lux_h=self.more_lux_h(so_far))
+        if self._enters:
+            _answered(self._ledger, partial(self._ledger.ask_again, asked, self._planned.plan_id))
+        else:
+            newest = _answered(self._ledger, self._ledger.newest)
+            asked.refuse_beyond(self._id, newest, self._unentered_lux_h)
 
     def end(self, given: LuxHours | None) -> LuxHours:
         """The light of the last `begin` is over; `given` None: what was planned stands. Returns what counts."""
-        if self._planned is None:
+        planned = self._planned
+        if planned is None:
             return np.zeros_like(self._given_lux_h)
-        at_most, w_per_lm, plan_id = self._planned
-        counts = at_most if given is None else given
-        if self._ledger is not None and given is not None:
-            entry = self._entry(counts, w_per_lm)
-            _answered(self._ledger, partial(self._ledger.correct, plan_id, *entry))
-        self._planned = None  # not before: if the ledger's disk hangs, `end(None)` counts what was planned
-        self.total_lux_h += self.more_lux_h(counts)
-        self._given_lux_h = self._given_lux_h + counts
+        counts = planned.at_most if given is None else given
+        if self._ledger is not None and self._enters and given is not None:
+            entry = self._entry(counts, planned.w_per_lm)
+            _answered(self._ledger, partial(self._ledger.correct, planned.plan_id, *entry))
+        if not self._enters:
+            self._unentered_lux_h += self.more_lux_h(counts)
+        self._given_lux_h, self._planned = self._given_lux_h + counts, None
         return counts
+
+    @property
+    def planned_lux_h(self) -> LuxHours:
+        """[points] of the last `begin`, until its `end`."""
+        return np.zeros_like(self._given_lux_h) if self._planned is None else self._planned.at_most
 
     def more_lux_h(self, lux_h: LuxHours) -> float:
         """What these add to the dose, so that a run's entries sum to the dose of its highest point."""
@@ -170,6 +213,12 @@ class FlashMeter:
             count = self._at_once if self._at_once * lux_h.max() <= self._light.left_lux_h else 1
             self._light.begin(count * lux_h + (at_most_lux_h - lux_h), count * lux_h, w_per_lm)
             self._flash_lux_h, self._left = lux_h, count
+        else:
+            try:
+                self._light.ask_again(self._given_lux_h + lux_h)
+            except DoseBudgetReached:
+                self.settle()
+                raise
         self._left -= 1
         self._given_lux_h = self._given_lux_h + lux_h
 
@@ -201,6 +250,12 @@ class DoseMeter:
         """Of the run so far, all its sessions; without the burst under way."""
         return self._light.lux_h
 
+    @property
+    def lux_h_in_all(self) -> float:
+        """Of the run, all its sessions, as journal and ledger have it: a burst whose light nobody could count
+        counts as planned."""
+        return self._light.lux_h_at_most
+
     def lux_h_after(self, steps: int) -> float:
         """Of the run so far, with so many steps of the burst under way, whose panel counts when it has ended."""
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
@@ -229,22 +284,36 @@ class DoseMeter:
         self._recorder.note(BurstBegun(view=burst.view, planned_lux_h=planned))
         self._recorder.commit(now=True)
 
-    def end(self, burst: Burst, log: NDArray[np.void], *, table_ran_s: float, panel_s: float) -> tuple[float, ...]:
-        """Count what a burst has given: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks and that
+    def ask_again(self, burst: Burst, step: int) -> None:
+        """To be called before the host lights a step of the burst that has begun. Raises DoseBudgetReached."""
+        so_far = burst.table[: step + 1]
+        share = len(so_far) / len(burst.table)
+        panel_s = share * (burst.duration_s + BURST_OVERHEAD_S) if burst.panel else 0.0
+        self._light.ask_again(self._of_leds(so_far["led"], so_far["on_us"]) + self._of_panel(panel_s))
+
+    def count(
+        self, burst: Burst, log: NDArray[np.void], *, table_ran_s: float, panel_s: float
+    ) -> tuple[float, ...]:
+        """What a burst has given [points]: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks and that
         may have begun while the box ran the table for `table_ran_s`; and a panel that was on for `panel_s`.
 
-        If it is not sure that the lights are off, all that was planned counts. Returns lux hours at each point.
+        If it is not sure that the lights are off, all that was planned counts. For the journal, then for `end`.
         """
-        self._under_way_lux_h = np.zeros(1)
         if not self._cell.lights_confirmed:
-            return tuple(np.round(self._light.end(None), _DIGITS).tolist())
+            return tuple(np.round(self._light.planned_lux_h, _DIGITS).tolist())
         given = self._of_leds(log["led"], log["on_us"])
         begins_us = np.cumsum(burst.table["period_us"]) - burst.table["period_us"]
         allowed_us = table_ran_s * (1e6 + _CLOCKS_PPM) + _START_US
         begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
         unlogged = burst.table[begun & ~np.isin(np.arange(len(begun)), log["step"])]
         given = given + self._of_leds(unlogged["led"], unlogged["on_us"]) + self._of_panel(panel_s)
-        return tuple(np.round(self._light.end(given), _DIGITS).tolist())
+        return tuple(np.round(given, _DIGITS).tolist())
+
+    def end(self, given_lux_h: tuple[float, ...]) -> None:
+        """Enter what `count` has found, once the journal has it. Until then all that was planned counts: so
+        journal and ledger say the same, whatever keeps the journal from it."""
+        self._under_way_lux_h = np.zeros(1)
+        self._light.end(np.array(given_lux_h) if self._cell.lights_confirmed else None)
 
     def give_up(self) -> None:
         """Nobody will tell how the burst under way ended: all that was planned counts, as in the ledger."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -64,9 +65,17 @@ class _Kept:
     fields: dict[str, int]
 
 
+class Dose(Protocol):
+    """The object's light (`coupole.acquisition.dose`); both raise DoseBudgetReached and StorageError."""
+
+    def begin(self, burst: Burst) -> None: ...
+
+    def ask_again(self, burst: Burst, step: int) -> None: ...
+
+
 class HostBurst:
-    """Fires bursts with software trigger. `begin(burst)` is called before its first light, `tell(burst, step)`
-    during a burst; `note` counts its light and writes its journal line."""
+    """Fires bursts with software trigger. The `dose` is asked before the burst and before each light of it;
+    `tell(burst, step)` is called during a burst; `note` counts its light and writes its journal line."""
 
     def __init__(
         self,
@@ -75,11 +84,11 @@ class HostBurst:
         arm: ArmSupervisor,
         tell: Callable[[Burst, int], None],
         wait_while_paused: Callable[[], None],
-        begin: Callable[[Burst], None],
+        dose: Dose,
         note: Callable[..., None],
     ) -> None:
         self._cell, self._recorder, self._arm = cell, recorder, arm
-        self._tell, self._wait_while_paused, self._begin, self._note = tell, wait_while_paused, begin, note
+        self._tell, self._wait_while_paused, self._dose, self._note = tell, wait_while_paused, dose, note
         self._panel_s = 0.0
         """For which the panel of this burst was on, at most."""
 
@@ -95,10 +104,12 @@ class HostBurst:
         arm_before, arm_after = self._cell.robot.measured(), None
         self._panel_s = 0.0
         try:
-            self._begin(burst)
+            self._dose.begin(burst)
             for index, shot in enumerate(burst.shots):
                 self._arm.attend()
                 self._wait_while_paused()
+                if _gives_light(burst, index):
+                    self._dose.ask_again(burst, index)
                 taken = self._fire_one(burst, index, given)
                 taken_frames += 1
                 if shot is not None and taken.record.invalid_exposure:
@@ -183,6 +194,10 @@ class HostBurst:
         if other is not None:
             other.release()
         return other is None
+
+
+def _gives_light(burst: Burst, index: int) -> bool:
+    return bool(burst.table["led"][index] != NO_LED) or (burst.panel > 0 and index in burst.inner)
 
 
 def _cut_short(led: int, on_us: float) -> StepRecord:

@@ -39,7 +39,7 @@ from coupole.preflight import exposure_advice
 from coupole.preflight.checking import check_job, ledger_warnings, light_refusals
 from coupole.preflight.job import Job, schedule_of
 from coupole.preflight.preflight import StorageFacts
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 from coupole.storage.ledger import ledger_of
 from coupole.viewing.live import Choice, RunSource, Source, Studio, Wanted, choice_from, run_source
 from coupole.viewing.live_page import serve
@@ -58,11 +58,12 @@ def meter(
     """
     small = metering_job(job)
     refuse_uncommissioned(job.cell)
-    ArmFaults(job.cell.state_folder).refuse(job.cell.document.path)
+    faults_of(job.cell).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     control = Control()
     with open_cell(job.cell, job=small, on_opened=identity_printer(console)) as cell:
         refuse_uncommissioned(job.cell, cell.identities)
+        faults_of(job.cell, cell.identities["robot"]).refuse(job.cell.document.path)
         observer = RunObserver(console, job.cell.rig.frame_bytes, 0)
         try:
             with obeyed_by(control, cell.halt), observer.showing(small.schedule.frames, len(small.schedule.views)):
@@ -113,9 +114,10 @@ def watch_cell(
         console.print("no object is known, so no light is counted; to have it counted, give a plan")
     else:
         _ask_the_ledger(job, console)
-    ArmFaults(rig_cell.state_folder).refuse(rig_cell.document.path)
+    faults_of(rig_cell).refuse(rig_cell.document.path)
     ask_to_begin(rig_cell, confirm=confirm)
     with open_cell(rig_cell, job=job, on_opened=identity_printer(console)) as cell:
+        faults_of(rig_cell, cell.identities["robot"]).refuse(rig_cell.document.path)
         meter = FlashMeter(job, cell, "live", frames_per_s) if job else None
         shots = SingleShots(rig_cell, cell, lux_of_leds(rig_cell, job), meter, 1.0 / frames_per_s)
         source = CellSource(cell, shots, tuple(leds.ids.tolist()), meter)

@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from coupole.acquisition.cell_marks import in_use
 from coupole.acquisition.noted_devices import NAMES, NotedDevice
-from coupole.acquisition.runtime_folder import in_use
 from coupole.acquisition.safeguard import Safeguard
 from coupole.acquisition.signals import held
 from coupole.bounded import NOW, bounded, hangs, under_way
 from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
 from coupole.errors import DeviceTimeout
 from coupole.plan.cell import Cell
+from coupole.plan.controller_places import remember_controller
 from coupole.plan.registry import WORLD, load_class, settings_class
 from coupole.plan.rig import Rig, Sensor
 from coupole.plan.rig_devices import device_for, in_world
@@ -103,7 +104,7 @@ def open_cell(
     """
     with contextlib.ExitStack() as stack:
         if not dry_run:
-            stack.enter_context(in_use(cell.state_folder))
+            stack.enter_context(in_use(cell))
         clock: Clock = SystemClock()
         endpoints: Mapping[str, Any] | None = None
         sensor = coarse(cell.rig.sensor) if dry_run else cell.rig.sensor
@@ -121,6 +122,8 @@ def open_cell(
             stack.push(partial(_close, opened[kind], NAMES[kind]))
             identities[kind] = bounded(opened[kind].identify)
             on_opened(kind, identities[kind])
+        if not dry_run:
+            remember_controller(cell, identities["robot"])
         opened_cell = OpenedCell(
             clock,
             **opened,

@@ -62,7 +62,7 @@ class Sequencer:
         """Expected duration of all that follows the burst under way."""
         self._view_number = 0
         self._view_name = ""
-        self.outcome = Outcome(shots=job.schedule.shots)
+        self.outcome = Outcome(shots=job.schedule.shots, dose_lux_h=self._dose.lux_h_in_all)
         self._control.can_stand = True
         self._arm = ArmSupervisor(
             job.cell.rig,
@@ -124,7 +124,7 @@ class Sequencer:
 
     def _conclude(self, done: set[ShotId]) -> None:
         """The outcome's figures, if these shots are proven."""
-        self.outcome.dose_lux_h = self._dose.lux_h
+        self.outcome.dose_lux_h = self._dose.lux_h_in_all
         self.outcome.proven = sum(shot.is_shot for shot in done)
         bursts = (burst for bursts in self._job.schedule.bursts for burst in bursts)
         expected = [shot for burst in bursts for shot in burst.shots if shot]

@@ -50,7 +50,7 @@ from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, without_hidden
 from coupole.preflight.preflight import StorageFacts
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import copied_s
@@ -119,11 +119,12 @@ def _acquire_into(
         found.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
         _say_outcome(console, run, outcome, "done")
         return
-    faults = ArmFaults(job.cell.state_folder)
-    faults.refuse(job.cell.document.path)
+    faults_of(job.cell).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
     console.print("opening the devices ...")
     with open_cell(job.cell, job=job, on_opened=identity_printer(console)) as cell:
+        faults = faults_of(job.cell, cell.identities["robot"])  # by its serial number too
+        on_disk(faults.where, partial(faults.refuse, job.cell.document.path))
         on_disk("the cell's commissioning record", partial(refuse_uncommissioned, job.cell, cell.identities))
         room_c = bounded(lambda: _refuse_other_calibrations(job, cell))
         if run is None:
@@ -139,8 +140,11 @@ def _acquire_into(
         recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, packed=packed))
         try:
             begun = SessionResumed if resumed else SessionStarted
-            acknowledged = on_disk(str(faults.path), partial(faults.begin_session, run.folder.name))
-            recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
+            heard = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
+            budget = preflight.dose_budget_lux_h
+            recorder.note(
+                begun(simulated=cell.simulated, room_c=room_c, acknowledged=heard, dose_budget_lux_h=budget)
+            )
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}

@@ -53,6 +53,6 @@ def note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run:
         found = "; ".join(cell.trouble)
     if found:
         try:
-            on_disk(str(faults.path), partial(faults.note, found, run.folder.name), stop=NOW)
+            on_disk(faults.where, partial(faults.note, found, run.folder.name), stop=NOW)
         except StorageError as error:
             cell.trouble.append(f"the arm's fault could not be recorded: {error}")

@@ -72,8 +72,8 @@ def arm(
     """
     from coupole.acquisition.cell_bench.bench_client import ask_bench
     from coupole.acquisition.cell_bench.bench_service import bench_of
+    from coupole.acquisition.cell_marks import is_in_use
     from coupole.acquisition.observer import Control
-    from coupole.acquisition.runtime_folder import is_in_use
     from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.preflight.job import read_job
@@ -85,7 +85,7 @@ def arm(
     console, control = make_console(quiet=as_json), Control()
     try:
         cell = read_cell(rig)
-        if is_in_use(cell.state_folder):
+        if is_in_use(cell):
             found = _driven(lambda command, **fields: ask_bench(cell, command, **fields), goal, control, yes=yes)
         else:
             lies = object_of or plan

@@ -27,9 +27,20 @@ def dose(
     warn_above: Annotated[
         float | None, typer.Option("--warn-above", min=0, help="Warn when the total exceeds this, lux hours.")
     ] = None,
+    budget: Annotated[
+        float | None,
+        typer.Option(
+            "--budget", min=0, help="All light that it may receive in its life, lux hours; needs --name."
+        ),
+    ] = None,
+    name: Annotated[str, typer.Option("--name", help="Who says so.")] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Why the budget is this.")] = "",
     as_json: JsonOption = False,
 ) -> None:
-    """All light that an object has received, run by run; light given elsewhere is entered by hand."""
+    """All light that an object has received, run by run, and its budget; light given elsewhere is entered by hand.
+
+    The budget holds under every rig and plan from the next burst on; a plan's own can only be stricter.
+    """
     from coupole.plan.cell import read_cell, users_ledger_folder
     from coupole.storage.ledger import Ledger, ledger_of, similar_ids
     from coupole.viewing.dose_table import document, show_dose
@@ -37,12 +48,17 @@ def dose(
 
     if (add is not None) != bool(note.strip()):
         raise InputError("--add and --note belong together: how many lux hours, and what that light was")
+    if (budget is not None) != bool(name.strip()) or (reason.strip() and budget is None):
+        raise InputError("--budget and --name belong together (and --reason to them): how many lux hours, and who")
     cell = read_cell(rig) if rig else None
     ledger = ledger_of(cell, object_id) if cell else Ledger(users_ledger_folder(), object_id)
     if add is not None and not _sent(cell, object_id, "light", {"dose_lux_h": add, "note": note.strip()}):
         ledger.enter(add, note.strip())
     if warn_above is not None and not _sent(cell, object_id, "warning", {"above_lux_h": warn_above}):
         ledger.warn_above(warn_above)
+    said = {"dose_lux_h": budget, "name": name.strip(), "reason": reason.strip()}
+    if budget is not None and not _sent(cell, object_id, "budget", said):
+        ledger.set_budget(budget, name, reason)
     history, others = ledger.read(), similar_ids(ledger.folder, object_id)
     show_dose(make_console(quiet=as_json), ledger, history, others)
     if as_json:

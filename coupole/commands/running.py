@@ -188,12 +188,12 @@ def confirm(
     """
     from coupole.errors import InputError
     from coupole.plan.cell import read_cell
-    from coupole.storage.arm_faults import ArmFaults
+    from coupole.storage.arm_faults import faults_of
     from coupole.viewing.terminal import make_console
 
     if not name.strip():
         raise InputError("--name: expected the name of the person who has been to the cell")
-    console, faults = make_console(quiet=as_json), ArmFaults(read_cell(rig).state_folder)
+    console, faults = make_console(quiet=as_json), faults_of(read_cell(rig))
     standing = faults.standing()
     for fault in standing:
         console.print(f"{fault.t}  {fault.message}", markup=False)

@@ -61,16 +61,26 @@ class Cell:
         return self.document.resolve(self.rig.ledger) if self.rig.ledger is not None else users_ledger_folder()
 
     @property
+    def controllers_folder(self) -> Path:
+        """Where it is kept what is true of arms' controllers (`coupole.plan.controller_places`)."""
+        given = self.rig.controllers
+        return self.document.resolve(given) if given is not None else users_data_folder() / "controllers"
+
+    @property
     def former_ledger_folder(self) -> Path:
         """Where version 0.1 kept them."""
         return self.storage_folder / "ledger"
 
 
 def users_ledger_folder() -> Path:
-    """Of rigs that name none: in the user's data folder (XDG Base Directory Specification; a relative path is
-    ignored there)."""
+    """Of rigs that name none."""
+    return users_data_folder() / "ledger"
+
+
+def users_data_folder() -> Path:
+    """Coupole's in the user's data folder (XDG Base Directory Specification; a relative path is ignored there)."""
     given = Path(os.environ.get("XDG_DATA_HOME", ""))
-    return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole/ledger"
+    return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole"
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:

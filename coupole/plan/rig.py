@@ -321,6 +321,9 @@ class Rig(Model):
     ledger: FilePath | None = None
     """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
     user's data folder (XDG) if not given."""
+    controllers: FilePath | None = None
+    """Folder of what is true of arms' controllers, whatever rig names them: faults that stand, commissioning.
+    `coupole/controllers` in the user's data folder (XDG) if not given."""
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     console: Consoles = Consoles()

@@ -14,14 +14,15 @@ from coupole.errors import StorageError
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import runs_tables
+from coupole.plan.rig_devices import in_world, runs_tables
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
 from coupole.preflight.framing import ObjectCheck, check_object
 from coupole.preflight.job import Job, at_pace
 from coupole.preflight.preflight import DISK_SHARE, Report, StorageFacts, Whole, check
-from coupole.storage.ledger import History, ledger_of, similar_ids
+from coupole.storage.ledger import ledger_of, similar_ids
+from coupole.storage.ledger_lines import History
 from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
@@ -97,6 +98,7 @@ def check_job(
             leds=job.cell.leds,
             storage=storage,
             object_points_support_mm=job.shape.dose_points_mm,
+            dose_budget_lux_h=history.budget_lux_h,
         )
         if all_views is None:
             return paced, checking(paced.schedule, itinerary=itinerary, dose_before_lux_h=before)
@@ -134,10 +136,15 @@ def check_job(
     return job, report
 
 
+def allowed_lux_h(job: Job, history: History) -> float | None:
+    """What the job's object may receive in its life, by its ledger's `history` or by the plan if that is stricter;
+    None without a budget."""
+    return history.allowed_lux_h(job.plan.object.dose_budget_lux_h) if job.plan.object else None
+
+
 def light_refusals(job: Job, history: History) -> list[str]:
     """Reasons why the object may receive no more light at all."""
-    measured = job.plan.object
-    budget = measured.dose_budget_lux_h if measured else None
+    measured, budget = job.plan.object, allowed_lux_h(job, history)
     if measured is None or budget is None or history.total_lux_h < budget:
         return []
     return [
@@ -155,6 +162,11 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
         warnings.append(
             f"object {name}: {more_lux_h:.3f} lux.h after {history.total_lux_h:.3f} lux.h before; its ledger "
             f"warns above {limit_lux_h:g} lux.h"
+        )
+    if allowed_lux_h(job, history) is None and not in_world(job.cell.rig, dry_run=False):
+        warnings.append(
+            f"object {name}: nobody has said how much light it may receive: `coupole dose {name} --budget LUX_H "
+            "--name NAME` does"
         )
     if others := similar_ids(job.cell.ledger_folder, name):
         warnings.append(

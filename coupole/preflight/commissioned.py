@@ -1,4 +1,5 @@
-"""The record of a cell's commissioning: `commissioning.yaml` in its state folder, and whether it fits the cell.
+"""The record of a cell's commissioning: `commissioning.yaml`, and whether it fits the cell. It is kept by the
+controller of the cell's arm, and in the rig's state folder (`coupole.plan.controller_places`).
 
 Each step keeps all of the rig that it covers (`commissioned_rig`) and the devices with which it was done. So a
 change of the rig, or another box, asks for the steps that it concerns and for no others. The file carries a
@@ -20,6 +21,7 @@ from coupole.devices import Identity
 from coupole.errors import InputError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
+from coupole.plan.controller_places import places_of_arm
 from coupole.plan.plan import Model, Name
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.commissioned_rig import STEPS, Step, covered
@@ -38,6 +40,7 @@ _DEVICES: Mapping[Step, tuple[str, ...]] = {
 }
 """The devices that a step is about."""
 _MOST_TOLD = 8
+_FILE = "commissioning.yaml"
 _HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, say `coupole commission`."
 
 
@@ -97,7 +100,8 @@ class CommissioningRecord(Model):
 
 
 def record_path(cell: Cell) -> Path:
-    return cell.state_folder / "commissioning.yaml"
+    """In the rig's state folder; copies are in the other places of the arm."""
+    return cell.state_folder / _FILE
 
 
 def empty_record(cell: Cell) -> CommissioningRecord:
@@ -105,10 +109,28 @@ def empty_record(cell: Cell) -> CommissioningRecord:
 
 
 def read_commissioning(cell: Cell) -> CommissioningRecord | None:
-    """The cell's record; None if there is none. Raises InputError for one that was edited or cannot be read."""
-    path = record_path(cell)
-    if not path.exists():
-        return None
+    """The record of the cell, by the controller of its arm and in the rig's state folder; None if there is none.
+
+    Of each step the newest result that fits the rig is taken, else the newest. Raises InputError for a record that
+    was edited or cannot be read.
+    """
+    paths = [place / _FILE for place in places_of_arm(cell)]
+    records = {path: _read(path) for path in paths if path.exists()}
+    simulated = in_world(cell.rig, dry_run=False)
+    own = {path: record for path, record in records.items() if record.simulated == simulated}
+    if not own:
+        return next(iter(records.values()), None)
+    if list(own) == [record_path(cell)]:
+        return own[record_path(cell)]
+    steps = []
+    for step in STEPS:
+        results = [found for record in own.values() if (found := record.result(step)) is not None]
+        fitting = [result for result in results if not outdated(cell, result)]
+        steps += sorted(fitting or results, key=lambda result: result.ended)[-1:]
+    return _sealed(cell.rig.name, tuple(steps), simulated=simulated)
+
+
+def _read(path: Path) -> CommissioningRecord:
     document = yamlfile.read(path)
     record = document.validate(CommissioningRecord)
     if content_sha256(json.loads(record.model_dump_json())) != record.sha256:
@@ -118,8 +140,9 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
 
 
 def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
-    """Raises StorageError."""
-    write_sealed(record_path(cell), json.loads(record.model_dump_json()), _HEAD)
+    """In all places of the arm. Raises StorageError."""
+    for place in places_of_arm(cell):
+        write_sealed(place / _FILE, json.loads(record.model_dump_json()), _HEAD)
 
 
 def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:

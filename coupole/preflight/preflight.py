@@ -117,14 +117,16 @@ def check(
     *,
     object_points_support_mm: NDArray[np.float64],
     dose_before_lux_h: float = 0.0,
+    dose_budget_lux_h: float | None = None,
     whole: Whole | None = None,
 ) -> Report:
     """Check a whole plan, or what is left of the run `whole`. The dose is computed at `object_points_support_mm`
-    [n, 3]; the highest counts."""
+    [n, 3]; the highest counts. `dose_budget_lux_h`: the object's own, by its ledger; a plan's can be stricter."""
     report = Report(whole, shots=schedule.shots, frames=schedule.frames)
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = dose_before_lux_h
-    report.dose_budget_lux_h = plan.object.dose_budget_lux_h if plan.object else None
+    budgets = [dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
+    report.dose_budget_lux_h = min((one for one in budgets if one is not None), default=None)
     report.refusals += itinerary.refusals
     report.refusals += _refuse_names(schedule)
     report.refusals += _refuse_optics(plan, rig)

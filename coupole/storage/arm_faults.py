@@ -1,17 +1,25 @@
-"""Faults of a cell's arm, and the words of those who have been there: `arm.jsonl` in the cell's state folder.
+"""Faults of a cell's arm, and the words of those who have been there: `arm.jsonl`, in each place of that arm.
 
-A fault belongs to the cell, not to the run in which it happened: until a named person confirms that the cause is
-found and the cell is clear, no session of any run may move that arm.
+A fault belongs to the arm, not to the run in which it happened, nor to the rig: until a named person confirms that
+the cause is found and the cell is clear, no session of any run may move that arm. So it is noted by the address
+and the serial number of the arm's controller and in the rig's state folder (`coupole.plan.controller_places`), and
+stands as long as it stands in one of them. A confirmation names the faults that it is about: it counts for these
+wherever else they are noted.
 """
 
 from __future__ import annotations
 
+import uuid
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from coupole.devices import Identity
 from coupole.errors import DeviceFault, StorageError
+from coupole.plan.cell import Cell
+from coupole.plan.controller_places import places_of_arm
+from coupole.storage.durable import make_folder
 from coupole.storage.line_file import LineFile, utc_now
 
 
@@ -27,6 +35,8 @@ class ArmFault(_Line):
     event: Literal["fault"] = "fault"
     message: str
     run: str = ""
+    id: str = ""
+    """The same in each place; empty in version 0.1, and for a line that cannot be read."""
 
 
 class Confirmation(_Line):
@@ -35,6 +45,8 @@ class Confirmation(_Line):
     event: Literal["confirmed"] = "confirmed"
     name: str
     note: str = ""
+    faults: tuple[str, ...] = ()
+    """Ids of those that it is about, beside all before it in its file."""
 
 
 class SessionOfArm(_Line):
@@ -44,36 +56,34 @@ class SessionOfArm(_Line):
     run: str = ""
 
 
-_LINE: TypeAdapter[ArmFault | Confirmation | SessionOfArm] = TypeAdapter(
-    Annotated[ArmFault | Confirmation | SessionOfArm, Field(discriminator="event")]
-)
+Line: TypeAlias = ArmFault | Confirmation | SessionOfArm
+_LINE: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
 
 
 class ArmFaults:
     """The faults of one cell's arm."""
 
-    def __init__(self, state_folder: Path) -> None:
-        self.path = state_folder / "arm.jsonl"
+    def __init__(self, *folders: Path) -> None:
+        """`folders`: all places of the arm."""
+        self._paths = tuple(folder / "arm.jsonl" for folder in folders)
 
-    def lines(self) -> list[ArmFault | Confirmation | SessionOfArm]:
-        """All lines, oldest first. A line that cannot be read counts as a fault: it may have been one."""
-        try:
-            texts = self.path.read_bytes().splitlines()
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise StorageError(f"{self.path}: cannot read the faults of the arm: {error.strerror}") from error
-        return [_read(text) for text in texts]
+    @property
+    def where(self) -> str:
+        """Its files, to be named when their disk does not answer."""
+        return ", ".join(map(str, self._paths))
 
     def standing(self) -> list[ArmFault]:
-        """Faults that nobody has confirmed yet."""
-        found: list[ArmFault] = []
-        for line in self.lines():
-            if isinstance(line, ArmFault):
-                found.append(line)
-            elif isinstance(line, Confirmation):
-                found.clear()
-        return found
+        """Faults that nobody has confirmed yet, oldest first. A line that cannot be read counts as one."""
+        files = [_lines(path) for path in self._paths]
+        confirmed = {
+            one for lines in files for line in lines if isinstance(line, Confirmation) for one in line.faults
+        }
+        found: dict[tuple[str, str], ArmFault] = {}
+        for lines in files:
+            for fault in _unconfirmed(lines):
+                if not fault.id or fault.id not in confirmed:
+                    found.setdefault((fault.t, fault.id or fault.message), fault)
+        return sorted(found.values(), key=lambda fault: fault.t)
 
     def refuse(self, rig: Path) -> None:
         """Raise DeviceFault if a fault stands. `rig` is the file that the message names."""
@@ -87,37 +97,83 @@ class ArmFaults:
             )
 
     def note(self, message: str, run: str = "") -> None:
-        """A fault, synced when this returns."""
-        self._append(ArmFault(message=message, run=run))
+        """A fault, synced when this returns. Raises StorageError if one of the places does not take it."""
+        self._append(ArmFault(message=message, run=run, id=uuid.uuid4().hex))
 
     def confirm(self, name: str, note: str = "") -> None:
-        self._append(Confirmation(name=name, note=note))
+        """Of all faults that stand."""
+        known = tuple(fault.id for fault in self.standing() if fault.id)
+        self._append(Confirmation(name=name, note=note, faults=known))
 
     def begin_session(self, run: str) -> str:
         """A session of this run begins; returns the words that no earlier session has begun with, empty if there
         are none."""
-        lines = self.lines()
-        since = max((i for i, line in enumerate(lines) if isinstance(line, SessionOfArm)), default=-1) + 1
-        faults = [line.message for line in lines if isinstance(line, ArmFault)]
-        words = [line for line in lines[since:] if isinstance(line, Confirmation)]
-        if not words:
+        files = [_lines(path) for path in self._paths]
+        words = next((found for lines in files if (found := _new_words(lines)) is not None), None)
+        if words is None:
             return ""
         self._append(SessionOfArm(run=run))
-        return f"{faults[-1] if faults else 'no fault'} (confirmed by {words[-1].name}, {words[-1].t})"
+        faults = [line for lines in files for line in lines if isinstance(line, ArmFault)]
+        last = max(faults, key=lambda fault: fault.t).message if faults else "no fault"
+        return f"{last} (confirmed by {words.name}, {words.t})"
 
     def _append(self, line: _Line) -> None:
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"{self.path.parent}: cannot be made: {error.strerror}") from error
-        file = LineFile(self.path)
+        """To all places, also if one of them does not take it."""
+        failures = [error for path in self._paths if (error := _append_to(path, line)) is not None]
+        if failures:
+            raise failures[0]
+
+
+def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
+    """Of a cell's arm; `identity` where it is opened."""
+    return ArmFaults(*places_of_arm(cell, identity))
+
+
+def _unconfirmed(lines: list[Line]) -> list[ArmFault]:
+    """Those after the last confirmation in the same file."""
+    found: list[ArmFault] = []
+    for line in lines:
+        if isinstance(line, ArmFault):
+            found.append(line)
+        elif isinstance(line, Confirmation):
+            found.clear()
+    return found
+
+
+def _new_words(lines: list[Line]) -> Confirmation | None:
+    """The last with which no session has begun yet."""
+    since = max((i for i, line in enumerate(lines) if isinstance(line, SessionOfArm)), default=-1) + 1
+    return next((line for line in reversed(lines[since:]) if isinstance(line, Confirmation)), None)
+
+
+def _append_to(path: Path, line: _Line) -> StorageError | None:
+    try:
+        make_folder(path.parent)
+    except OSError as error:
+        return StorageError(f"{path.parent}: cannot be made: {error.strerror}")
+    try:
+        file = LineFile(path)
         try:
             file.append([line.model_dump_json() + "\n"])
         finally:
             file.close()
+    except StorageError as error:
+        return error
+    return None
 
 
-def _read(text: bytes) -> ArmFault | Confirmation | SessionOfArm:
+def _lines(path: Path) -> list[Line]:
+    """All lines, oldest first. A line that cannot be read counts as a fault: it may have been one."""
+    try:
+        texts = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise StorageError(f"{path}: cannot read the faults of the arm: {error.strerror}") from error
+    return [_read(text) for text in texts]
+
+
+def _read(text: bytes) -> Line:
     try:
         return _LINE.validate_json(text)
     except ValidationError:

@@ -58,6 +58,8 @@ class SessionStarted(JournalEvent):
     """Temperature of the coolest LED board."""
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
+    dose_budget_lux_h: float | None = None
+    """What the object may receive in its life, by its ledger and the plan, as the session begins."""
 
 
 class SessionResumed(JournalEvent):
@@ -67,6 +69,7 @@ class SessionResumed(JournalEvent):
     simulated: bool = False
     room_c: float | None = None
     acknowledged: str = ""
+    dose_budget_lux_h: float | None = None
 
 
 class ViewBegun(JournalEvent):

@@ -3,132 +3,47 @@
 Whoever gives light enters what is planned before it is given (`Ledger.plan`), and afterwards what was given
 (`Ledger.correct`); both are on disk when the call returns. So a process that is killed, or a power cut, can only
 leave too high a figure: that of the last plan. Writers hold a lock on the object's file.
+
+The object's budget stands in the same file. A plan is entered only if the budget allows it after all that stands
+there at that moment, under the same lock: however many give light at once, their sum never exceeds it.
 """
 
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import re
 import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Name
-from coupole.storage.line_file import LineFile, utc_now
+from coupole.storage.ledger_lines import (
+    Asked,
+    BudgetSet,
+    History,
+    LightEntered,
+    LightGiven,
+    LightPlanned,
+    Line,
+    Reading,
+    WarningSet,
+    history_of,
+    read_lines,
+)
+from coupole.storage.line_file import LineFile
 
-BY_HAND = "by hand"
-"""In place of a run's name, for light that was entered with `coupole dose --add`."""
 LOCK_S = 10.0
 """Other writers hold the lock for one line each."""
 _NAP_S = 0.01
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
-Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
-
-
-class _Line(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore")
-
-    t: str = Field(default_factory=utc_now)
-
-
-class _Light(_Line):
-    dose_lux_h: Amount
-    damage_wh_m2: Amount | None = None
-    """Radiant exposure weighted by damage (`coupole.appearance.spectra.damage`); None if the lamps' spectrum is
-    not known."""
-
-
-class LightEntered(_Light):
-    """Light that was given: by hand, or by version 0.1."""
-
-    event: Literal["dose"] = "dose"
-    run: str = BY_HAND
-    note: str = ""
-
-
-class LightPlanned(_Light):
-    """Light that is about to be given, at most."""
-
-    event: Literal["planned"] = "planned"
-    id: str
-    run: str
-    """Name of the run's folder, or `meter`, or `live`."""
-
-
-class LightGiven(_Light):
-    """What was given of the plan with this id."""
-
-    event: Literal["given"] = "given"
-    id: str
-
-
-class WarningSet(_Line):
-    """From now on a total above this is warned of; None: no total is."""
-
-    event: Literal["warn_above"] = "warn_above"
-    dose_lux_h: Amount | None
-
-
-Line: TypeAlias = LightEntered | LightPlanned | LightGiven | WarningSet
-_LINE: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
-
-
-@dataclass
-class Entry:
-    """Light of one burst, of one second of a live view, or entered by hand."""
-
-    t: str
-    run: str
-    dose_lux_h: float
-    damage_wh_m2: float | None
-    note: str = ""
-    settled: bool = True
-    """False while only the plan is known: what was given is at most this."""
-
-
-@dataclass
-class History:
-    """All light of one object."""
-
-    entries: list[Entry] = field(default_factory=list)
-    warn_above_lux_h: float | None = None
-    unreadable: int = 0
-    """Lines that are no entries: torn by a crash before their light was given, or damaged later."""
-
-    @property
-    def total_lux_h(self) -> float:
-        return sum(entry.dose_lux_h for entry in self.entries)
-
-    @property
-    def damage_wh_m2(self) -> float:
-        """Of the light whose spectrum is known."""
-        return sum(entry.damage_wh_m2 or 0.0 for entry in self.entries)
-
-    @property
-    def of_unknown_spectrum_lux_h(self) -> float:
-        return sum(entry.dose_lux_h for entry in self.entries if entry.damage_wh_m2 is None)
-
-    @property
-    def unsettled_lux_h(self) -> float:
-        """Planned, with nobody left who could say what was given."""
-        return sum(entry.dose_lux_h for entry in self.entries if not entry.settled)
-
-    def of_run(self, run: str) -> History:
-        return History([entry for entry in self.entries if entry.run == run])
-
-    @property
-    def runs(self) -> list[str]:
-        """In the order of their first light."""
-        return list(dict.fromkeys(entry.run for entry in self.entries))
 
 
 class Ledger:
@@ -145,23 +60,42 @@ class Ledger:
             ) from error
         self.folder, self._former_folder = folder, former_folder
         self.path = folder / f"{object_id}.jsonl"
+        self._reading = Reading()
 
     def read(self) -> History:
         """Raises StorageError if a file cannot be read."""
-        texts = _lines(self.path)
-        history, by_id = History(), dict[str, Entry]()
-        for text in [*self._former_lines(texts), *texts]:
-            try:
-                _add(history, by_id, _LINE.validate_json(text))
-            except ValidationError:
-                history.unreadable += bool(text.strip())
-        return history
+        texts = read_lines(self.path)
+        return history_of([*self._former_lines(texts), *texts])
 
-    def plan(self, run: str, dose_lux_h: float, damage_wh_m2: float | None) -> str:
-        """Light that is about to be given, at most; returns the id for `correct`."""
+    def newest(self) -> History:
+        """The same as `read`, for who asks often: only lines that are new are read. Not to be changed."""
+        if self._former_folder is not None and (self._former_folder / self.path.name).exists():
+            return self.read()
+        self._reading = self._reading.renewed(self.path)
+        return self._reading.history
+
+    def plan(self, run: str, dose_lux_h: float, damage_wh_m2: float | None, asked: Asked | None = None) -> str:
+        """Light that is about to be given, at most; returns the id for `correct`.
+
+        The budget is asked for what is `asked`; a plan's budget becomes the object's if that has none. Raises
+        DoseBudgetReached: nothing is entered then.
+        """
         line = LightPlanned(id=uuid.uuid4().hex, run=run, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
-        self._append(line)
+        lines: list[Line] = [line]
+        with self._locked() as file:
+            if asked is not None:
+                history = self.newest()
+                asked.refuse_beyond(self.object_id, history)
+                if asked.budget_lux_h is not None and history.budget_lux_h is None:
+                    lines.insert(0, asked.as_the_objects())
+            file.append([one.model_dump_json() + "\n" for one in lines])
         return line.id
+
+    def ask_again(self, asked: Asked, plan_id: str) -> None:
+        """Ask the budget once more for light whose plan has this id. Raises DoseBudgetReached."""
+        with self._locked():
+            history = self.newest()
+            asked.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
 
     def correct(self, plan_id: str, dose_lux_h: float, damage_wh_m2: float | None) -> None:
         """What was given of that plan, in place of it."""
@@ -170,6 +104,14 @@ class Ledger:
     def enter(self, dose_lux_h: float, note: str) -> None:
         """Light that others have given, in a photographer's studio for example."""
         self._append(LightEntered(dose_lux_h=dose_lux_h, note=note))
+
+    def set_budget(self, dose_lux_h: float, name: str, reason: str = "") -> None:
+        """The object may receive so much in its life, by this person's word. Raises InputError without a name."""
+        if not name.strip():
+            raise InputError(f"object {self.object_id}: expected the name of the person who sets its light budget")
+        if not (math.isfinite(dose_lux_h) and dose_lux_h >= 0):
+            raise InputError(f"object {self.object_id}: expected a budget of 0 lux.h or more, found {dose_lux_h}")
+        self._append(BudgetSet(dose_lux_h=dose_lux_h, name=name.strip(), reason=reason.strip()))
 
     def warn_above(self, dose_lux_h: float | None) -> None:
         self._append(WarningSet(dose_lux_h=dose_lux_h))
@@ -184,7 +126,7 @@ class Ledger:
         if self._former_folder is None:
             return []
         known = set(texts)
-        return [text for text in _lines(self._former_folder / self.path.name) if text not in known]
+        return [text for text in read_lines(self._former_folder / self.path.name) if text not in known]
 
     def _append(self, line: Line) -> None:
         with self._locked() as file:
@@ -249,33 +191,6 @@ def _plain(object_id: str) -> str:
 
 def _did_you_mean(ids: list[str]) -> str:
     return f"; did you mean `{ids[0]}`?" if ids else ""
-
-
-def _lines(path: Path) -> list[bytes]:
-    try:
-        return path.read_bytes().split(b"\n")
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise StorageError(f"{path}: cannot read the dose ledger: {error.strerror}") from error
-
-
-def _add(history: History, by_id: dict[str, Entry], line: Line) -> None:
-    """A correction counts in place of its plan; one whose plan cannot be read counts by itself."""
-    if isinstance(line, WarningSet):
-        history.warn_above_lux_h = line.dose_lux_h
-        return
-    if isinstance(line, LightGiven):
-        entry = by_id.get(line.id)
-        if entry is not None:
-            entry.dose_lux_h, entry.damage_wh_m2, entry.settled = line.dose_lux_h, line.damage_wh_m2, True
-            return
-        entry = Entry(line.t, "unknown", line.dose_lux_h, line.damage_wh_m2)
-    elif isinstance(line, LightPlanned):
-        entry = by_id[line.id] = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, settled=False)
-    else:
-        entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, line.note)
-    history.entries.append(entry)
 
 
 def _sync_folders(folders: list[Path]) -> None:

@@ -68,7 +68,7 @@ class Run:
                 "software": {"name": "coupole", "version": coupole.__version__},
                 "created": utc_now(),
                 "host": platform.node(),
-                "operator": _user(),
+                "operator": user_name(),
                 **about,
                 **keep(inputs, folder),
             }
@@ -232,7 +232,8 @@ def _settled_bytes(view_file: Path) -> int:
     return layout.frames * layout.frame_bytes if layout.archived else view_file.stat().st_blocks * 512
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Whoever is logged in."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

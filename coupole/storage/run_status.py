@@ -79,6 +79,8 @@ class Status:
     """Proven and expected frames of each view."""
     last_event: str = ""
     dose_lux_h: float = 0.0
+    dose_budget_lux_h: float | None = None
+    """What the object may receive in its life, as the last session began; None: no budget, or not known."""
     """Light on the object in all sessions."""
     go_on: str = ""
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
@@ -131,6 +133,7 @@ def _note_event(found: Status, event: Event) -> None:
     match event:
         case SessionStarted() | SessionResumed():
             found.state, found.reason = RUNNING, ""
+            found.dose_budget_lux_h = event.dose_budget_lux_h
             session = Session(begun=event.t)
             found.sessions.append(session)
         case Continued():

@@ -9,9 +9,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from coupole.appearance.spectra.damage import B_PER_NM
-from coupole.storage.ledger import History, Ledger
+from coupole.storage.ledger import Ledger
+from coupole.storage.ledger_lines import History
 
 NOT_KNOWN = "not known"
+NO_BUDGET = "  it has no light budget: `coupole dose {} --budget LUX_H --name NAME` gives it one"
 
 
 def show_dose(console: Console, ledger: Ledger, history: History, others: list[str]) -> None:
@@ -28,6 +30,16 @@ def show_dose(console: Console, ledger: Ledger, history: History, others: list[s
         )
     table.add_row("[bold]total[/]", "", f"[bold]{history.total_lux_h:.3f}[/]", _damage(history), "")
     console.print(table)
+    for number, one in enumerate(history.budgets):
+        earlier = "" if number + 1 == len(history.budgets) else "earlier "
+        because = f": {one.reason}" if one.reason else ""
+        console.print(
+            f"  {earlier}budget {one.dose_lux_h:g} lux.h, by {one.name}, {one.t}{because}",
+            markup=False,
+            soft_wrap=True,
+        )
+    if history.budget_lux_h is None:
+        console.print(NO_BUDGET.format(ledger.object_id), markup=False, soft_wrap=True)
     limit_lux_h = history.warn_above_lux_h
     if limit_lux_h is not None and history.total_lux_h > limit_lux_h:
         console.print(f"[yellow]note:[/] the total is above {limit_lux_h:g} lux.h")
@@ -44,6 +56,8 @@ def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, A
         "object": ledger.object_id,
         "ledger": str(ledger.path),
         **_sums(history),
+        "budget_lux_h": history.budget_lux_h,
+        "budgets": [one.model_dump(include={"t", "dose_lux_h", "name", "reason"}) for one in history.budgets],
         "warn_above_lux_h": history.warn_above_lux_h,
         "above_warning": history.warn_above_lux_h is not None and history.total_lux_h > history.warn_above_lux_h,
         "similar_ids": others,

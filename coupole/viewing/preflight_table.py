@@ -76,6 +76,7 @@ def document_of(report: Report) -> dict[str, Any]:
         "ideal_s": report.ideal_s,
         "dose_lux_h": report.dose_lux_h,
         "dose_before_lux_h": report.dose_before_lux_h,
+        "dose_budget_lux_h": report.dose_budget_lux_h,
         "peak_board_c": report.peak_board_c,
         "exposures": [asdict(timing) for timing in report.timings],
         "exposure_scale": report.exposure_scale,

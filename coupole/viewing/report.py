@@ -95,7 +95,7 @@ def _glance(
         f"{found.darks_proven} dark frames",
         "exposure": _exposure_in_words(run, views),
         "coverage": coverage_in_words(covered) if isinstance(covered, Coverage) else covered,
-        "light": told.light_in_words(found, _budget_lux_h(run)),
+        "light": told.light_in_words(found, found.dose_budget_lux_h or _plans_budget_lux_h(run)),
         "duration": told.duration_in_words(found),
         "calibrations": told.calibrations_in_words(run),
         "trouble": f'<a href="#trouble">{things} went wrong</a>' if lines else "none",
@@ -107,7 +107,8 @@ def _exposure_in_words(run: Run, views: Sequence[SampledView]) -> str:
     return f"{found}{' (by simulated light)' if run.simulated else ''}" if found else "no picture yet"
 
 
-def _budget_lux_h(run: Run) -> float | None:
+def _plans_budget_lux_h(run: Run) -> float | None:
+    """For runs whose journal has none."""
     try:
         plan = yamlfile.read(run.plan_path).validate(Plan)
     except (InputError, OSError):

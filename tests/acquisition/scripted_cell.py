@@ -165,7 +165,9 @@ class Cell:
             held=False,
             await_news=self.await_news,
         )
-        dose: Any = SimpleNamespace(begin=lambda burst: None, end=lambda burst, log, **figures: (0.0,))
+        dose: Any = SimpleNamespace(
+            begin=lambda burst: None, count=lambda burst, log, **figures: (0.0,), end=lambda given_lux_h: None
+        )
         outcome: Any = SimpleNamespace(over_triggers=0, lost_transfers=0)
         self.runner = BurstRunner(
             cell,

@@ -65,6 +65,13 @@ def meter(job: Job, recorder: Recorder | None = None, **cell: Any) -> DoseMeter:
     return DoseMeter(job, opened, recorder or Recorder())  # type: ignore[arg-type]
 
 
+def end(meter: DoseMeter, burst: Burst, log: np.ndarray, **times: float) -> tuple[float, ...]:
+    """As the burst runner does."""
+    given = meter.count(burst, log, **times)
+    meter.end(given)
+    return given
+
+
 def log_of(burst: Burst, steps: int) -> np.ndarray:
     records = [
         StepRecord(k, int(row["led"]), True, False, False, False, float(row["on_us"]), 0, 0, 25.0, 700.0)
@@ -88,7 +95,7 @@ def test_the_whole_plan_is_entered_first_and_noted_on_disk(job: Job, burst: Burs
     assert recorder.committed == len(recorder.events) == 1
     planned = recorder.events[0].planned_lux_h
     assert total(job) == pytest.approx(max(planned), abs=1e-8)
-    given = found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    given = end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     assert given == pytest.approx(planned)
     assert total(job) == pytest.approx(found.lux_h, abs=1e-8)
 
@@ -100,7 +107,7 @@ def test_the_dose_moves_while_a_burst_is_under_way_and_ends_where_it_is_counted(
     assert found.lux_h == on_the_way[0] == 0.0
     assert sorted(on_the_way) == on_the_way
     assert len(set(on_the_way)) == len(lit(burst)) + 1
-    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     assert found.lux_h_after(3) == found.lux_h == pytest.approx(on_the_way[-1])
 
 
@@ -110,7 +117,7 @@ def test_a_burst_that_ended_early_counts_its_log(job: Job, burst: Burst) -> None
     whole = total(job)
     steps = int(lit(burst)[3]) + 1
     ran_s = float(burst.table["period_us"][: steps - 1].sum()) * 1e-6
-    found.end(burst, log_of(burst, steps), table_ran_s=ran_s, panel_s=0.0)
+    end(found, burst, log_of(burst, steps), table_ran_s=ran_s, panel_s=0.0)
     assert 0 < total(job) < 0.6 * whole
 
 
@@ -122,7 +129,7 @@ def test_steps_that_may_have_begun_count_though_the_log_lacks_them(job: Job, bur
         before = total(job)
         found.begin(burst)
         ran_s = float(burst.table["period_us"][: steps - 1].sum()) * 1e-6
-        found.end(burst, log_of(burst, logged), table_ran_s=ran_s, panel_s=0.0)
+        end(found, burst, log_of(burst, logged), table_ran_s=ran_s, panel_s=0.0)
         doses.append(total(job) - before)
     assert doses[1] == pytest.approx(doses[0], rel=1e-6)
 
@@ -130,7 +137,7 @@ def test_steps_that_may_have_begun_count_though_the_log_lacks_them(job: Job, bur
 def test_a_burst_that_never_started_gave_nothing(job: Job, burst: Burst) -> None:
     found = meter(job)
     found.begin(burst)
-    found.end(burst, log_of(burst, 0), table_ran_s=0.0, panel_s=0.0)
+    end(found, burst, log_of(burst, 0), table_ran_s=0.0, panel_s=0.0)
     assert total(job) == 0
 
 
@@ -138,7 +145,7 @@ def test_if_it_is_not_sure_that_the_lights_are_off_all_that_was_planned_counts(j
     found = meter(job, lights_confirmed=False)
     found.begin(burst)
     whole = total(job)
-    found.end(burst, log_of(burst, 3), table_ran_s=0.01, panel_s=0.0)
+    end(found, burst, log_of(burst, 3), table_ran_s=0.01, panel_s=0.0)
     history = ledger_of(job.cell, "relief").read()
     assert history.total_lux_h == history.unsettled_lux_h == whole
     assert found.lux_h == pytest.approx(whole, abs=1e-8)
@@ -151,7 +158,7 @@ def test_a_panel_counts_for_its_time_and_is_planned_until_the_boxs_watchdog(job:
     watchdog_s = job.cell.rig.ledbox.settings["watchdog_s"]
     lux = job.cell.rig.dome.panel_lux
     assert total(job) == pytest.approx(lux * (panel.duration_s + 0.14 + watchdog_s) / 3600, rel=1e-6)
-    found.end(panel, log_of(panel, 0), table_ran_s=0.0, panel_s=1.5)
+    end(found, panel, log_of(panel, 0), table_ran_s=0.0, panel_s=1.5)
     assert total(job) == pytest.approx(lux * 1.5 / 3600, rel=1e-6)
 
 
@@ -160,7 +167,7 @@ def test_a_resumed_run_goes_on_from_the_points_of_its_earlier_sessions(job: Job,
     before = tuple(float(k == 0) for k in range(points))  # one corner has received 1 lux.h
     found = meter(job, Recorder(before))
     found.begin(burst)
-    given = found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    given = end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     assert found.lux_h == pytest.approx(1.0 + given[0])
     assert total(job) == pytest.approx(given[0], abs=1e-8), "the entries sum to the dose of the highest point"
 
@@ -169,13 +176,13 @@ def test_a_burst_that_would_exceed_the_budget_is_not_planned(job: Job, burst: Bu
     one = meter(job)
     one.begin(burst)
     dose = total(job)
-    one.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    end(one, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     assert job.plan.object is not None
     limited = job.plan.object.model_copy(update={"dose_budget_lux_h": 2 * dose})
     poor = replace(job, plan=job.plan.model_copy(update={"object": limited}))
     found = meter(poor)
     found.begin(burst)  # exactly to the budget
-    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     with pytest.raises(DoseBudgetReached, match="object relief"):
         found.begin(burst)
     assert total(job) == pytest.approx(2 * dose)
@@ -200,7 +207,7 @@ def test_damage_is_entered_where_the_lamps_spectrum_is_known(job: Job, burst: Bu
     known = replace(job, cell=replace(job.cell, led_damage_w_per_lm=1e-3))
     found = meter(known)
     found.begin(burst)
-    found.end(burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     history = ledger_of(job.cell, "relief").read()
     assert history.damage_wh_m2 == pytest.approx(1e-3 * history.total_lux_h, rel=1e-5)
     assert history.of_unknown_spectrum_lux_h == 0
@@ -216,3 +223,68 @@ def test_flashes_with_different_highest_points_count_as_the_highest_of_their_sum
         flashes.settle()
         assert told == pytest.approx(flashes.total_lux_h) == pytest.approx(total(job))
     assert told == pytest.approx(1.8e-3)
+
+
+# -- what others enter meanwhile ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_light_that_comes_by_hand_between_two_bursts_is_asked_for_before_the_second(
+    job: Job, burst: Burst, simulated: bool
+) -> None:
+    dose = foreseen(job, burst)
+    ledger_of(job.cell, "relief").set_budget(3 * dose, "A. Keeper")
+    found = meter(job, simulated=simulated)
+    found.begin(burst)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    ledger_of(job.cell, "relief").enter(1.5 * dose, "studio")
+    with pytest.raises(DoseBudgetReached):
+        found.begin(burst)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_light_that_comes_by_hand_during_a_burst_of_the_host_is_asked_for_before_each_light(
+    job: Job, burst: Burst, simulated: bool
+) -> None:
+    dose = foreseen(job, burst)
+    ledger_of(job.cell, "relief").set_budget(1.5 * dose, "A. Keeper")
+    found, steps = meter(job, simulated=simulated), lit(burst)
+    by_host = replace(burst, hardware=False)
+    found.begin(by_host)
+    found.ask_again(by_host, int(steps[-1]))
+    ledger_of(job.cell, "relief").enter(dose, "studio")
+    found.ask_again(by_host, int(steps[len(steps) // 4]))
+    with pytest.raises(DoseBudgetReached):
+        found.ask_again(by_host, int(steps[-1]))
+
+
+def test_light_that_comes_by_hand_is_asked_for_before_the_next_flash_and_those_before_it_are_entered(
+    job: Job,
+) -> None:
+    ledger_of(job.cell, "relief").set_budget(1.0, "A. Keeper")
+    flash = np.full(len(job.shape.dose_points_mm), 0.05)
+    flashes = FlashMeter(job, SimpleNamespace(simulated=False, lights_confirmed=True), "live", 10.0)  # type: ignore[arg-type]
+    for _ in range(3):
+        flashes.begin(flash, flash)
+    ledger_of(job.cell, "relief").enter(0.84, "studio")
+    assert flashes.left_lux_h == pytest.approx(0.16)
+    with pytest.raises(DoseBudgetReached):
+        flashes.begin(flash, flash)
+    history = ledger_of(job.cell, "relief").read()
+    assert (history.total_lux_h, history.unsettled_lux_h) == (pytest.approx(0.99), 0.0)
+
+
+def test_a_burst_that_nobody_could_count_counts_as_planned_in_what_is_told(job: Job, burst: Burst) -> None:
+    found = meter(job)
+    found.begin(burst)
+    assert found.lux_h == 0.0
+    assert found.lux_h_in_all == pytest.approx(total(job), abs=1e-8)
+    assert found.lux_h_in_all > 0
+
+
+def foreseen(job: Job, burst: Burst) -> float:
+    """What the burst gives."""
+    found = meter(job, simulated=True)
+    found.begin(burst)
+    end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
+    return found.lux_h

@@ -17,7 +17,8 @@ import pytest
 
 from coupole.acquisition.host_burst import HostBurst, too_bright
 from coupole.acquisition.verdict import Verdict
-from coupole.devices import UNKNOWN_NS, CameraStatistics, Frame, FrameFormat, StepRecord
+from coupole.devices import NO_LED, UNKNOWN_NS, CameraStatistics, Frame, FrameFormat, StepRecord
+from coupole.errors import DoseBudgetReached
 from coupole.plan.bursts import Burst
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
@@ -60,6 +61,8 @@ class Cell:
     proven: dict[ShotId, Mapping[str, int]] = field(default_factory=dict)
     freed: list[int] = field(default_factory=list)
     noted: list[Any] = field(default_factory=list)
+    asked: list[int] = field(default_factory=list)
+    too_much_at: int = -1
     now_ns_: int = 0
     step: int = -1
     frames: int = 0
@@ -139,8 +142,14 @@ class Cell:
     def commit(self, *, now: bool) -> None:
         pass
 
+    # the object's light
     def begin(self, burst: Burst) -> None:
         self.done.append("begin")
+
+    def ask_again(self, burst: Burst, step: int) -> None:
+        self.asked.append(step)
+        if step == self.too_much_at:
+            raise DoseBudgetReached("too much")
 
     def fire(self, burst: Burst) -> Verdict:
         arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None, held=False)
@@ -148,7 +157,7 @@ class Cell:
         cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731
         runner = HostBurst(  # type: ignore[arg-type]
-            cell, self, arm, lambda *_: None, lambda: None, self.begin, note
+            cell, self, arm, lambda *_: None, lambda: None, self, note
         )
         return runner.fire(burst, FORMAT)
 
@@ -281,3 +290,24 @@ def test_a_burst_that_may_not_begin_gives_no_light() -> None:
     with pytest.raises(ZeroDivisionError):
         cell.fire(burst_of())
     assert not [one for one in cell.done if one.startswith(("on", "panel"))]
+
+
+# -- the object's budget ------------------------------------------------------------------------------------------
+
+
+def test_the_budget_is_asked_again_before_each_light_and_for_no_dark_step() -> None:
+    cell, burst = Cell(), burst_of()
+    cell.fire(burst)
+    assert cell.asked == [step for step, row in enumerate(burst.table) if row["led"] != NO_LED]
+
+
+def test_a_light_that_would_be_too_much_is_not_given_and_those_before_it_are_counted() -> None:
+    burst = burst_of()
+    second = [step for step, row in enumerate(burst.table) if row["led"] != NO_LED][1]
+    cell = Cell(too_much_at=second)
+    with pytest.raises(DoseBudgetReached):
+        cell.fire(burst)
+    lit = [word for word in cell.done if word.startswith("on ") and word != f"on {NO_LED}"]
+    assert len(lit) == 1
+    (noted,) = cell.noted
+    assert [int(row["led"]) for row in noted[1] if row["led"] != NO_LED] == [int(lit[0].split()[1])]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -103,8 +103,10 @@ def test_whatever_ends_the_use_of_a_cell_it_is_made_safe_before_its_devices_are_
         close=lambda: done.append("closed"),
     )
     monkeypatch.setattr(opened_cell, "in_world", lambda rig, dry_run: False)
+    monkeypatch.setattr(opened_cell, "in_use", lambda cell: contextlib.nullcontext())
+    monkeypatch.setattr(opened_cell, "remember_controller", lambda cell, identity: None)
     monkeypatch.setattr(opened_cell, "_open_device", lambda *arguments, **named: device)
-    cell: Any = SimpleNamespace(rig=SimpleNamespace(sensor=None), state_folder=Path("state"))
+    cell: Any = SimpleNamespace(rig=SimpleNamespace(sensor=None))
     with pytest.raises(LookupError), opened_cell.open_cell(cell):
         raise LookupError
     assert sorted(done[:2]) == ["arm stopped", "lights off"]

@@ -1,7 +1,7 @@
 """A run whose processes are frozen (SIGSTOP) in motions and bursts, and what the world saw of it.
 
-The world is kept outside and runs at the pace of life; RSI is not paced by its answers. Used by a test that freezes
-a few times, and by `tools/freeze_at_random.py`, which does so hundreds of times.
+The world is kept outside and runs at the pace of life; RSI is not paced by its answers. Used by a test that
+freezes a few times, and by `tools/freeze_at_random.py`, which does so hundreds of times.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from real_cells import commission
 from coupole.acquisition.operator import refuse_uncommissioned
 from coupole.devices import Identity
 from coupole.errors import InputError, PreflightRefused
-from coupole.plan.cell import read_cell
+from coupole.plan.cell import Cell, read_cell
 from coupole.plan.rig import WorldSection
 from coupole.preflight.commissioned import (
     commissioning_refusals,
@@ -22,7 +24,7 @@ from coupole.preflight.commissioned import (
     record_path,
     write_commissioning,
 )
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 
 DEVICES = {
     "ledbox": Identity("Coupole", "LED control box", "0017", "1.0"),
@@ -124,8 +126,6 @@ def test_a_record_that_was_edited_is_refused(real: CellFolder) -> None:
 
 def test_a_record_of_a_simulated_cell_does_not_serve_a_real_one(real: CellFolder) -> None:
     cell = read_cell(real.rig)
-    commission(cell, DEVICES)
-    assert commissioning_refusals(cell) == []
     simulated = replace(cell, rig=cell.rig.model_copy(update={"world": WorldSection()}))
     write_commissioning(cell, empty_record(simulated))
     (why,) = commissioning_refusals(cell)
@@ -148,10 +148,70 @@ def test_what_cannot_be_commissioned_is_told_with_two(
     assert told in ended.err
 
 
+# -- found by the controller --------------------------------------------------------------------------------------
+
+
+def copied(real: CellFolder, **changes: object) -> Cell:
+    """The same cell by a rig of another name, which keeps its runs elsewhere."""
+    data = {**real.rig_data, "name": "a-copy", "storage": {"folder": str(real.folder / "elsewhere")}, **changes}
+    path = real.folder / "copy.yaml"
+    path.write_text(json.dumps(data))
+    return read_cell(path)
+
+
+def test_a_copied_rig_that_keeps_its_runs_elsewhere_is_commissioned(real: CellFolder) -> None:
+    commission(read_cell(real.rig), DEVICES)
+    copy = copied(real)
+    assert commissioning_refusals(copy, DEVICES) == []
+    record = read_commissioning(copy)
+    assert record is not None
+    assert record.rig == "a-copy"
+
+
+def test_a_copied_rig_with_another_setting_asks_for_the_steps_that_depend_on_it(real: CellFolder) -> None:
+    commission(read_cell(real.rig), DEVICES)
+    motion = {**real.rig_data["motion"], "acceleration_deg_s2": 500.0}
+    refusals = commissioning_refusals(copied(real, motion=motion), DEVICES)
+    assert [why.split()[3] for why in refusals] == ["cycle", "axes", "stopping", "emergency-stop"]
+
+
+def test_commissioning_the_copy_takes_nothing_from_the_first_rig(real: CellFolder) -> None:
+    commission(read_cell(real.rig), DEVICES)
+    motion = {**real.rig_data["motion"], "acceleration_deg_s2": 500.0}
+    copy = copied(real, motion=motion)
+    commission(copy, DEVICES)
+    assert commissioning_refusals(copy, DEVICES) == []
+    assert commissioning_refusals(read_cell(real.rig), DEVICES) == []
+
+
+def test_a_step_that_failed_since_counts_though_it_passed_by_another_rig(real: CellFolder) -> None:
+    commission(read_cell(real.rig), DEVICES)
+    commission(copied(real), DEVICES, no="stopping")
+    (why,) = commissioning_refusals(read_cell(real.rig), DEVICES)
+    assert "the step stopping did not pass" in why
+
+
+def test_another_controller_is_another_cell(real: CellFolder) -> None:
+    commission(read_cell(real.rig), DEVICES)
+    robot = {
+        **real.rig_data["robot"],
+        "settings": {**real.rig_data["robot"]["settings"], "controller": "10.0.0.9"},
+    }
+    (why,) = commissioning_refusals(copied(real, robot=robot), DEVICES)
+    assert "has no record" in why
+
+
+def test_a_record_of_an_earlier_version_in_the_state_folder_is_found(real: CellFolder) -> None:
+    cell = read_cell(real.rig)
+    commission(cell, DEVICES)
+    shutil.rmtree(cell.controllers_folder)
+    assert commissioning_refusals(cell, DEVICES) == []
+
+
 def test_a_cell_with_a_fault_of_the_arm_is_not_commissioned_before_a_persons_word(
     real: CellFolder,
 ) -> None:
-    ArmFaults(read_cell(real.rig).state_folder).note("it fell")
+    faults_of(read_cell(real.rig)).note("it fell")
     ended = cells.here("commission", real.rig, "--name", "A")
     assert ended.code == 4
     assert "coupole confirm" in ended.err

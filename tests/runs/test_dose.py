@@ -22,7 +22,8 @@ from forks import fork_context
 from real_cells import HOME, real_cell, true_dose_lux_h
 
 from coupole.acquisition import burst_runner, looking
-from coupole.storage.ledger import History, Ledger
+from coupole.storage.ledger import Ledger
+from coupole.storage.ledger_lines import History
 from coupole.viewing import live
 from sim.world.client import World
 
@@ -45,6 +46,7 @@ class RealCell:
         self.cell.write(
             **{"views": [HOME], "lights": cells.SOME_LIGHTS, "exposure": BRACKET, "object": RELIEF, **plan}
         )
+        Ledger(Path(self.cell.rig_data["ledger"]), "relief").set_budget(1e6, "an operator")
         self.before_lux_h = self.history.total_lux_h
         self.true_before_lux_h = true_dose_lux_h(self.cell, self.world)
 

@@ -33,7 +33,7 @@ def test_a_line_that_cannot_be_read_counts_as_a_fault(tmp_path: Path, torn: byte
     faults = ArmFaults(tmp_path)
     faults.note("A3 left its path")
     faults.confirm("an operator")
-    with faults.path.open("ab") as file:
+    with (tmp_path / "arm.jsonl").open("ab") as file:
         file.write(torn)
     with pytest.raises(DeviceFault, match="cannot be read"):
         faults.refuse(RIG)

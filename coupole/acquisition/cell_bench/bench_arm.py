@@ -24,7 +24,7 @@ from coupole.acquisition.operator import refuse_uncommissioned
 from coupole.errors import DeviceError, DeviceRefused, InputError, Interrupted, PreflightRefused
 from coupole.plan.cell import Cell
 from coupole.preflight.job import Job
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 
 HOLD_S = 0.3
 """A motion by hand ends so long after its last renewal."""
@@ -41,7 +41,7 @@ class BenchArm:
 
     def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None, works: Works) -> None:
         self._cell, self._opened, self._works = cell, opened, works
-        self._faults = ArmFaults(cell.state_folder)
+        self._faults = faults_of(cell, opened.identities["robot"])
         self._paths = ArmPaths(cell, job)
         self._switch = EnablingSwitch(opened.ledbox, must_exist=cell.rig.console.enabling_switch)
         self._shown: dict[str, ShownPath] = {}

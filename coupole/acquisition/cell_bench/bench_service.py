@@ -40,11 +40,11 @@ from coupole.acquisition.cell_bench.bench_requests import (
     read_request,
 )
 from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.cell_marks import is_in_use
 from coupole.acquisition.looking import metered, metering_job
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import ask_to_begin, identity_printer
-from coupole.acquisition.runtime_folder import is_in_use
 from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.user_socket import UserSocket
@@ -53,7 +53,7 @@ from coupole.errors import CoupoleError, DeviceError, InputError, StorageError
 from coupole.plan.cell import Cell
 from coupole.preflight import exposure_advice
 from coupole.preflight.job import Job
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 from coupole.viewing.terminal import alarm
 
 _LOOK_EVERY_S = 0.1
@@ -215,7 +215,7 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
     """
     job = what if isinstance(what, Job) else None
     cell = what.cell if isinstance(what, Job) else what
-    if is_in_use(cell.state_folder):
+    if is_in_use(cell):
         raise InputError(
             f"{cell.document.path}: another process has this cell's devices open (acquire, live, meter, bench, "
             "calibrate, commission); end it first"
@@ -231,7 +231,7 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
                 for trouble in opened.trouble:
                     alarm(trouble)
                 if not opened.arm_confirmed:
-                    ArmFaults(cell.state_folder).note("; ".join(opened.trouble), "bench")
+                    faults_of(cell, opened.identities["robot"]).note("; ".join(opened.trouble), "bench")
 
 
 def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool) -> None:

@@ -44,7 +44,7 @@ from coupole.preflight.commissioned import (
     settings_of,
     write_commissioning,
 )
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 from coupole.viewing import commissioning_page
 from coupole.viewing.terminal import alarm, step_bars
 
@@ -85,12 +85,14 @@ def commission(
     devices any more. Raises CommissioningFailed after the first step that does not pass, DeviceError if a device
     fails, Interrupted if the person does not go on.
     """
-    ArmFaults(cell.state_folder).refuse(cell.document.path)
+    faults_of(cell).refuse(cell.document.path)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)), cell.link_meshes, cell.files)
     slow = replace(cell, rig=at_reduced_speed(cell.rig, bodies))
     record = _record_so_far(cell, console)
     control = Control()
     with open_cell(slow, on_opened=identity_printer(console)) as opened:
+        faults_of(cell, opened.identities["robot"]).refuse(cell.document.path)
+        record = _record_so_far(cell, console)  # of this controller, wherever it was reached before
         bench = replace(
             bounded(lambda: _bench(slow, opened, bodies, person_at(opened), control)),
             bars=lambda: step_bars(console),
@@ -116,14 +118,14 @@ def commission(
                         raise CommissioningFailed(step, shortcomings(result))
         except DeviceError as error:
             if error.device == "robot":
-                ArmFaults(cell.state_folder).note(str(error), "commissioning")
+                faults_of(cell, opened.identities["robot"]).note(str(error), "commissioning")
             raise
         finally:
             opened.make_safe()
             for trouble in opened.trouble:
                 alarm(trouble)
             if not opened.arm_confirmed:
-                ArmFaults(cell.state_folder).note("; ".join(opened.trouble), "commissioning")
+                faults_of(cell, opened.identities["robot"]).note("; ".join(opened.trouble), "commissioning")
     return record
 
 

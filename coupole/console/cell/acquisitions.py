@@ -17,8 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from coupole.acquisition.cell_marks import is_in_use
 from coupole.acquisition.run_control import Command, State, ask, running
-from coupole.acquisition.runtime_folder import is_in_use, named_after
+from coupole.acquisition.runtime_folder import named_after
 from coupole.console.cell.lending import Lending
 from coupole.console.plans.plan_queue import Entry, PlanQueue
 from coupole.console.processes.growing_file import end_of_file
@@ -116,7 +117,7 @@ class Acquisitions:
             return f"{Path(self.state['run']).name} is being acquired"
         if self.lending.lent_to:
             return f"the cell is lent to {self.lending.lent_to}"
-        return "another process of this user has its devices open" if is_in_use(self._cell.state_folder) else ""
+        return "another process of this user has its devices open" if is_in_use(self._cell) else ""
 
     def _is_ours(self, state: State) -> bool:
         """Whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names its

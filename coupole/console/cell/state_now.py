@@ -20,8 +20,9 @@ from coupole.errors import CoupoleError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
-from coupole.storage.arm_faults import ArmFaults
-from coupole.storage.ledger import History, Ledger
+from coupole.storage.arm_faults import faults_of
+from coupole.storage.ledger import Ledger
+from coupole.storage.ledger_lines import History
 from coupole.storage.line_file import utc_now, utc_text
 from coupole.storage.run import Run
 
@@ -65,7 +66,7 @@ def state_of(
     begun = "halted" if queue.halted else "idle"
     if entry is not None:
         begun = "concluding" if entry.run else "starting"
-    faults = ArmFaults(cell.state_folder).standing()
+    faults = faults_of(cell).standing()
     return StateNow(
         state=at_work.get("state", begun),
         rig=cell.rig.name,
@@ -125,27 +126,29 @@ _NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
 
 
 def _object_of(cell: Cell, run: str) -> dict[str, Any]:
-    """Of a run that is being acquired; nothing if it cannot be read."""
+    """Of a run that is being acquired: its object, the light on it that is not this run's, and its budget, both
+    as the ledger has them now; nothing if it cannot be read."""
     try:
-        return _object_when(cell.ledger_folder, cell.former_ledger_folder, run)
+        ledger, named, plans_budget = _ledger_when(cell.ledger_folder, cell.former_ledger_folder, run)
+        history = ledger.newest() if ledger else History()
     except CoupoleError:
         return _NO_OBJECT
+    name = Path(run).name
+    before = sum(entry.dose_lux_h for entry in history.entries if entry.run != name)
+    return {"object": named, "dose_before": before, "dose_budget": history.allowed_lux_h(plans_budget)}
 
 
 @functools.lru_cache(4)
-def _object_when(ledgers: Path, former: Path, run: str) -> dict[str, Any]:
-    """A run's object, the light on it that is not this run's, and its budget; they do not change while it runs.
-    Raises InputError, StorageError."""
+def _ledger_when(ledgers: Path, former: Path, run: str) -> tuple[Ledger | None, str, float | None]:
+    """The ledger of a run's object, its id, and its budget by the plan; they do not change while it runs. Raises
+    InputError."""
     opened = Run(Path(run))
     named = opened.about.get("object") or ""
-    plan = yamlfile.read(opened.plan_path).data
-    history = Ledger(ledgers, named, former).read() if named else History()
-    before = sum(entry.dose_lux_h for entry in history.entries if entry.run != opened.folder.name)
-    budget = (plan.get("object") or {}).get("dose_budget_lux_h")
-    return {"object": named, "dose_before": before, "dose_budget": budget}
+    budget = (yamlfile.read(opened.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
+    return Ledger(ledgers, named, former) if named else None, named, budget
 
 
 def _forget_runs() -> None:
     """A run that goes on later is read anew: its object may have received other light meanwhile."""
     _devices_when.cache_clear()
-    _object_when.cache_clear()
+    _ledger_when.cache_clear()

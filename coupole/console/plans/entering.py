@@ -151,8 +151,11 @@ class Entering:
         def received_lux_h(name: str) -> float:
             return ledger_of(self._cell, name).read().total_lux_h
 
-        now = too_much_light(self._queue.waiting, received_lux_h, at_work)
-        found = too_much_light(entries, received_lux_h, at_work)
+        def budget_lux_h(name: str) -> float | None:
+            return ledger_of(self._cell, name).read().budget_lux_h
+
+        now = too_much_light(self._queue.waiting, received_lux_h, at_work, budget_lux_h)
+        found = too_much_light(entries, received_lux_h, at_work, budget_lux_h)
         return {number: refusal for number, refusal in found.items() if number not in now}
 
 

@@ -14,7 +14,8 @@ from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.plan import NAME_PATTERN
 from coupole.storage.durable import make_folder, write_synced
-from coupole.storage.ledger import History, ledger_of, similar_ids
+from coupole.storage.ledger import ledger_of, similar_ids
+from coupole.storage.ledger_lines import History
 
 _PHOTOGRAPH_PX = 1600
 
@@ -63,6 +64,10 @@ class ObjectFiles:
         if not note.strip() or not 0 < dose_lux_h < 1e9:
             raise InputError("expected how many lux hours, above 0, and what that light was")
         ledger_of(self._cell, object_id).enter(dose_lux_h, note.strip())
+
+    def set_budget(self, object_id: str, dose_lux_h: float, name: str, reason: str) -> None:
+        """All light that it may receive. Raises InputError, StorageError."""
+        ledger_of(self._cell, object_id).set_budget(dose_lux_h, name, reason)
 
     def photograph(self, object_id: str) -> Path | None:
         path = self._photograph_path(object_id)

@@ -54,11 +54,15 @@ def _whole_s(entry: Entry) -> float:
 
 
 def too_much_light(
-    entries: Sequence[Entry], received_lux_h: Callable[[str], float], at_work: AtWork
+    entries: Sequence[Entry],
+    received_lux_h: Callable[[str], float],
+    at_work: AtWork,
+    budget_lux_h: Callable[[str], float | None] = lambda _: None,
 ) -> dict[str, str]:
     """Refusals of the entries that wait whose object's budget is exceeded when all before them are done, by id.
 
-    `received_lux_h` tells what an object has received by its ledger.
+    `received_lux_h` tells what an object has received by its ledger, `budget_lux_h` what it may receive by that; a
+    plan's own budget can only be stricter.
     """
     light: dict[str, float] = {}
     refused: dict[str, str] = {}
@@ -70,10 +74,11 @@ def too_much_light(
         if name not in light:
             light[name] = max(received_lux_h(name), at_work.light_after_lux_h.get(name, 0.0))
         before, light[name] = light[name], light[name] + needs.dose_lux_h
-        if needs.dose_budget_lux_h is not None and light[name] > needs.dose_budget_lux_h:
+        known = [one for one in (needs.dose_budget_lux_h, budget_lux_h(name)) if one is not None]
+        if known and light[name] > min(known):
             refused[entry.id] = (
                 f"object {name}: {needs.dose_lux_h:.2f} lux.h after {before:.2f} lux.h with what runs and waits "
-                f"before it; its budget is {needs.dose_budget_lux_h:g} lux.h"
+                f"before it; its budget is {min(known):g} lux.h"
             )
     return refused
 

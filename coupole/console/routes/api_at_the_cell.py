@@ -13,7 +13,7 @@ from coupole.console.people.accounts import Role
 from coupole.console.people.asking import REFUSALS, Who
 from coupole.console.people.guard import is_command_line
 from coupole.console.people.permission import NotAllowed, allow
-from coupole.console.routes.messages import Lease, Light, Move, Output, StateNow, Text, Warn
+from coupole.console.routes.messages import Budget, Lease, Light, Move, Output, StateNow, Text, Warn
 from coupole.console.service_parts import Service
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
@@ -94,6 +94,16 @@ def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
         request.state.about = f"{asked.dose_lux_h:g} lux.h: {asked.note}"
         ledger = ledger_of(cell, thing)
         ledger.enter(asked.dose_lux_h, asked.note)
+        return document(ledger)
+
+    @app.post("/api/v1/objects/{thing}/budget", responses=REFUSALS)
+    def set_budget(thing: Text, asked: Budget, who: Who, request: Request) -> dict[str, Any]:
+        """Say what an object may receive in its life, by a named person's word."""
+        allow(service, who, Role.OPERATOR, "set a light budget")
+        request.state.about = f"{asked.dose_lux_h:g} lux.h: {asked.reason}"
+        ledger = ledger_of(cell, thing)
+        name = asked.name.strip() or who.name
+        ledger.set_budget(asked.dose_lux_h, name if name == who.name else f"{name} (by {who.name})", asked.reason)
         return document(ledger)
 
     @app.post("/api/v1/objects/{thing}/warning", responses=REFUSALS)

@@ -72,6 +72,17 @@ class Light(Asked):
     """What that light was."""
 
 
+class Budget(Asked):
+    """What an object may receive in its life."""
+
+    dose_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """In lux hours."""
+    name: Annotated[str, Field(max_length=200)] = ""
+    """Whose word it is; empty: of who asks."""
+    reason: Annotated[str, Field(max_length=2000)] = ""
+    """Why it is this."""
+
+
 class Warn(Asked):
     """When an object's ledger warns."""
 
@@ -152,7 +163,7 @@ class StateNow(BaseModel):
     dose_before: float
     """Light on the object before the run, in lux hours."""
     dose_budget: float | None
-    """Light that the object may receive in its life, by the run's plan."""
+    """Light that the object may receive in its life, by its ledger and the run's plan."""
     left_s: float | None
     """Expected until the run is complete."""
     halted: str

@@ -7,7 +7,7 @@ from nicegui import ui
 from coupole.console.screens.parts import button, named, panel
 from coupole.console.screens.visit import Visit
 from coupole.errors import InputError
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 
 
 class FaultOfArm:
@@ -30,7 +30,7 @@ class FaultOfArm:
 
     async def _said(self) -> None:
         account, cause = self._visit.account, str(self._cause.value or "").strip()
-        faults = ArmFaults(self._visit.service.cell.state_folder)
+        faults = faults_of(self._visit.service.cell)
 
         seen = self._words.text
 

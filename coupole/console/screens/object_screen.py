@@ -13,7 +13,7 @@ from coupole.console.plans.drafts import Draft
 from coupole.console.screens.parts import Choice, button, facts_html, named, panel, table_html
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError, InputError
-from coupole.storage.ledger import History
+from coupole.storage.ledger_lines import History
 
 _SEND = """async event => {
   const file = event.target.files[0];
@@ -45,6 +45,7 @@ class _Screen:
                 self._bar = ui.linear_progress(0.0, show_value=False).props('aria-label="light of its budget"')
                 self._runs = ui.html("", sanitize=False).style("width:100%")
                 self._by_hand()
+                self._budget()
 
     async def open_first(self) -> None:
         """The object of the run at work, or else the first."""
@@ -67,8 +68,8 @@ class _Screen:
         except CoupoleError as error:
             self._visit.say(str(error), bad=True)
             return
-        budget = min((one.budget_lux_h for one in plans if one.budget_lux_h is not None), default=None)
-        self._show_light(history, budget, similar)
+        strictest = min((one.budget_lux_h for one in plans if one.budget_lux_h is not None), default=None)
+        self._show_light(history, strictest, similar)
         operators = {row.name: row.operator for row in runs}
         self._runs.set_content(_light_table(history, operators))
         self._show_photograph(object_id, there=photograph is not None)
@@ -76,11 +77,16 @@ class _Screen:
         self._plans.set_options({name: name for name in with_mesh})
         await self._draw()
 
-    def _show_light(self, history: History, budget: float | None, similar: list[str]) -> None:
-        total = history.total_lux_h
+    def _show_light(self, history: History, plans_budget: float | None, similar: list[str]) -> None:
+        total, budget = history.total_lux_h, history.budget_lux_h
         figures = {"in its life": f"{total:.3f} lux h"}
+        for one in history.budgets[-1:]:
+            because = f" ({one.reason})" if one.reason else ""
+            figures["it may receive"] = f"{one.dose_lux_h:g} lux h, by {one.name}{because}"
+        if plans_budget is not None and (budget is None or plans_budget < budget):
+            budget = plans_budget
+            figures["by the strictest of its plans"] = f"{budget:g} lux h"
         if budget is not None:
-            figures["it may receive"] = f"{budget:g} lux h, by its plans"
             figures["left"] = f"{max(0.0, budget - total):.3f} lux h"
         if history.unsettled_lux_h:
             figures["of which at most"] = f"{history.unsettled_lux_h:.3f} lux h: how a burst ended is not known"
@@ -124,6 +130,30 @@ class _Screen:
                     await self._show()
 
             button("Enter", enter, name="enter-light").set_enabled(self._visit.may_act)
+
+    def _budget(self) -> None:
+        with ui.row().classes("bar"):
+            amount = named(ui.number("It may receive in its life, lux h", min=0).classes("field"), "budget")
+            reason = named(ui.input("Why", placeholder="by the conservator, 12 May").classes("field"), "why")
+
+            async def enter() -> None:
+                object_id, account = self._chooser.value, self._visit.account
+                said, budget = f"{reason.value or ''}".strip(), amount.value
+
+                def do() -> bool:
+                    if account is None or budget is None:
+                        raise InputError("expected how many lux hours")
+                    self._objects.set_budget(object_id, float(budget), account.name, said)
+                    return True
+
+                if await self._visit.act(
+                    f"budget {object_id}: {budget} lux h, {said}", do, acts=False, done="the budget is set"
+                ):
+                    amount.set_value(None)
+                    reason.set_value("")
+                    await self._show()
+
+            button("Set its budget", enter, name="set-budget").set_enabled(self._visit.may_act)
 
     def _show_photograph(self, object_id: str, *, there: bool) -> None:
         self._photograph.clear()

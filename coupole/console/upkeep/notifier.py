@@ -15,7 +15,7 @@ from coupole.console.plans.plan_queue import Entry, PlanQueue
 from coupole.console.upkeep.notifications import Message, Settings, ways
 from coupole.errors import CoupoleError, InputError, StorageError
 from coupole.plan.cell import Cell
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 from coupole.storage.line_file import LineFile, utc_now
 
 _LOOK_EVERY_S, _TRIALS, _AGAIN_AFTER_S, _MOST_WAITING = 1.0, 3, 5.0, 100
@@ -28,7 +28,6 @@ class Occurrences:
 
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
-        self._faults = ArmFaults(cell.state_folder)
         self._ended = {entry.id for entry in plans.entries if entry.ended}
         self._halted = plans.halted
         self._known_fault = self._newest_fault()
@@ -64,7 +63,7 @@ class Occurrences:
         return self._message("plan-ended", f"{entry.words} is {entry.state}", text)
 
     def _newest_fault(self) -> str:
-        standing = self._faults.standing()
+        standing = faults_of(self._cell).standing()
         return f"{standing[-1].t}: {standing[-1].message}" if standing else ""
 
     def _disk(self) -> Iterator[Message]:

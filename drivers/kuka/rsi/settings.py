@@ -73,8 +73,8 @@ class Settings(BaseModel):
     settle_cycles: int = Field(default=10, ge=1)
     """Settled: within both tolerances for this many cycles, and again after the dwell."""
     attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
-    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only for a
-    simulated cell on a machine that is busy with other work."""
+    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only for
+    a simulated cell on a machine that is busy with other work."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_lag_s: float = Field(default=0.06, ge=0)

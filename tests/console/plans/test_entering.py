@@ -71,6 +71,13 @@ def test_the_light_of_all_that_waits_counts_against_an_objects_budget(desk: Desk
     assert desk.names == ["small.yaml", "small.yaml", "free.yaml", "hold: turn it"]
 
 
+def test_the_budget_in_its_ledger_counts_for_plans_that_name_none(desk: Desk) -> None:
+    Ledger(Path(desk.cell_folder.rig_data["ledger"]), "relief").set_budget(1.5, "A. Keeper")
+    desk.enter(plan="free.yaml")
+    with pytest.raises(InputError, match=r"its budget is 1.5 lux.h"):
+        desk.enter(plan="free.yaml")
+
+
 def test_a_run_at_work_counts_with_all_that_it_will_give(desk: Desk) -> None:
     desk.acquisitions.state = {
         "run": "/", "rig": "", "pid": 0, "state": "running", "light_after_lux_h": {"relief": 2.6}

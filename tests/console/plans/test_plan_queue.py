@@ -15,7 +15,8 @@ import cells
 import pytest
 from cells import CellFolder
 
-from coupole.acquisition.runtime_folder import in_use, named_after
+from coupole.acquisition.cell_marks import in_use
+from coupole.acquisition.runtime_folder import named_after
 from coupole.console.cell import acquisitions as module
 from coupole.console.cell.acquisitions import Acquisitions
 from coupole.console.cell.state_now import _entries_now
@@ -110,16 +111,14 @@ def live(rig: Path) -> Iterator[None]:
     """A live view of a cell."""
     process = cells.start("live", rig, "--yes")
     try:
-        cells.wait_until(lambda: module.is_in_use(rig.parent / "storage/state"), "the live view")
+        cells.wait_until(lambda: module.is_in_use(read_cell(rig)), "the live view")
         yield
     finally:
         process.terminate()
         cells.finish(process)
 
 
-@pytest.mark.parametrize(
-    "had", [lambda rig: in_use(rig.parent / "storage/state"), pytest.param(live, marks=pytest.mark.full)]
-)
+@pytest.mark.parametrize("had", [lambda rig: in_use(read_cell(rig)), pytest.param(live, marks=pytest.mark.full)])
 def test_a_plan_waits_while_somebody_else_has_the_devices(
     queue: PlanQueue,
     begun: list[list[str]],

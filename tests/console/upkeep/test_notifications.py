@@ -26,7 +26,7 @@ from coupole.console.upkeep.notifications import NAME, console_folder, read_sett
 from coupole.console.upkeep.notifier import Notifier, Occurrences
 from coupole.errors import InputError
 from coupole.plan.cell import Cell, read_cell
-from coupole.storage.arm_faults import ArmFaults
+from coupole.storage.arm_faults import faults_of
 
 MAILS: list[tuple[str, list[str], Mail]] = []
 POSTS: list[tuple[dict[str, str], dict[str, Any]]] = []
@@ -126,7 +126,7 @@ def test_what_happens_at_a_cell_reaches_people_by_mail_and_by_webhook(
     why = {"said": "no light", "halt": "bad.yaml: no light"}
     queue.conclude(bad.id, state="failed", ended="2026-01-01T00:00:02.000Z", **why)
     queue.conclude(hold.id, state="done", ended="2026-01-01T00:00:03.000Z", halt=hold.words)
-    ArmFaults(cell.state_folder).note("axis 3 is blocked")
+    faults_of(cell).note("axis 3 is blocked")
     log = console_folder(cell) / "notifications.jsonl"
     with Notifier(settings, occurrences, console_folder(cell)) as notifier:
         cells.wait_until(lambda: log.is_file() and log.read_text().count("\n") >= 10, "five messages by two ways")

@@ -1,0 +1,93 @@
+"""Folders for what is true of the controller of a cell's arm, whatever its rig is called and wherever runs are.
+
+A standing fault and a commissioning belong to the arm. So they are kept by the address at which its controller is
+reached, which is known before a device is opened, by its serial number, which is known afterwards, and in the
+rig's own state folder, as all who share that rig find it. Each is read; whoever writes, writes all. An address
+remembers the serial numbers that have answered there: what is kept by these is found before the next opening.
+
+A simulated cell has its state folder alone: each of its worlds is another controller.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from coupole.devices import Identity
+from coupole.plan.cell import Cell
+from coupole.plan.registry import settings_class
+from coupole.plan.rig_devices import device_for, in_world
+
+_SERIALS = "answered-here.txt"
+_OWN_SOCKET = "listen"
+_ADDRESSES = ("controller", "host", "address", _OWN_SOCKET)
+"""Settings of drivers that say where the arm's controller is, the most telling first. `listen` is this machine's
+own socket: all controllers that may speak to it count as one, which can only make too careful."""
+
+
+def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, ...]:
+    """Folders, perhaps not made yet; the controller's own first, the rig's state folder last. `identity`: of the
+    opened arm."""
+    if in_world(cell.rig, dry_run=False):
+        return (cell.state_folder,)
+    by_address = _by_address(cell)
+    serials = dict.fromkeys([*_by_serial(identity), *_remembered(by_address)])
+    return (*(cell.controllers_folder / name for name in serials), by_address, cell.state_folder)
+
+
+def remember_controller(cell: Cell, identity: Identity) -> None:
+    """An arm with this identity has answered: what is kept of it is found by its address from now on. A disk that
+    does not take it keeps nobody from working: the serial number is asked again at each opening."""
+    if in_world(cell.rig, dry_run=False):
+        return
+    by_address = _by_address(cell)
+    new = [name for name in _by_serial(identity) if name not in _remembered(by_address)]
+    if not new:
+        return
+    with contextlib.suppress(OSError):
+        by_address.mkdir(parents=True, exist_ok=True)
+        with (by_address / _SERIALS).open("a", encoding="utf-8") as file:
+            file.write("".join(f"{name}\n" for name in new))
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _by_address(cell: Cell) -> Path:
+    driver, settings = device_for(cell.rig, "robot", dry_run=False)
+    model = settings_class(driver)
+    address, name = _address(model, settings)
+    return cell.controllers_folder / _file_name("at", name, address)
+
+
+def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, str]:
+    """Where a driver with these settings finds its controller, and the setting that says so, if one does."""
+    for name in _ADDRESSES:
+        field = model.model_fields.get(name)
+        given = settings.get(name, field.default if field is not None else "")
+        if field is not None and isinstance(given, str) and given.strip():
+            host = given.strip().lower()
+            return (host if name == _OWN_SOCKET else host.partition(":")[0]), name
+    return "", "unknown"
+
+
+def _by_serial(identity: Identity | None) -> list[str]:
+    """None for a stand-in, nor for a driver that cannot know it."""
+    if identity is None or identity.simulated or not identity.serial.strip(" 0"):
+        return []
+    return [_file_name("serial", identity.vendor, identity.serial)]
+
+
+def _remembered(by_address: Path) -> list[str]:
+    try:
+        lines = (by_address / _SERIALS).read_text("utf-8", errors="replace").splitlines()
+    except OSError:
+        return []
+    return [line for line in lines if re.fullmatch(r"serial-[\w.-]{1,120}", line)]
+
+
+def _file_name(*parts: str) -> str:
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(parts))[:120]

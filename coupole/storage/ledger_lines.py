@@ -1,0 +1,263 @@
+"""The lines of an object's dose ledger, and what they say together: all light on it, and its budget."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, BinaryIO, ClassVar, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from coupole.errors import DoseBudgetReached, StorageError
+from coupole.storage.line_file import utc_now
+
+BY_HAND = "by hand"
+"""In place of a run's name, for light that was entered with `coupole dose --add`."""
+_ROUNDING = 1e-9
+_TAIL_BYTES = 256
+Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+
+
+class _Line(BaseModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore")
+
+    t: str = Field(default_factory=utc_now)
+
+
+class _Light(_Line):
+    dose_lux_h: Amount
+    damage_wh_m2: Amount | None = None
+    """Radiant exposure weighted by damage (`coupole.appearance.spectra.damage`); None if the lamps' spectrum is
+    not known."""
+
+
+class LightEntered(_Light):
+    """Light that was given: by hand, or by version 0.1."""
+
+    event: Literal["dose"] = "dose"
+    run: str = BY_HAND
+    note: str = ""
+
+
+class LightPlanned(_Light):
+    """Light that is about to be given, at most."""
+
+    event: Literal["planned"] = "planned"
+    id: str
+    run: str
+    """Name of the run's folder, or `meter`, or `live`."""
+
+
+class LightGiven(_Light):
+    """What was given of the plan with this id."""
+
+    event: Literal["given"] = "given"
+    id: str
+
+
+class WarningSet(_Line):
+    """From now on a total above this is warned of; None: no total is."""
+
+    event: Literal["warn_above"] = "warn_above"
+    dose_lux_h: Amount | None
+
+
+class BudgetSet(_Line):
+    """From now on the object may receive so much in its life, by this person's word."""
+
+    event: Literal["budget"] = "budget"
+    dose_lux_h: Amount
+    name: str
+    reason: str = ""
+
+
+Line: TypeAlias = LightEntered | LightPlanned | LightGiven | WarningSet | BudgetSet
+_LINE: TypeAdapter[Line] = TypeAdapter(Annotated[Line, Field(discriminator="event")])
+
+
+@dataclass
+class Entry:
+    """Light of one burst, of one second of a live view, or entered by hand."""
+
+    t: str
+    run: str
+    dose_lux_h: float
+    damage_wh_m2: float | None
+    note: str = ""
+    settled: bool = True
+    """False while only the plan is known: what was given is at most this."""
+
+
+@dataclass
+class History:
+    """All light of one object."""
+
+    entries: list[Entry] = field(default_factory=list)
+    of_plan: dict[str, Entry] = field(default_factory=dict)
+    """Those that were planned, by their id."""
+    warn_above_lux_h: float | None = None
+    budgets: list[BudgetSet] = field(default_factory=list)
+    """As they were set; the last one holds."""
+    unreadable: int = 0
+    """Lines that are no entries: torn by a crash before their light was given, or damaged later."""
+
+    @property
+    def total_lux_h(self) -> float:
+        return sum(entry.dose_lux_h for entry in self.entries)
+
+    @property
+    def budget_lux_h(self) -> float | None:
+        """The object's own; None if nobody has set one."""
+        return self.budgets[-1].dose_lux_h if self.budgets else None
+
+    def allowed_lux_h(self, plans_lux_h: float | None) -> float | None:
+        """What the object may receive in its life: the smaller of its budget and a plan's; None without both."""
+        known = [one for one in (self.budget_lux_h, plans_lux_h) if one is not None]
+        return min(known, default=None)
+
+    @property
+    def damage_wh_m2(self) -> float:
+        """Of the light whose spectrum is known."""
+        return sum(entry.damage_wh_m2 or 0.0 for entry in self.entries)
+
+    @property
+    def of_unknown_spectrum_lux_h(self) -> float:
+        return sum(entry.dose_lux_h for entry in self.entries if entry.damage_wh_m2 is None)
+
+    @property
+    def unsettled_lux_h(self) -> float:
+        """Planned, with nobody left who could say what was given."""
+        return sum(entry.dose_lux_h for entry in self.entries if not entry.settled)
+
+    def planned_lux_h(self, plan_id: str) -> float:
+        """What counts of the plan with this id; 0 if it is not known."""
+        return self.of_plan[plan_id].dose_lux_h if plan_id in self.of_plan else 0.0
+
+    def of_run(self, run: str) -> History:
+        return History([entry for entry in self.entries if entry.run == run])
+
+    @property
+    def runs(self) -> list[str]:
+        """In the order of their first light."""
+        return list(dict.fromkeys(entry.run for entry in self.entries))
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Light that somebody wants to give under a plan."""
+
+    lux_h: float
+    budget_lux_h: float | None
+    """The plan's own, which can only be stricter than the object's."""
+    plan: str = ""
+    name: str = ""
+    """Who runs it."""
+
+    def refuse_beyond(self, object_id: str, history: History, more_lux_h: float = 0.0) -> None:
+        """Raise DoseBudgetReached if this light, after what the ledger has and `more_lux_h`, is too much."""
+        total_lux_h, allowed_lux_h = history.total_lux_h + more_lux_h, history.allowed_lux_h(self.budget_lux_h)
+        if allowed_lux_h is None or total_lux_h + self.lux_h <= allowed_lux_h * (1.0 + _ROUNDING):
+            return
+        remedy = f"If it may receive more, say `coupole dose {object_id} --budget LUX_H --name NAME`"
+        if history.budget_lux_h is None or allowed_lux_h < history.budget_lux_h:
+            remedy = "Raise `dose_budget_lux_h` in the plan if the object may receive it"
+        raise DoseBudgetReached(
+            f"object {object_id}: the next {self.lux_h:.3g} lux.h after {total_lux_h:.3f} lux.h would exceed its "
+            f"budget of {allowed_lux_h:g} lux.h. {remedy}"
+        )
+
+    def as_the_objects(self) -> BudgetSet:
+        """The plan's budget, as that of an object that has none."""
+        assert self.budget_lux_h is not None
+        return BudgetSet(
+            dose_lux_h=self.budget_lux_h, name=self.name, reason=f"the first budget, by the plan {self.plan}"
+        )
+
+
+def read_lines(path: Path) -> list[bytes]:
+    """Lines of a file; none if there is no file. Raises StorageError."""
+    try:
+        return path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def history_of(texts: list[bytes]) -> History:
+    """What these lines say."""
+    reading = Reading()
+    for text in texts:
+        reading.take(text)
+    return reading.history
+
+
+class Reading:
+    """What has been read of a ledger that others go on writing."""
+
+    def __init__(self) -> None:
+        self.history = History()
+        self._inode, self._read_bytes, self._tail = 0, 0, b""
+
+    def renewed(self, path: Path) -> Reading:
+        """With the complete lines that came since; all of them anew if the file is another one now. Raises
+        StorageError."""
+        try:
+            with path.open("rb") as file:
+                return self._with_rest(file)
+        except FileNotFoundError:
+            return Reading()
+        except OSError as error:
+            raise _unreadable(path, error) from error
+
+    def _with_rest(self, file: BinaryIO) -> Reading:
+        inode, begin = os.fstat(file.fileno()).st_ino, self._read_bytes - len(self._tail)
+        file.seek(begin)
+        if inode != self._inode or file.read(len(self._tail)) != self._tail:
+            file.seek(0)
+            found = Reading()
+        else:
+            found = self
+        rest, _, _ = (file.read()).rpartition(b"\n")
+        if rest:
+            for text in rest.split(b"\n"):
+                found.take(text)
+            found._inode, found._read_bytes = inode, found._read_bytes + len(rest) + 1
+            found._tail = (found._tail + rest + b"\n")[-_TAIL_BYTES:]
+        return found
+
+    def take(self, text: bytes) -> None:
+        """One more line."""
+        try:
+            line = _LINE.validate_json(text)
+        except ValidationError:
+            self.history.unreadable += bool(text.strip())
+        else:
+            _add(self.history, line)
+
+
+def _unreadable(path: Path, error: OSError) -> StorageError:
+    return StorageError(f"{path}: cannot read the dose ledger: {error.strerror}")
+
+
+def _add(history: History, line: Line) -> None:
+    """A correction counts in place of its plan; one whose plan cannot be read counts by itself."""
+    if isinstance(line, WarningSet):
+        history.warn_above_lux_h = line.dose_lux_h
+        return
+    if isinstance(line, BudgetSet):
+        history.budgets.append(line)
+        return
+    if isinstance(line, LightGiven):
+        entry = history.of_plan.get(line.id)
+        if entry is not None:
+            entry.dose_lux_h, entry.damage_wh_m2, entry.settled = line.dose_lux_h, line.damage_wh_m2, True
+            return
+        entry = Entry(line.t, "unknown", line.dose_lux_h, line.damage_wh_m2)
+    elif isinstance(line, LightPlanned):
+        entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, settled=False)
+        history.of_plan[line.id] = entry
+    else:
+        entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, line.note)
+    history.entries.append(entry)

@@ -70,7 +70,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
                 controller, session.sender = address, _name(address)
             with contextlib.suppress(OSError):  # a controller that has gone is detected by its silence
                 link.sendto(answer, address)
-        if session.late > late:
+        if session.late > late or session.behind:
             _drop_backlog(link)  # answers to packets that are queued here would be late too
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)

@@ -63,6 +63,11 @@ class Settings(BaseModel):
     """Time-out for the first packets, in machine time."""
     delay_limit: int = Field(default=50, ge=1)
     """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
+    delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
+    """How the controller counts late answers: all of a session, so that a fall means that RSI was started anew; or
+    those in a row, from 0 again after one in time."""
+    unaccounted_s: float = Field(default=0.1, ge=0)
+    """A silence of the controller of this length that its IPOC does not count ends the session; 0: none does."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)
     """Fraction of the axes' highest speeds."""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)

@@ -39,6 +39,7 @@ from coupole.errors import (
     PreflightRefused,
     StorageError,
 )
+from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.schedule import Schedule
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, without_hidden
@@ -131,7 +132,8 @@ def _acquire_into(
         try:
             begun = SessionResumed if resumed else SessionStarted
             acknowledged = faults.begin_session(run.folder.name)
-            recorder.note(begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged))
+            said = {"acknowledged": acknowledged, "trusted": trusted_by_name(job.cell.rig)}
+            recorder.note(begun(simulated=cell.simulated, room_c=room_c, **said))
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, found=found)

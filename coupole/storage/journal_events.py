@@ -58,6 +58,8 @@ class SessionStarted(JournalEvent):
     """Temperature of the coolest LED board."""
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
+    trusted: tuple[str, ...] = ()
+    """What a person allows by name in the rig (`any_controller_by`, `without_realtime_by`), in words."""
 
 
 class SessionResumed(JournalEvent):
@@ -67,6 +69,7 @@ class SessionResumed(JournalEvent):
     simulated: bool = False
     room_c: float | None = None
     acknowledged: str = ""
+    trusted: tuple[str, ...] = ()
 
 
 class ViewBegun(JournalEvent):

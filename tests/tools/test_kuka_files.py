@@ -48,7 +48,7 @@ def test_the_committed_files_are_what_the_tool_writes(tool: dict[str, Any], tmp_
 
 
 def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
+    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person")
     assert rsi.tag == "ROOT"
     assert rsi.findtext("CONFIG/PORT") == settings.listen.rsplit(":", 1)[1]
     assert rsi.findtext("CONFIG/SENTYPE") == settings.sen_type
@@ -56,7 +56,7 @@ def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Eleme
 
 
 def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
+    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person")
     elements = [element.attrib for element in rsi.iterfind("SEND/ELEMENTS/ELEMENT")]
     assert {f"DEF_{settings.measured_tag}", f"DEF_{settings.delay_tag}"} <= {e["TAG"] for e in elements}
     assert {element["INDX"] for element in elements} == {"INTERNAL"}
@@ -106,12 +106,12 @@ def test_the_context_says_the_limits_and_the_meaning_of_the_settings(
 
 def test_the_monitor_stops_rsi_before_the_correction_is_clamped(tool: dict[str, Any]) -> None:
     stand_in = Limits()
-    assert kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).most_correction_deg == stand_in.axis_monitor_deg
+    assert kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person").most_correction_deg == stand_in.axis_monitor_deg
     assert stand_in.axis_clamp_deg == tuple(limit + 1 for limit in stand_in.axis_monitor_deg)
     for axis, clamp in enumerate(stand_in.axis_clamp_deg, start=1):
-        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings(arm_model=KR10_R1100_SIXX))
+        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person"))
     assert (
-        kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).pose_correction_mm
+        kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person").pose_correction_mm
         == stand_in.pose_monitor_mm
         < stand_in.pose_clamp_mm
     )
@@ -133,7 +133,7 @@ def test_rsi_runs_in_the_cycle_of_the_settings(
     program = (tmp_path / "rsi" / "coupole_rsi.src").read_text()
     assert f"RSI_ON(#ABSOLUTE,{mode})" in program
     committed = (KUKA / "rsi" / "coupole_rsi.src").read_text()
-    assert (committed == program) == (kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).cycle_ms == cycle_ms)
+    assert (committed == program) == (kuka_rsi.Settings(arm_model=KR10_R1100_SIXX, any_controller_by="A. Person").cycle_ms == cycle_ms)
 
 
 def test_rsi_starts_where_the_arm_stands() -> None:
@@ -154,7 +154,7 @@ def test_eki_listens_where_the_driver_connects(eki: ElementTree.Element) -> None
 
 
 def test_eki_connects_where_the_driver_listens(tool: dict[str, Any]) -> None:
-    settings = kuka_eki.Settings(arm_model=KR10_R1100_SIXX, controller_is="client", address="192.168.1.10:54601")
+    settings = kuka_eki.Settings(arm_model=KR10_R1100_SIXX, controller_is="client", address="192.168.1.10:54601", any_controller_by="A. Person")
     configuration = ElementTree.fromstring(tool["eki_xml"](settings))
     external = configuration.find("CONFIGURATION/EXTERNAL")
     assert external is not None

@@ -106,7 +106,7 @@ class RsiSession:
         self._bounds = StepBounds(
             config.corrects, config.cycle_s, config.velocity_deg_s, config.acceleration_deg_s2, config.geometry
         )
-        self._witness = self._new_witness(declared=False)
+        self._witness = self._new_witness(simulated=False)
         self._cycle = CycleMeter(config.cycle_s, None)
         self._counts_delay = False
         """Whether the session's first packet had a delay counter."""
@@ -290,14 +290,14 @@ class RsiSession:
         self._controller, self._counts_delay = controller, packet.delay is not None
         # Only a simulated controller may say how long its cycle is.
         declared_s = config.declared_cycle_s if b"simulated" in controller else None
-        self._witness = self._new_witness(declared=declared_s is not None)
+        self._witness = self._new_witness(simulated=b"simulated" in controller)
         self._cycle = CycleMeter(config.cycle_s, declared_s)
         self._start_deg = self._measured_deg = packet.joints_deg
         self._corrections.begin(packet.joints_deg)
         self.motion.stand_at(packet.joints_deg)
 
-    def _new_witness(self, *, declared: bool) -> ArmWitness:
-        """`declared`: the world waits for answers, or has a pace of its own; the machine's clock says nothing."""
+    def _new_witness(self, *, simulated: bool) -> ArmWitness:
+        """`simulated`: the world waits for answers, or for its busy machine; the clock says nothing of silences."""
         config = self._config
         return ArmWitness(
             self._corrections.place,
@@ -307,7 +307,7 @@ class RsiSession:
             lag_s=config.follow_lag_s,
             cycle_s=config.cycle_s,
             counts_in_a_row=config.delay_counts == "consecutive",
-            unaccounted_s=0.0 if declared else config.unaccounted_s,
+            unaccounted_s=0.0 if simulated else config.unaccounted_s,
         )
 
     def _in_sequence(self, ipoc: int, advance: int, seen: int) -> bool:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validato
 from coupole.kinematics import Arm, SphericalWrist, slowed, structure_of
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.rsi.corrections import TAGS
+from drivers.senders import refuse_anybody
 
 _TAG = r"^[A-Za-z_]\w*$"
 
@@ -26,8 +27,14 @@ class Settings(BaseModel):
     listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
     """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
     controller: Literal[""] | IPv4Address = ""
-    """The controller's address in the RSI network. Packets of any other are ignored and counted. Without it the
-    first sender of an answerable packet counts as the controller, until the driver is closed."""
+    """The controller's address in the RSI network. Packets of any other are ignored and counted. It may be left
+    out only where no other machine can send (`listen` on loopback), or by a person's word: the first sender of an
+    answerable packet then counts as the controller, until the driver is closed."""
+    any_controller_by: str = Field(default="", max_length=60)
+    """Who has decided that whoever sends first is taken for the controller."""
+    without_realtime_by: str = Field(default="", max_length=60)
+    """Who has decided that this machine may answer at normal priority; without that word, and the right to
+    real-time priority, a controller on the network is not answered."""
     cycle_ms: Literal[4, 12] = 4
     """4 for #IPO_FAST, 12 for #IPO. It is compared with the arrival of the packets before the first motion."""
     declared_cycle_ms: float | None = Field(default=None, gt=0)
@@ -82,6 +89,11 @@ class Settings(BaseModel):
     follow_cycles: int = Field(default=10, ge=1)
     """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
     the commanded axes for this many cycles."""
+
+    @model_validator(mode="after")
+    def _controller_is_named(self) -> Self:
+        refuse_anybody(self.listen, self.controller, self.any_controller_by)
+        return self
 
     @model_validator(mode="after")
     def _pose_is_known(self) -> Self:

@@ -132,8 +132,8 @@ def _acquire_into(
         try:
             begun = SessionResumed if resumed else SessionStarted
             acknowledged = faults.begin_session(run.folder.name)
-            said = {"acknowledged": acknowledged, "trusted": trusted_by_name(job.cell.rig)}
-            recorder.note(begun(simulated=cell.simulated, room_c=room_c, **said))
+            said = begun(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledged)
+            recorder.note(said.model_copy(update={"trusted": trusted_by_name(job.cell.rig)}))
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, found=found)

@@ -79,6 +79,13 @@ def planning_arm(rig: Rig) -> Arm | None:
     )
 
 
+def robot_settings_here(rig: Rig) -> Any:
+    """Settings of the robot's driver as if its controller were on this machine, at the rig's cycle."""
+    driver, settings = device_for(rig, "robot", dry_run=False)
+    model = settings_class(driver)
+    return model(**settings | _known(NOWHERE["robot"], model))
+
+
 def runs_tables(rig: Rig) -> bool:
     """True if the rig's LED box runs tables and triggers the camera (`coupole.devices.LedBox.runs_tables`)."""
     return bool(load_class(rig.ledbox.driver).runs_tables)

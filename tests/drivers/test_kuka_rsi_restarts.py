@@ -1,4 +1,4 @@
-"""An answer starts from the arm: RSI that is started anew, counters that fall, cycles that change within a session.
+"""An answer starts from the arm: RSI that is started anew, counters that fall, cycles that change in a session.
 
 The controller at the other end is a model of its own. Corrections count from where *it* last started RSI, whatever
 the driver believes; what each answer moves is measured from the axes that it reports.

@@ -1,4 +1,4 @@
-"""Whom a driver takes for its controller, and with what right it answers: named in the rig, or by a person's word."""
+"""Whom a driver takes for its controller, and with what right it answers: the rig's, or a person's word."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from typing import Any
 
 import pytest
 from arms import KR10_R1100_SIXX
+from places import REPO
 from pydantic import ValidationError
 
+from coupole.plan.cell import read_cell
+from coupole.plan.rig_devices import trusted_by_name
 from drivers.kuka import eki, rsi
 from drivers.senders import only_here
 
@@ -17,7 +20,9 @@ RSI = {"arm_model": KR10_R1100_SIXX}
 EKI = {"arm_model": KR10_R1100_SIXX, "controller_is": "client", "address": "0.0.0.0:54600"}
 
 
-@pytest.mark.parametrize(("driver", "settings"), [(rsi, RSI), (rsi, RSI | {"listen": "192.0.2.7:49152"}), (eki, EKI)])
+@pytest.mark.parametrize(
+    ("driver", "settings"), [(rsi, RSI), (rsi, RSI | {"listen": "192.0.2.7:49152"}), (eki, EKI)]
+)
 def test_whoever_sends_first_is_not_taken_for_the_controller(driver: Any, settings: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"expected `controller`, the address.*any_controller_by: NAME"):
         driver.Settings(**settings)
@@ -80,6 +85,7 @@ def test_without_the_right_to_real_time_priority_no_controller_on_the_network_is
     settings = rsi.Settings(**RSI, listen=listen, controller="192.0.2.20", connect_timeout_s=0.2, **more)
     ended = subprocess.run(
         [sys.executable, "-c", _DROPS_THE_RIGHT, _OPENS, settings.model_dump_json()],
+        check=False,
         capture_output=True,
         text=True,
         timeout=60,
@@ -88,3 +94,20 @@ def test_without_the_right_to_real_time_priority_no_controller_on_the_network_is
     if expected == "DeviceRefused":
         for word in ("setcap cap_sys_nice+ep", "limits.d", "LimitRTPRIO", "without_realtime_by: NAME"):
             assert word in ended.stdout
+
+
+def test_a_persons_word_is_told_of_a_real_cell_and_never_of_a_simulated_one() -> None:
+    cell = read_cell(REPO / "configs/rigs/la-coupole.yaml")
+    robot = cell.rig.robot.model_copy(
+        update={
+            "driver": "drivers.kuka.rsi:KukaRsi",
+            "settings": {"any_controller_by": "A. Person", "without_realtime_by": "B. Person"},
+        }
+    )
+    real = cell.rig.model_copy(update={"robot": robot})
+    assert trusted_by_name(real) == (
+        "robot: whoever sends first is taken for the controller, by the word of A. Person",
+        "robot: the arm may be answered at normal priority, by the word of B. Person",
+    )
+    simulated = read_cell(REPO / "configs/rigs/sim.yaml").rig.model_copy(update={"robot": robot})
+    assert trusted_by_name(simulated) == ()

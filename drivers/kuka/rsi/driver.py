@@ -303,8 +303,8 @@ def _refuse_normal_priority(settings: Settings) -> None:
         return
     raise DeviceRefused(
         "robot",
-        expected="the right to real-time priority (SCHED_FIFO) for the process that answers the controller in every "
-        f"{settings.cycle_ms} ms",
+        expected="the right to real-time priority (SCHED_FIFO) for the process that answers the controller "
+        f"in every {settings.cycle_ms} ms",
         happened="this user does not have it: beside other work 16 % of the answers were late",
         remedy=f"{how_to_give_the_right()}. Or a person writes `without_realtime_by: NAME` among the robot's "
         "`settings:` in the rig's file; `coupole doctor` measures what this machine can",

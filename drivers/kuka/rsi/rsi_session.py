@@ -37,7 +37,7 @@ _REMEMBERED = 250
 _LAST_WORDS = 5
 """Packets that are still answered once the commanded axes are at rest after a fault."""
 _HALTED_PACKETS = 5
-"""After this many cycles in a row in which it was not led on, by late answers or because it is not where it was led,
+"""After this many cycles in a row in which it was not led on, by late answers or since it is not where it was led,
 the arm has halted."""
 _QUIET_NS = 500_000_000
 """Without delay counter, a packet after a silence this long counts as the first of a session."""
@@ -195,7 +195,9 @@ class RsiSession:
         elif not self.motion.step():
             self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
-        self._last_answer = None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=rested)
+        self._last_answer = (
+            None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=rested)
+        )
         self.answers += self._last_answer is not None
         return self._last_answer
 
@@ -297,7 +299,7 @@ class RsiSession:
         self.motion.stand_at(packet.joints_deg)
 
     def _new_witness(self, *, simulated: bool) -> ArmWitness:
-        """`simulated`: the world waits for answers, or for its busy machine; the clock says nothing of silences."""
+        """`simulated`: the world waits for answers, or for its machine; the clock says nothing of silences."""
         config = self._config
         return ArmWitness(
             self._corrections.place,
@@ -338,7 +340,8 @@ class RsiSession:
             return
         if 0 < advance <= _GAP_STEPS * step:
             self.fail(
-                shared_state.RESTARTED, f"its IPOC steps by {apart}, by {step} before: the controller's cycle has changed"
+                shared_state.RESTARTED,
+                f"its IPOC steps by {apart}, by {step} before: the controller's cycle has changed",
             )
         elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")

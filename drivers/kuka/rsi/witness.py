@@ -27,7 +27,7 @@ from drivers.kuka.rsi.wire import Packet
 Six = tuple[float, ...]
 
 _PATIENT_PACKETS = 5
-"""Packets that are left unanswered until the IPOC has caught up with a silence: this machine may have been busy."""
+"""Packets that are left unanswered until the IPOC has caught up with a silence: this machine may be busy."""
 _SURE = 10
 """Answers after which the smallest step of the IPOC is its step: a packet may be lost on the network."""
 _ROUNDING = 2e-5
@@ -78,19 +78,17 @@ class ArmWitness:
         if last.delay is None or packet.delay is None:
             return f"{missed} cycles are missing, and no counter tells whether RSI was started anew" * (missed > 0)
         rise = packet.delay - last.delay
-        if self._in_a_row:
-            told = packet.delay == missed or rise == missed + 1
-        else:
-            told = rise >= missed
+        in_a_row = packet.delay == missed or rise == missed + 1
+        told = in_a_row if self._in_a_row else rise >= missed
         if not told and rise < 0:
             return (
-                f"its counter of late answers fell from {last.delay} to {packet.delay}: RSI was started anew, or the "
-                "controller counts late answers in a row (`delay_counts`)"
+                f"its counter of late answers fell from {last.delay} to {packet.delay}: RSI was started anew, or "
+                "the controller counts late answers in a row (`delay_counts`)"
             )
         if not told:
             return (
-                f"{missed} cycles passed without an answer, but its counter of late answers rose by {rise}: RSI was "
-                "started anew, or its cycle has changed"
+                f"{missed} cycles passed without an answer, but its counter of late answers rose by {rise}: RSI "
+                "was started anew, or its cycle has changed"
             )
         silent_s = (now_ns - self._last_ns) / 1e9 - advance // step * self._cycle_s
         if not 0 < self._unaccounted_s < silent_s:
@@ -100,8 +98,8 @@ class ArmWitness:
         return ""
 
     def waits(self, packet: Packet, now_ns: int) -> bool:
-        """True for a packet after a silence that its IPOC has not accounted for yet. It is left unanswered: if this
-        machine was busy, its answer would be late, and the packets behind it account for the silence."""
+        """True for a packet after a silence that its IPOC has not accounted for yet. It is left unanswered: if
+        this machine was busy, its answer would be late, and the packets behind it account for the silence."""
         last = self._last
         if last is None or not self._unaccounted_s or not self._step:
             return False
@@ -141,7 +139,5 @@ class ArmWitness:
         off = self._between(arm, place)
         behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
         return [
-            not abs(away) <= allowed + abs(lag)
-            for away, lag, allowed in zip(off, behind, within, strict=True)
+            not abs(away) <= allowed + abs(lag) for away, lag, allowed in zip(off, behind, within, strict=True)
         ]
-

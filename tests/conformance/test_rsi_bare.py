@@ -271,7 +271,7 @@ def test_rsi_restarted_in_a_tenth_of_a_second_with_a_continuing_ipoc_is_not_led_
         if at_rest:
             robot.wait_settled()
         else:
-            wait_until(lambda: abs(arm.commanded_deg[0]) > 2.0, "an arm under way")
+            wait_until(lambda: robot.measured().joints_deg[0] > 2.0, "an arm under way")
         arm.restart_rsi(silent_cycles=20)
         wait_until(lambda: "RSI was started anew" in robot.measured().fault, "the fault")
         with pytest.raises(DeviceLost, match="20 cycles passed without an answer"):

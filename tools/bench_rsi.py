@@ -7,112 +7,37 @@ SCHED_FIFO if permitted; each figure states it.
 
 from __future__ import annotations
 
-import os
-import re
-import select
 import shutil
-import socket
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from coupole.plan.arm_description import shipped_arm
+from drivers.kuka.rsi.jitter import StandInController, above_the_loop, asked, free_port
+from drivers.kuka.rsi.settings import Settings
+
 CYCLE_S = 0.004
 _BLOCK_CYCLES, _BLOCKS = 250, 8
 """The responders alternate every second; number of seconds per round."""
-_PRIORITY = 30
 _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
-_IPOC = re.compile(rb"<IPOC>(\d+)</IPOC>")
-_AXES = b'<AIPos A1="0.0000" A2="-90.0000" A3="90.0000" A4="0.0000" A5="90.0000" A6="0.0000"/>'
-
-
-class Controller:
-    """The controller's end of one responder's wire."""
-
-    def __init__(self, port: int) -> None:
-        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._link.connect(("127.0.0.1", port))
-        self._link.setblocking(False)
-        self._ipoc = 1000
-        self._late = -1
-        """The delay counter; -1 until the first answer begins a session."""
-        self.latencies_us: list[float] = []
-
-    def ask(self, cycles: int) -> None:
-        """Send packets, one per cycle, and record the latency of each answer; infinity for a late one."""
-        next_s = time.perf_counter()
-        for _ in range(cycles):
-            next_s += CYCLE_S
-            time.sleep(max(0.0, next_s - time.perf_counter()))
-            next_s = max(next_s, time.perf_counter())
-            self._ipoc += 4
-            told = _AXES, max(0, self._late), self._ipoc
-            packet = b'<Rob Type="KUKA">%b<Delay D="%d"/><IPOC>%d</IPOC></Rob>' % told
-            sent_s = time.perf_counter()
-            self._link.send(packet)
-            answered = self._await(sent_s + CYCLE_S)
-            if self._late >= 0 or answered:
-                self._late = max(0, self._late) + (not answered)
-            self.latencies_us.append((time.perf_counter() - sent_s) * 1e6 if answered else float("inf"))
-
-    def _await(self, until_s: float) -> bool:
-        while (left_s := until_s - time.perf_counter()) > 0:
-            if select.select([self._link], [], [], left_s)[0]:
-                try:
-                    answer = _IPOC.search(self._link.recv(4096))
-                except ConnectionRefusedError:
-                    continue
-                if answer and int(answer[1]) == self._ipoc:
-                    return True
-        return False
-
-    def close(self) -> None:
-        self._link.close()
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @contextmanager
-def our_responder() -> Iterator[tuple[Controller, bool]]:
+def our_responder() -> Iterator[tuple[StandInController, bool]]:
     """The driver's process with a session, and True if it runs under SCHED_FIFO."""
-    from coupole.devices import SystemClock
-    from coupole.plan.arm_description import shipped_arm
-    from drivers.kuka.rsi.driver import KukaRsi, Settings
-
-    port = free_port()
-    settings = Settings(
-        arm_model=shipped_arm("kr10_r1100_sixx").arm,
-        listen=f"127.0.0.1:{port}",
-        delay_limit=10**9,
-        attention_s=0.1,
-        link_timeout_s=1e6,
-    )
-    opened: list[KukaRsi] = []
-    opening = threading.Thread(target=lambda: opened.append(KukaRsi(settings, SystemClock())))
-    opening.start()
-    with closing(Controller(port)) as controller:
-        while opening.is_alive():
-            controller.ask(10)
-        controller.latencies_us.clear()
-        with closing(opened[0]) as robot:
-            yield controller, robot.statistics()["realtime"] > 0
+    with asked(Settings(arm_model=shipped_arm("kr10_r1100_sixx").arm, listen="127.0.0.1:0")) as ours:
+        yield ours
 
 
 @contextmanager
-def c_responder(folder: Path) -> Iterator[tuple[Controller, bool] | None]:
+def c_responder(folder: Path) -> Iterator[tuple[StandInController, bool] | None]:
     """The program in C, compiled here; None without compiler."""
     compiler, port = shutil.which("cc"), free_port()
     if compiler is None:
@@ -123,7 +48,7 @@ def c_responder(folder: Path) -> Iterator[tuple[Controller, bool] | None]:
     with subprocess.Popen([str(program), str(port)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         realtime = process.stdout.readline() == b"1\n"
-        with closing(Controller(port)) as controller:
+        with closing(StandInController(port, CYCLE_S)) as controller:
             try:
                 yield controller, realtime
             finally:
@@ -144,15 +69,7 @@ def neighbours(count: int) -> Iterator[None]:
 
 def figures(rounds: int) -> Iterator[dict[str, Any]]:
     """Latencies in us and fractions of late answers, each with its peer."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        try:  # for this process only; the busy neighbours have normal priority
-            realtime = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-            os.sched_setscheduler(0, realtime, os.sched_param(_PRIORITY))
-        except PermissionError:
-            pass
-        else:
-            stack.callback(os.sched_setscheduler, 0, *before)
+    with tempfile.TemporaryDirectory() as folder, above_the_loop():  # busy neighbours have normal priority
         for load, count in (("idle", 0), ("two_busy_neighbours", 2)):
             with our_responder() as ours, c_responder(Path(folder)) as theirs, neighbours(count):
                 both = [ours] if theirs is None else [ours, theirs]
@@ -163,7 +80,7 @@ def figures(rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def compared(
-    load: str, ours: tuple[Controller, bool], theirs: tuple[Controller, bool] | None = None
+    load: str, ours: tuple[StandInController, bool], theirs: tuple[StandInController, bool] | None = None
 ) -> Iterator[dict[str, Any]]:
     """Figures for one load. Without a peer they are compared with the cycle."""
     peer = "c_responder" if theirs else "cycle"
@@ -194,10 +111,10 @@ def compared(
     }
 
 
-def quantile_us(controller: Controller, share: float) -> float:
+def quantile_us(controller: StandInController, share: float) -> float:
     """A quantile of the latency; late answers count as one cycle."""
     return float(np.quantile(np.minimum(controller.latencies_us, CYCLE_S * 1e6), share))
 
 
-def late_share(controller: Controller) -> float:
+def late_share(controller: StandInController) -> float:
     return statistics.fmean(np.isinf(controller.latencies_us))

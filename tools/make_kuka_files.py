@@ -245,9 +245,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--eki", default="{}", help="settings of drivers.kuka.eki, JSON")
     parser.add_argument("--load", type=int, default=1, help="number of the camera's LOAD_DATA")
     options = parser.parse_args(arguments)
-    arm = {"arm_model": shipped_arm("kr10_r1100_sixx").arm}
-    rsi = kuka_rsi.Settings.model_validate(arm | json.loads(options.rsi))
-    eki = kuka_eki.Settings.model_validate(arm | json.loads(options.eki))
+    # The files do not say whom the driver listens to.
+    arm = {"arm_model": shipped_arm("kr10_r1100_sixx").arm, "any_controller_by": Path(__file__).name}
+    rsi = kuka_rsi.Settings.model_validate(arm | json.loads(options.rsi) | {"controller": ""})
+    eki = kuka_eki.Settings.model_validate(arm | json.loads(options.eki) | {"controller": ""})
     for path, text in files(rsi, eki, options.pc_address, options.load):
         target = options.output / path
         target.parent.mkdir(parents=True, exist_ok=True)

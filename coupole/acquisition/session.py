@@ -45,6 +45,7 @@ from coupole.errors import (
     Interrupted,
     PreflightRefused,
 )
+from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.schedule import Schedule
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
@@ -141,10 +142,9 @@ def _acquire_into(
         try:
             begun = SessionResumed if resumed else SessionStarted
             heard = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
-            budget = preflight.dose_budget_lux_h
-            recorder.note(
-                begun(simulated=cell.simulated, room_c=room_c, acknowledged=heard, dose_budget_lux_h=budget)
-            )
+            said = begun(simulated=cell.simulated, room_c=room_c, acknowledged=heard)
+            known = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
+            recorder.note(said.model_copy(update=known))
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}

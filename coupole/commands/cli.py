@@ -18,6 +18,7 @@ from coupole.commands.bracketing import bracket, sphere_brdf
 from coupole.commands.calibrate import calibrate_app
 from coupole.commands.commissioning import commission
 from coupole.commands.compare_states import compare
+from coupole.commands.doctor import doctor
 from coupole.commands.dose_ledger import dose
 from coupole.commands.identify import identify
 from coupole.commands.layer import layer
@@ -49,6 +50,7 @@ for command in (
     running.meter,
     running.live,
     running.devices,
+    doctor,
     benching.bench,
     benching.arm,
     running.confirm,

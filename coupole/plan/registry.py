@@ -43,7 +43,17 @@ class StandIn:
 ROBOT_STAND_INS = {
     "drivers.kuka.rsi:KukaRsi": StandIn(
         "rsi",
-        ("cycle_ms", "corrects", "mode", "sen_type", "measured_tag", "delay_tag", "correction_tag", "stop_tag"),
+        (
+            "cycle_ms",
+            "corrects",
+            "mode",
+            "sen_type",
+            "measured_tag",
+            "delay_tag",
+            "correction_tag",
+            "stop_tag",
+            "delay_counts",
+        ),
         {"sends_to": "127.0.0.1:0"},
     ),
     "drivers.kuka.eki:KukaEki": StandIn(
@@ -52,6 +62,8 @@ ROBOT_STAND_INS = {
     "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
 """For the included robot drivers; all choose a free address."""
+ANSWER_JITTER = {"drivers.kuka.rsi:KukaRsi": "drivers.kuka.rsi.jitter:measured"}
+"""Measures how soon the driver answers its controller; of drivers that must in every cycle."""
 ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
 """The default arm (in `configs/robots`) of each driver."""
 UR = "drivers.ur:UrRobot"

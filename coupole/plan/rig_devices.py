@@ -44,6 +44,11 @@ _MOTION_SETTINGS = {
     "settle_dwell_s": "dwell_s",
 }
 """Keys of the rig's `motion:` and the corresponding settings of a robot's driver."""
+_WORDS = {
+    "any_controller_by": "whoever sends first is taken for the controller",
+    "without_realtime_by": "the arm may be answered at normal priority",
+}
+"""Settings of drivers that hold a person's name."""
 
 
 def described_arm(rig: Rig) -> ArmDescription | None:
@@ -72,6 +77,13 @@ def planning_arm(rig: Rig) -> Arm | None:
         acceleration_deg_s2=motion.acceleration_deg_s2,
         jerk_deg_s3=motion.jerk_deg_s3,
     )
+
+
+def robot_settings_here(rig: Rig) -> Any:
+    """Settings of the robot's driver as if its controller were on this machine, at the rig's cycle."""
+    driver, settings = device_for(rig, "robot", dry_run=False)
+    model = settings_class(driver)
+    return model(**settings | _known(NOWHERE["robot"], model))
 
 
 def runs_tables(rig: Rig) -> bool:
@@ -141,6 +153,15 @@ def camera_kind(rig: Rig, *, dry_run: bool) -> str:
     """Kind of the camera's stand-in in this rig's world."""
     driver, _ = device_for(rig, "camera", dry_run=dry_run or not in_world(rig, dry_run=False))
     return CAMERA_STAND_INS.get(driver, "memory")
+
+
+def trusted_by_name(rig: Rig) -> tuple[str, ...]:
+    """What a person has allowed in the settings of the rig's real devices, in words with the name; nothing of a
+    cell of stand-ins, whose devices nobody else can reach."""
+    if in_world(rig, dry_run=False):
+        return ()
+    said = ((kind, key, getattr(rig, kind).settings.get(key)) for kind in DEVICES for key in _WORDS)
+    return tuple(f"{kind}: {_WORDS[key]}, by the word of {name}" for kind, key, name in said if name)
 
 
 def driver_problems(document: Document, rig: Rig) -> list[Problem]:

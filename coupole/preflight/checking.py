@@ -14,7 +14,7 @@ from coupole.errors import StorageError
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
-from coupole.plan.rig_devices import in_world, runs_tables
+from coupole.plan.rig_devices import in_world, runs_tables, trusted_by_name
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
@@ -54,6 +54,7 @@ def preflight_of(
     job, report = check_job(job, storage, paths=paths, proven=proven)
     if measure and not storage.write_bytes_s and not storage.trouble:
         report.warnings.append(f"storage {folder}: too little room to measure the disk's speed; none is assumed")
+    report.warnings += trusted_by_name(job.cell.rig)
     report.refusals += commissioning_refusals(job.cell)
     return job, report
 

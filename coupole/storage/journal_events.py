@@ -60,6 +60,8 @@ class SessionStarted(JournalEvent):
     """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
     """What the object may receive in its life, by its ledger and the plan, as the session begins."""
+    trusted: tuple[str, ...] = ()
+    """What a person allows by name in the rig (`any_controller_by`, `without_realtime_by`), in words."""
 
 
 class SessionResumed(JournalEvent):
@@ -70,6 +72,7 @@ class SessionResumed(JournalEvent):
     room_c: float | None = None
     acknowledged: str = ""
     dose_budget_lux_h: float | None = None
+    trusted: tuple[str, ...] = ()
 
 
 class ViewBegun(JournalEvent):

@@ -69,8 +69,8 @@ class Settings(BaseModel):
     watchdog_s: float = Field(default=0.1, ge=0.05)
     """The controller ends all motion after this time without a message from the host's process."""
     attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
-    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only for
-    a simulated cell on a machine that is busy with other work."""
+    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only
+    for a simulated cell on a machine that is busy with other work."""
     link_timeout_s: float = Field(default=1.0, gt=0)
     """The link counts as lost after this time without a sample from the controller."""
     connect_timeout_s: float = Field(default=20.0, gt=0)

@@ -30,7 +30,7 @@ from sim.world.reactor import Reactor, Timer
 
 __all__ = ["ALIKE", "KukaController", "Settings"]
 
-ALIKE = ("corrects", "mode", "sen_type", "measured_tag", "correction_tag", "stop_tag")
+ALIKE = ("corrects", "mode", "sen_type", "measured_tag", "correction_tag", "stop_tag", "delay_counts")
 """Settings that must be equal at both ends of the wire; the driver's settings have the same names."""
 _FIRST_IPOC = 4208163634
 _SEND_AGAIN_S = 0.05

@@ -79,12 +79,14 @@ def build(
             settings = settings.model_copy(update={"sends_to": sends_to})
             paced = settings.lock_step or reactor.clock.speed != 1.0
             declared = {"declared_cycle_ms": settings.cycle_ms} if paced else {}
-            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike, **declared}
+            # Whom a rehearsed rig names as its controller is not here.
+            here = {"controller": "127.0.0.1", "any_controller_by": ""}
+            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike, **declared, **here}
             return kuka_controller.KukaController(reactor, settings, tell, stranger), endpoint
         case kuka_eki_controller.Settings():
             eki = kuka_eki_controller.KukaEkiController(reactor, settings, stranger)
             theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
-            return eki, {"address": eki.address, **theirs}
+            return eki, {"address": eki.address, **theirs, "controller": "", "any_controller_by": ""}
         case ur_controller.Settings():
             ur = ur_controller.UrController(reactor, settings)
             return ur, {"host": ur.address}

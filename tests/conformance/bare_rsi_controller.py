@@ -95,7 +95,7 @@ class BareRsiController:
     @property
     def speeds_deg_s(self) -> np.ndarray:
         """Speed that each cycle commanded, by the controller's own cycle [cycles - 1, 6]."""
-        commanded = np.array([self.start_deg, *(cycle.commanded_deg for cycle in list(self.history))])
+        commanded = np.array([self.start_axes_deg, *(cycle.commanded_deg for cycle in list(self.history))])
         return np.diff(commanded, axis=0) / self.cycle_s
 
     @property
@@ -145,6 +145,17 @@ class BareRsiController:
     def send_once(self, packet: bytes) -> None:
         """Send these bytes from the controller's own address, beside its cycle."""
         self.at_next_cycle(lambda: self._send(packet))
+
+    def restart_rsi(self, silent_cycles: int) -> None:
+        """Start RSI anew where the arm is: corrections count from there, late answers from 0, the IPOC goes on."""
+        self.at_next_cycle(lambda: self._restart(silent_cycles))
+
+    def _restart(self, silent_cycles: int) -> None:
+        time.sleep(silent_cycles * self.cycle_s)
+        self.ipoc += silent_cycles * self.ipoc_step
+        self.start_deg = self.commanded_deg
+        self.held_deg = np.zeros(AXES)
+        self.delay = 0
 
     def say_delay(self, delay: str | None) -> None:
         """Write this in `Delay`, in place of the count; None for the count again."""

@@ -41,6 +41,7 @@ def port() -> int:
 
 def settings_for(port: int, **settings: Any) -> Settings:
     ours = {"arm_model": KR10_R1100_SIXX, "listen": f"127.0.0.1:{port}", "speed_fraction": 0.3, "dwell_s": 0.0}
+    ours["unaccounted_s"] = 0.0  # this controller's time stands still while it waits for an answer
     return Settings.model_validate(ours | settings)
 
 
@@ -54,10 +55,15 @@ def opened(port: int, settings: dict[str, Any], **controller: Any) -> Iterator[t
         yield robot, arm
 
 
+def assert_within_limits_of_speed(robot: KukaRsi, arm: BareRsiController) -> None:
+    """What the controller commanded to its axes, by its own clock."""
+    assert np.all(arm.peak_speed_deg_s <= 1.001 * np.array(robot.arm.velocity_deg_s) + 2e-6 / arm.cycle_s)
+
+
 def assert_within_limits(robot: KukaRsi, arm: BareRsiController) -> None:
-    """What the controller commanded to its axes, by its own clock; four cycles of rounding to six decimals."""
+    """The same, and its acceleration; four cycles of rounding to six decimals."""
     cycle_s = arm.cycle_s
-    assert np.all(arm.peak_speed_deg_s <= 1.001 * np.array(robot.arm.velocity_deg_s) + 2e-6 / cycle_s)
+    assert_within_limits_of_speed(robot, arm)
     assert np.all(
         arm.peak_acceleration_deg_s2 <= 1.001 * np.array(robot.arm.acceleration_deg_s2) + 4e-6 / cycle_s**2
     )
@@ -253,6 +259,24 @@ def test_an_orphaned_loop_brakes_for_as_long_as_the_limits_demand(port: int) -> 
         assert speeds_deg_s[-1] == 0.0
         assert np.abs(np.diff(speeds_deg_s)).max() <= 1.001 * 100.0 * 0.012 + 4e-6 / 0.012
         assert arm.commanded_deg[5] < 290.0
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_rsi_restarted_in_a_tenth_of_a_second_with_a_continuing_ipoc_is_not_led_on(
+    port: int, at_rest: bool
+) -> None:
+    """The old corrections, counted from where the arm is now, would be a step of as much as it has moved."""
+    with opened(port, {}, lock_step_patience_s=0.05) as (robot, arm):
+        robot.move_to(THERE_DEG)
+        if at_rest:
+            robot.wait_settled()
+        else:
+            wait_until(lambda: robot.measured().joints_deg[0] > 2.0, "an arm under way")
+        arm.restart_rsi(silent_cycles=20)
+        wait_until(lambda: "RSI was started anew" in robot.measured().fault, "the fault")
+        with pytest.raises(DeviceLost, match="20 cycles passed without an answer"):
+            robot.move_to(HOME_DEG)
+        assert_within_limits_of_speed(robot, arm)
 
 
 def test_a_restarted_program_is_a_fault_that_only_a_new_driver_leaves_behind(port: int) -> None:

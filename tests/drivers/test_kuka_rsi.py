@@ -39,6 +39,8 @@ CONFIG = Config(
     link_timeout_s=0.5,
     delay_limit=50,
     attention_s=0.1,
+    delay_counts="cumulative",
+    unaccounted_s=0.1,
     settle_deg=0.003,
     settle_deg_s=0.1,
     follow_deg=1.0,
@@ -254,7 +256,7 @@ def test_late_answers_and_lost_packets_change_neither_the_way_nor_its_end(
     mode: str, corrects: str, counts: str, seed: int, late_share: float, lost_share: float
 ) -> None:
     chance = Random(seed)
-    session = RsiSession(replace(CONFIG, mode=mode, corrects=corrects, delay_limit=10**6))
+    session = RsiSession(replace(CONFIG, mode=mode, corrects=corrects, delay_counts=counts, delay_limit=10**6))
     controller = Corrections(ControllerSettings(mode=mode, corrects=corrects))
     controller.begin(HOME_DEG)
     target_deg = (6.0, -88.0, 91.0, -4.0, 85.0, 3.0)

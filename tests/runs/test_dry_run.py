@@ -19,7 +19,10 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellFolder, End
     cell = CellFolder(tmp_path_factory.mktemp("dry"))
     cell.rig_data["ledbox"] = {"driver": "drivers.ledbox:LedBox", "settings": {"port": "/dev/ttyNOPE"}}
     cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
-    cell.rig_data["robot"] = {"driver": "drivers.kuka.rsi:KukaRsi", "settings": {"listen": "192.0.2.1:49152"}}
+    cell.rig_data["robot"] = {
+        "driver": "drivers.kuka.rsi:KukaRsi",
+        "settings": {"listen": "192.0.2.1:49152", "controller": "192.0.2.2"},
+    }
     cell.rig_data["world"] = {"serves": "dry_run"}
     cell.rig_data["white_response"] = WHITE_RESPONSE
     cell.write(views=[TOP, SIDE, LOW], lights={"kind": "all"})

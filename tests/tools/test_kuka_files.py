@@ -21,6 +21,7 @@ from sim.devices.kuka_settings import Limits
 
 ROOT = REPO
 KUKA = ROOT / "configs" / "kuka"
+OF_RSI = {"arm_model": KR10_R1100_SIXX, "any_controller_by": "A. Person"}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_the_committed_files_are_what_the_tool_writes(tool: dict[str, Any], tmp_
 
 
 def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
+    settings = kuka_rsi.Settings(**OF_RSI)
     assert rsi.tag == "ROOT"
     assert rsi.findtext("CONFIG/PORT") == settings.listen.rsplit(":", 1)[1]
     assert rsi.findtext("CONFIG/SENTYPE") == settings.sen_type
@@ -56,7 +57,7 @@ def test_rsi_names_the_port_the_type_and_asks_for_answers(rsi: ElementTree.Eleme
 
 
 def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
-    settings = kuka_rsi.Settings(arm_model=KR10_R1100_SIXX)
+    settings = kuka_rsi.Settings(**OF_RSI)
     elements = [element.attrib for element in rsi.iterfind("SEND/ELEMENTS/ELEMENT")]
     assert {f"DEF_{settings.measured_tag}", f"DEF_{settings.delay_tag}"} <= {e["TAG"] for e in elements}
     assert {element["INDX"] for element in elements} == {"INTERNAL"}
@@ -67,7 +68,7 @@ def test_rsi_sends_what_the_driver_reads(rsi: ElementTree.Element) -> None:
 def test_rsi_receives_what_the_driver_sends_and_holds_what_may_be_held(
     tool: dict[str, Any], corrects: str, mode: str, hold_on: str
 ) -> None:
-    settings = kuka_rsi.Settings.model_validate({"arm_model": KR10_R1100_SIXX, "corrects": corrects, "mode": mode})
+    settings = kuka_rsi.Settings.model_validate(OF_RSI | {"corrects": corrects, "mode": mode})
     template = answer_template(settings.sen_type, settings.tag, NAMES[corrects], stop_element("Stop", stops=True))
     sent = ElementTree.fromstring(template % (*(0.0,) * 6, b"1"))
     corrections = [f"{child.tag}.{name}" for child in sent for name in child.attrib]
@@ -106,15 +107,11 @@ def test_the_context_says_the_limits_and_the_meaning_of_the_settings(
 
 def test_the_monitor_stops_rsi_before_the_correction_is_clamped(tool: dict[str, Any]) -> None:
     stand_in = Limits()
-    assert kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).most_correction_deg == stand_in.axis_monitor_deg
+    assert kuka_rsi.Settings(**OF_RSI).most_correction_deg == stand_in.axis_monitor_deg
     assert stand_in.axis_clamp_deg == tuple(limit + 1 for limit in stand_in.axis_monitor_deg)
     for axis, clamp in enumerate(stand_in.axis_clamp_deg, start=1):
-        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings(arm_model=KR10_R1100_SIXX))
-    assert (
-        kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).pose_correction_mm
-        == stand_in.pose_monitor_mm
-        < stand_in.pose_clamp_mm
-    )
+        assert f"A{axis} +-{clamp:g}" in tool["correction_rows"](kuka_rsi.Settings(**OF_RSI))
+    assert kuka_rsi.Settings(**OF_RSI).pose_correction_mm == stand_in.pose_monitor_mm < stand_in.pose_clamp_mm
 
 
 @pytest.mark.parametrize(("mode", "word"), [("absolute", "#ABSOLUTE"), ("relative", "#RELATIVE")])
@@ -133,7 +130,7 @@ def test_rsi_runs_in_the_cycle_of_the_settings(
     program = (tmp_path / "rsi" / "coupole_rsi.src").read_text()
     assert f"RSI_ON(#ABSOLUTE,{mode})" in program
     committed = (KUKA / "rsi" / "coupole_rsi.src").read_text()
-    assert (committed == program) == (kuka_rsi.Settings(arm_model=KR10_R1100_SIXX).cycle_ms == cycle_ms)
+    assert (committed == program) == (kuka_rsi.Settings(**OF_RSI).cycle_ms == cycle_ms)
 
 
 def test_rsi_starts_where_the_arm_stands() -> None:
@@ -154,7 +151,7 @@ def test_eki_listens_where_the_driver_connects(eki: ElementTree.Element) -> None
 
 
 def test_eki_connects_where_the_driver_listens(tool: dict[str, Any]) -> None:
-    settings = kuka_eki.Settings(arm_model=KR10_R1100_SIXX, controller_is="client", address="192.168.1.10:54601")
+    settings = kuka_eki.Settings(**OF_RSI, controller_is="client", address="192.168.1.10:54601")
     configuration = ElementTree.fromstring(tool["eki_xml"](settings))
     external = configuration.find("CONFIGURATION/EXTERNAL")
     assert external is not None

@@ -32,9 +32,9 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
         case JournalBegun() | FrameProven() | ArmSettled():
             return ""
         case SessionStarted():
-            return "began: the devices are open"
+            return "; ".join(("began: the devices are open", *event.trusted))
         case SessionResumed():
-            return "resumed: the devices are open"
+            return "; ".join(("resumed: the devices are open", *event.trusted))
         case ViewBegun():
             hidden = f"; {len(event.hidden_leds)} LEDs are hidden from it" if event.hidden_leds else ""
             return f"view {event.view}{hidden}"

@@ -36,6 +36,7 @@ from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
 from drivers.kuka.eki.watch import Tolerances, Watch
 from drivers.kuka.eki.wire import Command, Six, Status
+from drivers.senders import refuse_anybody
 
 _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
 """Largest allowed difference between the controller's flange pose and that computed from its axes."""
@@ -57,7 +58,10 @@ class Settings(BaseModel):
     """Which side listens for the connection; EKI's own configuration (EXTERNAL/TYPE) names the opposite side."""
     controller: Literal[""] | IPv4Address = ""
     """The controller's address, where it is the client: connections of any other are turned away and counted. (A
-    controller that is the server is reached at `address`.)"""
+    controller that is the server is reached at `address`.) It may be left out only where no other machine can
+    connect, or by a person's word."""
+    any_controller_by: str = Field(default="", max_length=60)
+    """Who has decided that whoever connects first is taken for the controller."""
     status_ms: int = Field(default=20, ge=4)
     """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)
@@ -85,6 +89,8 @@ class Settings(BaseModel):
     def _controller_can_be_checked(self) -> Self:
         if self.controller and self.controller_is == "server":
             raise ValueError("`controller` is for `controller_is: client`; a server is reached at `address`")
+        if self.controller_is == "client":
+            refuse_anybody(self.address, self.controller, self.any_controller_by)
         return self
 
     @model_validator(mode="after")

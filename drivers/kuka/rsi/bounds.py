@@ -31,12 +31,12 @@ class StepBounds:
         self, corrects: str, cycle_s: float, velocity_deg_s: Six, acceleration_deg_s2: Six, geometry: Geometry
     ) -> None:
         if corrects == "axes":
-            self._farthest: Six = tuple(_SLACK * speed * cycle_s + _ROUNDING for speed in velocity_deg_s)
+            self.farthest: Six = tuple(_SLACK * speed * cycle_s + _ROUNDING for speed in velocity_deg_s)
             self._change: Six = tuple(_SLACK * a * cycle_s**2 + 2 * _ROUNDING for a in acceleration_deg_s2)
         else:
             turn = sum(map(radians, velocity_deg_s)) * cycle_s
             change = sum(map(radians, acceleration_deg_s2)) * cycle_s**2 + turn**2
-            self._farthest = _pose_bounds(_SLACK * turn, geometry)
+            self.farthest = _pose_bounds(_SLACK * turn, geometry)
             self._change = _pose_bounds(_POSE_SLACK * change, geometry)
         self._last: Six = (0.0,) * 6
         """The step of the last cycle in which the axes advanced."""
@@ -47,7 +47,7 @@ class StepBounds:
 
     def violation(self, step: Six, *, advances: bool) -> str:
         """Why an answer that makes this step must not be sent, or ""."""
-        for number, (length, farthest) in enumerate(zip(step, self._farthest, strict=True), start=1):
+        for number, (length, farthest) in enumerate(zip(step, self.farthest, strict=True), start=1):
             if not abs(length) <= farthest:
                 return f"correction {number} would step by {length:.4f} in one cycle, {farthest:.4f} is the limit"
         if not advances:
@@ -58,6 +58,11 @@ class StepBounds:
                 change = length - before
                 return f"the step of correction {number} would change by {change:.4f}, {most:.4f} is the limit"
         return ""
+
+
+def follow_bounds(corrects: str, follow_deg: float, geometry: Geometry) -> Six:
+    """How far a place may be from another, if each axis is within `follow_deg`."""
+    return (follow_deg,) * 6 if corrects == "axes" else _pose_bounds(6.0 * radians(follow_deg), geometry)
 
 
 def _pose_bounds(turn: float, geometry: Geometry) -> Six:

@@ -29,21 +29,23 @@ class Corrections:
 
     def __init__(self, corrects: str, mode: str, geometry: Geometry) -> None:
         self._relative = mode == "relative"
-        self._place: Callable[[Six], Any] = tuple
-        self._between: Callable[[Any, Any], Six] = _axes_between
+        self.place: Callable[[Six], Any] = tuple
+        """The place at given axes."""
+        self.between: Callable[[Any, Any], Six] = _axes_between
+        """The correction from one place to another."""
         self._moved: Callable[[Any, Six], Any] = _axes_moved
         if corrects == "pose":
-            self._place, self._between, self._moved = partial(flange_pose, geometry), correction, corrected
+            self.place, self.between, self._moved = partial(flange_pose, geometry), correction, corrected
         self._from: Any = None
         """The place from which the next correction counts."""
         self._last = self._applied = _NOTHING
         """The last correction sent, and the last that the controller is known to have applied."""
-        self._led_to: Any = None
-        """The place to which the last absolute correction leads."""
+        self.led_to: Any = None
+        """The place to which the last correction leads."""
 
     def begin(self, start_deg: Six) -> None:
         """Begin a session with the axes at `start_deg`."""
-        self._from = self._led_to = self._place(start_deg)
+        self._from = self.led_to = self.place(start_deg)
         self._last = self._applied = _NOTHING
 
     def taken(self) -> None:
@@ -55,7 +57,7 @@ class Corrections:
 
     def to(self, commanded_deg: Six) -> Six:
         """The correction that leads to `commanded_deg`."""
-        values = self._between(self._from, self._place(commanded_deg))
+        values = self.between(self._from, self.place(commanded_deg))
         self._last = tuple(round(value, DECIMALS) for value in values)
         return self._last
 
@@ -66,10 +68,8 @@ class Corrections:
 
     def step(self, values: Six) -> Six:
         """From the place to which the answer before led to that of an answer with these corrections."""
-        if self._relative:
-            return values
-        before, self._led_to = self._led_to, self._moved(self._from, values)
-        return self._between(before, self._led_to)
+        before, self.led_to = self.led_to, self._moved(self._from, values)
+        return values if self._relative else self.between(before, self.led_to)
 
 
 def _axes_between(before_deg: Six, after_deg: Six) -> Six:

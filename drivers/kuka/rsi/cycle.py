@@ -38,7 +38,7 @@ class CycleMeter:
         self._begun_ns: int | None = None
         self._last_ns = self._cycles = self._wrong = 0
         self._gaps_ms: list[float] = []
-        """Time per cycle between packets, in the windows before the cycle is known."""
+        """Time per cycle between the packets of the window."""
 
     def packet(self, now_ns: int, advance: int, cycles: int) -> str:
         """A packet came whose IPOC is `advance` higher than the last one's, `cycles` cycles later. Returns why the
@@ -49,8 +49,8 @@ class CycleMeter:
         self._cycles += cycles
         if not self.ipoc_step:
             self._advances[advance] += 1
-            self._gaps_ms.append((now_ns - self._last_ns) / 1e6 / cycles)
-            self._last_ns = now_ns
+        self._gaps_ms.append((now_ns - self._last_ns) / 1e6 / cycles)
+        self._last_ns = now_ns
         if self._cycles < (WINDOW if self._declared_ms is None else _DECLARED_WINDOW):
             return ""
         arrived_ms = (now_ns - self._begun_ns) / 1e6 / self._cycles
@@ -61,9 +61,8 @@ class CycleMeter:
         first = not self.measured_ns
         ratio = cycle_ms / self._cycle_ms
         wrong = ratio < _FASTEST
-        if first and ratio > _SLOWEST:
-            # A link that falters makes the mean longer, but few of the gaps. Later it is not judged here any more:
-            # a longer cycle makes the arm slower, and late answers are counted elsewhere.
+        if ratio > _SLOWEST:
+            # A link that falters makes the mean longer, but few of the gaps.
             median_ms = sorted(self._gaps_ms)[len(self._gaps_ms) // 2]
             wrong |= self._declared_ms is not None or median_ms > _SLOWEST * self._cycle_ms
         self._gaps_ms.clear()

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import ArmState, Clock, Deadline, Identity
-from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceTimeout
+from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
 from coupole.supervision import ASKS_FROM_S, LOOK_S, Attention, Silence
 from drivers.arm_motion import (
@@ -38,8 +38,10 @@ from drivers.arm_motion import (
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.limits import correction_violations
 from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.realtime import how_to_give_the_right, may_be_realtime
 from drivers.kuka.rsi.rsi_session import Config
 from drivers.kuka.rsi.settings import Settings
+from drivers.senders import only_here
 
 __all__ = ["KukaRsi", "Settings"]
 
@@ -58,8 +60,10 @@ class KukaRsi:
     def __init__(self, settings: Settings, clock: Clock) -> None:
         """Wait for the controller's packets; they are answered with zero correction until `move_to`.
 
-        Raises DeviceLost if the port cannot be bound, DeviceTimeout if no session begins in time.
+        Raises DeviceRefused without the right to real-time priority, DeviceLost if the port cannot be bound,
+        DeviceTimeout if no session begins in time.
         """
+        _refuse_normal_priority(settings)
         self.settings = settings
         self.arm = settings.arm()
         self._clock = clock
@@ -96,11 +100,13 @@ class KukaRsi:
         state = self._state()
         self._raise_fault(state)
         axes = ", ".join(f"{angle:.3f}" for angle in state.measured_deg)
+        strangers = f"{state.foreign} packets ignored, the last of {state.other_sender.decode()}"
         return {
             "axes": f"{axes} deg",
             "delay counter": f"{state.delay}",
             "cycle": f"{state.cycle_ns / 1e6:.2f} ms",
             "scheduling": "SCHED_FIFO" if state.realtime else "normal: answers may be late on a busy machine",
+            **({"other senders": strangers} if state.foreign else {}),
         }
 
     def move_to(self, joints_deg: NDArray[np.float64], speed: float = 1.0) -> None:
@@ -297,6 +303,21 @@ class KukaRsi:
             happened=state.fault_text.decode(errors="replace"),
             remedy="Check the cell, acknowledge at the controller, restart its program, reopen the robot",
         )
+
+
+def _refuse_normal_priority(settings: Settings) -> None:
+    """Raises DeviceRefused where a controller on the network would be answered at normal priority, and nobody has
+    taken that upon themselves."""
+    if only_here(settings.listen) or settings.without_realtime_by or may_be_realtime():
+        return
+    raise DeviceRefused(
+        "robot",
+        expected="the right to real-time priority (SCHED_FIFO) for the process that answers the controller "
+        f"in every {settings.cycle_ms} ms",
+        happened="this user does not have it: beside other work 16 % of the answers were late",
+        remedy=f"{how_to_give_the_right()}. Or a person writes `without_realtime_by: NAME` among the robot's "
+        "`settings:` in the rig's file; `coupole doctor` measures what this machine can",
+    )
 
 
 def _no_session_reason(state: shared_state.State) -> str:

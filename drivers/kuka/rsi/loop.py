@@ -19,6 +19,7 @@ import time
 
 from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.pose import Geometry
+from drivers.kuka.rsi.realtime import become_realtime
 from drivers.kuka.rsi.rsi_session import Config, RsiSession
 
 _TICK_S = 0.05
@@ -29,7 +30,6 @@ _ENDED_S = 0.1
 """A controller that is silent for this long after that answer has ended its program."""
 _MOST_STOP_ANSWERS = 50
 """A controller that goes on after so many has no stop element in its configuration."""
-_REALTIME_PRIORITY = 20
 
 
 def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, config: Config) -> None:
@@ -37,7 +37,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
     end the controller's program."""
     # SO_RCVTIMEO costs nothing per packet; a Python socket time-out costs a poll() before every call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
-    realtime = _become_realtime()
+    realtime = int(become_realtime())
     session = RsiSession(config, time.monotonic_ns())
     shared.write_state(session.state(realtime))
     _drop_backlog(link)
@@ -71,7 +71,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
                 controller, session.sender = address, _name(address)
             with contextlib.suppress(OSError):  # a controller that has gone is detected by its silence
                 link.sendto(answer, address)
-        if session.late > late:
+        if session.late > late or session.behind:
             _drop_backlog(link)  # answers to packets that are queued here would be late too
         if now_ns > look_ns:
             look_ns = now_ns + int(_TICK_S * 1e9)
@@ -129,15 +129,6 @@ class Leaving:
 
 def _name(address: tuple[str, int]) -> bytes:
     return f"{address[0]}:{address[1]}".encode()
-
-
-def _become_realtime() -> int:
-    """1 if the process may run under SCHED_FIFO; 0 if not, and it then runs with normal priority."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_REALTIME_PRIORITY))
-    except OSError:
-        return 0
-    return 1
 
 
 def _drop_backlog(link: socket.socket) -> None:

@@ -6,33 +6,38 @@ corrections. So the motion follows the controller's cycles, also in a simulated 
 Corrections count from where RSI was started (`drivers.kuka.rsi.corrections`). Therefore only a program that saw
 the session begin may answer: in a session in progress, a first answer of zero would be a jump back to its start.
 For the same reason a session keeps its start for as long as this program runs: a packet that does not continue it
-is not answered, and when RSI was restarted, the driver has to be opened again. `drivers.kuka.rsi.bounds` states
-what holds for every answer.
+is not answered, and when RSI was restarted, the driver has to be opened again. `drivers.kuka.rsi.bounds` and
+`witness` state what holds for every answer; both are asked where answers are formed.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from drivers.kuka.rsi import shared_state
-from drivers.kuka.rsi.bounds import StepBounds
+from drivers.kuka.rsi.bounds import StepBounds, follow_bounds
 from drivers.kuka.rsi.corrections import NAMES, Corrections
 from drivers.kuka.rsi.cycle import CycleMeter
 from drivers.kuka.rsi.pose import Geometry
 from drivers.kuka.rsi.trajectory import Motion
 from drivers.kuka.rsi.wire import Packet, answer_template, controller_type, packet_parser, stop_element
+from drivers.kuka.rsi.witness import ArmWitness
 
 _GAP_STEPS = 25
 """A jump of the IPOC by more than this many steps does not continue the session: it comes from an old packet, from
 a new session, or after an outage long enough for one."""
 _LONGEST_STEP = 12
 """Largest step of the IPOC that is believed before it is known: the longest cycle in ms."""
-_ANOTHER_RUN = 5
+_ANOTHER_RUN = 2
 """After this many packets in a row that continue one another, but not the session, the session is over."""
+_REMEMBERED = 250
+"""Packets that are known again when the network brings them a second time; more than are in a second."""
 _LAST_WORDS = 5
 """Packets that are still answered once the commanded axes are at rest after a fault."""
 _HALTED_PACKETS = 5
-"""After this many late answers in a row the arm has halted at the last correction that was in time."""
+"""After this many cycles in a row in which it was not led on, by late answers or since it is not where it was led,
+the arm has halted."""
 _QUIET_NS = 500_000_000
 """Without delay counter, a packet after a silence this long counts as the first of a session."""
 
@@ -62,6 +67,8 @@ class Config:
     link_timeout_s: float
     delay_limit: int
     attention_s: float
+    delay_counts: str
+    unaccounted_s: float
     settle_deg: float
     settle_deg_s: float
     follow_deg: float
@@ -81,7 +88,7 @@ class RsiSession:
         """Motions that ended because nobody watched them."""
         self.stop_answers = self.program_ended = 0
         """Answers that end the controller's program; 1 once it has ended on one of them."""
-        self.settled_cycles = self._astray_cycles = self._late_before = self._late_in_row = 0
+        self.settled_cycles = self._astray_cycles = self._late_before = self._held_in_row = 0
         limits = config.velocity_deg_s, config.acceleration_deg_s2, config.jerk_deg_s3
         self.motion = Motion(config.cycle_s, limits)
         self._config = config
@@ -97,6 +104,7 @@ class RsiSession:
         self._bounds = StepBounds(
             config.corrects, config.cycle_s, config.velocity_deg_s, config.acceleration_deg_s2, config.geometry
         )
+        self._witness = self._new_witness(simulated=False)
         self._cycle = CycleMeter(config.cycle_s, None)
         self._counts_delay = False
         """Whether the session's first packet had a delay counter."""
@@ -111,6 +119,11 @@ class RsiSession:
         self._session_over = self._leaves = False
         self._last_words = _LAST_WORDS
         self._last_answer: bytes | None = None
+        self._last_data = b""
+        self._remembered: deque[int] = deque(maxlen=_REMEMBERED)
+        """Hashes of the last packets of the session."""
+        self.behind = False
+        """Whether the last packet came after a silence for which nothing accounts yet."""
 
     def obey(self, command: shared_state.Command) -> None:
         """Take a command. After a fault, motion commands are ignored."""
@@ -147,13 +160,19 @@ class RsiSession:
                 return None
             self._begin_session(packet, controller_type(data))
         else:
-            if not self._in_sequence(int(packet.ipoc), advance):
-                return self._last_answer if advance == 0 else None
+            if data == self._last_data:  # sent again: its first answer may be lost
+                return self._last_answer
+            if not self._in_sequence(int(packet.ipoc), advance, hash(data)) or not self._proves(packet, now_ns):
+                return None
             self.max_gap_ns = max(self.max_gap_ns, now_ns - self._packet_ns)
             rose = max(0, (packet.delay or 0) - self.delay)
             cycles = advance // self._ipoc_step
+        self._last_data = data
+        self._remembered.append(hash(data))
         self._ipoc, self._packet_ns, self.delay = int(packet.ipoc), now_ns, packet.delay or 0
         if mismatch := self._cycle.packet(now_ns, advance, cycles):
+            # What moves the arm at rest and in motion is a cycle's step: of another cycle none is right.
+            self._session_over |= self._cycle.measured_ns > 0
             self.fail(shared_state.WRONG_CYCLE, mismatch)
         self._ipoc_step = self._cycle.ipoc_step or self._ipoc_step
         self.packets += 1
@@ -162,32 +181,47 @@ class RsiSession:
         applied = rose == 0 or rose < cycles
         if applied:
             self._corrections.taken()
-        self._watch(packet)
-        self._late_in_row = self._late_in_row + 1 if rose else 0
+        strays = self._witness.strays(packet.joints_deg)
+        self._watch(packet, strays=strays)
+        self._held_in_row = self._held_in_row + 1 if rose or strays else 0
         rested = self.motion.phase == shared_state.STANDING
-        if not applied:  # repeat the last answer instead of advancing ahead of the arm
-            if self._late_in_row >= _HALTED_PACKETS:
+        advances = applied and not strays
+        if not advances:  # repeat the last answer instead of advancing ahead of the arm
+            if self._held_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
                 self._bounds.at_rest()
         elif not self.motion.step():
             self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
-        self._last_answer = None if self._silent() else self._formed(packet.ipoc, applied, rested)
+        self._last_answer = (
+            None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=rested)
+        )
         self.answers += self._last_answer is not None
         return self._last_answer
 
-    def _formed(self, ipoc: bytes, advances: bool, rested: bool) -> bytes | None:
+    def _proves(self, packet: Packet, now_ns: int) -> bool:
+        """Whether this packet's corrections still count from the session's start, as far as can be seen; else
+        nothing is answered."""
+        self.behind = False
+        if broken := self._witness.broken(packet, now_ns):
+            self.fail(shared_state.RESTARTED, broken)
+        else:
+            self.behind = self._witness.waits(packet, now_ns)
+        return not broken and not self.behind
+
+    def _formed(self, packet: Packet, now_ns: int, *, advances: bool, rested: bool) -> bytes | None:
         """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
         the arm is at rest after a fault, its corrections cause no further motion. `rested`: the axes were at rest
         in the answer before."""
         holds = self.motion.phase == shared_state.STANDING and self.fault != shared_state.NO_FAULT
         values = self._corrections.hold() if holds else self._corrections.to(self.motion.commanded_deg)
-        if violation := self._bounds.violation(self._corrections.step(values), advances=advances and not holds):
+        violation = self._bounds.violation(self._corrections.step(values), advances=advances and not holds)
+        if violation := violation or self._witness.violation(packet, self._corrections.led_to, now_ns):
             self.fail(shared_state.OUT_OF_BOUNDS, f"an answer was withheld: {violation}")
             return None
         ends = self._leaves and rested and self.fault == shared_state.NO_FAULT and bool(self._config.stop_tag)
         self.stop_answers += ends
-        return (self._stop_template if ends else self._template) % (*values, ipoc)
+        return (self._stop_template if ends else self._template) % (*values, packet.ipoc)
 
     def _silent(self) -> bool:
         """After a fault the driver ends the session by not answering, so that no old correction reaches a new
@@ -256,14 +290,29 @@ class RsiSession:
         self._controller, self._counts_delay = controller, packet.delay is not None
         # Only a simulated controller may say how long its cycle is.
         declared_s = config.declared_cycle_s if b"simulated" in controller else None
+        self._witness = self._new_witness(simulated=b"simulated" in controller)
         self._cycle = CycleMeter(config.cycle_s, declared_s)
         self._start_deg = self._measured_deg = packet.joints_deg
         self._corrections.begin(packet.joints_deg)
         self.motion.stand_at(packet.joints_deg)
 
-    def _in_sequence(self, ipoc: int, advance: int) -> bool:
+    def _new_witness(self, *, simulated: bool) -> ArmWitness:
+        """`simulated`: the world waits for answers, or for its machine; the clock says nothing of silences."""
+        config = self._config
+        return ArmWitness(
+            self._corrections.place,
+            self._corrections.between,
+            follow=follow_bounds(config.corrects, config.follow_deg, config.geometry),
+            step=self._bounds.farthest,
+            lag_s=config.follow_lag_s,
+            cycle_s=config.cycle_s,
+            counts_in_a_row=config.delay_counts == "consecutive",
+            unaccounted_s=0.0 if simulated else config.unaccounted_s,
+        )
+
+    def _in_sequence(self, ipoc: int, advance: int, seen: int) -> bool:
         """True for a packet that continues the session. Others, twice, old or of another session, change nothing;
-        a run of others ends the session."""
+        a run of others ends the session. `seen`: the packet's hash."""
         step = self._cycle.ipoc_step
         if step:
             continues = 0 < advance <= _GAP_STEPS * step and advance % step == 0
@@ -273,24 +322,31 @@ class RsiSession:
             if not 0 < self._ipoc_step <= advance:
                 self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the network
             self._astray_run = 0
-        elif advance != 0:
+        elif seen in self._remembered:
+            self.astray += 1
+        else:
             self._astray(ipoc, advance, self._ipoc_step or 1)
         return continues
 
     def _astray(self, ipoc: int, advance: int, step: int) -> None:
         """A packet with an IPOC of the past, or too far ahead: perhaps one old packet, perhaps a new session."""
         self.astray += 1
-        follows = 0 < ipoc - self._astray_ipoc <= _GAP_STEPS * step
-        self._astray_run = self._astray_run + 1 if follows else 1
+        apart = ipoc - self._astray_ipoc
+        self._astray_run = self._astray_run + 1 if 0 < apart <= _GAP_STEPS * step else 1
         self._astray_ipoc = ipoc
         if self._astray_run < _ANOTHER_RUN:
             return
-        if advance > 0:
+        if 0 < advance <= _GAP_STEPS * step:
+            self.fail(
+                shared_state.RESTARTED,
+                f"its IPOC steps by {apart}, by {step} before: the controller's cycle has changed",
+            )
+        elif advance > 0:
             self.fail(shared_state.LINK_LOST, f"{advance // step - self._astray_run} packets are missing")
         else:
             self.fail(shared_state.RESTARTED, "RSI was restarted: its packets begin to count anew")
 
-    def _watch(self, packet: Packet) -> None:
+    def _watch(self, packet: Packet, *, strays: bool) -> None:
         """Compare the measured axes with those commanded in the last answer."""
         config, motion = self._config, self.motion
         if packet.joints_deg == self._measured_deg:
@@ -306,7 +362,7 @@ class RsiSession:
         self.settled_cycles = self.settled_cycles + 1 if settled and speed_deg_s <= config.settle_deg_s else 0
 
         allowed_deg = config.follow_deg + config.follow_lag_s * max(map(abs, motion.velocity_deg_s))
-        self._astray_cycles = self._astray_cycles + 1 if error_deg > allowed_deg else 0
+        self._astray_cycles = self._astray_cycles + 1 if strays or error_deg > allowed_deg else 0
         if self._astray_cycles <= 1:
             self._late_before = self.late
         if self._astray_cycles >= config.follow_cycles:

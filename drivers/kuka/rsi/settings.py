@@ -13,6 +13,7 @@ from coupole.kinematics import Arm, SphericalWrist, slowed, structure_of
 from coupole.supervision import ATTENTION_S
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.rsi.corrections import TAGS
+from drivers.senders import refuse_anybody
 
 _TAG = r"^[A-Za-z_]\w*$"
 
@@ -27,8 +28,14 @@ class Settings(BaseModel):
     listen: str = Field(default="0.0.0.0:49152", pattern=r"^[^:]+:\d+$")
     """host:port to bind; the controller's RSI configuration names it (IP_NUMBER, PORT)."""
     controller: Literal[""] | IPv4Address = ""
-    """The controller's address in the RSI network. Packets of any other are ignored and counted. Without it the
-    first sender of an answerable packet counts as the controller, until the driver is closed."""
+    """The controller's address in the RSI network. Packets of any other are ignored and counted. It may be left
+    out only where no other machine can send (`listen` on loopback), or by a person's word: the first sender of an
+    answerable packet then counts as the controller, until the driver is closed."""
+    any_controller_by: str = Field(default="", max_length=60)
+    """Who has decided that whoever sends first is taken for the controller."""
+    without_realtime_by: str = Field(default="", max_length=60)
+    """Who has decided that this machine may answer at normal priority; without that word, and the right to
+    real-time priority, a controller on the network is not answered."""
     cycle_ms: Literal[4, 12] = 4
     """4 for #IPO_FAST, 12 for #IPO. It is compared with the arrival of the packets before the first motion."""
     declared_cycle_ms: float | None = Field(default=None, gt=0)
@@ -64,6 +71,11 @@ class Settings(BaseModel):
     """Time-out for the first packets, in machine time."""
     delay_limit: int = Field(default=50, ge=1)
     """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
+    delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
+    """How the controller counts late answers: all of a session, so that a fall means that RSI was started anew; or
+    those in a row, from 0 again after one in time."""
+    unaccounted_s: float = Field(default=0.1, ge=0)
+    """A silence of the controller of this length that its IPOC does not count ends the session; 0: none does."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)
     """Fraction of the axes' highest speeds."""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)
@@ -73,14 +85,19 @@ class Settings(BaseModel):
     settle_cycles: int = Field(default=10, ge=1)
     """Settled: within both tolerances for this many cycles, and again after the dwell."""
     attention_s: float = Field(default=ATTENTION_S, gt=0, le=0.5)
-    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only for
-    a simulated cell on a machine that is busy with other work."""
+    """A motion that nobody has looked at for this long, machine time, ends (`coupole.supervision`). Longer only
+    for a simulated cell on a machine that is busy with other work."""
     dwell_s: float = Field(default=0.1, ge=0)
     follow_deg: float = Field(default=1.0, gt=0)
     follow_lag_s: float = Field(default=0.06, ge=0)
     follow_cycles: int = Field(default=10, ge=1)
     """The arm does not follow: farther than `follow_deg` plus `follow_lag_s` times the commanded speed from
     the commanded axes for this many cycles."""
+
+    @model_validator(mode="after")
+    def _controller_is_named(self) -> Self:
+        refuse_anybody(self.listen, self.controller, self.any_controller_by)
+        return self
 
     @model_validator(mode="after")
     def _pose_is_known(self) -> Self:

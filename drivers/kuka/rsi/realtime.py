@@ -1,0 +1,37 @@
+"""The right to answer before all other processes, which keeps answers in time on a busy machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+PRIORITY = 20
+"""Under SCHED_FIFO, of 1 to 99; threads of the network in the kernel have 50."""
+
+
+def become_realtime() -> bool:
+    """True if this thread now runs under SCHED_FIFO; False without the right: it has normal priority."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except OSError:
+        return False
+    return True
+
+
+def may_be_realtime() -> bool:
+    """Whether a process that this one starts may do so; tried in a thread that ends."""
+    tried: list[bool] = []
+    thread = threading.Thread(target=lambda: tried.append(become_realtime()))
+    thread.start()
+    thread.join()
+    return tried == [True]
+
+
+def how_to_give_the_right() -> str:
+    """For messages; in full: docs/how-to/kuka-controller.md."""
+    return (
+        f"Say `sudo setcap cap_sys_nice+ep {os.path.realpath(sys.executable)}`, or write "
+        f"`@GROUP - rtprio {PRIORITY}` into /etc/security/limits.d/coupole.conf and log in again, or in a "
+        f"systemd unit `LimitRTPRIO={PRIORITY}` (docs/how-to/kuka-controller.md)"
+    )

@@ -1,0 +1,143 @@
+"""The invariant of every answer to the arm itself, whoever lost count:
+
+    An answer starts from the arm. It is sent only if the controller's own packet proves that corrections still
+    count from where this session counts them, and if it leads to no place farther from the axes that this packet
+    reports than the arm lags behind, plus one cycle's step.
+
+*Proves*: since the last packet that was answered, every cycle of the controller's IPOC that was not answered
+stands in its counter of late answers, and that counter has not fallen; and a silence on the machine's clock is one
+by the IPOC too. A controller that starts RSI anew takes some cycles for it, counts none of them, and begins its
+counter at 0: the old corrections would then lead as far from the arm as it had moved.
+
+*Lags behind*: the arm is between the places to which the answers led within the last `follow_lag_s`, give or
+take `follow_deg`. Where it is not, no answer leads farther away from it.
+
+Nothing here is counted by `rsi_session`: the witness keeps the last answered packet, and where answers led.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from math import ceil
+from typing import Any
+
+from drivers.kuka.rsi.wire import Packet
+
+Six = tuple[float, ...]
+
+_PATIENT_PACKETS = 5
+"""Packets that are left unanswered until the IPOC has caught up with a silence: this machine may be busy."""
+_SURE = 10
+"""Answers after which the smallest step of the IPOC is its step: a packet may be lost on the network."""
+_ROUNDING = 2e-5
+"""Numbers on the wire have six decimals."""
+_NOWHERE: Six = (0.0,) * 6
+
+
+class ArmWitness:
+    """See the module. A `place` is the arm's position: its axes, or the flange's pose."""
+
+    def __init__(
+        self,
+        reported: Callable[[Six], Any],
+        between: Callable[[Any, Any], Six],
+        *,
+        follow: Six,
+        step: Six,
+        lag_s: float,
+        cycle_s: float,
+        counts_in_a_row: bool,
+        unaccounted_s: float,
+    ) -> None:
+        """`reported` gives the place at reported axes, `between` what leads from one place to another; `follow`
+        and `step` are how far the arm may be from where it was led, and one cycle's step. `counts_in_a_row`: the
+        counter of late answers falls to 0 at one in time. `unaccounted_s`: see the module; 0: never."""
+        self._reported, self._between = reported, between
+        self._follow = follow
+        self._follow_and_step: Six = tuple(map(float.__add__, follow, step))
+        self._cycle_s, self._in_a_row, self._unaccounted_s = cycle_s, counts_in_a_row, unaccounted_s
+        self._led: deque[Any] = deque(maxlen=2 + ceil(lag_s / cycle_s))
+        """Places to which the last answers led, the newest last."""
+        self._last: Packet | None = None
+        """The last answered packet."""
+        self._last_ns = self._step = self._answered = self._waits = 0
+
+    def broken(self, packet: Packet, now_ns: int) -> str:
+        """Why corrections may no longer count from where they did, by this packet; "" if that is proven."""
+        last = self._last
+        if last is None:
+            return ""
+        advance = int(packet.ipoc) - int(last.ipoc)
+        step = min(self._step or advance, advance)
+        if advance <= 0:
+            return f"its IPOC went back from {int(last.ipoc)} to {int(packet.ipoc)}: RSI was started anew"
+        if advance % (self._step or step) and self._answered > _SURE:
+            return f"its IPOC went on by {advance}, {self._step} is its step: its cycle has changed"
+        missed = advance // step - 1
+        if last.delay is None or packet.delay is None:
+            return f"{missed} cycles are missing, and no counter tells whether RSI was started anew" * (missed > 0)
+        rise = packet.delay - last.delay
+        in_a_row = packet.delay == missed or rise == missed + 1
+        told = in_a_row if self._in_a_row else rise >= missed
+        if not told and rise < 0:
+            return (
+                f"its counter of late answers fell from {last.delay} to {packet.delay}: RSI was started anew, or "
+                "the controller counts late answers in a row (`delay_counts`)"
+            )
+        if not told:
+            return (
+                f"{missed} cycles passed without an answer, but its counter of late answers rose by {rise}: RSI "
+                "was started anew, or its cycle has changed"
+            )
+        silent_s = (now_ns - self._last_ns) / 1e9 - advance // step * self._cycle_s
+        if not 0 < self._unaccounted_s < silent_s:
+            self._waits = 0
+        elif self._waits >= _PATIENT_PACKETS:
+            return f"it was silent for {silent_s:.2f} s that its IPOC did not count: RSI was started anew"
+        return ""
+
+    def waits(self, packet: Packet, now_ns: int) -> bool:
+        """True for a packet after a silence that its IPOC has not accounted for yet. It is left unanswered: if
+        this machine was busy, its answer would be late, and the packets behind it account for the silence."""
+        last = self._last
+        if last is None or not self._unaccounted_s or not self._step:
+            return False
+        cycles = (int(packet.ipoc) - int(last.ipoc)) // self._step
+        if (now_ns - self._last_ns) / 1e9 - cycles * self._cycle_s <= self._unaccounted_s:
+            return False
+        self._waits += 1
+        return True
+
+    def strays(self, joints_deg: Six) -> bool:
+        """True if the arm is not where it was led: it must not be led on."""
+        return bool(self._led) and any(self._beyond(self._reported(joints_deg), self._led[-1], self._follow))
+
+    def violation(self, packet: Packet, place: Any, now_ns: int) -> str:
+        """Why an answer to `packet` that leads to `place` must not be sent, or ""; it is then taken as sent."""
+        if why := self.broken(packet, now_ns):
+            return why
+        arm = self._reported(packet.joints_deg)
+        before = self._led[-1] if self._led else arm
+        beyond = self._beyond(arm, place, self._follow_and_step)
+        if any(beyond):
+            already = map(abs, self._between(arm, before))
+            away = map(abs, self._between(arm, place))
+            for number, (off, was, out) in enumerate(zip(away, already, beyond, strict=True), start=1):
+                if out and not off <= was + _ROUNDING:
+                    return f"it would lead axis or coordinate {number} to {off:.3f} from where the arm is reported"
+        if self._last is not None:
+            advance = int(packet.ipoc) - int(self._last.ipoc)
+            self._step = min(self._step or advance, advance)
+        self._led.append(place)
+        self._last, self._last_ns = packet, now_ns
+        self._answered += 1
+        return ""
+
+    def _beyond(self, arm: Any, place: Any, within: Six) -> list[bool]:
+        """For each number of a place, whether the arm is neither there nor where it lags behind."""
+        off = self._between(arm, place)
+        behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
+        return [
+            not abs(away) <= allowed + abs(lag) for away, lag, allowed in zip(off, behind, within, strict=True)
+        ]

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from rich.console import Console
 
+from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.signals import SignalReceived
 from coupole.storage import journal, manifest, run_dose
-from coupole.storage.journal_events import SessionResumed, SessionStopped
+from coupole.storage.journal_events import SessionResumed, SessionStopped, TextUnread
 from coupole.storage.run import Run
 from coupole.viewing import report
 from coupole.viewing.terminal import bytes_text
+from coupole.viewing.text_outlet import unread
 
 MOST_HASHED_BYTES = 2_000_000_000
 """Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
@@ -76,3 +78,16 @@ def conclude(run: Run, console: Console) -> None:
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
         console.print(f"  [yellow]the report or {manifest.NAME} could not be written:[/] {error}")
+
+
+def note_unread(recorder: RunRecorder) -> None:
+    """The journal's line, if the session's text was not read: it was not waited for."""
+    if found := unread():
+        recorder.note(
+            TextUnread(
+                lost_lines=found.lost_lines,
+                lost_bytes=found.lost_bytes,
+                waiting_bytes=found.waiting_bytes,
+                stalled_s=round(found.stalled_s, 1),
+            )
+        )

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from rich.console import Console
 
-from coupole.acquisition.conclusion import close_complete, conclude, open_for_session
+from coupole.acquisition.conclusion import close_complete, conclude, note_unread, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
@@ -258,6 +258,7 @@ def _acquire(
             for trouble in cell.trouble:
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
+            note_unread(recorder)
             recorder.note(
                 SessionStopped(
                     outcome=ended,

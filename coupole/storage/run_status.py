@@ -24,6 +24,7 @@ from coupole.storage.journal_events import (
     SessionResumed,
     SessionStarted,
     SessionStopped,
+    TextUnread,
     ViewBegun,
     ViewSealed,
 )
@@ -151,7 +152,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.light_s += event.on_s
         case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
-        case BurstBegun() | GapFound() | ViewSealed():
+        case BurstBegun() | GapFound() | TextUnread() | ViewSealed():
             pass
         case _:
             assert_never(event)

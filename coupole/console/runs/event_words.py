@@ -20,6 +20,7 @@ from coupole.storage.journal_events import (
     SessionResumed,
     SessionStarted,
     SessionStopped,
+    TextUnread,
     ViewBegun,
     ViewSealed,
 )
@@ -56,6 +57,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return "paused: lights off, arm still"
         case Continued():
             return "went on"
+        case TextUnread():
+            return f"{event.lost_lines} lines of text were dropped, {event.waiting_bytes} bytes waited: nobody read them"
         case ViewSealed():
             return f"view {event.view} is finished"
         case SessionStopped():

@@ -30,24 +30,8 @@ from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, Interrupted
 from coupole.viewing import text_outlet
 
-AT_A_CELL = frozenset(
-    [
-        "acquire",
-        "meter",
-        "live",
-        "devices",
-        "bench",
-        "arm",
-        "commission",
-        "confirm",
-        "calibrate",
-        "sim",
-        "serve",
-        "pause",
-        "go-on",
-        "stop",
-    ]
-)
+AT_A_CELL = {"acquire", "meter", "live", "devices", "bench", "arm", "commission", "confirm", "calibrate", "sim"}
+AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
 """Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
 
 app = typer.Typer(

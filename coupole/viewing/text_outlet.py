@@ -121,7 +121,7 @@ def install() -> None:
             sys,
             name,
             io.TextIOWrapper(
-                _Stream(outlet),  # type: ignore[type-var]
+                _Stream(outlet),
                 encoding=encoding,
                 errors=errors,
                 line_buffering=True,

@@ -104,11 +104,9 @@ class TextQueue:
         self._untold_lines, self._untold_bytes = self._untold_lines + lines, self._untold_bytes + len(text)
 
     def _notice(self) -> bytes:
-        said = (
-            f"\n[{self._untold_lines} lines of text ({self._untold_bytes} bytes) were dropped: nobody read them]\n"
-        )
+        what = f"{self._untold_lines} lines of text ({self._untold_bytes} bytes)"
         self._untold_lines = self._untold_bytes = 0
-        return said.encode()
+        return f"\n[{what} were dropped: nobody read them]\n".encode()
 
     def _handed_out(self, text: bytes) -> bytes:
         self._taken_bytes += len(text)

@@ -141,15 +141,19 @@ def test_a_run_without_any_standard_stream_is_done(tmp_path: Path) -> None:
 
 def test_a_reader_who_comes_back_gets_the_newest_text_and_the_number_of_dropped_lines() -> None:
     reader, writer = os.pipe()
-    process = subprocess.Popen(
-        [sys.executable, "-c", SPEAK_MUCH], stdout=subprocess.PIPE, stderr=writer, cwd=REPO, text=True
-    )
-    os.close(writer)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "the document\n"  # though nobody has read the rest
-    with open(reader, encoding="utf-8") as text:
-        said = text.read()
-    assert process.wait() == 0
+    with subprocess.Popen(
+        [sys.executable, "-c", SPEAK_MUCH.replace("finish()", "finish(9)")],
+        stdout=subprocess.PIPE,
+        stderr=writer,
+        cwd=REPO,
+        text=True,
+    ) as process:
+        os.close(writer)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "the document\n"  # though nobody has read the rest
+        with os.fdopen(reader, encoding="utf-8") as text:
+            said = text.read()
+    assert process.returncode == 0
     assert said.startswith("line 0 ")
     assert "lines of text (" in said
     assert said.rstrip().endswith("of a library\nof a child\nlast")

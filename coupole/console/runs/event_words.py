@@ -58,7 +58,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
         case Continued():
             return "went on"
         case TextUnread():
-            return f"{event.lost_lines} lines of text were dropped, {event.waiting_bytes} bytes waited: nobody read them"
+            waiting = f"{event.waiting_bytes} bytes waited"
+            return f"nobody read the text: {event.lost_lines} lines were dropped, {waiting}"
         case ViewSealed():
             return f"view {event.view} is finished"
         case SessionStopped():

@@ -6,14 +6,16 @@ from pathlib import Path
 
 from rich.console import Console
 
+from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.signals import SignalReceived
 from coupole.bounded import DISK, hangs, left_behind, on_disk
 from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
-from coupole.storage.journal_events import SessionResumed, SessionStopped
+from coupole.storage.journal_events import SessionResumed, SessionStopped, TextUnread
 from coupole.storage.run import Run
 from coupole.viewing import report
 from coupole.viewing.terminal import alarm, bytes_text
+from coupole.viewing.text_outlet import unread
 
 MOST_HASHED_BYTES = 2_000_000_000
 """Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
@@ -91,3 +93,16 @@ def _report(run: Run) -> tuple[list[str], int]:
     listed = manifest.read(run.folder)
     views = [name for name in complete_views(run) if name not in listed]
     return views, sum((run.folder / name).stat().st_size for name in views)
+
+
+def note_unread(recorder: RunRecorder) -> None:
+    """The journal's line, if the session's text was not read: it was not waited for."""
+    if found := unread():
+        recorder.note(
+            TextUnread(
+                lost_lines=found.lost_lines,
+                lost_bytes=found.lost_bytes,
+                waiting_bytes=found.waiting_bytes,
+                stalled_s=round(found.stalled_s, 1),
+            )
+        )

@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from coupole.acquisition.changed_inputs import tell_changes
-from coupole.acquisition.conclusion import close_complete, conclude, open_for_session
+from coupole.acquisition.conclusion import close_complete, conclude, note_unread, open_for_session
 from coupole.acquisition.memory_recorder import DryRecorder
 from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
@@ -274,6 +274,7 @@ def _acquire(
                 recorder.note(FaultNoted(kind="unsafe", message=trouble))
                 alarm(trouble)
             tell_changes(job.cell.files, recorder, console)
+            note_unread(recorder)
             recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
             if left_behind():

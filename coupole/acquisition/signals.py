@@ -27,12 +27,13 @@ from coupole import bounded
 from coupole.acquisition.observer import Control, frozen
 from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.supervision import ASKS_FROM_S
+from coupole.viewing.text_outlet import finish
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
 """When the main thread last heard of one, outside sessions."""
 
-_PULSE_S = 0.25
+_PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
 """Longer than devices that hang when they are closed, and a report."""
 _SAFE_WITHIN_S = 4.0
@@ -200,10 +201,10 @@ def _suspend(control: Control, act: Callable[[], object]) -> None:
 
 
 def _tell(text: str) -> None:
-    """On the terminal, if it takes it at once."""
+    """On the terminal, if it takes it within a moment: the process is about to stop, and its queue of text too."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        if select.select([], [sys.stderr.fileno()], [], 0)[1]:
-            os.write(sys.stderr.fileno(), text.encode())
+        sys.stderr.write(text)
+        finish(_TOLD_WITHIN_S)
 
 
 @contextmanager

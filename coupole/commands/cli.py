@@ -30,6 +30,11 @@ from coupole.commands.restore import restore_app
 from coupole.commands.show import show
 from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, Interrupted
+from coupole.viewing import text_outlet
+
+AT_A_CELL = {"acquire", "meter", "live", "devices", "bench", "arm", "commission", "confirm", "calibrate", "sim"}
+AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
+"""Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
 
 app = typer.Typer(
     name="coupole",
@@ -92,10 +97,13 @@ def _print_version(asked: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     _: Annotated[
         bool, typer.Option("--version", help="Print the version and end.", callback=_print_version, is_eager=True)
     ] = False,
-) -> None: ...
+) -> None:
+    if context.invoked_subcommand in AT_A_CELL:
+        text_outlet.install()
 
 
 @functools.cache
@@ -134,6 +142,8 @@ def _ended() -> int:
                 traceback.print_exception(error)
                 print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
             code = 1
+    with contextlib.suppress(SignalReceived):  # a signal more: nothing is waited for
+        text_outlet.finish()
     return int(code or 0)
 
 

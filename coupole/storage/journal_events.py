@@ -200,6 +200,18 @@ class Continued(JournalEvent):
     event: Literal["continue"] = "continue"
 
 
+class TextUnread(JournalEvent):
+    """The reader of the session's text (a terminal, a pipe) did not take it; the session did not wait for it."""
+
+    event: Literal["unread"] = "unread"
+    lost_lines: int
+    lost_bytes: int
+    waiting_bytes: int
+    """Kept for the reader when this was written."""
+    stalled_s: float
+    """For how long nothing had been taken."""
+
+
 class ViewSealed(JournalEvent):
     """The session has finished a view, complete or not."""
 
@@ -234,6 +246,7 @@ Event: TypeAlias = (
     | InputsChanged
     | Paused
     | Continued
+    | TextUnread
     | ViewSealed
     | SessionStopped
 )

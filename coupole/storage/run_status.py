@@ -25,6 +25,7 @@ from coupole.storage.journal_events import (
     SessionResumed,
     SessionStarted,
     SessionStopped,
+    TextUnread,
     ViewBegun,
     ViewSealed,
 )
@@ -155,7 +156,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.light_s += event.on_s
         case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
-        case BurstBegun() | GapFound() | ViewSealed() | InputsChanged():
+        case BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
             pass
         case _:
             assert_never(event)

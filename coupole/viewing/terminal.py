@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.live import Live
 from rich.progress import (
     BarColumn,
@@ -28,6 +28,7 @@ from coupole.preflight.exposure_scale import HOW_TO_KNOW
 from coupole.storage.run_status import Status
 from coupole.viewing.progress import Outcome, ViewExposure
 from coupole.viewing.progress import Progress as RunProgress
+from coupole.viewing.text_outlet import terminal_size
 
 if TYPE_CHECKING:
     from coupole.preflight.exposure_advice import Advice
@@ -41,7 +42,20 @@ _WIDE = 110
 def make_console(*, quiet: bool) -> Console:
     """The console for text: standard error, so that standard output is free for `--json`."""
     stream: Any = _Terminal(sys.stderr)
-    return Console(file=stream, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+    return _Console(file=stream, quiet=quiet, highlight=False, soft_wrap=not sys.stderr.isatty())
+
+
+class _Console(Console):
+    """As wide as the terminal that reads it, also where a queue lies between."""
+
+    @property
+    def size(self) -> ConsoleDimensions:
+        found = terminal_size()
+        return ConsoleDimensions(*found) if found and found.columns else super().size
+
+    @size.setter
+    def size(self, new_size: tuple[int, int]) -> None:
+        self._width, self._height = new_size
 
 
 class _Terminal:

@@ -21,6 +21,7 @@ from coupole.storage.journal_events import (
     SessionResumed,
     SessionStarted,
     SessionStopped,
+    TextUnread,
     ViewBegun,
     ViewSealed,
 )
@@ -59,6 +60,9 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return "paused: lights off, arm still"
         case Continued():
             return "went on"
+        case TextUnread():
+            waiting = f"{event.waiting_bytes} bytes waited"
+            return f"nobody read the text: {event.lost_lines} lines were dropped, {waiting}"
         case ViewSealed():
             return f"view {event.view} is finished"
         case SessionStopped():

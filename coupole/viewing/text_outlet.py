@@ -1,0 +1,174 @@
+"""Standard output and standard error of a command that holds a cell: nothing in it waits for a reader of text.
+
+A terminal that stands still (Ctrl-S, a half-dead ssh), a full pipe, a disk that hangs: a write to them may block
+for ever, and with it whoever supervises. `install` puts a queue between. What Python writes goes into it at once;
+file descriptors 1 and 2 become pipes into it, for libraries and for children that inherit them. A thread alone
+writes to the reader, and may wait for him. When the queue is full the oldest text is dropped, which is said when
+somebody reads again. `finish` gives the reader a bounded time at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import os
+import select
+import signal
+import sys
+import threading
+
+from coupole.viewing.text_queue import TextQueue, Unread
+
+PATIENCE_S = 1.0
+"""At its end a command waits so long for a reader who takes nothing."""
+AT_MOST_S = 10.0
+"""And so long for one who is slow."""
+_DOCUMENT_BYTES = 1 << 24
+_WRITE_BYTES = 4096
+_FIRST_KEPT_FD = 10
+
+
+class Outlet:
+    """The way of one of the standard streams from this process, its libraries and children to its reader."""
+
+    def __init__(self, fd: int, queue: TextQueue) -> None:
+        """From now on descriptor `fd` leads into the queue, and only a thread of this to what it was."""
+        self.fd, self.queue = fd, queue
+        self.reader_fd = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
+        ours, theirs = os.pipe()
+        self._pipe = fcntl.fcntl(ours, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
+        os.set_blocking(self._pipe, False)
+        os.dup2(theirs, fd)
+        os.close(ours)
+        os.close(theirs)
+        self._order = threading.RLock()
+        for run in (self._give, self._listen):
+            threading.Thread(target=run, name=f"text {fd}", daemon=True).start()
+
+    def put(self, text: bytes) -> None:
+        """After what libraries and children have written so far. Never waits."""
+        with self._order:
+            self.collect()
+            self.queue.put(text)
+
+    def collect(self) -> None:
+        """What libraries and children have written."""
+        with self._order, contextlib.suppress(BlockingIOError):
+            while text := os.read(self._pipe, 65536):
+                self.queue.put(text)
+
+    def _listen(self) -> None:
+        while True:
+            select.select([self._pipe], [], [])
+            self.collect()
+
+    def _give(self) -> None:
+        # In the background of a terminal with `tostop` a write would stop the whole process (SIGTTOU).
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        while True:
+            text = self.queue.take()
+            while text:
+                try:
+                    count = os.write(self.reader_fd, text[:_WRITE_BYTES])
+                except BlockingIOError:  # whoever gave us the stream had made it so
+                    select.select([], [self.reader_fd], [])
+                except OSError:  # a closed pipe, a terminal that is gone, a full disk
+                    self.queue.failed(text)
+                    break
+                else:
+                    self.queue.gave(count)
+                    text = text[count:]
+
+
+class _Stream(io.RawIOBase):
+    """What `sys.stdout` and `sys.stderr` write to."""
+
+    def __init__(self, outlet: Outlet) -> None:
+        self._outlet = outlet
+
+    def write(self, text: bytes) -> int:  # type: ignore[override]
+        self._outlet.put(bytes(text))
+        return len(text)
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._outlet.fd
+
+    def isatty(self) -> bool:
+        return os.isatty(self._outlet.reader_fd)
+
+
+_installed: dict[str, Outlet] = {}
+
+
+def install() -> None:
+    """From now on, to the end of this process, nothing that it prints waits for a reader. Standard streams that
+    are closed lead nowhere: a device that is opened must not take their place and be given text. Streams that
+    somebody has replaced (tests) stay as they are."""
+    for fd in range(3):
+        _lead_nowhere_if_closed(fd)
+    for fd, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if name in _installed or not _is(stream, fd):
+            continue
+        outlet = Outlet(fd, TextQueue() if fd == 2 else TextQueue(_DOCUMENT_BYTES, tells=False))
+        _installed[name] = outlet
+        encoding, errors = getattr(stream, "encoding", "utf-8"), getattr(stream, "errors", "backslashreplace")
+        setattr(
+            sys,
+            name,
+            io.TextIOWrapper(
+                _Stream(outlet),
+                encoding=encoding,
+                errors=errors,
+                line_buffering=True,
+            ),
+        )
+    if sys.stdin is None:
+        sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115  to the end of the process
+
+
+def unread() -> Unread | None:
+    """What was not taken of standard error so far; None if all was, or its reader is only a little late."""
+    outlet = _installed.get("stderr")
+    found = outlet.queue.unread() if outlet else None
+    return found if found and (found.lost_bytes or found.stalled_s >= PATIENCE_S) else None
+
+
+def terminal_size() -> os.terminal_size | None:
+    """Of the terminal that reads standard error, if one does and text goes there by a queue."""
+    outlet = _installed.get("stderr")
+    with contextlib.suppress(OSError):
+        return os.get_terminal_size(outlet.reader_fd) if outlet else None
+    return None
+
+
+def finish(patience_s: float = PATIENCE_S) -> None:
+    """Wait a bounded time until the readers have taken everything."""
+    for name, outlet in _installed.items():
+        with contextlib.suppress(OSError, ValueError):
+            getattr(sys, name).flush()
+        outlet.collect()
+    for outlet in _installed.values():
+        outlet.queue.drained(patience_s, AT_MOST_S)
+
+
+def _is(stream: object, fd: int) -> bool:
+    """Whether a stream leads to a descriptor; one that was closed when the process began does now."""
+    try:
+        return stream is None or stream.fileno() == fd  # type: ignore[attr-defined]
+    except (AttributeError, OSError, ValueError):
+        return False
+
+
+def _lead_nowhere_if_closed(fd: int) -> None:
+    try:
+        fcntl.fcntl(fd, fcntl.F_GETFD)
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        if nowhere != fd:
+            os.dup2(nowhere, fd)
+            os.close(nowhere)

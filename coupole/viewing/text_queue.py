@@ -1,0 +1,113 @@
+"""Text on its way to a reader who may not read: in order, in bounded memory, and nobody waits to put it in."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+
+MOST_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Unread:
+    """What a reader has not been given."""
+
+    lost_lines: int
+    lost_bytes: int
+    waiting_bytes: int
+    stalled_s: float
+    """How long the reader has taken nothing though something waits."""
+
+    def __bool__(self) -> bool:
+        return bool(self.lost_bytes or self.waiting_bytes)
+
+
+class TextQueue:
+    """Bytes in the order in which they were put in. When it is full the oldest go, and what is taken next says how
+    many lines are gone. From any thread."""
+
+    def __init__(self, most_bytes: int = MOST_BYTES, *, tells: bool = True) -> None:
+        """`tells`: of what was dropped, in its place; not in a document."""
+        self._most_bytes, self._tells = most_bytes, tells
+        self._pieces: deque[bytes] = deque()
+        self._waiting_bytes = self._taken_bytes = 0  # taken: handed out, not yet with the reader
+        self._lost_lines = self._lost_bytes = 0
+        self._untold_lines = self._untold_bytes = 0
+        self._moved_s = time.monotonic()
+        self._changed = threading.Condition()
+
+    def put(self, text: bytes) -> None:
+        """Never waits."""
+        if not text:
+            return
+        with self._changed:
+            if not (self._waiting_bytes or self._taken_bytes):
+                self._moved_s = time.monotonic()
+            self._pieces.append(text)
+            self._waiting_bytes += len(text)
+            while self._waiting_bytes > self._most_bytes:
+                oldest = self._pieces.popleft()
+                self._waiting_bytes -= len(oldest)
+                self._note_lost(oldest)
+            self._changed.notify_all()
+
+    def take(self, wait_s: float | None = None) -> bytes:
+        """The oldest piece, to be given to the reader, which `gave` or `failed` then tells of; empty if none comes
+        within a time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._pieces or (self._tells and self._untold_bytes), wait_s)
+            if self._tells and self._untold_bytes:
+                return self._handed_out(self._notice())
+            if not self._pieces:
+                return b""
+            piece = self._pieces.popleft()
+            self._waiting_bytes -= len(piece)
+            return self._handed_out(piece)
+
+    def gave(self, count: int) -> None:
+        """The reader has taken so many bytes of what was handed out."""
+        with self._changed:
+            self._taken_bytes -= count
+            self._moved_s = time.monotonic()
+            self._changed.notify_all()
+
+    def failed(self, rest: bytes) -> None:
+        """The reader refused this rest of what was handed out."""
+        with self._changed:
+            self._taken_bytes -= len(rest)
+            self._lost_lines, self._lost_bytes = self._lost_lines + rest.count(b"\n"), self._lost_bytes + len(rest)
+            self._changed.notify_all()
+
+    def unread(self) -> Unread:
+        with self._changed:
+            waiting = self._waiting_bytes + self._taken_bytes
+            stalled_s = time.monotonic() - self._moved_s if waiting else 0.0
+            return Unread(self._lost_lines, self._lost_bytes, waiting, stalled_s)
+
+    def drained(self, patience_s: float, at_most_s: float) -> bool:
+        """Wait until the reader has all, or takes nothing for `patience_s`, or `at_most_s` have passed."""
+        begun_s = time.monotonic()
+        with self._changed:
+            while self._waiting_bytes or self._taken_bytes:
+                now_s = time.monotonic()
+                end_s = min(max(begun_s, self._moved_s) + patience_s, begun_s + at_most_s)
+                if now_s >= end_s:
+                    return False
+                self._changed.wait(end_s - now_s)
+            return True
+
+    def _note_lost(self, text: bytes) -> None:
+        lines = text.count(b"\n")
+        self._lost_lines, self._lost_bytes = self._lost_lines + lines, self._lost_bytes + len(text)
+        self._untold_lines, self._untold_bytes = self._untold_lines + lines, self._untold_bytes + len(text)
+
+    def _notice(self) -> bytes:
+        what = f"{self._untold_lines} lines of text ({self._untold_bytes} bytes)"
+        self._untold_lines = self._untold_bytes = 0
+        return f"\n[{what} were dropped: nobody read them]\n".encode()
+
+    def _handed_out(self, text: bytes) -> bytes:
+        self._taken_bytes += len(text)
+        return text

@@ -21,8 +21,9 @@ children of a session   their parent's life                    0.05 s           
 ======================  =====================================  ======================  ==========================
 
 All of these are times of the machine's monotonic clock, whatever the rig's clock does. A motion is watched from
-its command until its axes are at rest. After a lapse below `ASKS_FROM_S` (a busy machine) the session goes on
-along the checked path by itself; after a longer one a person is asked. docs/reference/safety.md draws the states.
+its command until its axes are at rest. After a freeze of `ASKS_FROM_S` a person is asked; after a shorter one,
+or a lapse that a busy machine explains, the session goes on along the checked path by itself.
+docs/reference/safety.md has the table.
 """
 
 from __future__ import annotations
@@ -35,7 +36,11 @@ ATTENTION_S = 0.1
 LOOK_S = 0.02
 """Whoever watches an arm that moves waits no longer than this, machine time, before looking again."""
 ASKS_FROM_S = 1.0
-"""A lapse of attention of this length or more is not a busy machine: a person decides whether to go on."""
+"""A process that did not run for so long was frozen, or its machine slept: a person decides whether to go on."""
+HEARD_WITHIN_S = 0.5
+"""Whether it was frozen is heard (SIGCONT) within this time after it runs again."""
+ASKS_AFTER_LAPSE_S = 5.0
+"""The same for a lapse of attention that nothing explains: a busy machine, or a call that took its time."""
 _LISTENED_NS = 100_000_000
 
 

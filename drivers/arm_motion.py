@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coupole.devices import Clock, Deadline
+from coupole.clock import Clock, Deadline
 from coupole.errors import DeviceRefused, DeviceTimeout
 
 State = TypeVar("State")

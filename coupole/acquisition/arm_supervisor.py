@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.observer import Control, Held
 from coupole.acquisition.opened_cell import OpenedCell
-from coupole.devices import ArmState, Deadline
+from coupole.clock import Deadline
+from coupole.devices import ArmState
 from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, PreflightRefused
 from coupole.geometry import Transform
 from coupole.kinematics import move_duration_s
@@ -23,7 +24,7 @@ from coupole.motion.path_deviation import PATH_TOLERANCE_MM, deviation_at_rest_m
 from coupole.motion.path_planner import Joints
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import ViewPose
-from coupole.supervision import ASKS_FROM_S, LOOK_S
+from coupole.supervision import ASKS_AFTER_LAPSE_S, LOOK_S
 
 _POLL_S = 0.01
 _SPEED_OVER_NS = 30_000_000
@@ -138,7 +139,7 @@ class ArmSupervisor:
         self._robot.stop()
         if lapse_s:
             self._tell_lapse(str(error))
-        if lapse_s >= ASKS_FROM_S:
+        if lapse_s >= ASKS_AFTER_LAPSE_S:
             if self._stand is None:
                 raise error
             self._control.hold(str(error))

@@ -21,16 +21,8 @@ from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import Verdict
 from coupole.bounded import Workers
-from coupole.devices import (
-    NO_LED,
-    STEP_RECORD_DTYPE,
-    ArmState,
-    CameraStatistics,
-    Deadline,
-    Exposure,
-    StepRecord,
-    table_box,
-)
+from coupole.clock import Deadline
+from coupole.devices import NO_LED, STEP_RECORD_DTYPE, ArmState, CameraStatistics, Exposure, StepRecord, table_box
 from coupole.errors import DeviceError, DeviceTimeout, StorageError
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId

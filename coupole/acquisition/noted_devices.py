@@ -16,7 +16,7 @@ from coupole.plan.rig import Rig
 NAMES = {"ledbox": "led box", "camera": "camera", "robot": "robot"}
 """As errors name them."""
 _DEADLINE_SHARE = 10.0
-"""`coupole.devices.Deadline` waits this many times as long by the machine's clock, if the rig's clock stands."""
+"""`coupole.clock.Deadline` waits this many times as long by the machine's clock, if the rig's clock stands."""
 _STEP_BYTES, _SLOWEST_BYTES_S = 16, 480.0
 """Of a table; a serial line of 4800 baud."""
 

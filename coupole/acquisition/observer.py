@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from coupole.errors import Interrupted
-from coupole.supervision import ASKS_FROM_S
+from coupole.supervision import ASKS_FROM_S, HEARD_WITHIN_S
 from coupole.viewing.progress import Progress
 
 
@@ -72,6 +72,8 @@ class Control:
     pulse_s: float = math.inf
     """When this process last proved that it runs, monotonic s: a thread that does nothing else sets it
     (`coupole.acquisition.signals`); never, where there is none."""
+    stood_at_s: float = -math.inf
+    """When that thread last found that it had not run for a while, monotonic s."""
     signal_number: int = signal.SIGINT
     """The signal that set `stop`."""
 
@@ -109,10 +111,11 @@ class Control:
     @property
     def stands(self) -> bool:
         """True while the session is to stand, and does not yet: devices fail then because they were stopped, or
-        because this process was. One that was frozen is held here, whichever thread is the first to run again."""
-        silent_s = time.monotonic() - self.pulse_s
-        if silent_s > ASKS_FROM_S and self.can_stand:
-            self.hold(frozen(silent_s))
+        because this process was. If it did not run for a while, this waits for the word of the thread that hears
+        of SIGCONT: whether it was frozen, or the machine only busy."""
+        now_s = time.monotonic()
+        if now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S:
+            self.held.wait(HEARD_WITHIN_S)
         return self.held.is_set()
 
     def go_on(self) -> None:

@@ -15,7 +15,8 @@ from coupole.acquisition.noted_devices import NAMES, NotedDevice
 from coupole.acquisition.safeguard import Safeguard
 from coupole.acquisition.signals import held
 from coupole.bounded import NOW, bounded, hangs, under_way
-from coupole.devices import Camera, Clock, Identity, LedBox, Robot, SystemClock
+from coupole.clock import Clock, SystemClock
+from coupole.devices import Camera, Identity, LedBox, Robot
 from coupole.errors import DeviceTimeout
 from coupole.plan.cell import Cell
 from coupole.plan.controller_places import remember_controller

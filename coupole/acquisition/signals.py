@@ -154,7 +154,8 @@ def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
         now_s = time.monotonic()
         silent_s, control.pulse_s = now_s - control.pulse_s, now_s
         if silent_s > ASKS_FROM_S:  # SIGCONT may be heard a moment later; without it the machine was only busy
-            stood_s, noticed_s = silent_s, now_s
+            stood_s = silent_s
+            control.stood_at_s = noticed_s = now_s
         if (asleep_s := _slept_s() - slept_s) > ASKS_FROM_S:
             slept_s += asleep_s
             _hold(control, act, frozen(asleep_s))

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.dose import FlashMeter
 from coupole.acquisition.opened_cell import OpenedCell
-from coupole.devices import NO_LED, STEP_DTYPE, Deadline, Exposure, Frame, Step, table_box
+from coupole.clock import Deadline
+from coupole.devices import NO_LED, STEP_DTYPE, Exposure, Frame, Step, table_box
 from coupole.errors import DeviceTimeout
 from coupole.plan.bursts import BurstTiming, burst_timing
 from coupole.plan.cell import Cell

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.devices import STEP_DTYPE, Clock, Deadline, Identity, Step, StepRecord
+from coupole.clock import Clock, Deadline
+from coupole.devices import STEP_DTYPE, Identity, Step, StepRecord
 from coupole.errors import DeviceError, DeviceFault, DeviceRefused, DeviceTimeout
 from drivers.ledbox.link import CallEnded, Link
 from drivers.ledbox.scpi import REPLY_MARGIN_S, ScpiSession

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from coupole.devices import Deadline
+from coupole.clock import Deadline
 from coupole.errors import DeviceError
 
 

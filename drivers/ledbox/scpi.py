@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-from coupole.devices import Clock, Deadline
+from coupole.clock import Clock, Deadline
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.fair_lock import FairLock
 from drivers.ledbox.link import CallEnded, Cleared, Link

@@ -17,7 +17,7 @@ import struct
 import threading
 from typing import Any
 
-from coupole.devices import Clock, Deadline
+from coupole.clock import Clock, Deadline
 from coupole.errors import DeviceLost
 from drivers.ledbox.link import Cleared
 

@@ -18,7 +18,8 @@ from typing import Literal, NoReturn, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coupole.devices import NO_LED, UNKNOWN_NS, Clock, Deadline, Identity, StepRecord
+from coupole.clock import Clock, Deadline
+from coupole.devices import NO_LED, UNKNOWN_NS, Identity, StepRecord
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.ledbox.link import CallEnded, Cleared
 from drivers.ledbox.serial_link import SerialLink, open_serial

@@ -11,7 +11,7 @@ import struct
 import threading
 from typing import Any
 
-from coupole.devices import Clock, Deadline
+from coupole.clock import Clock, Deadline
 from drivers.ledbox.link import Cleared
 
 _HEADER = struct.Struct("<BBBxIB3x")

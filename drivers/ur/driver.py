@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
-from coupole.devices import ArmCondition, ArmState, Clock, Deadline, Identity
+from coupole.clock import Clock, Deadline
+from coupole.devices import ArmCondition, ArmState, Identity
 from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
 from coupole.supervision import ATTENTION_S, LOOK_S, Attention

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.clock import Clock
+from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
 from sim.devices.camera_server import FRAME_MESSAGE, SLOT_MESSAGE
 

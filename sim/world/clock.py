@@ -97,7 +97,7 @@ class ClockWriter:
 
 
 class SharedClock:
-    """A reader's side: `coupole.devices.Clock` on the block at `path`.
+    """A reader's side: `coupole.clock.Clock` on the block at `path`.
 
     When the world has ended, or its process was killed, time goes on at the world's speed: whoever waits for
     something by this clock must not wait for ever.

@@ -16,7 +16,7 @@ from coupole.acquisition.cell_bench.enabling_switch import EnablingSwitch, Relea
 from coupole.acquisition.commissioning import presence_step
 from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedError
 from coupole.acquisition.observer import Control
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 
 
 class Box:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from camera_conformance import A_MOMENT_S, BY_SOFTWARE, EXPOSURE, take
 
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from coupole.errors import DeviceLost, DeviceRefused
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings

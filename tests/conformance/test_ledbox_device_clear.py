@@ -13,7 +13,7 @@ import pytest
 from ledbox_world import Call, LedBoxWorld, ledbox_world, opened, run_to_end, table, wait_until
 from test_ledbox import TcpLink, usb_world
 
-from coupole.devices import Deadline, SystemClock
+from coupole.clock import Deadline, SystemClock
 from coupole.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.ledbox.driver import LedBox, Settings
 from drivers.ledbox.link import Cleared

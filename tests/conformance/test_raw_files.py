@@ -24,7 +24,8 @@ from places import SHARED_DATA
 from tiny_dng import BLACK_DN, WHITE_DN, write_dng
 
 from coupole.acquisition.frame_matching import FaultModel, match
-from coupole.devices import STEP_RECORD_DTYPE, Exposure, Frame, FrameFormat, SystemClock
+from coupole.clock import SystemClock
+from coupole.devices import STEP_RECORD_DTYPE, Exposure, Frame, FrameFormat
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan

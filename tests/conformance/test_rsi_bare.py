@@ -21,7 +21,7 @@ from arms import KR10_R1100_SIXX
 from bare_rsi_controller import BareRsiController, packet_of
 from cells import wait_until
 
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from coupole.errors import DeviceFault, DeviceLost, DeviceTimeout
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 
@@ -232,7 +232,7 @@ def test_a_lost_link_is_no_ended_program(port: int) -> None:
 
 _PARENT = """
 import sys, time, numpy
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 
 robot = KukaRsi(Settings.model_validate_json(sys.argv[1]), SystemClock())

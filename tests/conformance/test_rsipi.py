@@ -24,7 +24,7 @@ import pytest
 from arms import KR10_R1100_SIXX
 from cells import REPO, CellFolder, wait_until
 
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from coupole.errors import DeviceFault
 from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from foreign_state import Left
 
-from coupole.devices import Camera, Frame, SystemClock
+from coupole.clock import SystemClock
+from coupole.devices import Camera, Frame
 from drivers.camera.xiapi.driver import Settings, XiCamera
 
 SOURCE = Path(__file__).with_name("xiapi_stub.c")

@@ -8,7 +8,7 @@ from itertools import count
 import numpy as np
 import pytest
 
-from coupole.devices import Deadline
+from coupole.clock import Deadline
 from coupole.errors import DeviceFault, DeviceRefused, DeviceTimeout
 from drivers.arm_motion import MessageTime, checked_target, wait_for
 

@@ -59,7 +59,7 @@ os.execv(sys.executable, [sys.executable, "-c", *sys.argv[1:]])
 """
 _OPENS = """
 import sys
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from coupole.errors import DeviceError
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 

@@ -169,7 +169,7 @@ def scpi_replies() -> list[bytes]:
 
 def read_scpi_reply(path: Path) -> None:
     """Every failure is one of the driver's own."""
-    from coupole.devices import SystemClock
+    from coupole.clock import SystemClock
     from drivers.ledbox.scpi import ScpiSession
 
     session = ScpiSession("led box", "case", Line(pieces(path.read_bytes())), SystemClock())

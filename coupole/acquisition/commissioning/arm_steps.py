@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
 from coupole.acquisition.commissioning.directions import described_motion
-from coupole.devices import Deadline
+from coupole.clock import Deadline
 from coupole.kinematics import forward
 from coupole.motion.itinerary import arm_of
 from coupole.plan.registry import settings_class

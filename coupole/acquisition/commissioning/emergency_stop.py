@@ -7,7 +7,8 @@ import contextlib
 import numpy as np
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
-from coupole.devices import ArmState, Deadline
+from coupole.clock import Deadline
+from coupole.devices import ArmState
 from coupole.errors import DeviceError, DeviceFault
 
 _PACE_S = 3.0

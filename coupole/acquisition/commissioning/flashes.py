@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
-from coupole.devices import NO_LED, STEP_DTYPE, Deadline, Exposure, Frame, Step, StepRecord, table_box
+from coupole.clock import Deadline
+from coupole.devices import NO_LED, STEP_DTYPE, Exposure, Frame, Step, StepRecord, table_box
 from coupole.errors import DeviceTimeout
 from coupole.plan.bursts import LED_GAP_US, BurstTiming, burst_timing
 

@@ -4,7 +4,7 @@ are seen."""
 from __future__ import annotations
 
 from coupole.acquisition.commissioning.bench import Bench, StepFailedError
-from coupole.devices import Deadline
+from coupole.clock import Deadline
 
 _WITHIN_S, _POLL_S = 30.0, 0.05
 

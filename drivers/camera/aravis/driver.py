@@ -16,7 +16,8 @@ from functools import partial
 
 import numpy as np
 
-from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.clock import Clock
+from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.aravis.discovery import name_of, open_controlled
 from drivers.camera.aravis.features import Features

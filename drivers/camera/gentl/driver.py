@@ -16,7 +16,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.clock import Clock
+from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
 from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up

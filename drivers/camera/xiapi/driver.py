@@ -23,7 +23,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import CameraStatistics, Clock, Exposure, Frame, FrameFormat, Identity
+from coupole.clock import Clock
+from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
 from drivers.camera.misuse import misused

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.devices import ArmState, Clock, Deadline, Identity
+from coupole.clock import Clock, Deadline
+from coupole.devices import ArmState, Identity
 from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import Arm, forward, move_duration_s
 from coupole.supervision import ASKS_FROM_S, LOOK_S, Attention, Silence

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coupole.devices import SystemClock
+from coupole.clock import SystemClock
 from drivers.kuka.rsi.driver import KukaRsi
 from drivers.kuka.rsi.settings import Settings
 

@@ -10,7 +10,7 @@ import pytest
 from cells import wait_until
 from places import REPO
 
-from coupole.devices import Deadline
+from coupole.clock import Deadline
 from sim.world.clock import FOREVER_NS, ClockWriter, SharedClock
 
 WORLD = """

@@ -35,8 +35,7 @@ _BLOCK_BYTES = 512
 """Largest part of a table in one message: what a box that lacks the device clear lets another command wait for."""
 _BLOCK_OVERHEAD_BYTES, _BLOCK_OVERHEAD_S = 70, 0.003
 _UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
-_UNDEFINED_HEADER, _HARDWARE_MISSING = "-113", "-241"
-_FIRST_PROTOCOL = "1.0"
+_UNDEFINED_HEADER, _HARDWARE_MISSING, _FIRST_PROTOCOL = "-113", "-241", "1.0"
 _CLEARS_AT_ONCE = 5
 """Threads that may switch the lights off at the same time; each clears the box, and ends the others' messages."""
 _SHORTEST_PERIOD_US = 100

@@ -19,7 +19,7 @@ from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
 
 from coupole.devices import Robot
-from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
+from coupole.errors import ArmUnattended, DeviceError, DeviceFault, DeviceLost, DeviceRefused
 from coupole.kinematics import forward
 from drivers.kuka.rsi.driver import KukaRsi, Settings
 from sim.devices.kuka_controller import ALIKE, KukaController
@@ -304,6 +304,31 @@ class RobotConformance:
         robot.stop()
         robot.move_to(HOME_DEG)
         assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+
+    def test_a_motion_that_nobody_watches_brakes_on_its_path_and_another_may_follow(
+        self, cell: RobotCell, robot: Robot
+    ) -> None:
+        """Another thread that looks at the arm is not the one that watches it."""
+        robot.move_to(AWAY_DEG, 0.05)
+        cell.wait_until_under_way()
+        with ThreadPoolExecutor(1) as other:
+            give_up = time.monotonic() + 30.0
+            while cell.controller.moving:
+                other.submit(robot.measured).result()
+                assert time.monotonic() < give_up, "it moves on although nobody watches it"
+                time.sleep(0.02)
+        stood_deg = cell.joints_deg()
+        assert np.abs(stood_deg - AWAY_DEG).max() > 1.0, "it was there before it could be stopped"
+        way = (stood_deg - HOME_DEG) / (AWAY_DEG - HOME_DEG)
+        assert np.ptp(way) < 0.01, "it left its line"
+        with pytest.raises(ArmUnattended):
+            robot.wait_settled()
+        assert robot.measured().unattended_s >= UNHURRIED_S
+        assert not robot.measured().fault
+        cell.assert_smooth()
+        robot.move_to(HOME_DEG)
+        assert np.allclose(robot.wait_settled().joints_deg, HOME_DEG, atol=1e-3)
+        assert robot.measured().unattended_s == 0.0
 
     def test_closing_in_mid_motion_brings_it_to_rest_smoothly(self, cell: RobotCell, robot: Robot) -> None:
         robot.move_to(AWAY_DEG)

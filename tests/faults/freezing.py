@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
-from cells import LOW, SIDE, TOP, CellFolder
+from cells import SIDE, TOP, CellFolder
 
 from coupole.acquisition.run_control import ask
 from coupole.errors import CoupoleError
@@ -75,7 +75,7 @@ class Freeze:
 
 
 def cell_in(folder: Path, arm: str) -> CellFolder:
-    """Three views of 54 LEDs, slow motions between them."""
+    """Two views of 54 LEDs, a slow motion to each."""
     cell = CellFolder(folder, speed=1.0)
     if arm == "ur":
         cell.moved_by_ur("ur10e")
@@ -84,7 +84,7 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
     cell.rig_data["motion"] |= {"speed_fraction": 0.1}
     cell.rig_data["ledbox"]["settings"]["watchdog_s"] = WATCHDOG_S
     cell.join()
-    cell.write(views=[TOP, SIDE, LOW], exposure={"kind": "fixed", "exposure_us": 16000})
+    cell.write(views=[TOP, SIDE], exposure={"kind": "fixed", "exposure_us": 16000})
     return cell
 
 

@@ -1,0 +1,84 @@
+"""A process that does not run: the arm brakes, lamps go dark, and a person is asked."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from datetime import date
+from pathlib import Path
+
+import cells
+import freezing
+import pytest
+from freezing import Freeze
+from ur import needs_ur_rtde
+
+ARMS = [
+    "rsi",
+    pytest.param("eki", marks=pytest.mark.full),
+    pytest.param("ur", marks=(needs_ur_rtde, pytest.mark.full)),
+]
+TODAY = date.today().toordinal()
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_frozen_controller_leaves_no_arm_in_motion_and_no_lamp_on_and_asks(tmp_path: Path, arm: str) -> None:
+    """Frozen in a motion, then in a burst, at moments of the day's draw; the run is done all the same."""
+    cell, draw = freezing.cell_in(tmp_path, arm), random.Random(TODAY)
+    with freezing.running(cell, arm) as (world, process):
+        for moving in (True, False):
+            assert freezing.moment(world, process, draw, moving=moving)
+            seen = freezing.freeze(world, process.pid, Freeze(arm, "controller", moving))
+            assert seen.wrong == [], seen
+            assert freezing.go_on(cell.run_folder, process)
+        ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    held = [fault for fault in cells.events(cell.run_folder, "fault") if fault["kind"] == "Held"]
+    assert len(held) == 2
+    assert all("the program did not run for" in fault["message"] for fault in held)
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+@pytest.mark.parametrize("arm", ["rsi", pytest.param("ur", marks=(needs_ur_rtde, pytest.mark.full))])
+def test_a_frozen_process_of_the_arm_ends_the_run_with_a_fault_and_the_arm_at_rest(
+    tmp_path: Path, arm: str
+) -> None:
+    cell = freezing.cell_in(tmp_path, arm)
+    with freezing.running(cell, arm) as (world, process):
+        assert freezing.moment(world, process, random.Random(TODAY), moving=True)
+        pid = freezing.frozen_pid(process, "arm's process")
+        assert pid != process.pid
+        seen = freezing.freeze(world, pid, Freeze(arm, "arm's process", while_moving=True))
+        ended = cells.finish(process)
+        assert seen.wrong == [], seen
+        assert not world.ask("state")["arm_moving"]
+    assert ended.code == 4
+    assert cells.events(cell.run_folder, "fault")[0]["device"] == "robot"
+    assert not cells.alive(pid)
+
+
+def test_ctrl_z_makes_the_cell_safe_before_the_process_stops_and_the_run_asks_when_it_goes_on(
+    tmp_path: Path,
+) -> None:
+    cell = freezing.cell_in(tmp_path, "rsi")
+    with freezing.running(cell, "rsi") as (world, process):
+        assert freezing.moment(world, process, random.Random(TODAY), moving=True)
+        process.send_signal(signal.SIGTSTP)
+        cells.wait_until(lambda: _stopped(process.pid), "a stopped process")
+        state = world.ask("state")
+        assert not state["arm_moving"]
+        assert not state["shining"]
+        time.sleep(0.3)
+        assert world.ask("state")["joints_deg"] == state["joints_deg"]
+        process.send_signal(signal.SIGCONT)
+        assert freezing.go_on(cell.run_folder, process)
+        ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    (held,) = [fault for fault in cells.events(cell.run_folder, "fault") if fault["kind"] == "Held"]
+    assert held["message"].startswith("suspended by Ctrl-Z")
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def _stopped(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"

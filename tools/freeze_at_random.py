@@ -1,0 +1,133 @@
+"""Freezes the processes of small runs (SIGSTOP) at random moments, and tells what the arm and the lamps did.
+
+    python tools/freeze_at_random.py [--freezes N] [--arm rsi|eki|ur ...] [--jobs N] [--seed N] [--keep FILE]
+
+So many freezes of each arm's runs, in real time, some twenty seconds each; those that FILE holds are not done again.
+Most are of the command's process, in a motion; every fourth is in a burst, every fifth run freezes the process that
+answers the arm instead, which ends the run. Exits with 1 if a promise of docs/reference/safety.md was broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import sys
+import tempfile
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults")]
+
+import cells  # noqa: E402
+import freezing  # noqa: E402
+from freezing import ARMS, FROZEN, Freeze  # noqa: E402
+
+
+def one_run(arm: str, number: int, seed: int) -> list[dict[str, Any]]:
+    """The freezes of one run; the last one's `wrong` tells too what is wrong with the run."""
+    draw, found = random.Random(f"{seed} {arm} {number}"), []
+    which = FROZEN[int(number % 5 == 4 and arm != "eki")]
+    with tempfile.TemporaryDirectory(prefix="coupole-freeze-") as folder:
+        cell = freezing.cell_in(Path(folder), arm)
+        with freezing.running(cell, arm) as (world, process):
+            moving = draw.random() < 0.75
+            while freezing.moment(world, process, draw, moving=moving):
+                seen = freezing.freeze(world, freezing.frozen_pid(process, which), Freeze(arm, which, moving))
+                found.append({"number": number, **seen.line()})
+                if which != FROZEN[0] or not freezing.go_on(cell.run_folder, process):
+                    break
+                moving = draw.random() < 0.75
+            ended = cells.finish(process)
+            state = world.ask("state")
+        if found:
+            found[-1]["wrong"] += _wrong_at_the_end(ended.code, which, state, cell.run_folder)
+    return found
+
+
+def _wrong_at_the_end(code: int, which: str, state: dict[str, Any], run: Path) -> list[str]:
+    wrong = []
+    if code != (0 if which == FROZEN[0] else 4):
+        wrong.append(f"exit code {code}")
+    if state["arm_moving"] or state["shining"] or state["panels"]:
+        wrong.append("the cell is not safe at the end")
+    if code == 0:
+        try:
+            cells.assert_each_shot_proven_once(run)
+        except AssertionError as error:
+            wrong.append(f"frames: {error}")
+    return wrong
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--freezes", type=int, default=70, help="of each arm")
+    parser.add_argument("--arm", nargs="+", choices=ARMS, default=list(ARMS))
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--keep", type=Path, default=ROOT / "runs" / "proofs" / "freezes.jsonl", help="freezes done"
+    )
+    options = parser.parse_args()
+    options.keep.parent.mkdir(parents=True, exist_ok=True)
+    lines, lock = freezing.lines_in(options.keep), threading.Lock()
+    console = Console(stderr=True)
+    with Progress(console=console) as progress:
+        bars = {arm: progress.add_task(arm, total=options.freezes) for arm in options.arm}
+
+        def work(share: int) -> None:
+            for arm in options.arm:
+                begun = 1 + max((line["number"] for line in lines if line["arm"] == arm), default=-1)
+                number = begun + share
+                while sum(line["arm"] == arm for line in lines) < options.freezes:
+                    found = one_run(arm, number, options.seed)
+                    number += options.jobs
+                    with lock, options.keep.open("a") as file:
+                        lines.extend(found)
+                        file.writelines(json.dumps(line) + "\n" for line in found)
+                    progress.update(bars[arm], completed=sum(line["arm"] == arm for line in lines))
+
+        with ThreadPoolExecutor(options.jobs) as pool:
+            for share in pool.map(work, range(options.jobs)):
+                assert share is None
+    return report([line for line in lines if line["arm"] in options.arm])
+
+
+def report(lines: list[dict[str, Any]]) -> int:
+    table = Table("arm", "frozen", "in", "cases", "wrong", *(f"{what}, s" for what in ("brakes", "still", "dark")))
+    table.add_column("turned, deg")
+    for arm in ARMS:
+        for which in FROZEN:
+            for moving in (True, False):
+                mine = [
+                    one
+                    for one in lines
+                    if (one["arm"], one["frozen"], one["while_moving"]) == (arm, which, moving)
+                ]
+                if mine:
+                    wrong = sum(bool(one["wrong"]) for one in mine)
+                    spreads = (_spread(mine, name) for name in ("brakes_s", "still_s", "dark_s", "turned_deg"))
+                    table.add_row(
+                        arm, which, "motion" if moving else "burst", str(len(mine)), str(wrong), *spreads
+                    )
+    Console(soft_wrap=True).print(table)
+    bad = [line for line in lines if line["wrong"]]
+    for line in bad:
+        print(f"{line['arm']}, run {line['number']}, {line['frozen']}: {'; '.join(line['wrong'])}")
+    return int(bool(bad))
+
+
+def _spread(lines: list[dict[str, Any]], name: str) -> str:
+    values = sorted(line[name] for line in lines if line[name] is not None)
+    return f"{values[len(values) // 2]:.3f}, {values[-1]:.3f}" if values else "-"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -85,7 +85,11 @@ class CellFolder:
         rig = YAML(typ="safe").load(REPO / "configs/rigs/sim.yaml")
         rig["sensor"] |= {"width_px": 128, "height_px": 96, "pixel_pitch_um": 176.0}
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
-        rig["robot"]["settings"] = {"cycle_ms": 12, "attention_s": 0.5}  # a third of the work that one of 4 ms is
+        rig["robot"]["settings"] = {
+            "cycle_ms": 12,  # a third of the work that one of 4 ms is
+            "attention_s": 0.5,  # a busy machine
+            "controller": "192.0.2.7",  # a real one, where there is no world
+        }
         rig["ledbox"]["settings"]["watchdog_s"] = 4 * self.speed  # of the world's time; the machine may be busy
         rig["storage"] = {"folder": str(self.folder / "storage"), "reserve_bytes": 0}
         rig["ledger"] = str(self.folder / "ledger")

@@ -2,33 +2,38 @@
 
     python tools/freeze_at_random.py [--freezes N] [--arm rsi|eki|ur ...] [--jobs N] [--seed N] [--keep FILE]
 
-So many freezes of each arm's runs, in real time, some twenty seconds each; those that FILE holds are not done again.
-Most are of the command's process, in a motion; every fourth is in a burst, every fifth run freezes the process that
-answers the arm instead, which ends the run. Exits with 1 if a promise of docs/reference/safety.md was broken.
+So many freezes of each arm's runs, in real time, some twenty seconds each; those that FILE holds are not done
+again. Most are of the command's process, in a motion; every fourth is in a burst, every fifth run freezes the
+process that answers the arm instead, which ends the run. Exits with 1 if a promise of docs/reference/safety.md was
+broken.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import multiprocessing
+import os
 import random
 import sys
 import tempfile
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults"), str(ROOT / "tools")]
 
 import cells  # noqa: E402
 import freezing  # noqa: E402
 from freezing import ARMS, FROZEN, Freeze  # noqa: E402
+
+from fail_every_call import begin_job  # noqa: E402
 
 
 def one_run(arm: str, number: int, seed: int) -> list[dict[str, Any]]:
@@ -77,27 +82,39 @@ def main() -> int:
     )
     options = parser.parse_args()
     options.keep.parent.mkdir(parents=True, exist_ok=True)
-    lines, lock = freezing.lines_in(options.keep), threading.Lock()
+    lines = freezing.lines_in(options.keep)
     console = Console(stderr=True)
     with Progress(console=console) as progress:
         bars = {arm: progress.add_task(arm, total=options.freezes) for arm in options.arm}
 
-        def work(share: int) -> None:
-            for arm in options.arm:
-                begun = 1 + max((line["number"] for line in lines if line["arm"] == arm), default=-1)
-                number = begun + share
-                while sum(line["arm"] == arm for line in lines) < options.freezes:
-                    found = one_run(arm, number, options.seed)
-                    number += options.jobs
-                    with lock, options.keep.open("a") as file:
-                        lines.extend(found)
-                        file.writelines(json.dumps(line) + "\n" for line in found)
-                    progress.update(bars[arm], completed=sum(line["arm"] == arm for line in lines))
+        def keep(done: Future[list[dict[str, Any]]], file: TextIO) -> None:
+            lines.extend(found := done.result())
+            file.writelines(json.dumps(line) + "\n" for line in found)
+            file.flush()
+            for arm, bar in bars.items():
+                progress.update(bar, completed=_count(lines, arm))
 
-        with ThreadPoolExecutor(options.jobs) as pool:
-            for share in pool.map(work, range(options.jobs)):
-                assert share is None
+        context = multiprocessing.get_context("spawn")
+        with (
+            options.keep.open("a") as file,
+            ProcessPoolExecutor(options.jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool,
+        ):
+            for arm in options.arm:
+                numbers = itertools.count(
+                    1 + max((one["number"] for one in lines if one["arm"] == arm), default=-1)
+                )
+                under_way: set[Future[list[dict[str, Any]]]] = set()
+                while (left := options.freezes - _count(lines, arm)) > 0 or under_way:
+                    while left > 0 and len(under_way) < options.jobs:
+                        under_way.add(pool.submit(one_run, arm, next(numbers), options.seed))
+                    done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        keep(future, file)
     return report([line for line in lines if line["arm"] in options.arm])
+
+
+def _count(lines: list[dict[str, Any]], arm: str) -> int:
+    return sum(one["arm"] == arm for one in lines)
 
 
 def report(lines: list[dict[str, Any]]) -> int:

@@ -73,8 +73,14 @@ class UserSocket:
 
 def peer_uid(connection: socket.socket) -> int:
     """The user at the other end."""
+    return _peer(connection)[1]
+
+
+def _peer(connection: socket.socket) -> tuple[int, int, int]:
+    """Process, user and group at the other end; of a server the process that listens."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    return int(struct.unpack("3i", credentials)[1])
+    pid, uid, gid = struct.unpack("3i", credentials)
+    return pid, uid, gid
 
 
 def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENCE_S) -> dict[str, Any]:
@@ -82,13 +88,30 @@ def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENC
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(patience_s)
         connection.connect(str(path))
-        connection.sendall(json.dumps(request).encode() + b"\n")
-        answer = _line(connection, _LONGEST_ANSWER_BYTES)
+        try:
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            answer = _line(connection, _LONGEST_ANSWER_BYTES)
+        except TimeoutError as error:
+            raise TimeoutError(_silence(_peer(connection)[0], patience_s)) from error
     try:
         found: dict[str, Any] = json_of(answer, str(path), allow_nan=True)
     except InputError as error:
         raise ValueError(str(error)) from error
     return found
+
+
+def _silence(pid: int, patience_s: float) -> str:
+    """Why a process does not answer."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        state = ""
+    if state in ("T", "t"):
+        return (
+            f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "
+            f"switches lamps off; `kill -CONT {pid}` lets the process run again, and a run then asks a person"
+        )
+    return f"nothing within {patience_s:g} s from process {pid}"
 
 
 def _line(connection: socket.socket, longest_bytes: int) -> bytes:

@@ -6,7 +6,6 @@ which steps a change of it asks for; one that it does not name asks for all of t
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -140,7 +139,7 @@ def _value(cell: Cell, value: Any) -> Any:
     """As JSON has it; a file by the SHA-256 of its content."""
     if isinstance(value, Path):
         path = cell.document.resolve(value)
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(value)
+        return cell.files.sha256(path) if cell.files.there(path) else str(value)
     if isinstance(value, (tuple, list)):
         return [_value(cell, inner) for inner in value]
     return value

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import socket
 import stat
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cells
 import pytest
 
 from coupole.acquisition import run_control, runtime_folder, user_socket
@@ -150,6 +154,25 @@ def test_a_run_that_nobody_acquires_is_told_and_a_killed_one_is_told_from_one_th
         hung.bind(str(runtime_folder.runtime_folder() / "4567.sock"))
         hung.listen()
         assert [state["state"] for state in running()] == ["silent"], "it may be at work"
+
+
+def test_a_frozen_process_is_told_from_one_that_hangs(tmp_path: Path) -> None:
+    path = tmp_path / "frozen.sock"
+    serve = f"""
+import time
+from pathlib import Path
+from coupole.acquisition.user_socket import UserSocket
+with UserSocket(Path({str(path)!r}), lambda line: time.sleep(60)):
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", serve]) as served:
+        cells.wait_until(path.exists, "a socket")
+        with pytest.raises(TimeoutError, match=f"nothing within 0.2 s from process {served.pid}"):
+            user_socket.exchange(path, {}, 0.2)
+        served.send_signal(signal.SIGSTOP)
+        with pytest.raises(TimeoutError, match=f"process {served.pid} is stopped .*kill -CONT {served.pid}"):
+            user_socket.exchange(path, {}, 0.2)
+        served.kill()
 
 
 def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(

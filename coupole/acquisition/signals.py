@@ -10,12 +10,10 @@ asleep: when the process runs again, the session is held, and a person is asked 
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import select
 import signal
-import sys
 import threading
 import time
 from collections import deque
@@ -27,7 +25,7 @@ from coupole import bounded
 from coupole.acquisition.observer import Control, frozen
 from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.supervision import ASKS_FROM_S
-from coupole.viewing.text_outlet import finish
+from coupole.viewing.text_outlet import say_now
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
@@ -203,9 +201,7 @@ def _suspend(control: Control, act: Callable[[], object]) -> None:
 
 def _tell(text: str) -> None:
     """On the terminal, if it takes it within a moment: the process is about to stop, and its queue of text too."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        sys.stderr.write(text)
-        finish(_TOLD_WITHIN_S)
+    say_now(text, _TOLD_WITHIN_S)
 
 
 @contextmanager

@@ -24,6 +24,8 @@ PATIENCE_S = 1.0
 """At its end a command waits so long for a reader who takes nothing."""
 AT_MOST_S = 10.0
 """And so long for one who is slow."""
+DOCUMENT_PATIENCE_S = 10.0
+"""So long for a reader of standard output who takes nothing: half a document is worth nothing."""
 _DOCUMENT_BYTES = 1 << 24
 _WRITE_BYTES = 4096
 _FIRST_KEPT_FD = 10
@@ -43,8 +45,8 @@ class Outlet:
         os.close(ours)
         os.close(theirs)
         self._order = threading.RLock()
-        for run in (self._give, self._listen):
-            threading.Thread(target=run, name=f"text {fd}", daemon=True).start()
+        threading.Thread(target=self._give, name=f"text {fd}", daemon=True).start()
+        threading.Thread(target=self._listen, name=f"text into {fd}", daemon=True).start()
 
     def put(self, text: bytes) -> None:
         """After what libraries and children have written so far. Never waits."""
@@ -52,16 +54,19 @@ class Outlet:
             self.collect()
             self.queue.put(text)
 
-    def collect(self) -> None:
-        """What libraries and children have written."""
+    def collect(self) -> bool:
+        """What libraries and children have written; whether any of them can write more."""
         with self._order, contextlib.suppress(BlockingIOError):
             while text := os.read(self._pipe, 65536):
                 self.queue.put(text)
+            return False
+        return True
 
     def _listen(self) -> None:
         while True:
             select.select([self._pipe], [], [])
-            self.collect()
+            if not self.collect():  # somebody has closed the descriptor
+                return
 
     def _give(self) -> None:
         # In the background of a terminal with `tostop` a write would stop the whole process (SIGTTOU).
@@ -146,14 +151,24 @@ def terminal_size() -> os.terminal_size | None:
     return None
 
 
-def finish(patience_s: float = PATIENCE_S) -> None:
-    """Wait a bounded time until the readers have taken everything."""
+def say_now(text: str, patience_s: float) -> None:
+    """On standard error, whose reader has this time for it. Never waits longer."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody is there
+        if "stderr" in _installed:
+            sys.stderr.write(text)
+            finish(patience_s, 0.0)
+        elif select.select([], [sys.stderr.fileno()], [], patience_s)[1]:
+            os.write(sys.stderr.fileno(), text.encode())
+
+
+def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE_S) -> None:
+    """Wait a bounded time until the readers have taken everything; `document_s`: for that of standard output."""
     for name, outlet in _installed.items():
         with contextlib.suppress(OSError, ValueError):
             getattr(sys, name).flush()
         outlet.collect()
-    for outlet in _installed.values():
-        outlet.queue.drained(patience_s, AT_MOST_S)
+    for name, outlet in _installed.items():
+        outlet.queue.drained(document_s if name == "stdout" else patience_s, AT_MOST_S)
 
 
 def _is(stream: object, fd: int) -> bool:

@@ -36,6 +36,26 @@ text_outlet.finish()
 """
 
 
+PRINT_A_DOCUMENT = """
+from coupole.viewing import text_outlet
+text_outlet.install()
+print("the document")
+text_outlet.finish()
+"""
+
+CLOSE_ALL = """
+import os, threading
+from coupole.viewing import text_outlet
+text_outlet.install()
+os.close(1)
+os.close(2)
+for thread in threading.enumerate():
+    if thread.name.startswith("text into"):
+        thread.join(20)
+        assert not thread.is_alive()
+"""
+
+
 @pytest.fixture
 def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
     """A cell whose world outlives its controllers."""
@@ -45,15 +65,22 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
         yield cell, world
 
 
+def fill(writer: int) -> int:
+    """Fill a pipe; how many bytes it took."""
+    os.set_blocking(writer, False)
+    count = 0
+    with suppress(BlockingIOError):
+        while True:
+            count += os.write(writer, bytes(4096))
+    os.set_blocking(writer, True)
+    return count
+
+
 @contextmanager
 def full_pipe() -> Iterator[int]:
     """The end for writing of a pipe that is full and is never read."""
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    with suppress(BlockingIOError):
-        while True:
-            os.write(writer, bytes(4096))
-    os.set_blocking(writer, True)
+    fill(writer)
     yield writer
     os.close(reader)
     os.close(writer)
@@ -173,8 +200,33 @@ def test_a_reader_who_reads_gets_every_line() -> None:
 
 
 def test_a_command_that_nobody_reads_ends_within_a_bounded_time() -> None:
+    speak = SPEAK_MUCH.replace("finish()", "finish(0.2, 0.2)")
     with full_pipe() as nobody:
-        process = subprocess.Popen([sys.executable, "-c", SPEAK_MUCH], stdout=nobody, stderr=nobody, cwd=REPO)
+        process = subprocess.Popen([sys.executable, "-c", speak], stdout=nobody, stderr=nobody, cwd=REPO)
         begun_s = time.monotonic()
         assert process.wait(cells.PATIENCE_S) == 0
     assert time.monotonic() - begun_s < cells.PATIENCE_S
+
+
+def test_a_reader_of_the_document_who_pauses_for_three_seconds_gets_it() -> None:
+    reader, writer = os.pipe()
+    full = fill(writer)
+    with subprocess.Popen([sys.executable, "-c", PRINT_A_DOCUMENT], stdout=writer, cwd=REPO) as process:
+        os.close(writer)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(3.0)
+        with os.fdopen(reader, "rb") as found:
+            assert found.read()[full:] == b"the document\n"
+    assert process.returncode == 0
+
+
+def test_a_last_word_waits_for_no_reader_where_no_queue_lies_between() -> None:
+    words = [sys.executable, "-c", "from coupole.viewing.text_outlet import say_now; say_now('a word', 0.1)"]
+    for kind in READERS.values():
+        with kind() as nobody:
+            assert subprocess.run(words, stderr=nobody, cwd=REPO, timeout=30, check=False).returncode == 0
+    assert subprocess.run(words, capture_output=True, cwd=REPO, check=True).stderr == b"a word"
+
+
+def test_nobody_listens_to_descriptors_that_were_closed() -> None:
+    assert subprocess.run([sys.executable, "-c", CLOSE_ALL], cwd=REPO, timeout=60, check=False).returncode == 0

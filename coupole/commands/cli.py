@@ -114,6 +114,7 @@ def _commands() -> Any:
 
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
+    text_outlet.keep_standard_places()
     raise_outside_sessions()
     with unheard_end():
         code = _ended()

@@ -33,6 +33,7 @@ HARMLESS: Mapping[str, str] = {
     "contact": "whom to ask about data",
     "storage": "where runs are kept and how",
     "ledger": "where the objects' light is kept",
+    "controllers": "where faults and commissioning are kept",
     "calibrations": "records carry limits and a checksum of their own, and move neither arm nor lamps",
     "white_response": "advice about exposures",
     "lens.f_number": "how bright pictures are",

@@ -109,12 +109,17 @@ class _Stream(io.RawIOBase):
 _installed: dict[str, Outlet] = {}
 
 
-def install() -> None:
-    """From now on, to the end of this process, nothing that it prints waits for a reader. Standard streams that
-    are closed lead nowhere: a device that is opened must not take their place and be given text. Streams that
-    somebody has replaced (tests) stay as they are."""
+def keep_standard_places() -> None:
+    """Standard streams that are closed lead nowhere: a device or a pipe that is opened must not take their place
+    and be given text. To be called before anything is opened."""
     for fd in range(3):
         _lead_nowhere_if_closed(fd)
+
+
+def install() -> None:
+    """From now on, to the end of this process, nothing that it prints waits for a reader. Streams that somebody
+    has replaced (tests) stay as they are."""
+    keep_standard_places()
     for fd, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if name in _installed or not _is(stream, fd):

@@ -81,7 +81,7 @@ def test_an_increment_that_was_not_applied_is_said_again_with_the_next() -> None
 
 def violations(target_deg: shared_state.Six, *on_the_way_deg: shared_state.Six, **settings: object) -> str:
     return correction_violations(
-        Settings.model_validate({"arm_model": KR10_R1100_SIXX, **settings}),
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, "listen": "127.0.0.1:0", **settings}),
         KR10_R1100_SIXX,
         HOME_DEG,
         on_the_way_deg or (HOME_DEG,),
@@ -152,7 +152,7 @@ def test_a_trajectory_that_cannot_be_computed_leaves_the_axes_at_rest_and_is_tol
 )
 def test_settings_that_make_no_sense_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
-        Settings.model_validate({"arm_model": KR10_R1100_SIXX, **settings})
+        Settings.model_validate({"arm_model": KR10_R1100_SIXX, "listen": "127.0.0.1:0", **settings})
 
 
 @given(
@@ -171,6 +171,7 @@ def test_the_stopping_distance_holds_for_every_motion(
 ) -> None:
     settings = Settings(
         arm_model=KR10_R1100_SIXX,
+        listen="127.0.0.1:0",
         speed_fraction=speed_fraction,
         acceleration_deg_s2=acceleration_deg_s2,
         jerk_deg_s3=jerk_deg_s3,

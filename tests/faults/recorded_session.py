@@ -27,6 +27,7 @@ from coupole.viewing.terminal import make_console
 
 FORMAT = FrameFormat(height_px=32, width_px=64, bit_depth=12, bayer_pattern="GBRG", black_dn=64, white_dn=4095)
 VIEWS = ("top", "side")
+JOINTS_DEG = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 LABELS = tuple(f"led{number:04d}/e0" for number in range(5))
 METADATA = {"sample": "relief", "simulated": True, "pixel_pitch_um": 5.5, "focal_length_mm": 35.0}
 ABOUT = {"views": list(VIEWS), "labels": list(LABELS), "simulated": True, "object": None}
@@ -44,7 +45,7 @@ def picture(number: int) -> Frame:
 
 
 def begin_view(recorder: RunRecorder, view: str) -> None:
-    arm = ArmState((1, 2, 3, 4, 5, 6), np.eye(4), 7, moving=False)
+    arm = ArmState(JOINTS_DEG, np.eye(4), 7, moving=False)
     recorder.begin_view(view, len(LABELS), FORMAT, arm, np.eye(4), {"shadow": {"leds": np.arange(5)}})
 
 
@@ -53,7 +54,8 @@ def take(recorder: RunRecorder, shot: str) -> None:
     number = sum(shot.encode())
     recorder.free(recorder.put(picture(number + 1000), 8000))
     slot = recorder.put(picture(number), 8000)
-    recorder.prove(slot, ShotId.parse(shot), {"led": 1, "step": 2, "t_trigger_ns": 3})
+    led = LABELS.index(shot.partition("/")[2])
+    recorder.prove(slot, ShotId.parse(shot), {"led": led, "step": 2, "t_trigger_ns": 3})
 
 
 def main(folder: Path) -> None:

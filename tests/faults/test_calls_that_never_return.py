@@ -235,6 +235,8 @@ def test_whatever_else_opens_a_cell_ends_too(
 
 @pytest.mark.parametrize(("name", "code"), [("robot.measured", 4), ("motion.file", 6)])
 def test_an_arm_whose_watching_thread_hangs_brakes_on_its_way(cell: CellFolder, name: str, code: int) -> None:
+    cell.rig_data["robot"]["settings"]["attention_s"] = 0.1
+    cell.write()
     with cell.world() as world:
         session = begin(cell, Hang(name, IN_MOTION))
         session.wait_until_it_hangs()

@@ -19,6 +19,7 @@ import recorded_session
 import write_cuts
 from cells import CellFolder
 from places import REPO
+from recorded_session import JOINTS_DEG, LABELS, VIEWS
 from write_cuts import CHANGING, RENAME, SYNC, UNKNOWN, WRITE, Call, Disk
 
 from coupole.errors import InputError
@@ -52,7 +53,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     cell = CellFolder(folder, write_now=False)
     cell.rig_data["dome"]["leds"] = "dome.csv"
     del cell.plan_data["object"]
-    cell.write()
+    cell.write(
+        views=[{"kind": "joints", "name": view, "joints_deg": JOINTS_DEG} for view in VIEWS],
+        lights={"kind": "ids", "ids": list(range(len(LABELS)))},
+    )
     shutil.copy(REPO / "configs/domes/text-dome.csv", folder / "dome.csv")
     (folder / "runs").mkdir()
     library, log = folder / "recorder.so", folder / "calls.log"

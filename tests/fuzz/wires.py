@@ -95,7 +95,8 @@ def read_rsi_answer(path: Path) -> None:
 def eki_statuses() -> list[bytes]:
     axes = " ".join(f'A{axis}="{angle}"' for axis, angle in enumerate(AXES_DEG, 1))
     status = (
-        '<Status Session="7" Taken="3" Done="2" Moving="1" Fault="0" Time="123456" Override="100" T1="0"/>'
+        '<Status Session="7" Taken="3" Done="2" Moving="1" Fault="0" Time="123456" Override="100" T1="0" '
+        'Lapsed="0"/>'
         f'<Arm Model="#KR10R1100SIXX" Serial="12345"/><Axes {axes}/>'
         '<Pose Valid="1" X="700.5" Y="0.0" Z="900.0" A="180.0" B="0.0" C="-180.0"/>'
     )

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from real_cells import commission
 from test_commissioned import DEVICES, checked, real
 
+from coupole.intake.input_files import InputFiles
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.registry import settings_class
 from coupole.plan.rig import Rig
@@ -34,7 +35,7 @@ from coupole.preflight.commissioned_rig import HARMLESS, steps_of
 __all__ = ["real"]
 EXPECTED_HARMLESS = {
     *("schema_version", "arm.schema_version", "name", "arm.name", "licence", "contact"),
-    *("storage", "ledger", "calibrations", "white_response", "world"),
+    *("storage", "ledger", "controllers", "calibrations", "white_response", "world"),
     *("lens.f_number", "sensor.bit_depth", "sensor.bayer_pattern", "sensor.black_dn"),
     *("motion.home_joints_deg", "motion.park_joints_deg"),
     *("ledbox.twin", "camera.twin", "robot.twin"),
@@ -59,7 +60,7 @@ DRIVERS = {
 
 OTHERS: tuple[Any, ...] = (
     *(1, 2, 0.5, "x", None, True, False, {"a": 1}, ["a"], [1.0], [1.0] * 6, "/elsewhere", "10.0.0.7"),
-    *("10.0.0.7:9999", "ur5e", {"width_px": 8, "height_px": 8}, {"read": "Lost"}),
+    *("10.0.0.7:9999", "127.0.0.1:9999", "ur5e", {"width_px": 8, "height_px": 8}, {"read": "Lost"}),
     *([-1.0, 1.0], [[1.0]] * 6, 8, 12, 1000),
 )
 """Values of which some setting accepts one."""
@@ -301,7 +302,7 @@ def test_a_mesh_of_a_link_that_is_replaced_asks_for_the_geometry(full: tuple[Cel
     cell, record = full
     assert isinstance(cell.rig.link_meshes, Path)
     (cell.rig.link_meshes / "link_3.stl").write_text("solid other\nendsolid\n")
-    assert asked_for(cell, record) == ["geometry"]
+    assert asked_for(replace(cell, files=InputFiles()), record) == ["geometry"]
 
 
 def test_a_record_of_an_earlier_version_is_read_and_says_what_it_lacks(real: CellFolder) -> None:

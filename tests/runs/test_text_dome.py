@@ -107,7 +107,7 @@ def test_a_box_that_confirms_nothing_is_refused(cell: CellFolder, reply: str | N
 def test_a_dry_run_rehearses_with_the_same_kind_of_box(cell: CellFolder) -> None:
     cell.rig_data["ledbox"]["settings"]["port"] = "/dev/ttyNOPE"
     cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
-    cell.rig_data["robot"]["settings"] = {"listen": "192.0.2.1:49152"}
+    cell.rig_data["robot"]["settings"] = {"listen": "192.0.2.1:49152", "controller": "192.0.2.7"}
     cell.rig_data["world"] = {"serves": "dry_run"}
     cell.write()
     ended = cell.acquire("--dry-run")
@@ -119,7 +119,11 @@ def test_the_box_is_named_by_the_devices_command() -> None:
     ended = cells.here("devices", "--rig", cells.REPO / "configs/rigs/sim-text-dome.yaml", "--json")
     assert ended.code == 0, ended.err
     assert ended.document["ledbox"]["serial"] == "SIM-0002"
-    assert ended.document["ledbox"]["self_test"] == {"LEDs": "64", "confirms": "with `OK`"}
+    assert ended.document["ledbox"]["self_test"] == {
+        "LEDs": "64",
+        "confirms": "with `OK`",
+        "enabling switch": "no input for one",
+    }
 
 
 # -- what goes wrong ------------------------------------------------------------------------------------------

@@ -31,6 +31,8 @@ def rig(folder: Path, *, storage: str = "storage", state: str = "", **robot: Any
     cell.rig_data["storage"] = {"folder": str(folder / storage), **({"state": state} if state else {})}
     cell.rig_data["ledbox"]["settings"]["port"] = "/dev/nowhere"
     cell.rig_data["camera"]["settings"] = {"address": "/nowhere"}
+    if robot:
+        del cell.rig_data["robot"]["settings"]["controller"]
     cell.rig_data["robot"]["settings"] |= robot or {"controller": ADDRESS}
     cell.write()
     return read_cell(cell.rig)
@@ -115,10 +117,10 @@ def test_a_driver_that_gives_no_serial_number_and_a_stand_in_are_known_by_addres
 def test_without_an_address_of_its_controller_the_arm_is_known_by_the_socket_where_it_calls(
     tmp_path: Path,
 ) -> None:
-    first = rig(tmp_path / "first", listen="0.0.0.0:49152")
+    first = rig(tmp_path / "first", listen="0.0.0.0:49152", any_controller_by="A. Keeper")
     faults_of(first).note("it fell")
-    assert stands(rig(tmp_path / "copy", listen="0.0.0.0:49152"))
-    assert not stands(rig(tmp_path / "other", listen="0.0.0.0:49153"))
+    assert stands(rig(tmp_path / "copy", listen="0.0.0.0:49152", any_controller_by="A. Keeper"))
+    assert not stands(rig(tmp_path / "other", listen="0.0.0.0:49153", any_controller_by="A. Keeper"))
 
 
 def test_a_simulated_cell_keeps_to_its_own_folder(tmp_path: Path) -> None:

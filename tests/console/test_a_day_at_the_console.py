@@ -151,7 +151,7 @@ def _looks_at_the_object(day: Day) -> None:
     ada, photograph = day.visitor, day.folder / "vase.png"
     Image.effect_noise((640, 480), 90).save(photograph)
     ada.goes_to("/object")
-    ada.sees("[data-name=light]", "5 lux h, by its plans")
+    ada.sees("[data-name=light]", "by the strictest of its plans")
     ada.at("input[data-name=photograph]").send_keys(str(photograph))
     ada.sees("[data-name=light]", "in its life")
     ada.at("img[src*=photograph]")

@@ -118,11 +118,11 @@ def thread_steps(now: State, wrong: Rules) -> Iterator[Step]:
     if now.thread == STANDS:
         if now.halting:
             yield "waits until all is safe", now
-        elif now.held:
+        if now.held:
             yield "stands", now._replace(held=False)
-        elif now.stop or now.unsure:
+        elif now.stop or (now.unsure and not now.halting):
             yield "leaves", _safe(now)._replace(thread=ENDED)
-        else:
+        elif not now.halting:
             yield ("stands still", now) if now.pause else ("goes on", now._replace(thread=ASKS))
     elif now.thread == ASKS:
         if stops or now.lost or now.answering == DEAD:
@@ -285,24 +285,26 @@ def _later(now: State, wrong: Rules) -> State:
 
 def told_apart(now: State) -> State:
     """The state without what no rule and no promise can see any more; two that differ in it alone are one."""
-    if now.arm == REST and now.order != MOVE:
-        now = now._replace(looked=0, unwatched=0)
-    if not now.lamps:
-        now = now._replace(quiet=0, unspoken=0)
-    if now.lost:
-        now = now._replace(mute=0, unanswered=0 if now.arm == REST else now.unanswered)
-    if not (now.owed or now.stop):
-        now = now._replace(since=0)
-    if not now.held and now.signals != SUSPENDED:
-        now = now._replace(slipped=False)
-    if now.process == FROZEN:
-        now = now._replace(thread_ran=False)
     if now.process == DEAD or (now.thread == ENDED and now.signals == IDLE):
-        kept = {name: getattr(now, name) for name in _OUTLIVES}
-        now = State(process=DEAD, thread=ENDED, **kept)
-    return now
+        now = State(DEAD, ENDED, **{name: getattr(now, name) for name in _OUTLIVES})
+    unseen: dict[str, int] = {}
+    if now.arm == REST and now.order != MOVE:
+        unseen |= _UNSEEN_AT_REST
+    if not now.lamps:
+        unseen |= _UNSEEN_IN_THE_DARK
+    if now.lost:
+        unseen |= _UNSEEN_WHEN_LOST if now.arm == REST else {"mute": 0}
+    if now.since and not (now.owed or now.stop):
+        unseen["since"] = 0
+    if now.slipped and not now.held and now.signals != SUSPENDED:
+        unseen["slipped"] = False
+    if now.thread_ran and now.process == FROZEN:
+        unseen["thread_ran"] = False
+    return now._replace(**unseen) if unseen else now
 
 
+_UNSEEN_AT_REST, _UNSEEN_IN_THE_DARK = {"looked": 0, "unwatched": 0}, {"quiet": 0, "unspoken": 0}
+_UNSEEN_WHEN_LOST = {"mute": 0, "unanswered": 0}
 _OUTLIVES = ("answering", "arm", "lamps", "order", "lost", "answered", "looked", "mute", "quiet", "unwatched")
 _OUTLIVES += ("unanswered", "unspoken", "false_lapse", "spared")
 

@@ -113,41 +113,48 @@ def steps(now: State, wrong: Rules = frozenset()) -> Iterator[Step]:
 
 def thread_steps(now: State, wrong: Rules) -> Iterator[Step]:
     """The supervising thread: `ArmSupervisor.go`, the bursts, `Sequencer._wait_while_paused`."""
-    looked = now._replace(unwatched=0, looked=now.looked if "beats once" in wrong else 0, quiet=0, unspoken=0)
-    stops = now.stop and "stop is for the thread that sleeps" not in wrong
     if now.thread == STANDS:
-        if now.halting:
-            yield "waits until all is safe", now
-        if now.held:
-            yield "stands", now._replace(held=False)
-        elif now.stop or (now.unsure and not now.halting):
-            yield "leaves", _safe(now)._replace(thread=ENDED)
-        elif not now.halting:
-            yield ("stands still", now) if now.pause else ("goes on", now._replace(thread=ASKS))
-    elif now.thread == ASKS:
-        if stops or now.lost or now.answering == DEAD:
-            yield "leaves", _safe(now)._replace(thread=ENDED)
-        elif now.held or now.pause:
-            yield "is held", _safe(now)._replace(thread=STANDS)
-        else:
-            yield "may command", now._replace(thread=ALLOWED, lapsed=False)
+        yield from _standing(now)
     elif now.thread == ALLOWED:
-        slipped = now.slipped or now.held
-        begun = looked._replace(thread=WATCHES, slipped=slipped, looked=0)
+        begun = _looked(now)._replace(thread=WATCHES, slipped=now.slipped or now.held, looked=0)
         yield "moves the arm", begun._replace(order=MOVE)
         if now.arm == REST and now.order == NOTHING:
             yield "lights lamps", begun._replace(lamps=True)
-    elif now.thread == WATCHES:
-        if stops or now.lost or now.answering == DEAD:
-            yield "is to leave", _safe(now)._replace(thread=ENDED)
-        elif now.held:
-            yield "is held", _safe(now)._replace(thread=STANDS)
-        elif now.lapsed:
-            yield "finds it braked", _safe(now)._replace(thread=ASKS)
-        elif now.lamps or now.arm != REST or now.order:
-            yield "looks", looked
-        if now.lamps or (now.arm == REST and now.order == NOTHING):
-            yield "is done", now._replace(thread=ASKS, lamps=False)
+    elif now.thread != ENDED:
+        yield from _asking(now, wrong)
+
+
+def _standing(now: State) -> Iterator[Step]:
+    if now.halting:
+        yield "waits until all is safe", now
+    if now.held:
+        yield "stands", now._replace(held=False)
+    elif now.stop or (now.unsure and not now.halting):
+        yield "leaves", _safe(now)._replace(thread=ENDED)
+    elif not now.halting:
+        yield ("stands still", now) if now.pause else ("goes on", now._replace(thread=ASKS))
+
+
+def _asking(now: State, wrong: Rules) -> Iterator[Step]:
+    """`Control.go_on`, before a command and in each turn of a motion or a burst."""
+    stops = now.stop and "stop is for the thread that sleeps" not in wrong
+    if stops or now.lost or now.answering == DEAD:
+        yield "leaves", _safe(now)._replace(thread=ENDED)
+    elif now.held or (now.pause and now.thread == ASKS):
+        yield "is held", _safe(now)._replace(thread=STANDS)
+    elif now.thread == ASKS:
+        yield "may command", now._replace(thread=ALLOWED, lapsed=False)
+    elif now.lapsed:
+        yield "finds it braked", _safe(now)._replace(thread=ASKS)
+    elif now.lamps or now.arm != REST or now.order:
+        looked = _looked(now)
+        yield "looks", looked._replace(looked=now.looked) if "beats once" in wrong else looked
+    if now.thread == WATCHES and (now.lamps or (now.arm == REST and now.order == NOTHING)):
+        yield "is done", now._replace(thread=ASKS, lamps=False)
+
+
+def _looked(now: State) -> State:
+    return now._replace(unwatched=0, looked=0, quiet=0, unspoken=0)
 
 
 def _safe(now: State) -> State:
@@ -309,7 +316,6 @@ _OUTLIVES = ("answering", "arm", "lamps", "order", "lost", "answered", "looked",
 _OUTLIVES += ("unanswered", "unspoken", "false_lapse", "spared")
 
 
-
 def search(wrong: Rules, broken: Callable[[State], bool], spared: int) -> tuple[int, list[str]]:
     """Number of states until all are known, or until one is `broken`, and then the shortest way there."""
     begin = State(spared=spared)
@@ -319,9 +325,8 @@ def search(wrong: Rules, broken: Callable[[State], bool], spared: int) -> tuple[
         now = waiting.popleft()
         if broken(now):
             return len(came), _way_to(now, came)
-        for what, then in steps(now, wrong):
-            then = told_apart(then)
-            if then not in came:
+        for what, step in steps(now, wrong):
+            if (then := told_apart(step)) not in came:
                 came[then] = now, what
                 waiting.append(then)
     return len(came), []

@@ -88,8 +88,8 @@ class Control:
         (self.let_go_on if self.pause.is_set() else self.pause.set)()
 
     def let_go_on(self) -> None:
-        """A person's word ends a pause, but no hold that is still being made safe, or at which the session does not
-        stand yet: it has not said what happened then, and would stand without a pause for ever."""
+        """A person's word ends a pause, but no hold that is still being made safe, or at which the session does
+        not stand yet: it has not said what happened, and would then be held without a pause to stand in."""
         if not self.coming_to_stand:
             self.pause.clear()
 

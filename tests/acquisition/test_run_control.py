@@ -94,7 +94,6 @@ def test_a_word_before_the_session_stands_does_not_end_its_hold(served: Served) 
     assert ask(served.run, "go-on")["state"] == "running"
 
 
-
 @pytest.mark.parametrize(
     ("line", "says"),
     [

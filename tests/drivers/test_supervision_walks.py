@@ -27,7 +27,7 @@ HAPPENINGS, HAPPENS_SELDOM = 5, 0.15
 CYCLE_NS = 4_000_000
 FAR_DEG = 170.0
 """No motion arrives within a walk."""
-STOPS = ("is held", "is to leave", "leaves", "finds it braked", "makes safe")
+STOPS = ("is held", "leaves", "finds it braked", "makes safe")
 ANSWERS = {f"answering: {done}" for done in ("answers", "nobody looks", "has no parent", "is over")}
 
 
@@ -67,9 +67,8 @@ class Implementation:
         elif what == "moves the arm":
             self.driver.write_looked(self.attention.begin())
             self.send(shared_state.MOVE)
-        elif what == "looks":
-            if looked_ns := self.attention.look():  # None before the first motion
-                self.driver.write_looked(looked_ns)
+        elif what == "looks" and (looked_ns := self.attention.look()):  # None before the first motion
+            self.driver.write_looked(looked_ns)
 
     def signals(self, what: str) -> None:
         if what == "hears Ctrl-C":

@@ -3,7 +3,9 @@ is broken by a model that is wrong on purpose."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from supervision_model import (
@@ -23,13 +25,15 @@ from supervision_model import (
 )
 
 PROMISES: dict[str, Callable[[State], bool]] = {
-    "An arm that moves was looked at by the supervising thread within the attention and a cycle, or it brakes": (
+    "An arm that moves was looked at by the supervising thread within 0.1 s and a cycle, or it brakes": (
         lambda now: now.arm != MOVES or now.unwatched <= ATTENTION + 1 or now.unanswered > 0
     ),
     "An arm that is not answered brakes within the controller's limit": (
         lambda now: now.arm != MOVES or now.unanswered <= DELAY_LIMIT
     ),
-    "Nothing moves the arm once its controller has ended RSI": lambda now: not (now.lost and now.arm == MOVES),
+    "Nothing moves the arm once its controller has ended RSI, whoever wakes up": lambda now: (
+        not (now.lost and now.arm == MOVES)
+    ),
     "Lamps are dark when the session has not spoken to the box for the watchdog's time": (
         lambda now: not now.lamps or now.unspoken <= WATCHDOG
     ),
@@ -64,6 +68,15 @@ WRONG = {
     "suspends first": SUSPENDS,
 }
 """What is wrong, and what it breaks."""
+
+
+SAFETY = Path(__file__).parents[2] / "docs/reference/safety.md"
+
+
+def test_the_promises_are_those_of_the_reference() -> None:
+    section = SAFETY.read_text(encoding="utf-8").partition("**Checked by a model.**")[2].partition("\n## ")[0]
+    promised = re.findall(r"^\d\. (.+?)\.$", section, re.MULTILINE)
+    assert promised == list(PROMISES)
 
 
 def broken(now: State) -> bool:

@@ -88,9 +88,15 @@ class Control:
         (self.let_go_on if self.pause.is_set() else self.pause.set)()
 
     def let_go_on(self) -> None:
-        """A person's word ends a pause, but not one that is still being made safe."""
-        if not self.halting.is_set():
+        """A person's word ends a pause, but no hold that is still being made safe, or at which the session does
+        not stand yet: it has not said what happened, and would then be held without a pause to stand in."""
+        if not self.coming_to_stand:
             self.pause.clear()
+
+    @property
+    def coming_to_stand(self) -> bool:
+        """True from a hold until all is safe and the session stands: no word is heard."""
+        return self.halting.is_set() or self.held.is_set()
 
     def hold(self, why: str) -> None:
         """Stand at once, wherever the session is; the first reason counts until it stands."""

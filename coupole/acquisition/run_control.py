@@ -78,7 +78,7 @@ class RunControl:
         control = self._control
         state = "running"
         if control.pause.is_set():
-            state = "paused" if control.paused.is_set() else "pausing"
+            state = "paused" if control.paused.is_set() and not control.coming_to_stand else "pausing"
         state = "stopping" if control.stop.is_set() else state
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}

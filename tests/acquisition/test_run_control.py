@@ -90,6 +90,14 @@ def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Serve
     assert served.control.interrupted().exit_code == 130
 
 
+def test_a_word_before_the_session_stands_does_not_end_its_hold(served: Served) -> None:
+    served.control.can_stand = True
+    served.control.hold("the machine slept")
+    assert ask(served.run, "go-on")["state"] == "pausing"
+    served.control.held.clear()  # it stands, and has said why
+    assert ask(served.run, "go-on")["state"] == "running"
+
+
 @pytest.mark.parametrize(
     ("line", "says"),
     [

@@ -7,6 +7,7 @@ and measured, camera armed, lights; and the reverse order at the end. On every e
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -306,7 +307,8 @@ class Sequencer:
                     self._note_fault("Held", control.held_because)
                     control.held.clear()
                     held = True
-                self._arm.attend()
+                with contextlib.suppress(Held):  # it is held already
+                    self._arm.attend()
                 self._cell.clock.sleep(_PAUSE_NAP_S)
         finally:
             control.paused.clear()

@@ -98,10 +98,13 @@ class Happenings:
                     os.open(self.folder / "fifo", os.O_RDONLY)  # nobody ever writes
             case "world":
                 os.kill(self.world_pid, signal.SIGKILL)
-            case "sigkill":
-                os.kill(os.getpid(), signal.SIGKILL)
-            case _ if kind in SIGNALS:
-                os.kill(os.getpid(), SIGNALS[kind])
+            case "sigkill" | "sigint" | "sigterm" | "sighup":
+                os.kill(os.getpid(), SIGNALS.get(kind, signal.SIGKILL))
+            case _:
+                self._change(kind)
+
+    def _change(self, kind: str) -> None:
+        match kind:
             case _ if kind == READER:
                 for name in ("out", "err"):
                     _fill(self.folder / name)
@@ -150,7 +153,9 @@ def change(folder: Path, name: str, how: str) -> None:
 _EDITS: dict[str, Callable[[bytes], bytes]] = {
     "plan": lambda text: text.replace(b'"exposure_us": 20000', b'"exposure_us": 10000'),
     "rig": lambda text: text.replace(b'"pixel_pitch_um": 176.0', b'"pixel_pitch_um": 88.0'),
-    "LED table": lambda text: text.replace(b"\n0,", b"\n9999,").replace(b"\n1,", b"\n0,").replace(b"\n9999,", b"\n1,"),
+    "LED table": lambda text: (
+        text.replace(b"\n0,", b"\n9999,").replace(b"\n1,", b"\n0,").replace(b"\n9999,", b"\n1,")
+    ),
     "mesh": lambda text: text[:-1] + bytes([text[-1] ^ 1]),
 }
 
@@ -184,7 +189,9 @@ class Jumped(datetime, metaclass=_AnyTime):
         return datetime.now(tz) + cls.by
 
 
-def session(folder: str, arguments: list[str], events: tuple[Event, ...], world_pid: int, line: Connection) -> None:
+def session(
+    folder: str, arguments: list[str], events: tuple[Event, ...], world_pid: int, line: Connection
+) -> None:
     """The command in this process, which ends by itself."""
     here = Path(folder)
     for number, name in ((1, "out"), (2, "err")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import select
 import signal
 import threading
@@ -11,6 +12,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -22,6 +24,7 @@ from failing_calls import (
     CODES,
     DARK_WITHIN_S,
     EXPOSURE_US,
+    KINDS,
     SPEED,
     STILL_WITHIN_S,
     WATCHDOG_S,
@@ -185,6 +188,22 @@ def _state(pid: int) -> str:
         return "Z"
 
 
+def drawn_kind() -> str:
+    """Of today."""
+    return random.Random(datetime.now(UTC).date().toordinal()).choice((*KINDS, *MEANWHILE))
+
+
+def draw_pair(
+    draw: random.Random, calls: int, first: str | None = None, k: int | None = None
+) -> tuple[Event, Event]:
+    """Two failures in one session of so many calls; half of the second ones soon after the first, while the cell
+    is made safe or the end is noted."""
+    kinds = (*KINDS, *MEANWHILE)
+    k = k or draw.randint(1, calls)
+    later = draw.randint(1, 12) if draw.random() < 0.5 else draw.randint(1, calls)
+    return Event(k, first or draw.choice(kinds)), Event(k + later, draw.choice(kinds))
+
+
 def run_events(folder: Path, events: tuple[Event, ...]) -> MeanwhileCase:
     """The session in which these happen; the cell, what is stored, the ledger, the resumed run."""
     begun_s = time.monotonic()
@@ -204,7 +223,7 @@ def run_events(folder: Path, events: tuple[Event, ...]) -> MeanwhileCase:
         runs = sorted((folder / "storage").glob("2*/run.json"))
         run = runs[0].parent if runs else None
         if run is not None:
-            case.wrong += _wrong_in_what_was_read(run, case, originals)
+            case.wrong += wrong_in_what_was_read(run, case, originals)
         for name, path in FILES.items():
             (folder / path).write_bytes(originals[name])
         if "world" not in case.reached:
@@ -281,7 +300,7 @@ def _wrong_in_the_cell(case: MeanwhileCase, world: World) -> list[str]:
     return wrong
 
 
-def _wrong_in_what_was_read(run: Path, case: MeanwhileCase, originals: dict[str, bytes]) -> list[str]:
+def wrong_in_what_was_read(run: Path, case: MeanwhileCase, originals: dict[str, bytes]) -> list[str]:
     """Files may have changed since; run.json, inputs/ and verify have what was read."""
     about = cells.about(run)
     texts = [about[name]["text"].encode() for name in ("plan", "rig")]
@@ -291,7 +310,9 @@ def _wrong_in_what_was_read(run: Path, case: MeanwhileCase, originals: dict[str,
         if text != originals[name]
     ]
     kept = [path.read_bytes() for path in (run / "inputs").rglob("*") if path.is_file()]
-    wrong += [f"inputs/ lack the {name} that was read" for name in ("LED table", "mesh") if originals[name] not in kept]
+    wrong += [
+        f"inputs/ lack the {name} that was read" for name in ("LED table", "mesh") if originals[name] not in kept
+    ]
     if f'"exposure_us": {EXPOSURE_US}'.encode() not in (run / "inputs/plan.yaml").read_bytes():
         wrong.append("inputs/plan.yaml is another plan")
     verified = cells.here("verify", run, "--json")
@@ -308,19 +329,17 @@ def _wrong_in_what_was_read(run: Path, case: MeanwhileCase, originals: dict[str,
 
 
 def _wrong_in_the_times(run: Path, case: MeanwhileCase, from_s: float, lasted_s: float) -> list[str]:
-    """Of the journal, line by line: the wall clock's, with what it jumped by then and no more."""
-    jumps_s = [JUMPS_S[kind] for kind in case.reached if kind in JUMPS_S]
-    reached_s = [0.0]
-    for jump_s in jumps_s:
-        reached_s.append(reached_s[-1] + jump_s)
-    at, wrong = 0, []
+    """Of the journal, line by line: the wall clock's, with what it had jumped by and no more. A line is written a
+    moment after its time was noted, so one beside a jump may be out of order."""
+    by_s = [0.0]
+    for kind in case.reached:
+        by_s += [by_s[-1] + JUMPS_S[kind]] if kind in JUMPS_S else []
+    clocks = []
     for event in cells.events(run):
-        t_s = datetime.fromisoformat(event["t"]).timestamp()
-        while at < len(reached_s) and not -UTC_SLACK_S < t_s - reached_s[at] - from_s < lasted_s + UTC_SLACK_S:
-            at += 1
-        if at == len(reached_s):
-            wrong.append(f"the journal's line {event['event']} has the time {event['t']}")
-            break
-    return wrong
-
-
+        since_s = datetime.fromisoformat(event["t"]).timestamp() - from_s
+        fits = [at for at, jump_s in enumerate(by_s) if -UTC_SLACK_S < since_s - jump_s < lasted_s + UTC_SLACK_S]
+        if not fits:
+            return [f"the journal's line {event['event']} has the time {event['t']}"]
+        clocks.append(by_s[fits[0]])
+    switches = sum(a != b for a, b in pairwise(clocks))
+    return [f"times of the journal go forth and back: {clocks}"] if switches > 3 * (len(by_s) - 1) else []

@@ -67,6 +67,7 @@ def test_whatever_two_failures_a_session_has_the_cell_is_safe_and_the_run_goes_o
         assert not case.wrong, (today, case)
 
 
+@pytest.mark.full
 def test_a_harness_sees_what_was_changed_where_the_run_does_not_keep_what_it_read(tmp_path: Path) -> None:
     """The judge itself: a run whose kept inputs are edited is told."""
     run_events(tmp_path, (Event(CALLS // 2, "plan edited"),))

@@ -1,9 +1,12 @@
-"""Lets each call of each device of a small run fail once in each way, and tells what became of it.
+"""Lets each call of each device of a small run fail, stop or change once in each way, and tells what became of it.
 
-    python tools/fail_every_call.py [--cases N] [--seed N] [--jobs N] [--keep FILE]
+    python tools/fail_every_call.py [--cases N] [--kinds WORD ...] [--seed N] [--jobs N] [--keep FILE]
+    python tools/fail_every_call.py --pairs N [--first KIND] ...
 
-Without `--cases` all of them, for hours; those that FILE holds are not done again. Prints how long after the event
-lamps were dark and the arm stood, by kind of failure. Exits with 1 if anything was wrong in any case.
+Without `--cases` all of them, for hours; those that FILE holds are not done again, so days may be put together of
+several calls with the same seed. `--pairs`: so many drawn cases of two failures in one session, the second after
+the first; `--first` has the first at every call in turn. Prints how long after the event lamps were dark and the
+arm stood, by kind of failure. Exits with 1 if anything was wrong in any case.
 """
 
 from __future__ import annotations
@@ -30,18 +33,34 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "faults")]
 
 from failing_calls import KINDS, count_calls, run_case  # noqa: E402
+from happenings import MEANWHILE, Event  # noqa: E402
+from judged_sessions import draw_pair, drawn_kind, run_events  # noqa: E402
 from nursery import Nursery  # noqa: E402
 
 from sim.world import client  # noqa: E402
 
+Case = tuple[Event, ...]
 
-def one(k: int, kind: str) -> dict[str, Any]:
+
+def one(case: Case) -> dict[str, Any]:
     """One case, in a folder that is removed."""
+    begun_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         try:
-            return run_case(Path(folder), k, kind).line()
+            if len(case) == 1 and case[0].kind in KINDS:
+                line = run_case(Path(folder), case[0].k, case[0].kind).line()
+            else:
+                line = run_events(Path(folder), case).line()
         except Exception as error:  # noqa: BLE001  a case that cannot be judged is one that is wrong
-            return {"k": k, "kind": kind, "wrong": [f"{type(error).__name__}: {error}"]}
+            line = {"k": case[0].k, "kind": case[0].kind, "wrong": [f"{type(error).__name__}: {error}"]}
+            line |= {"k2": case[1].k, "kind2": case[1].kind} if len(case) > 1 else {}
+    return {**line, "took_s": round(time.monotonic() - begun_s, 2)}
+
+
+def case_of(line: dict[str, Any]) -> Case:
+    """Of a line that was kept."""
+    second = (Event(line["k2"], line["kind2"]),) if line.get("kind2") else ()
+    return (Event(line["k"], line["kind"]), *second)
 
 
 def begin_job(parent_pid: int) -> None:
@@ -56,35 +75,55 @@ def begin_job(parent_pid: int) -> None:
     threading.Thread(target=look, daemon=True).start()
 
 
-def done(cases: list[tuple[int, str]], jobs: int) -> Iterator[dict[str, Any]]:
+def done(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
     """Cases as they come; each job is a process whose main thread takes the signals."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool:
-        yield from (future.result() for future in as_completed([pool.submit(one, *case) for case in cases]))
+        yield from (future.result() for future in as_completed([pool.submit(one, case) for case in cases]))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--cases", type=int, help="so many, drawn at random")
+    parser.add_argument("--kinds", nargs="+", default=[], metavar="WORD", help="kinds that begin with these words")
+    parser.add_argument("--pairs", type=int, help="so many cases of two failures in one session")
+    parser.add_argument("--first", help="the first of both, at every call in turn: a kind, or `drawn` by the day")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
     parser.add_argument("--keep", type=Path, default=ROOT / "runs" / "proofs" / "calls.jsonl", help="cases done")
     options = parser.parse_args()
+    if options.first not in (None, "drawn", *KINDS, *MEANWHILE):
+        parser.error(f"--first: expected `drawn` or one of {', '.join((*KINDS, *MEANWHILE))}")
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         calls = count_calls(Path(folder))
-    wanted = [(k, kind) for k in range(1, len(calls) + 1) for kind in KINDS]
-    random.Random(options.seed).shuffle(wanted)
-    wanted = wanted[: options.cases]
+    wanted = chosen(options, len(calls))
     options.keep.parent.mkdir(parents=True, exist_ok=True)
     kept = [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
-    known = {(line["k"], line["kind"]) for line in kept}
+    known = {case_of(line) for line in kept}
     left = [case for case in wanted if case not in known]
     with options.keep.open("a") as file:
         for line in track(done(left, options.jobs), "cases", len(left), console=Console(stderr=True)):
             kept.append(line)
             file.write(json.dumps(line) + "\n")
             file.flush()
-    return report([line for line in kept if (line["k"], line["kind"]) in set(wanted)])
+    asked = set(wanted)
+    return report([line for line in kept if case_of(line) in asked])
+
+
+def chosen(options: argparse.Namespace, calls: int) -> list[Case]:
+    """The cases that are asked for, in an order that the seed gives."""
+    draw = random.Random(options.seed)
+    if options.pairs is not None:
+        first = drawn_kind() if options.first == "drawn" else options.first
+        cases: dict[Case, None] = {}
+        while len(cases) < options.pairs:
+            k = len(cases) % calls + 1 if first else None
+            cases[draw_pair(draw, calls, first, k)] = None
+        return list(cases)
+    kinds = [kind for kind in (*KINDS, *MEANWHILE) if not options.kinds or kind.startswith(tuple(options.kinds))]
+    wanted: list[Case] = [(Event(k, kind),) for k in range(1, calls + 1) for kind in kinds]
+    draw.shuffle(wanted)
+    return wanted[: options.cases]
 
 
 def report(lines: list[dict[str, Any]]) -> int:
@@ -93,20 +132,26 @@ def report(lines: list[dict[str, Any]]) -> int:
         "failure",
         "cases",
         "wrong",
+        "reached both",
         *(f"{what} after, s (median, most)" for what in ("dark", "stop", "still")),
+        "a case takes, s",
         box=None,
     )
-    for kind in KINDS:
-        mine = [line for line in lines if line["kind"] == kind]
+    for kind in (*KINDS, *MEANWHILE):
+        if not (mine := [line for line in lines if kind in (line["kind"], line.get("kind2"))]):
+            continue
         wrong = sum(bool(line["wrong"]) for line in mine)
-        table.add_row(
-            kind, str(len(mine)), str(wrong), *(_spread(mine, name) for name in ("dark_s", "stop_s", "still_s"))
-        )
+        both = sum(bool(line.get("call2")) for line in mine)
+        times = [_spread(mine, name) for name in ("dark_s", "stop_s", "still_s", "took_s")]
+        table.add_row(kind, str(len(mine)), str(wrong), str(both or "-"), *times)
     console.print(table)
     bad = [line for line in lines if line["wrong"]]
+    console.print(f"{len(lines)} cases, {len(bad)} wrong", markup=False)
     for line in bad:
+        then = f", then call {line['k2']} ({line.get('call2')}), {line['kind2']}" if line.get("kind2") else ""
         console.print(
-            f"call {line['k']} ({line.get('call')}), {line['kind']}: {'; '.join(line['wrong'])}", markup=False
+            f"call {line['k']} ({line.get('call')}), {line['kind']}{then}: {'; '.join(line['wrong'])}",
+            markup=False,
         )
     return int(bool(bad))
 

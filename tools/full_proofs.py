@@ -39,7 +39,14 @@ PROOFS = (
     Proof("soak", "sixty runs in one world: nothing grows", f"{_PYTEST} tests/runs/test_soak.py"),
     Proof("rehearsals", "a million rehearsed shots with faults: labels true, nothing lost", "tools/soak.py"),
     Proof(
-        "calls", "each call of each device fails once in each way: the cell is safe", "tools/fail_every_call.py"
+        "calls",
+        "each call of each device fails or stops once in each way: the cell is safe",
+        "tools/fail_every_call.py",
+    ),
+    Proof(
+        "pairs",
+        "today's failure at each call, then another one: the cell is safe",
+        "tools/fail_every_call.py --pairs 600 --first drawn --keep runs/proofs/pairs.jsonl",
     ),
     Proof("fuzz", "10,000 mutated files and messages are read or refused", f"{_PYTEST} tests/fuzz"),
     Proof("mutants", "95 % of single mistakes in critical code are noticed", "tools/mutants.py"),

@@ -193,7 +193,7 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
     cell, case = cell_in(folder), Case(k, kind)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs this may have ignored it
     with cell.world({"kind": "drop_trigger", "edge": 9}) as world:
-        watch = _Watch(world)
+        watch = Watch(world)
         failure = Failure(k, kind, world_pid=world.endpoints["pid"], on_event=watch.begin)
         if kind == "sigkill":
             ended = _killed(cell, k, watch)
@@ -214,15 +214,15 @@ def run_case(folder: Path, k: int, kind: str) -> Case:
         if kind != "world":
             case.dark_s, case.still_s = watch.end()
             case.wrong += _wrong_in_the_cell(case, world)
-            case.wrong += _wrong_in_the_dose(cell, world)
+            case.wrong += wrong_in_the_dose(cell, world)
     runs = sorted((folder / "storage").glob("2*/run.json"))
     if runs and kind != "sigkill":
-        case.wrong += _wrong_in_the_journal(runs[0].parent, ended)
-    case.wrong += _wrong_after_resuming(cell, runs[0].parent if runs else None, ended)
+        case.wrong += wrong_in_the_journal(runs[0].parent, ended)
+    case.wrong += wrong_after_resuming(cell, runs[0].parent if runs else None, ended)
     return case
 
 
-class _Watch:
+class Watch:
     """Looks at the world every few milliseconds, from the event until the session has ended, and for `QUIET_S`
     nothing has shone and the arm has stood: a box without its host goes on with its table, LED by LED."""
 
@@ -233,9 +233,15 @@ class _Watch:
         self._still_s: float | None = None
 
     def begin(self) -> None:
-        """The event is now."""
+        """The event is now; a later one counts in place of the earlier."""
         self._event_s = self._world.clock.now_ns() / 1e9
-        self._thread.start()
+        self._dark_s = self._still_s = None
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def so_far(self) -> tuple[float, float, float]:
+        """Seconds since the event, since then until it was last seen bright, and moving."""
+        return self._world.clock.now_ns() / 1e9 - self._event_s, self._dark_s or 0.0, self._still_s or 0.0
 
     def end(self) -> tuple[float | None, float | None]:
         """Seconds from the event until it was dark, and until the arm stood."""
@@ -264,7 +270,7 @@ class _Watch:
             time.sleep(0.002)
 
 
-def _killed(cell: CellFolder, k: int, watch: _Watch) -> Ended:
+def _killed(cell: CellFolder, k: int, watch: Watch) -> Ended:
     """The session in a process of its own, which kills itself at its k-th call."""
     code = (
         "import sys; sys.path[:0] = sys.argv[1:3]\n"
@@ -310,7 +316,7 @@ def _wrong_in_the_cell(case: Case, world: World) -> list[str]:
     return wrong
 
 
-def _wrong_in_the_dose(cell: CellFolder, world: World) -> list[str]:
+def wrong_in_the_dose(cell: CellFolder, world: World) -> list[str]:
     """What the run says that it gave, against the world's own account."""
     true_lux_h = float(true_dose_lux_h(cell, world).max())
     runs = sorted((cell.folder / "storage").glob("2*/run.json"))
@@ -322,7 +328,7 @@ def _wrong_in_the_dose(cell: CellFolder, world: World) -> list[str]:
     return []
 
 
-def _wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
+def wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
     stops = cells.events(run, "stop")
     if not stops:
         return [] if not cells.events(run) else ["the journal has no line of the session's end"]
@@ -338,7 +344,7 @@ def _wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
     )
 
 
-def _wrong_after_resuming(cell: CellFolder, run: Path | None, ended: Ended) -> list[str]:
+def wrong_after_resuming(cell: CellFolder, run: Path | None, ended: Ended) -> list[str]:
     """In a new world; a fault of the arm is confirmed first, and must be asked for."""
     again = ("--resume", run) if run is not None else ()
     with cell.world():

@@ -12,8 +12,13 @@ import cells
 import pytest
 from cells import TOP
 from failing_calls import KINDS, Failure, acquire, cell_in, count_calls, run_case
+from happenings import FILES, MEANWHILE, Event
+from judged_sessions import MeanwhileCase, draw_pair, run_events, wrong_in_what_was_read
 
 from coupole.acquisition.recorder import RunRecorder
+
+CALLS = 500
+"""A session has some more; all of them are gone through by the tool."""
 
 
 @pytest.mark.timeout(600)
@@ -30,6 +35,49 @@ def test_whatever_call_fails_in_whatever_way_the_cell_is_safe_and_the_run_goes_o
         folder.mkdir()
         case = run_case(folder, k, kind)
         assert not case.wrong, (today, case)
+
+
+@pytest.mark.timeout(600)
+def test_whatever_stops_stalls_or_changes_at_whatever_call_the_cell_is_safe_and_the_run_is_what_was_read(
+    tmp_path: Path, scale: Callable[[int, int], int]
+) -> None:
+    today = datetime.datetime.now(datetime.UTC).date()
+    drawn = random.Random(f"meanwhile {today}")
+    kinds = [kind for kind in MEANWHILE if scale(0, 1) or "20 s" not in kind]  # it takes that long
+    for number in range(scale(1, 8)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        case = run_events(folder, (Event(drawn.randint(1, CALLS), drawn.choice(kinds)),))
+        assert not case.wrong, (today, case)
+
+
+@pytest.mark.timeout(600)
+def test_whatever_two_failures_a_session_has_the_cell_is_safe_and_the_run_goes_on(
+    tmp_path: Path, scale: Callable[[int, int], int]
+) -> None:
+    today = datetime.datetime.now(datetime.UTC).date()
+    drawn = random.Random(f"pairs {today}")
+    for number in range(scale(1, 8)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        pair = draw_pair(drawn, CALLS)
+        while not scale(0, 1) and any("20 s" in event.kind for event in pair):
+            pair = draw_pair(drawn, CALLS)
+        case = run_events(folder, pair)
+        assert not case.wrong, (today, case)
+
+
+@pytest.mark.full
+def test_a_harness_sees_what_was_changed_where_the_run_does_not_keep_what_it_read(tmp_path: Path) -> None:
+    """The judge itself: a run whose kept inputs are edited is told."""
+    run_events(tmp_path, (Event(CALLS // 2, "plan edited"),))
+    run = next((tmp_path / "storage").glob("2*/run.json")).parent
+    originals = {name: (tmp_path / path).read_bytes() for name, path in FILES.items()}
+    case = MeanwhileCase(1, "plan edited", code=0)
+    assert not wrong_in_what_was_read(run, case, originals)
+    kept = run / "inputs/plan.yaml"
+    kept.write_text(kept.read_text().replace("20000", "10000"))
+    assert "inputs/plan.yaml is another plan" in wrong_in_what_was_read(run, case, originals)
 
 
 def test_an_unexpected_error_ends_with_one_a_safe_cell_a_true_journal_and_its_trace(tmp_path: Path) -> None:

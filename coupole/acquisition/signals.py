@@ -34,6 +34,8 @@ _heard_s = deque([-math.inf], maxlen=1)
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
 """Longer than devices that hang when they are closed, and a report."""
+_STOPS_WITHIN_S = 0.1
+"""A process that stops itself may run on for a moment: the time that it stood is not to be taken for a freeze."""
 _SAFE_WITHIN_S = 4.0
 """Ctrl-Z stops the process after this time though it is not sure that the cell is safe; that is told."""
 
@@ -196,6 +198,7 @@ def _suspend(control: Control, act: Callable[[], object]) -> None:
     state = "; ".join(control.unsure) or "lights are off, the arm is at rest"
     _tell(f"\n{state}; suspended (`fg` continues the program, the run then asks)\n")
     os.kill(os.getpid(), signal.SIGSTOP)
+    time.sleep(_STOPS_WITHIN_S)
     control.pulse_s = time.monotonic()
 
 

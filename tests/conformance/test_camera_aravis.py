@@ -215,7 +215,8 @@ def test_a_camera_that_forgets_its_client_in_a_burst_is_lost(world: GigeWorld) -
 
 def test_a_camera_whose_client_was_killed_is_had_after_its_heartbeat(world: GigeWorld) -> None:
     script = (
-        "import os, sys; from drivers.camera.aravis import AravisCamera, Settings; from coupole.devices import *;"
+        "import os, sys; from drivers.camera.aravis import AravisCamera, Settings;"
+        "from coupole.clock import SystemClock; from coupole.devices import Exposure;"
         "camera = AravisCamera(Settings.model_validate_json(sys.argv[1]), SystemClock());"
         "camera.configure(Exposure(2000)); camera.arm(8); os.kill(os.getpid(), 9)"
     )

@@ -91,7 +91,11 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
 @contextmanager
 def running(cell: CellFolder, arm: str) -> Iterator[tuple[World, subprocess.Popen[str]]]:
     """A world and a run in it, ended with the context at the latest."""
-    real_time = {"robot": {"kind": "rsi", "cycle_ms": 12, "lock_step": False}} if arm == "rsi" else {}
+    real_time = (
+        {"robot": {"kind": "rsi", "sends_to": "127.0.0.1:0", "cycle_ms": 12, "lock_step": False}}
+        if arm == "rsi"
+        else {}
+    )
     with ExitStack() as stack:
         world = stack.enter_context(cell.world(**real_time))
         process = stack.enter_context(cell.start_acquire())

@@ -29,7 +29,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._file = LineFile(path)
         self._lines: list[str] = []
-        self._begun = not self._file.was_empty
+        self._head = [event_line(JournalBegun())] if self._file.was_empty else []
 
     def write(self, event: Event) -> None:
         """Add an event; the next `commit()` writes it to the disk."""
@@ -48,9 +48,8 @@ class Journal:
         """Write and sync lines from `take`; may run on another thread than `write` and `take`."""
         if not lines:
             return
-        begin = [] if self._begun else [event_line(JournalBegun())]
-        self._file.append([*begin, *lines])
-        self._begun = True
+        self._file.append([*self._head, *lines])
+        self._head = []
 
     def close(self) -> None:
         self._file.close()
@@ -60,8 +59,8 @@ def append_lines(path: Path, lines: list[str]) -> None:
     """Write and sync lines of `Journal.take` after whatever the journal has; raises DiskFull or StorageError."""
     file = LineFile(path)
     try:
-        begin = [event_line(JournalBegun())] if file.was_empty else []
-        file.append([*begin, *lines])
+        head = [event_line(JournalBegun(t=json.loads(lines[0])["t"]))] if file.was_empty else []
+        file.append([*head, *lines])
     finally:
         file.close()
 

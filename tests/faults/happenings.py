@@ -174,12 +174,14 @@ def jump(seconds: float) -> None:
 _WALL_NS = time.time_ns
 
 
-class _AnyTime(type):
+class AnyTime(type):
+    """Whoever asks whether a time is one of a set clock is told that any is."""
+
     def __instancecheck__(cls, value: object) -> bool:
         return isinstance(value, datetime)
 
 
-class Jumped(datetime, metaclass=_AnyTime):
+class Jumped(datetime, metaclass=AnyTime):
     """Python's `datetime` of a clock that was set."""
 
     by = timedelta()

@@ -17,7 +17,7 @@ from judged_sessions import MeanwhileCase, draw_pair, run_events, wrong_in_what_
 
 from coupole.acquisition.recorder import RunRecorder
 
-CALLS = 500
+CALLS = 350
 """A session has some more; all of them are gone through by the tool."""
 
 

@@ -103,6 +103,10 @@ class KukaEkiController:
         """Axes and speed (fraction of the highest) of the motion to begin once the axes are at rest."""
         self._client: socket.socket | None = None
         self._parser = Messages()
+        self._unsent = b""
+        """The rest of a status that did not fit into the send buffer."""
+        self._left_behind = False
+        """The client has not read for as long as the world waits for it."""
         self._cut = False
         """True while `lose_link` blocks all communication."""
         self._healing: Timer | None = None
@@ -202,7 +206,7 @@ class KukaEkiController:
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNSENT_BYTES)
-        self._client, self._parser = client, Messages()
+        self._client, self._parser, self._unsent, self._left_behind = client, Messages(), b"", False
         self._reactor.add_reader(client, self._receive)
 
     def _receive(self) -> None:
@@ -282,14 +286,20 @@ class KukaEkiController:
         self._timer = self._reactor.after(self._settings.status_ms / 1e3, self._cycle)
 
     def _send(self, status: bytes) -> None:
+        """A client that has not read for `write_limit_s` holds the world no longer: until it reads it misses
+        statuses; each that it gets is whole."""
         assert self._client is not None
-        try:
-            while status:
-                if not select.select([], [self._client], [], self._settings.write_limit_s)[1]:
-                    raise TimeoutError
-                status = status[self._client.send(status) :]
-        except OSError:
-            return  # the client is gone; `_receive` detects it
+        self._unsent = self._unsent or status
+        while self._unsent:
+            limit_s = 0.0 if self._left_behind else self._settings.write_limit_s
+            try:
+                if not select.select([], [self._client], [], limit_s)[1]:
+                    self._left_behind = True
+                    return
+                self._unsent = self._unsent[self._client.send(self._unsent) :]
+            except OSError:
+                return  # the client is gone; `_receive` detects it
+        self._left_behind = False
 
     def _status(self) -> bytes:
         axes = " ".join(f'A{axis}="{angle:.4f}"' for axis, angle in enumerate(self.joints_deg, start=1))

@@ -11,8 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from ipaddress import IPv4Address
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -192,6 +194,26 @@ def test_a_world_in_a_hurry_does_not_run_ahead_of_its_client(tmp_path: Path) -> 
             status = robot._watch.status
             assert status is not None
             assert cell.clock.now_ns() / 1e6 - status.time_ms < 1000.0
+
+
+def test_a_client_that_stops_reading_does_not_hold_the_world_and_gets_whole_statuses_afterwards(
+    tmp_path: Path,
+) -> None:
+    """As one that is frozen."""
+    cell = EkiCell(tmp_path, speed=200.0, write_limit_s=0.2)
+    host, port = cell.settings.address.rsplit(":", 1)
+    with closing(cell), socket.create_connection((host, int(port))) as client:
+        cell.wait_until(lambda: cell.controller._left_behind)
+        cell.clock.sleep(100.0)
+        assert cell.controller._left_behind
+        client.settimeout(0.5)
+        text = b""
+        left_at_s = cell.clock.now_ns() / 1e9
+        while b'Time="' not in text or int(text.rpartition(b'Time="')[2].partition(b'"')[0]) < 1e3 * left_at_s:
+            text += client.recv(65536)
+    whole = text[: text.rindex(b"</Coupole>")] + b"</Coupole>"
+    times_ms = [int(one.find("Status").attrib["Time"]) for one in ElementTree.fromstring(b"<s>" + whole + b"</s>")]
+    assert max(b - a for a, b in pairwise(times_ms)) > 90_000
 
 
 def test_a_silent_link_is_a_fault_though_the_connection_stays_open(cell: EkiCell, robot: KukaEki) -> None:

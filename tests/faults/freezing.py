@@ -86,7 +86,7 @@ class Freeze:
 
 
 def cell_in(folder: Path, arm: str) -> CellFolder:
-    """Two views of 54 LEDs, a slow motion to each."""
+    """Two views of 54 LEDs, a slow motion to each; a burst lasts longer than the box's watchdog."""
     cell = CellFolder(folder, speed=1.0)
     if arm == "ur":
         cell.moved_by_ur("ur10e")
@@ -95,7 +95,7 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
     cell.rig_data["motion"] |= {"speed_fraction": 0.1}
     cell.rig_data["ledbox"]["settings"]["watchdog_s"] = WATCHDOG_S
     cell.join()
-    cell.write(views=[TOP, SIDE], exposure={"kind": "fixed", "exposure_us": 16000})
+    cell.write(views=[TOP, SIDE], exposure={"kind": "fixed", "exposure_us": 80_000})
     return cell
 
 

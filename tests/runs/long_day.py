@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
-from cells import LOW, SIDE, TOP, CellFolder
+from cells import LOW, SIDE, TOP, CellFolder, Ended
 from soaking import figures_of
 
 from coupole.errors import DeviceError
@@ -42,7 +42,7 @@ class Day:
     labels: int = 0
     """Of the journal, each compared with what shone."""
     dropped: int = 0
-    code: int | None = None
+    ended: Ended = field(default_factory=lambda: Ended(-1, "", ""))
     mislabelled: list[str] = field(default_factory=list)
     samples: list[dict[str, Any]] = field(default_factory=list)
 
@@ -90,7 +90,8 @@ class Watcher:
                     self.day.hours = (self.day.samples[-1]["t_s"] - began_s) / 3600.0
                     yield self.day
             time.sleep(_LOOK_S)
-        self.day.code = self._process.returncode
+        out, err = self._process.communicate()
+        self.day.ended = Ended(self._process.returncode, out, err)
         yield self.day
 
     def _ask_the_world(self) -> None:
@@ -171,8 +172,8 @@ def _others(run: Path) -> int:
 def wrong_at_the_end(cell: CellFolder, day: Day) -> list[str]:
     """Nothing was lost in silence: the command says that all is there, and all is."""
     wrong = [*day.mislabelled]
-    if day.code != 0:
-        wrong.append(f"exit code {day.code}")
+    if day.ended.code != 0:
+        wrong.append(f"exit code {day.ended.code}: {day.ended.err[-1000:]}")
     expected = cells.about(cell.run_folder)["expected"]["frames"]
     if day.labels != expected:
         wrong.append(f"{day.labels} labels, {expected} frames expected")

@@ -23,6 +23,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -32,6 +33,8 @@ from places import REPO
 
 FDS = 4
 OURS = ("coupole.", "drivers.", "sim.")
+IMPORTED_BY_NEED = (*OURS, "PIL.", "cffi", "h5py.", "py_opw_kinematics", "rich.", "scipy.", "serial", "trimesh.", "typer.")
+"""What the next forks find imported, once one of them has."""
 MOST_BYTES = 1 << 16
 
 
@@ -64,6 +67,10 @@ class Nursery:
     def command(self, arguments: list[str], **streams: Any) -> Born:
         """`coupole` with these arguments, here and with this environment."""
         return Born(self, ["coupole", *arguments], **streams)
+
+    def function(self, name: str, arguments: list[str], **streams: Any) -> Born:
+        """A function of the tests, `module:function`, with these arguments."""
+        return Born(self, [name, *arguments], **streams)
 
 
 class Born(subprocess.Popen[str]):
@@ -163,20 +170,25 @@ def live(
     sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     from sim.world import world
 
-    known = signatures()
+    known, imported = signatures(), set(sys.modules)
     code = exit_code(commanded(arguments, nursery) if arguments else world.main)
-    if new := signatures() - known:
-        learnt.send(pickle.dumps(new))
+    kernels, modules = signatures() - known, {*sys.modules} - imported
+    if kernels or modules:
+        learnt.send(pickle.dumps((sorted(filter(_by_need, modules)), kernels)))
     os.write(told, bytes([code]))
     os._exit(code)
 
 
 def commanded(arguments: list[str], nursery: Nursery) -> Callable[[], None]:
-    """The command line, whose worlds are of this nursery."""
-    from coupole.commands import cli
+    """The command line, whose worlds are of this nursery; or a function."""
     from sim.world import client
 
     client._launch = nursery.start
+    if arguments[0] != "coupole":
+        module, _, name = arguments[0].partition(":")
+        return partial(getattr(importlib.import_module(module), name), *arguments[1:])
+    from coupole.commands import cli
+
     sys.argv = arguments
     return cli.main
 
@@ -209,11 +221,20 @@ def signatures() -> set[tuple[str, str, Any]]:
 
 
 def learn(lessons: socket.socket) -> None:
-    """Compile (that is, load from numba's cache) what worlds used; nothing is run here."""
+    """Import what forks imported, and compile (that is, load from numba's cache) what they used; nothing is run
+    here."""
     while select.select([lessons], [], [], 0)[0]:
+        modules, kernels = pickle.loads(lessons.recv(1 << 20))
         with no_threads():
-            for module, name, signature in pickle.loads(lessons.recv(1 << 20)):
+            for module in modules:
+                with contextlib.suppress(ImportError):
+                    importlib.import_module(module)
+            for module, name, signature in kernels:
                 getattr(importlib.import_module(module), name).compile(signature)
+
+
+def _by_need(module: str) -> bool:
+    return module.startswith(IMPORTED_BY_NEED)
 
 
 LAUNCH = ctypes.CFUNCTYPE(None, ctypes.c_int)
@@ -250,5 +271,5 @@ def start_threads() -> None:
 
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(REPO)]
+    sys.path[:0] = [str(REPO), str(REPO / "tests" / "faults")]
     serve(socket.socket(fileno=os.dup(0)))

@@ -14,6 +14,7 @@ import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
 from coupole.acquisition.burst_runner import BurstRunner
+from coupole.acquisition.collector import collected_when_asked
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
 from coupole.acquisition.observer import Control, Held, Observer, Unwatched
@@ -107,12 +108,14 @@ class Sequencer:
         )
         start_ns = self._cell.clock.now_ns()
         try:
-            for count, index in enumerate(itinerary.order):
-                number, visit = numbers[index], itinerary.visits[index]
-                assert visit is not None
-                view = schedule.views[number]
-                self._view_number, self._view_name = len(schedule.views) - len(left) + count, view.name
-                self._acquire_view(view, visit, left[number], schedule.bursts[number])
+            with collected_when_asked() as collect:
+                for count, index in enumerate(itinerary.order):
+                    collect()  # the arm is at rest, nothing shines
+                    number, visit = numbers[index], itinerary.visits[index]
+                    assert visit is not None
+                    view = schedule.views[number]
+                    self._view_number, self._view_name = len(schedule.views) - len(left) + count, view.name
+                    self._acquire_view(view, visit, left[number], schedule.bursts[number])
         except BaseException:
             self._cell.make_safe()
             raise

@@ -53,7 +53,12 @@ class PathPlanner:
     def straight_s(self, places_deg: NDArray[np.float64]) -> NDArray[np.float64]:
         """Times [n, n] of straight motions between postures [n, 6], clear or not; lower bounds of the legs'
         times."""
-        return move_durations_s(self._arm, places_deg[:, None], places_deg)
+        from coupole.motion.straight_times import pairwise_s
+
+        arm = self._arm
+        limits = (np.asarray(limit) for limit in (arm.velocity_deg_s, arm.acceleration_deg_s2, arm.jerk_deg_s3))
+        seconds: NDArray[np.float64] = pairwise_s(np.ascontiguousarray(places_deg), *limits)
+        return seconds
 
     def is_straight(self, start: Joints, goal: Joints) -> bool:
         """True if the straight motion is clear."""

@@ -33,7 +33,18 @@ from places import REPO
 
 FDS = 4
 OURS = ("coupole.", "drivers.", "sim.")
-IMPORTED_BY_NEED = (*OURS, "PIL.", "cffi", "h5py.", "py_opw_kinematics", "rich.", "scipy.", "serial", "trimesh.", "typer.")
+IMPORTED_BY_NEED = (
+    *OURS,
+    "PIL.",
+    "cffi",
+    "h5py.",
+    "py_opw_kinematics",
+    "rich.",
+    "scipy.",
+    "serial",
+    "trimesh.",
+    "typer.",
+)
 """What the next forks find imported, once one of them has."""
 MOST_BYTES = 1 << 16
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import select
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from ipaddress import IPv4Address
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -23,9 +26,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell, RobotConformance
 
+from coupole import supervision
 from coupole.devices import ArmCondition, Robot
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from coupole.kinematics import move_duration_s
+from drivers.kuka.eki import link
 from drivers.kuka.eki.driver import KukaEki, Settings
 from sim.devices.kuka_eki_controller import KukaEkiController
 from sim.devices.kuka_eki_controller import Settings as ControllerSettings
@@ -214,6 +219,32 @@ def test_a_client_that_stops_reading_does_not_hold_the_world_and_gets_whole_stat
     whole = text[: text.rindex(b"</Coupole>")] + b"</Coupole>"
     times_ms = [int(one.find("Status").attrib["Time"]) for one in ElementTree.fromstring(b"<s>" + whole + b"</s>")]
     assert max(b - a for a, b in pairwise(times_ms)) > 90_000
+
+
+def test_a_process_that_was_frozen_does_not_take_the_time_for_the_controllers_silence(
+    cell: EkiCell, robot: KukaEki, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After it Python's `select` says that nothing came in time, without another look."""
+    froze, shift_s = threading.Event(), [0.0]
+
+    def select_when_frozen(*arguments: Any) -> Any:
+        if threading.current_thread() is robot._link._thread and not froze.is_set():
+            shift_s[0] += 10.0
+            froze.set()
+            return [], [], []
+        return select.select(*arguments)
+
+    clock = SimpleNamespace(
+        monotonic=lambda: time.monotonic() + shift_s[0],
+        monotonic_ns=lambda: time.monotonic_ns() + int(shift_s[0] * 1e9),
+    )
+    monkeypatch.setattr(supervision, "time", clock)
+    monkeypatch.setattr(link, "time", clock)
+    monkeypatch.setattr(link, "select", SimpleNamespace(select=select_when_frozen))
+    assert froze.wait(10.0)
+    before_ns = robot.measured().t_ns
+    cell.wait_until(lambda: robot.measured().t_ns > before_ns)
+    assert not robot._watch.link_lost
 
 
 def test_a_silent_link_is_a_fault_though_the_connection_stays_open(cell: EkiCell, robot: KukaEki) -> None:

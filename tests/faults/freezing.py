@@ -102,11 +102,11 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
 @contextmanager
 def running(cell: CellFolder, arm: str) -> Iterator[tuple[World, subprocess.Popen[str]]]:
     """A world and a run in it, ended with the context at the latest."""
-    real_time = (
-        {"robot": {"kind": "rsi", "sends_to": "127.0.0.1:0", "cycle_ms": 12, "lock_step": False}}
-        if arm == "rsi"
-        else {}
-    )
+    robots: dict[str, dict[str, Any]] = {
+        "rsi": {"kind": "rsi", "sends_to": "127.0.0.1:0", "cycle_ms": 12, "lock_step": False},
+        "eki": {"kind": "eki", "write_limit_s": 0.01},
+    }
+    real_time = {"robot": robots[arm]} if arm in robots else {}
     with ExitStack() as stack:
         world = stack.enter_context(cell.world(**real_time))
         process = stack.enter_context(cell.start_acquire())

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Literal, TypeVar
 
 from coupole.errors import DeviceLost
-from coupole.supervision import LOOK_S
+from coupole.supervision import LOOK_S, Silence
 from drivers.kuka.eki.watch import Watch
 from drivers.kuka.eki.wire import Command, StatusReader, command_xml
 
@@ -121,14 +121,14 @@ class Link:
         self._link.close()
 
     def _read(self) -> None:
-        heard = time.monotonic()
+        silence, heard = Silence(), 1
         while not self._closing:
             try:
-                if not select.select([self._link], [], [], _LOOK_S)[0]:
-                    silent_s = time.monotonic() - heard
-                    if silent_s > self._timeout_s:
-                        self._lose(f"link lost: no status for {silent_s:.2f} s")
-                        return
+                ready = select.select([self._link], [], [], _LOOK_S)[0]
+                if (silent_s := silence.after(heard)) > self._timeout_s:
+                    self._lose(f"link lost: no status for {silent_s:.2f} s")
+                    return
+                if not ready:  # or this process was frozen: `select` then says so without another look
                     continue
                 data = self._link.recv(65536)
             except OSError as error:
@@ -137,7 +137,7 @@ class Link:
             if not data:
                 self._lose("link lost: the connection was closed")
                 return
-            heard = time.monotonic()
+            heard += 1
             with self.changed:
                 for status in self.reader.feed(data):
                     self._watch.take(status)

@@ -33,18 +33,8 @@ from places import REPO
 
 FDS = 4
 OURS = ("coupole.", "drivers.", "sim.")
-IMPORTED_BY_NEED = (
-    *OURS,
-    "PIL.",
-    "cffi",
-    "h5py.",
-    "py_opw_kinematics",
-    "rich.",
-    "scipy.",
-    "serial",
-    "trimesh.",
-    "typer.",
-)
+OTHERS = ("PIL.", "cffi", "h5py.", "py_opw_kinematics", "rich.", "scipy.", "serial", "trimesh.", "typer.")
+IMPORTED_BY_NEED = (*OURS, *OTHERS)
 """What the next forks find imported, once one of them has."""
 MOST_BYTES = 1 << 16
 
@@ -182,12 +172,18 @@ def live(
     from sim.world import world
 
     known, imported = signatures(), set(sys.modules)
+    leave = os._exit
+
+    def tell_and_leave(status: int) -> NoReturn:
+        os.write(told, bytes([status]))
+        leave(status)
+
+    os._exit = tell_and_leave  # a program that leaves a hung call behind ends by it
     code = exit_code(commanded(arguments, nursery) if arguments else world.main)
     kernels, modules = signatures() - known, {*sys.modules} - imported
     if kernels or modules:
         learnt.send(pickle.dumps((sorted(filter(_by_need, modules)), kernels)))
-    os.write(told, bytes([code]))
-    os._exit(code)
+    tell_and_leave(code)
 
 
 def commanded(arguments: list[str], nursery: Nursery) -> Callable[[], None]:

@@ -6,6 +6,7 @@ The process tells of each before it happens, on a line to whoever started it, wh
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -16,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, tzinfo
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Client, Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -191,11 +192,9 @@ class Jumped(datetime, metaclass=AnyTime):
         return datetime.now(tz) + cls.by
 
 
-def session(
-    folder: str, arguments: list[str], events: tuple[Event, ...], world_pid: int, line: Connection
-) -> None:
-    """The command in this process, which ends by itself."""
-    here = Path(folder)
+def session(folder: str, happens: str, world_pid: str, line: str) -> None:
+    """`acquire` in this process, to which what `happens` (JSON: call and kind of each event) does happen."""
+    here, events = Path(folder), tuple(Event(*one) for one in json.loads(happens))
     for number, name in ((1, "out"), (2, "err")):
         os.dup2(os.open(here / name, os.O_WRONLY), number)
     sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", buffering=1, closefd=False)
@@ -204,7 +203,7 @@ def session(
     if any(event.kind == "never" for event in events):
         bounded.DEVICE_S = bounded.DISK_S = bounded.STOPPED_S = safeguard._SAFE_WITHIN_S = LIMITS_S
     conclusion._REPORT_S = 0.0
-    happenings = Happenings(events, here, world_pid, line)
+    happenings = Happenings(events, here, int(world_pid), Client(line))
     open_device = opened_cell._open_device
 
     def open_watched(rig: Any, kind: str, clock: Any, *rest: Any, **named: Any) -> Any:
@@ -212,5 +211,5 @@ def session(
         return Watched(open_device(rig, kind, clock, *rest, **named), name, cast("Any", happenings), clock)
 
     opened_cell._open_device = open_watched
-    sys.argv = ["coupole", *arguments]
+    sys.argv = ["coupole", "acquire", str(here / "plan.yaml"), "--json", "--yes"]
     cli.main()

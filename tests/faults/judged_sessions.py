@@ -7,14 +7,14 @@ import os
 import random
 import select
 import signal
+import subprocess
 import threading
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import pairwise
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
+from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 from typing import Any, cast
 
@@ -35,9 +35,9 @@ from failing_calls import (
     wrong_in_the_dose,
     wrong_in_the_journal,
 )
-from forks import fork_context
 from freezing import go_on
-from happenings import ALLOWED, CHANGES, FILES, JUMPS_S, LASTING_S, MEANWHILE, READER, STOPS, Event, session
+from happenings import ALLOWED, CHANGES, FILES, JUMPS_S, LASTING_S, MEANWHILE, READER, STOPS, Event
+from nursery import NURSERY
 
 from sim.world.client import World
 
@@ -71,7 +71,7 @@ class _Session:
     """The process, what it says, and whoever attends to it."""
 
     cell: CellFolder
-    process: BaseProcess
+    process: subprocess.Popen[str]
     line: Connection
     watch: Watch
     case: MeanwhileCase
@@ -91,15 +91,16 @@ class _Session:
         self._begin(self._read, readers)
         if any(kind in STOPS for kind in (self.case.kind, self.case.kind2)):
             self._begin(self._give_word)
-        self.process.join(ENDS_WITHIN_S)
-        if self.process.is_alive():
+        try:
+            self.process.wait(ENDS_WITHIN_S)
+        except subprocess.TimeoutExpired:
             self.case.wrong.append("it never ended")
             self.process.kill()
-            self.process.join()
+            self.process.wait()
         self._over.set()
         for thread in self._threads:
             thread.join()
-        return Ended(self.process.exitcode or 0, *(self.texts[name].decode() for name in ("out", "err")))
+        return Ended(self.process.returncode, *(self.texts[name].decode() for name in ("out", "err")))
 
     def _begin(self, what: Any, *arguments: Any) -> None:
         self._threads.append(threading.Thread(target=what, args=arguments, daemon=True))
@@ -257,20 +258,17 @@ def _attended(
         os.mkfifo(cell.folder / name)
         if name != "fifo":
             readers[name] = os.open(cell.folder / name, os.O_RDONLY | os.O_NONBLOCK)
-    context = fork_context()
-    ours, theirs = context.Pipe()
-    words = ["acquire", str(cell.plan), "--json", "--yes"]
-    process = context.Process(
-        target=session, args=(str(cell.folder), words, events, world.endpoints["pid"], theirs)
-    )
-    process.start()
-    try:
-        return _Session(cell, process, ours, watch, case).attend(readers)
-    finally:
-        for fd in readers.values():
-            os.close(fd)
-        ours.close()
-        theirs.close()
+    happens = json.dumps([(event.k, event.kind) for event in events])
+    with Listener(str(cell.folder / "line"), "AF_UNIX") as listener:
+        process = NURSERY.function(
+            "happenings:session", [str(cell.folder), happens, str(world.endpoints["pid"]), str(listener.address)]
+        )
+        with listener.accept() as line:
+            try:
+                return _Session(cell, process, line, watch, case).attend(readers)
+            finally:
+                for fd in readers.values():
+                    os.close(fd)
 
 
 def _allowed(case: MeanwhileCase) -> set[int]:

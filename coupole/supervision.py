@@ -90,7 +90,8 @@ class Attention:
         self._looked_ns = now_ns
         return now_ns
 
-    @property
     def longest_gap_s(self) -> float:
-        """Longest time between two looks of the motion under way, or of the last one."""
+        """Longest time between two looks of the motion under way, or of the last one; asked for by the thread that
+        watches, this is a look: it may have been frozen since the last one."""
+        self.look()
         return self._longest_ns / 1e9

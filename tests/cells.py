@@ -245,10 +245,15 @@ def wait_until(condition: Callable[[], Any], what: str) -> Any:
 
 def alive(pid: int) -> bool:
     """True while a process runs; zombies do not."""
+    return state_of(pid) != "Z"
+
+
+def state_of(pid: int) -> str:
+    """Of a process, as the kernel has it: T stopped, Z ended."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
-        return False
+        return "Z"
 
 
 def children(pid: int) -> list[int]:

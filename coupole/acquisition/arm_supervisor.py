@@ -138,7 +138,8 @@ class ArmSupervisor:
             raise error
         self._robot.stop()
         if lapse_s:
-            self._tell_lapse(str(error))
+            asks = lapse_s >= ASKS_AFTER_LAPSE_S or self._control.held.is_set()
+            self._tell_lapse(str(error) if asks else _may_go_on(lapse_s))
         if lapse_s >= ASKS_AFTER_LAPSE_S:
             if self._stand is None:
                 raise error
@@ -254,3 +255,11 @@ class ArmSupervisor:
         arm = self._robot.wait_settled()
         self._settled = SettledPose(arm, arm.base_from_flange @ self._rig.flange_from_camera.matrix())
         return self._settled
+
+
+def _may_go_on(lapse_s: float) -> str:
+    """What is said of a lapse after which no person is asked."""
+    return (
+        f"robot: nobody looked at its motion for {lapse_s:.2f} s (the program stood still, or waited for "
+        "something), so it braked on its path. It may move on by itself at any moment: keep clear of it."
+    )

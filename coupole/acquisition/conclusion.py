@@ -68,6 +68,7 @@ def conclude(run: Run, console: Console) -> None:
         if call := hangs(DISK):
             raise StorageError(f"{call}: the disk does not answer")
         views, size = on_disk(str(run.folder), lambda: _report(run), _REPORT_S)
+        console.print(f"  report  {run.report_path}")
         if size > MOST_HASHED_BYTES:
             console.print(
                 f"  {bytes_text(size)} of frames are not in {manifest.NAME} yet: "

@@ -62,7 +62,7 @@ class LightOnObject:
         """`before_lux_h` [points] was given by earlier sessions of the same run. Raises StorageError if the ledger
         cannot be read and written."""
         measured = job.plan.object
-        self._ledger = ledger_of(job.cell, measured.id) if measured else None
+        self._ledger = ledger_of(job.cell, measured.id, only_grows=True) if measured else None
         self._enters = self._ledger is not None and not cell.simulated
         if self._ledger is not None and self._enters:
             _answered(self._ledger, self._ledger.prove_writable)

@@ -188,7 +188,7 @@ def _show_live(
             server.shutdown()
             server.server_close()
     if control.stop.is_set():  # what failed then was ended by `halt`
-        if control.signal_number != signal.SIGINT:  # Ctrl-C is how a live view ends
+        if control.signal_number != signal.SIGINT or control.held_because:  # Ctrl-C is how a live view ends
             raise control.interrupted()
     elif failures:
         raise failures[0]

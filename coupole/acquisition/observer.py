@@ -101,6 +101,7 @@ class Control:
     def hold(self, why: str) -> None:
         """Stand at once, wherever the session is; the first reason counts until it stands."""
         if not self.can_stand:
+            self.held_because = why
             self.stop_by(signal.SIGINT)
             return
         if not self.held.is_set():
@@ -112,6 +113,9 @@ class Control:
         """The error that ends a stopped session."""
         word = "stopped by the operator" if self.signal_number == signal.SIGINT else "stopped"
         name = signal.Signals(self.signal_number).name
+        if self.held_because and not self.can_stand:
+            why = f"{self.held_because}; this cannot stand and go on, so it was ended"
+            return Interrupted(why, self.signal_number)
         return Interrupted(f"{word} ({name}); everything proven so far is kept", self.signal_number)
 
     @property

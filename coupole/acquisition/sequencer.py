@@ -121,12 +121,12 @@ class Sequencer:
             raise
         finally:
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
-            self._conclude(self._recorder.proven())
+            self.conclude(self._recorder.proven())
         if self.outcome.missing or self.outcome.missing_darks:
             raise UnprovenError(self._say_missing())
         return self.outcome
 
-    def _conclude(self, done: set[ShotId]) -> None:
+    def conclude(self, done: set[ShotId]) -> None:
         """The outcome's figures, if these shots are proven."""
         self.outcome.dose_lux_h = self._dose.lux_h_in_all
         self.outcome.proven = sum(shot.is_shot for shot in done)
@@ -139,7 +139,7 @@ class Sequencer:
         """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
         The light of a burst under way counts as planned."""
         self._dose.give_up()
-        self._conclude(done)
+        self.conclude(done)
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)

@@ -279,6 +279,8 @@ def _acquire(
             recorder.close_quietly()
             if left_behind():
                 sequencer.give_up(recorder.committed)
+            else:
+                sequencer.conclude(recorder.committed)
             found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, ended)
 
@@ -319,7 +321,7 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
         f"{ended}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
         f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
     )
-    console.print(f"  frames  {run.folder / 'views'}\n  report  {run.folder / 'report.html'}")
+    console.print(f"  frames  {run.folder / 'views'}")
     if ended != "done":
         console.print(f"  go on   {run.go_on_command}")
 

@@ -196,7 +196,8 @@ def _suspend(control: Control, act: Callable[[], object]) -> None:
     """Ctrl-Z: first the cell is safe, then the process stops; when it goes on, a person is asked."""
     _hold(control, act, "suspended by Ctrl-Z: the lights were switched off and the arm was stopped first")
     state = "; ".join(control.unsure) or "lights are off, the arm is at rest"
-    _tell(f"\n{state}; suspended (`fg` continues the program, the run then asks)\n")
+    then = "the run then asks" if control.can_stand else "which then ends"
+    _tell(f"\n{state}; suspended (`fg` continues the program, {then})\n")
     os.kill(os.getpid(), signal.SIGSTOP)
     time.sleep(_STOPS_WITHIN_S)
     control.pulse_s = time.monotonic()

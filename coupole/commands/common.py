@@ -77,9 +77,12 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
         cell = read_plan(plan, rig).cell
     elif resume is not None:
         begun_with = rig or Path(Run(resume).about["rig"]["path"])
-        if not begun_with.is_file():
-            return None
-        cell = read_cell(begun_with)
+        try:
+            cell = read_cell(begun_with)
+        except InputError:
+            if rig is not None:
+                raise
+            return None  # a run needs nothing outside its folder
     else:
         return None
     return cell if is_served(cell) else None

@@ -49,8 +49,11 @@ _NAME: TypeAdapter[str] = TypeAdapter(Name)
 class Ledger:
     """The ledger of one object in `folder`; entries in `former_folder`, the place of version 0.1, count too."""
 
-    def __init__(self, folder: Path, object_id: str, former_folder: Path | None = None) -> None:
-        """Raises InputError for an id that no plan can have."""
+    def __init__(
+        self, folder: Path, object_id: str, former_folder: Path | None = None, *, only_grows: bool = False
+    ) -> None:
+        """`only_grows`: `newest`, `plan` and `ask_again` raise StorageError if lines that were read are gone, or
+        if it is no text. Raises InputError for an id that no plan can have."""
         try:
             self.object_id = _NAME.validate_python(object_id)
         except ValidationError as error:
@@ -60,7 +63,7 @@ class Ledger:
             ) from error
         self.folder, self._former_folder = folder, former_folder
         self.path = folder / f"{object_id}.jsonl"
-        self._reading = Reading()
+        self._reading = Reading(only_grows=only_grows)
 
     def read(self) -> History:
         """Raises StorageError if a file cannot be read."""
@@ -69,9 +72,9 @@ class Ledger:
 
     def newest(self) -> History:
         """The same as `read`, for who asks often: only lines that are new are read. Not to be changed."""
+        self._reading = self._reading.renewed(self.path)
         if self._former_folder is not None and (self._former_folder / self.path.name).exists():
             return self.read()
-        self._reading = self._reading.renewed(self.path)
         return self._reading.history
 
     def plan(self, run: str, dose_lux_h: float, damage_wh_m2: float | None, asked: Asked | None = None) -> str:
@@ -171,9 +174,9 @@ class Ledger:
                 return
 
 
-def ledger_of(cell: Cell, object_id: str) -> Ledger:
+def ledger_of(cell: Cell, object_id: str, *, only_grows: bool = False) -> Ledger:
     """The ledger of an object in the place that the cell's rig names."""
-    return Ledger(cell.ledger_folder, object_id, cell.former_ledger_folder)
+    return Ledger(cell.ledger_folder, object_id, cell.former_ledger_folder, only_grows=only_grows)
 
 
 def similar_ids(folder: Path, object_id: str) -> list[str]:

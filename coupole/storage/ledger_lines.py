@@ -196,8 +196,11 @@ def history_of(texts: list[bytes]) -> History:
 class Reading:
     """What has been read of a ledger that others go on writing."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, only_grows: bool = False) -> None:
+        """`only_grows`: once lines were read, the file must keep them, and must be text; `renewed` raises
+        StorageError otherwise."""
         self.history = History()
+        self._only_grows = only_grows
         self._inode, self._read_bytes, self._tail = 0, 0, b""
 
     def renewed(self, path: Path) -> Reading:
@@ -205,21 +208,38 @@ class Reading:
         StorageError."""
         try:
             with path.open("rb") as file:
-                return self._with_rest(file)
+                return self._with_rest(path, file)
         except FileNotFoundError:
-            return Reading()
+            self._refuse_loss(path, "was removed")
+            return Reading(only_grows=self._only_grows)
         except OSError as error:
             raise _unreadable(path, error) from error
 
-    def _with_rest(self, file: BinaryIO) -> Reading:
+    def _refuse_loss(self, path: Path, what: str) -> None:
+        if self._only_grows and self._read_bytes:
+            raise StorageError(
+                f"{path}: the dose ledger {what} while light was given, so nobody knows what the object may "
+                "still receive. Put it back, then go on."
+            )
+
+    def _with_rest(self, path: Path, file: BinaryIO) -> Reading:
         inode, begin = os.fstat(file.fileno()).st_ino, self._read_bytes - len(self._tail)
         file.seek(begin)
-        if inode != self._inode or file.read(len(self._tail)) != self._tail:
+        if file.read(len(self._tail)) != self._tail:
+            self._refuse_loss(path, "lost lines, or is another file,")
+            found = Reading(only_grows=self._only_grows)
             file.seek(0)
+        elif inode != self._inode and not self._only_grows:
             found = Reading()
+            file.seek(0)
         else:
             found = self
         rest, _, _ = (file.read()).rpartition(b"\n")
+        if self._only_grows and b"\0" in rest:
+            raise StorageError(
+                f"{path}: expected text in UTF-8, found bytes 0 (UTF-16, or a damaged file), so nobody "
+                "knows what the object may still receive. Restore the dose ledger, then go on."
+            )
         if rest:
             for text in rest.split(b"\n"):
                 found.take(text)

@@ -205,7 +205,7 @@ class UrRobot:
             moving=state.still_samples < self.settings.settle_samples,
             fault=state.fault,
             condition=_condition(state),
-            unattended_s=self._attention.longest_gap_s if state.lapses != self._lapses else 0.0,
+            unattended_s=self._attention.longest_gap_s() if state.lapses != self._lapses else 0.0,
         )
 
     def stop(self) -> None:
@@ -284,7 +284,7 @@ class UrRobot:
         if self._number != number:
             raise overtaken()
         if state.lapses != self._lapses:
-            raise ArmUnattended(self._attention.longest_gap_s)
+            raise ArmUnattended(self._attention.longest_gap_s())
         return state.command == number and self._is_still(state)
 
     def _is_still(self, state: State) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,6 +34,8 @@ class Arm:
         self.done: list[str] = []
         self.still_deg: Any = HERE_DEG
         self.silent, self.fault = False, ""
+        self.unattended_s: list[float] = []
+        """Lapses to come: at each, the arm brakes half-way."""
 
     def now_ns(self) -> int:
         return int(self.now * 1e9)
@@ -54,6 +57,10 @@ class Arm:
         self.t_ns += not self.silent
         if self.share >= 1.0:
             return self._state(self.still_deg, moving=False)
+        if self.share >= 0.5 and self.unattended_s:
+            self.still_deg = self.from_deg + 0.5 * (self.to_deg - self.from_deg)
+            self.share = 1.0
+            return replace(self._state(self.still_deg, moving=False), unattended_s=self.unattended_s.pop())
         self.share += 0.1
         joints_deg = self.from_deg + min(1.0, self.share) * (self.to_deg - self.from_deg)
         joints_deg = np.add(joints_deg, [MRAD_DEG * self._off_mrad(self.share), 0, 0, 0, 0, 0])
@@ -88,6 +95,28 @@ def supervised(monkeypatch: pytest.MonkeyPatch) -> Callable[[Arm], ArmSupervisor
         return supervisor
 
     return supervise
+
+
+@pytest.mark.parametrize(("lapse_s", "asks"), [(0.4, False), (6.0, True)])
+def test_nobody_is_sent_to_the_cell_while_the_arm_may_move_on_by_itself(
+    supervised: Supervise, lapse_s: float, asks: bool
+) -> None:
+    arm, told, stood = Arm(), list[str](), list[str]()
+    arm.unattended_s = [lapse_s]
+    supervisor = supervised(arm)
+    supervisor._tell_lapse = told.append
+    supervisor._control.can_stand = True
+
+    def stand() -> None:
+        stood.append("stood")
+        supervisor._control.held.clear()
+
+    supervisor._stand = stand
+    supervisor.go(VISIT)
+    assert arm.done == ["move", "stop", "move"]
+    (text,) = told
+    assert ("See that the cell is clear, then go on" in text) == asks == bool(stood)
+    assert ("It may move on by itself at any moment: keep clear of it" in text) != asks
 
 
 VISIT: Any = SimpleNamespace(leg=SimpleNamespace(waypoints=[THERE_DEG]))

@@ -136,9 +136,9 @@ class _Session:
         whose, seconds = STOPS[kind]
         self.frozen += 1
         try:
-            cells.wait_until(lambda: _state(pid) in "TZ", "a frozen process")
+            cells.wait_until(lambda: cells.state_of(pid) in "TZ", "a frozen process")
             time.sleep(seconds)
-            if watched and not self.case.call2 and _state(pid) == "T":
+            if watched and not self.case.call2 and cells.state_of(pid) == "T":
                 self.case.wrong += self._wrong_while_frozen(whose, kind)
         finally:
             self.frozen -= 1
@@ -179,14 +179,6 @@ class _Session:
             found = sorted(storage.glob("2*/run.json"))
             if found and self.case.call and not self.frozen:
                 self.case.asked |= go_on(found[0].parent, cast("Any", self))
-
-
-def _state(pid: int) -> str:
-    """As the kernel has it: T stopped, Z ended."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return "Z"
 
 
 def drawn_kind() -> str:

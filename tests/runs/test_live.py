@@ -221,6 +221,24 @@ def test_a_camera_that_is_unplugged_ends_the_live_view_with_four(cell: CellFolde
     assert "camera: expected" in ended.err
 
 
+def test_a_live_view_that_was_suspended_by_ctrl_z_does_not_light_again_and_says_so(cell: CellFolder) -> None:
+    with cell.world() as world:
+        cell.join()
+        with live(cell.plan) as (viewer, process):
+            viewer.choose({"led": 640, "exposure_us": 8000})
+            cells.wait_until(lambda: world.ask("state")["shining"], "a lamp")
+            process.send_signal(signal.SIGTSTP)
+            cells.wait_until(lambda: cells.state_of(process.pid) == "T", "a stopped process")
+            assert not world.ask("state")["shining"]
+            process.send_signal(signal.SIGCONT)
+            ended = cells.finish(process)
+        assert ended.code == 130
+        assert "which then ends" in ended.err
+        assert "suspended by Ctrl-Z" in ended.err
+        assert "cannot stand and go on, so it was ended" in ended.err
+        assert not world.ask("state")["shining"]
+
+
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGHUP, 129, marks=pytest.mark.full)]
 )

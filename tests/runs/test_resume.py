@@ -208,6 +208,18 @@ def test_comments_another_order_and_another_place_of_a_file_are_no_change(killed
     Run(run).refuse_changes(read_job(cell.plan).inputs)
 
 
+@pytest.mark.parametrize("text", ["", "name: another\n", "[" * 50])
+def test_a_run_goes_on_with_its_own_copies_whatever_became_of_the_rig_it_began_with(
+    killed: Killed, tmp_path: Path, text: str
+) -> None:
+    cell, run = killed.copy(tmp_path)
+    about = run / "run.json"
+    about.write_text(about.read_text().replace(str(killed.folder), str(tmp_path)))  # it began here
+    cell.rig.write_text(text)
+    resumed = cells.here("acquire", "--resume", run, "--yes", "--json")
+    assert resumed.code == 0, resumed
+
+
 def test_a_folder_that_is_no_run_is_not_resumed(cell: CellFolder) -> None:
     assert cell.acquire("--resume", cell.folder).code == 2
 

@@ -10,7 +10,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cells
 import pytest
+from cells import SIDE, TOP, CellFolder
 from view_files import FORMAT, METADATA, SLOTS, frame
 
 from coupole.errors import DiskFull
@@ -22,13 +24,12 @@ from coupole.storage.view_writer import ViewWriter
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 1 MiB of its own."""
-    disk = tmp_path / "disk"
+def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A disk of its own, of 1 MiB or so many as are asked for."""
+    disk, mib = tmp_path / "disk", getattr(request, "param", 1)
     disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], check=False, capture_output=True, text=True
-    )
+    words = ["mount", "-t", "tmpfs", "-o", f"size={mib}m", "tmpfs", str(disk)]
+    mounted = subprocess.run(words, check=False, capture_output=True, text=True)
     if mounted.returncode != 0:
         pytest.skip(f"cannot mount a small tmpfs here: {mounted.stderr.strip()}")
     yield disk
@@ -40,6 +41,15 @@ def fill(disk: Path, leave_bytes: int) -> None:
     facts = os.statvfs(disk)
     with (disk / "ballast").open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, facts.f_bavail * facts.f_frsize - leave_bytes)
+
+
+def _filled(disk: Path) -> bool:
+    """False if somebody else took some of the space meanwhile."""
+    try:
+        fill(disk, 0)
+    except OSError:
+        return False
+    return True
 
 
 def test_a_view_for_which_there_is_no_room_is_refused_and_leaves_no_file(small_disk: Path) -> None:
@@ -113,3 +123,24 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
     assert done.stdout.strip() == "StorageError"
     assert [event.event for event in journal.read(path)] == ["journal", "start"]
     assert path.read_bytes().endswith(b"\n")
+
+
+@pytest.mark.parametrize("small_disk", [64], indirect=True)
+def test_a_session_whose_disk_filled_up_claims_no_frame_that_the_run_does_not_have(
+    small_disk: Path, tmp_path: Path
+) -> None:
+    cell = CellFolder(tmp_path)
+    cell.rig_data["storage"]["folder"] = str(small_disk / "storage")
+    cell.write(views=[TOP, SIDE], lights={"kind": "every", "every": 5})
+    process = cells.start("acquire", cell.plan, "--yes")
+    views = cells.wait_until(lambda: [*small_disk.glob("storage/*/views/*.h5")], "a view's file")
+    cells.wait_until(lambda: _filled(small_disk), "a full disk")
+    ended = cells.finish(process)
+    run = views[0].parent.parent
+    assert ended.code == 6
+    told = cells.here("status", run, "--json").document
+    said = " ".join((ended.out + ended.err).split())
+    assert f"failed: {told['proven']} of {told['shots']} shots proven" in said
+    (small_disk / "ballast").unlink()
+    assert cells.here("acquire", "--resume", run, "--yes", "--json").code == 0
+    cells.assert_each_shot_proven_once(run)

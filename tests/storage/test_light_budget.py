@@ -7,6 +7,7 @@ import fcntl
 import json
 import math
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import cells
@@ -14,7 +15,7 @@ import pytest
 from cells import CellFolder
 from forks import fork_context
 
-from coupole.errors import DoseBudgetReached, InputError
+from coupole.errors import DoseBudgetReached, InputError, StorageError
 from coupole.storage.ledger import Ledger
 from coupole.storage.ledger_lines import Asked, LightEntered
 
@@ -212,6 +213,55 @@ def test_a_ledger_that_somebody_edits_is_read_anew(tmp_path: Path, how: str) -> 
     else:
         ledger.path.write_text(first if how == "shortened" else text.replace("1.0", "7.0"))
     assert ledger.newest() == Ledger(tmp_path, "shroud").read()
+
+
+def _removed(path: Path) -> None:
+    path.rename(path.with_suffix(".elsewhere"))
+
+
+def _emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _another(path: Path) -> None:
+    path.unlink()
+    Ledger(path.parent, path.stem).enter(0.1, "somebody else's file")
+
+
+def _in_utf_16(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + "\n".join(["{}", "{}", ""]).encode("utf-16"))
+
+
+@pytest.mark.parametrize("harm", [_removed, _emptied, _another, _in_utf_16])
+@pytest.mark.parametrize("reads", ["newest", "plan", "ask_again"])
+def test_whoever_gives_light_does_not_forget_a_budget_with_the_file_that_had_it(
+    tmp_path: Path, harm: Callable[[Path], None], reads: str
+) -> None:
+    Ledger(tmp_path, "shroud").set_budget(1.0, "A. Keeper")
+    ours = Ledger(tmp_path, "shroud", only_grows=True)
+    plan = ours.plan("a run", 0.4, None, asked(0.4))
+    Ledger(tmp_path, "shroud").enter(0.1, "studio")
+    assert ours.newest().total_lux_h == pytest.approx(0.5)
+    harm(ours.path)
+    asks: dict[str, Callable[[], object]] = {
+        "newest": ours.newest,
+        "plan": lambda: ours.plan("a run", 0.7, None, asked(0.7)),
+        "ask_again": lambda: ours.ask_again(asked(0.7), plan),
+    }
+    for _ in range(2):  # nor when it is asked again
+        with pytest.raises(StorageError, match="nobody knows what the object may still"):
+            asks[reads]()
+
+
+def test_a_copy_of_a_ledger_with_more_lines_may_take_its_place(tmp_path: Path) -> None:
+    """As a network disk's client or an editor leaves it."""
+    ours = Ledger(tmp_path, "shroud", only_grows=True)
+    give(ours, 0.4)
+    copy = tmp_path / "copy"
+    copy.write_bytes(ours.path.read_bytes())
+    copy.replace(ours.path)
+    Ledger(tmp_path, "shroud").enter(0.1, "studio")
+    assert ours.newest().total_lux_h == pytest.approx(0.5)
 
 
 def test_a_ledger_with_a_former_place_counts_that_too(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ class KukaEki:
                 raise overtaken()
             self._look()
             if watch.lapsed and not watch.moving:
-                raise ArmUnattended(self._attention.longest_gap_s)
+                raise ArmUnattended(self._attention.longest_gap_s())
             return watch.taken_ms is not None and watch.settled_cycles >= settings.settle_cycles
 
         self._wait(settled, limit_s, "the arm at its target and still")
@@ -164,7 +164,7 @@ class KukaEki:
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
                 condition=_condition(status),
-                unattended_s=self._attention.longest_gap_s if self._watch.lapsed else 0.0,
+                unattended_s=self._attention.longest_gap_s() if self._watch.lapsed else 0.0,
             )
 
     def stop(self) -> None:

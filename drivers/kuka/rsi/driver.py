@@ -150,7 +150,7 @@ class KukaRsi:
             t_ns=self._message_time.since_ns(state.packets),
             moving=self._moves(state),
             fault=state.fault_text.decode(errors="replace"),
-            unattended_s=self._attention.longest_gap_s if state.lapses != self._lapses else 0.0,
+            unattended_s=self._attention.longest_gap_s() if state.lapses != self._lapses else 0.0,
         )
 
     def stop(self) -> None:
@@ -271,7 +271,7 @@ class KukaRsi:
         if self._command is not command:
             raise overtaken()
         if state.lapses != self._lapses:
-            raise ArmUnattended(self._attention.longest_gap_s)
+            raise ArmUnattended(self._attention.longest_gap_s())
         return state.command == command.number and state.settled_cycles >= self.settings.settle_cycles
 
     def _moves(self, state: shared_state.State) -> bool:

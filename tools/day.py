@@ -33,6 +33,7 @@ since the moment of a sample is any."""
 KEPT_BYTES = 400
 """What the controller may keep of each frame besides: which shots are proven, and where."""
 WRAP_S = 2**32 / 1e6
+MOST_SESSIONS = 20
 WHO = ("controller", "arm's process", "world")
 
 
@@ -46,11 +47,8 @@ def main() -> int:
     options.keep.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="coupole-day-", dir=options.keep.parent) as folder:
         cell = cell_in(Path(folder), options.hours, options.leds, options.speed)
-        with cell.world(**WORLD) as world, cell.start_acquire(anew=True) as process:
-            try:
-                day = _followed(Watcher(cell, world, process, seed=0), options.hours)
-            finally:
-                process.kill()
+        with cell.world(**WORLD) as world:
+            day = _followed(Watcher(cell, world, seed=0), options.hours)
         wrong = wrong_at_the_end(cell, day)
     options.keep.write_text("".join(json.dumps(sample) + "\n" for sample in day.samples))
     return report(day, wrong)
@@ -59,7 +57,7 @@ def main() -> int:
 def _followed(watcher: Watcher, hours: float) -> Day:
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task("hours of the rig", total=hours)
-        for _ in watcher.follow():
+        for _ in watcher.follow(MOST_SESSIONS):
             bar.update(task, completed=watcher.day.hours)
     return watcher.day
 
@@ -69,8 +67,11 @@ def report(day: Day, wrong: list[str]) -> int:
     console = Console(soft_wrap=True, highlight=False)
     console.print(
         f"{day.hours:.2f} h of the rig's clock ({day.hours * 3600.0 / WRAP_S:.1f} turns of a counter of 32 bits "
-        f"in us), {day.labels} labels, {day.dropped} edges dropped, {len(day.mislabelled)} mislabelled"
+        f"in us), {day.labels} labels, {day.dropped} edges dropped, {len(day.mislabelled)} mislabelled, "
+        f"{1 + len(day.ends)} sessions"
     )
+    for text in day.ends:
+        console.print(f"ended, and resumed: {text}", markup=False)
     shots = [sample for sample in day.samples if sample["labels"] < day.labels]  # then the report is written
     warm = [sample for sample in shots if sample["labels"] >= WARM_UP_SHARE * day.labels] or day.samples
     labels = warm[-1]["labels"] - warm[0]["labels"]

@@ -44,6 +44,8 @@ class Day:
     dropped: int = 0
     ended: Ended = field(default_factory=lambda: Ended(-1, "", ""))
     mislabelled: list[str] = field(default_factory=list)
+    ends: list[str] = field(default_factory=list)
+    """Why sessions ended before the run was done."""
     samples: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -65,17 +67,32 @@ def cell_in(folder: Path, hours: float, leds: int, speed: float) -> CellFolder:
 
 
 class Watcher:
-    """Follows a run from outside, until it ends."""
+    """Follows a run from outside, session by session, until it is done."""
 
-    def __init__(self, cell: CellFolder, world: World, process: subprocess.Popen[str], seed: int) -> None:
-        self._cell, self._world, self._process = cell, world, process
+    def __init__(self, cell: CellFolder, world: World, seed: int) -> None:
+        self._cell, self._world = cell, world
         self._random = random.Random(seed)
         self._shone: dict[int, dict[int, float]] = {}
         self._seen_exposures = self._seen_bytes = 0
+        self._process: subprocess.Popen[str]
         self.day = Day()
 
-    def follow(self) -> Iterator[Day]:
-        """After each sample, and at the end, the day so far."""
+    def follow(self, most_sessions: int = 1) -> Iterator[Day]:
+        """After each sample, and at the end, the day so far. A session that ends by an error of a device (a machine
+        that stands still for a moment stands still for long on a clock that runs fast) is told, and resumed."""
+        for number in range(most_sessions):
+            resumed = ("--resume", self._cell.run_folder) if number else ()
+            with self._cell.start_acquire(*resumed, anew=True) as self._process:
+                try:
+                    yield from self._follow()
+                finally:
+                    self._process.kill()
+            if self.day.ended.code != DeviceError.exit_code:
+                return
+            self.day.ends.append(self.day.ended.err.strip().splitlines()[-1])
+            self._shone.clear()
+
+    def _follow(self) -> Iterator[Day]:
         run = self._cell.run_folder
         cells.wait_until((run / "journal.jsonl").exists, "a journal")
         next_s = began_s = 0.0

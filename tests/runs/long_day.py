@@ -78,8 +78,8 @@ class Watcher:
         self.day = Day()
 
     def follow(self, most_sessions: int = 1) -> Iterator[Day]:
-        """After each sample, and at the end, the day so far. A session that ends by an error of a device (a machine
-        that stands still for a moment stands still for long on a clock that runs fast) is told, and resumed."""
+        """After each sample, and at the end, the day so far. A session that ends by an error of a device is told,
+        and resumed: a machine that stands still for a moment does so for long on a clock that runs fast."""
         for number in range(most_sessions):
             resumed = ("--resume", self._cell.run_folder) if number else ()
             with self._cell.start_acquire(*resumed, anew=True) as self._process:

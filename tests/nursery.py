@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fork_account import ForkAccount
 from numba.core.dispatcher import Dispatcher
 from numba.np.ufunc import parallel
 from places import REPO
@@ -41,12 +42,14 @@ class Nursery:
     def __init__(self, line: socket.socket | None = None) -> None:
         self._line = line
         self._asking = threading.Lock()
+        self.account: Path | None = None
+        """A folder for what each fork used (tests/time_account.py)."""
 
     def _open(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, __file__], stdin=theirs, start_new_session=True, cwd=REPO
+                [sys.executable, __file__, *([str(self.account)] if self.account else [])], stdin=theirs, start_new_session=True, cwd=REPO
             )
         return ours
 
@@ -107,17 +110,19 @@ NURSERY = Nursery()
 """That of the tests' process."""
 
 
-def serve(line: socket.socket) -> None:
+def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
     """Fork a world or a command for each message, until the line is closed."""
     for module in ("sim.world.world", "trimesh"):  # which takes a third of a second, where there is a mesh
         importlib.import_module(module)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them here
+    signal.signal(signal.SIGCHLD, account.bury if account else signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     lines = [line]
     while True:
         for asking in select.select(lines, [], [])[0]:
             message, fds, _, _ = socket.recv_fds(asking, MOST_BYTES, FDS)
             if not message and asking is line:
+                if account:
+                    account.close()
                 return
             if not message:
                 lines.remove(asking)
@@ -130,6 +135,8 @@ def serve(line: socket.socket) -> None:
             gc.freeze()  # a fork that went through all of this would have to copy it
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             if pid := os.fork():
+                if account:
+                    account.forked(pid, asking, ours)
                 asking.send(pid.to_bytes(8, "little"))
                 for end in (*fds, theirs.detach()):
                     os.close(end)
@@ -137,7 +144,8 @@ def serve(line: socket.socket) -> None:
                 continue
             for other in (*lines, ours):
                 other.close()
-            live(arguments, folder, environment, fds, Nursery(theirs), learnt)
+            ended = account.of_fork() if account else None
+            live(arguments, folder, environment, fds, Nursery(theirs), learnt, ended)
 
 
 def live(
@@ -147,6 +155,7 @@ def live(
     fds: list[int],
     nursery: Nursery,
     learnt: socket.socket,
+    ended: Callable[[], None] | None,
 ) -> NoReturn:
     """In a fork: be the world, or the command with these arguments, and tell the exit code."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -167,6 +176,8 @@ def live(
     code = exit_code(commanded(arguments, nursery) if arguments else world.main)
     if new := signatures() - known:
         learnt.send(pickle.dumps(new))
+    if ended:
+        ended()
     os.write(told, bytes([code]))
     os._exit(code)
 
@@ -251,4 +262,4 @@ def start_threads() -> None:
 
 if __name__ == "__main__":
     sys.path[:0] = [str(REPO)]
-    serve(socket.socket(fileno=os.dup(0)))
+    serve(socket.socket(fileno=os.dup(0)), ForkAccount(Path(sys.argv[1])) if sys.argv[1:] else None)

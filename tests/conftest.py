@@ -36,7 +36,7 @@ settings.load_profile("coupole")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--full", action="store_true", help="full scale: minutes to an hour instead of seconds")
-    parser.addoption("--account", metavar="FOLDER", help="folder for what each test spends (tools/where_seconds_go.py)")
+    parser.addoption("--account", metavar="FOLDER", help="for tools/where_seconds_go.py: what each test spends")
 
 
 def pytest_configure(config: pytest.Config) -> None:

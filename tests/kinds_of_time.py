@@ -1,8 +1,9 @@
-"""Tells what a process spends its time on: imports, numba, the start of processes and waiting for them, the browser,
-Mitsuba. What runs inside something else counts only there: an import that numba makes is an import.
+"""What a process spends its time on: imports, numba, starting processes and waiting for them, the browser,
+Mitsuba.
 
-CPU seconds are those of the calling thread, but for Mitsuba, which has threads of its own: there, the process's. Wall
-seconds are those of the main thread.
+Each moment is counted once: an import inside of numba's compiler is an import. CPU seconds are those of the
+calling thread. Mitsuba has threads of its own: there, they are those of the process. Wall seconds are the main
+thread's.
 """
 
 from __future__ import annotations

@@ -48,8 +48,9 @@ class Nursery:
     def _open(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
+            account = [str(self.account)] if self.account else []
             self._process = subprocess.Popen(
-                [sys.executable, __file__, *([str(self.account)] if self.account else [])], stdin=theirs, start_new_session=True, cwd=REPO
+                [sys.executable, __file__, *account], stdin=theirs, start_new_session=True, cwd=REPO
             )
         return ours
 

@@ -1,8 +1,8 @@
 """What each test spends, for tools/where_seconds_go.py: a line of JSON for each test, process and end of a worker.
 
-A test's own CPU seconds are those of the tests' process from its set-up to its tear-down; fixtures that several tests
-share are the first one's. Those of a process are what the system says of it at its end (`wait4`, with its waited-for
-children), and are of the test that started it, whenever it ends.
+A test's own CPU seconds are those of the tests' process from its set-up to its tear-down. A fixture that several
+tests share counts for the first. The CPU seconds of a process are what `wait4` says at its end, with the
+children that it waited for. They count for the test that started it, whenever it ends.
 """
 
 from __future__ import annotations

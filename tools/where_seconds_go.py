@@ -1,22 +1,26 @@
-"""Where the seconds of the tests go, by room (a folder of tests) and by kind: `python tools/where_seconds_go.py
-[--workers N] [--show] [PATH ...]`.
+"""Where the seconds of the tests go, by room (a folder of tests) and by kind.
 
-Runs the tests (all, or these paths) with pytest's `--account` and prints two tables and the dearest tests; what was
-counted stays in `runs/where_seconds_go`, and `--show` prints it again. CPU seconds, of all processes together:
+`python tools/where_seconds_go.py [--workers N] [--show] [PATH ...]` runs the tests (all, or these paths) with
+pytest's `--account`. It prints two tables and the dearest tests. The counts stay in `runs/where_seconds_go`;
+`--show` prints them again. Unknown options go to pytest.
 
-- *imports*, *compile*, *load* (numba's compiler; kernels from its cache) and *starts* (calls of `Popen`) are counted
-  inside the tests' process and what its nursery forks (worlds and most commands), without what each holds of another;
-- *world* and *python* are the rest of simulated worlds, and interpreters with all that they do, their imports too,
-  which nobody counts inside them; *browser* and *others* are processes by their names; *mitsuba* is the tests'
-  process while a call of `render` or `load_dict` lasts;
-- *work* is all else: the tests' own, and that of commands.
+CPU seconds, of all processes together:
 
-A process of the room "(workers)" is no test's: start of the tests' processes and of their nurseries, collection of
-the tests, and what the system says of everything beyond all that was accounted for ("rest", in *others*).
+- *starts* (calls of `Popen`), *imports*, *compile* (numba) and *load* (kernels from numba's cache) are counted
+  inside of the tests' process and of what its nursery forks: worlds and most commands.
+- *world*: the rest of simulated worlds.
+- *browser*: Chromium, its driver, and the calls to it.
+- *mitsuba*: the tests' process during `render` and `load_dict`.
+- *python*: interpreters of their own, with all that they do. Nobody looks inside: imports are among it.
+- *others*: other processes.
+- *work*: the rest of the tests' process and of forked commands.
 
-Wall seconds are those of the tests' process, one after the other: *cpu* on a core, *queue* waiting for one, *processes*
-blocked while processes of the test computed (no more than their CPU seconds), and blocked otherwise: in the
-*browser*, *paced* in a test that has a world or a command, or *still*.
+The room "(workers)" is no test's: start of the tests' processes and of their nurseries, collection of the tests,
+and, in *others*, all that the system counted beyond what was accounted for.
+
+Wall seconds of the tests' process: on a core (*cpu*), waiting for a core (*queue*), blocked while processes of
+the test computed (*processes*: at most their CPU seconds), and blocked otherwise: in the *browser*, *paced* (the
+test has a world or a command), or *still*. With several workers the rooms' wall seconds run side by side.
 """
 
 from __future__ import annotations
@@ -108,7 +112,8 @@ def count(paths: list[str], workers: int) -> int:
             else:
                 file.write(json.dumps({"what": "ended", "pid": pid, "name": name, "cpu": cpu_s}) + "\n")
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    about = {"begun": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", "arguments": paths, "workers": workers, "code": code}
+    ended = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    about = {"ended": ended, "arguments": paths, "workers": workers, "code": code}
     (KEPT / "about.json").write_text(json.dumps({**about, "cpu_s": used.ru_utime + used.ru_stime}))
     return code
 
@@ -235,14 +240,14 @@ def show() -> None:
     accounted = sum(spent.cpu_s.total() for spent in rooms.values())
     nobody.cpu_s["others"] += max(0.0, about["cpu_s"] - accounted)
     what = " ".join(about["arguments"]) or "all tests"
-    print(f"{what}, {about['workers']} at a time, to {about['begun']}, exit code {about['code']}:")
+    print(f"{what}, {about['workers']} at a time, ended {about['ended']}, exit code {about['code']}:")
     print(f"{about['cpu_s']:.0f} s of CPU, of which {accounted:.0f} s are accounted for")
     for title, kinds in (("CPU seconds", CPU), ("wall seconds", WALL)):
         of = "cpu_s" if kinds is CPU else "wall_s"
         table(title, kinds, [(room, getattr(spent, of), spent.tests) for room, spent in rooms.items()])
     print(f"\nthe {DEAREST} dearest tests: CPU s, wall s, what most of the CPU was")
     for test, spent in sorted(by_test.items(), key=lambda one: -one[1].cpu_s.total())[:DEAREST]:
-        most = ", ".join(f"{kind} {seconds:.1f}" for kind, seconds in spent.cpu_s.most_common(3) if seconds >= 0.05)
+        most = ", ".join(f"{kind} {used:.1f}" for kind, used in spent.cpu_s.most_common(3) if used >= 0.05)
         print(f"{spent.cpu_s.total():7.1f}{spent.wall_s.total():7.1f}  {test}  ({most})")
 
 

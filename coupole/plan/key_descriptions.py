@@ -1,7 +1,7 @@
 """What the keys of a plan or a rig mean: the docstrings under the fields of their models, read for a JSON schema.
 
-`use_attribute_docstrings` of pydantic reads them when a model is made, in every process: a third of the time that it
-takes to import the models of plans and rigs.
+`use_attribute_docstrings` of pydantic reads them when a model is made, in every process. That took a third of the
+time of importing the models of plans and rigs.
 """
 
 from __future__ import annotations

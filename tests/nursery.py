@@ -34,6 +34,19 @@ from places import REPO
 FDS = 4
 OURS = ("coupole.", "drivers.", "sim.")
 MOST_BYTES = 1 << 16
+WORLDS_IMPORT = ("sim.world.world", "trimesh")
+"""trimesh where there is a mesh: a third of a second."""
+COMMANDS_IMPORT = (
+    "coupole.commands.cli",
+    "coupole.commands.keeping",
+    "coupole.commands.running",
+    "coupole.acquisition.session",
+    "coupole.preflight.job",
+    "py_opw_kinematics",
+    "drivers.kuka.rsi",
+    "drivers.ledbox",
+)
+"""What `acquire` wants, which most commands of the tests are."""
 
 
 class Nursery:
@@ -113,7 +126,7 @@ NURSERY = Nursery()
 
 def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
     """Fork a world or a command for each message, until the line is closed."""
-    for module in ("sim.world.world", "trimesh"):  # which takes a third of a second, where there is a mesh
+    for module in WORLDS_IMPORT:
         importlib.import_module(module)
     signal.signal(signal.SIGCHLD, account.bury if account else signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -131,8 +144,8 @@ def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
                 continue
             arguments, folder, environment = pickle.loads(message)
             learn(lessons)
-            if arguments:
-                importlib.import_module("coupole.commands.cli")
+            for module in COMMANDS_IMPORT if arguments else ():
+                importlib.import_module(module)
             gc.freeze()  # a fork that went through all of this would have to copy it
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             if pid := os.fork():

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 FILE, *ARGUMENTS = sys.argv[1:]
 sys.path[:0] = [str(Path(__file__).resolve().parent.parent)]
 
-from coupole.commands import cli
+from coupole.commands import cli  # noqa: E402  # found by the path above
 
 seen: dict[str, list[str]] = {}
 leave = cli.leave

@@ -36,12 +36,17 @@ settings.load_profile("coupole")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--full", action="store_true", help="full scale: minutes to an hour instead of seconds")
+    parser.addoption("--account", metavar="FOLDER", help="for tools/where_seconds_go.py: what each test spends")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "full: at full scale only; left out without --full")
     if config.getoption("--full"):
         settings.load_profile("coupole at full scale")
+    if folder := config.getoption("--account"):
+        from time_account import Account
+
+        config.pluginmanager.register(Account(Path(folder)))
 
 
 COMPILE_LONGEST = ("tests/calibration/test_corner_fit.py", "tests/runs/test_reflectance_of_other_runs.py")

@@ -27,6 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from fork_account import ForkAccount
 from numba.core.dispatcher import Dispatcher
 from numba.np.ufunc import parallel
 from places import REPO
@@ -37,6 +38,19 @@ OTHERS = ("PIL.", "cffi", "h5py.", "py_opw_kinematics", "rich.", "scipy.", "seri
 IMPORTED_BY_NEED = (*OURS, *OTHERS)
 """What the next forks find imported, once one of them has."""
 MOST_BYTES = 1 << 16
+WORLDS_IMPORT = ("sim.world.world", "trimesh")
+"""trimesh where there is a mesh: a third of a second."""
+COMMANDS_IMPORT = (
+    "coupole.commands.cli",
+    "coupole.commands.keeping",
+    "coupole.commands.running",
+    "coupole.acquisition.session",
+    "coupole.preflight.job",
+    "py_opw_kinematics",
+    "drivers.kuka.rsi",
+    "drivers.ledbox",
+)
+"""What `acquire` wants, which most commands of the tests are."""
 
 
 class Nursery:
@@ -45,12 +59,15 @@ class Nursery:
     def __init__(self, line: socket.socket | None = None) -> None:
         self._line = line
         self._asking = threading.Lock()
+        self.account: Path | None = None
+        """A folder for what each fork used (tests/time_account.py)."""
 
     def _open(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
+            account = [str(self.account)] if self.account else []
             self._process = subprocess.Popen(
-                [sys.executable, __file__], stdin=theirs, start_new_session=True, cwd=REPO
+                [sys.executable, __file__, *account], stdin=theirs, start_new_session=True, cwd=REPO
             )
         return ours
 
@@ -115,17 +132,19 @@ NURSERY = Nursery()
 """That of the tests' process."""
 
 
-def serve(line: socket.socket) -> None:
+def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
     """Fork a world or a command for each message, until the line is closed."""
-    for module in ("sim.world.world", "trimesh"):  # which takes a third of a second, where there is a mesh
+    for module in WORLDS_IMPORT:
         importlib.import_module(module)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them here
+    signal.signal(signal.SIGCHLD, account.bury if account else signal.SIG_IGN)  # nobody waits for them here
     lessons, learnt = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     lines = [line]
     while True:
         for asking in select.select(lines, [], [])[0]:
             message, fds, _, _ = socket.recv_fds(asking, MOST_BYTES, FDS)
             if not message and asking is line:
+                if account:
+                    account.close()
                 return
             if not message:
                 lines.remove(asking)
@@ -133,11 +152,13 @@ def serve(line: socket.socket) -> None:
                 continue
             arguments, folder, environment = pickle.loads(message)
             learn(lessons)
-            if arguments:
-                importlib.import_module("coupole.commands.cli")
+            for module in COMMANDS_IMPORT if arguments else ():
+                importlib.import_module(module)
             gc.freeze()  # a fork that went through all of this would have to copy it
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             if pid := os.fork():
+                if account:
+                    account.forked(pid, asking, ours)
                 asking.send(pid.to_bytes(8, "little"))
                 for end in (*fds, theirs.detach()):
                     os.close(end)
@@ -145,7 +166,8 @@ def serve(line: socket.socket) -> None:
                 continue
             for other in (*lines, ours):
                 other.close()
-            live(arguments, folder, environment, fds, Nursery(theirs), learnt)
+            ended = account.of_fork() if account else None
+            live(arguments, folder, environment, fds, Nursery(theirs), learnt, ended)
 
 
 def live(
@@ -155,6 +177,7 @@ def live(
     fds: list[int],
     nursery: Nursery,
     learnt: socket.socket,
+    ended: Callable[[], None] | None,
 ) -> NoReturn:
     """In a fork: be the world, or the command with these arguments, and tell the exit code."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -183,6 +206,8 @@ def live(
     kernels, modules = signatures() - known, {*sys.modules} - imported
     if kernels or modules:
         learnt.send(pickle.dumps((sorted(filter(_by_need, modules)), kernels)))
+    if ended:
+        ended()
     tell_and_leave(code)
 
 
@@ -279,4 +304,4 @@ def start_threads() -> None:
 
 if __name__ == "__main__":
     sys.path[:0] = [str(REPO), str(REPO / "tests" / "faults")]
-    serve(socket.socket(fileno=os.dup(0)))
+    serve(socket.socket(fileno=os.dup(0)), ForkAccount(Path(sys.argv[1])) if sys.argv[1:] else None)

@@ -8,11 +8,13 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from coupole.errors import Interrupted
 from coupole.supervision import ASKS_FROM_S, HEARD_WITHIN_S
-from coupole.viewing.progress import Progress
+
+if TYPE_CHECKING:
+    from coupole.viewing.progress import Progress
 
 
 class Observer(Protocol):

@@ -19,7 +19,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from coupole.acquisition.observer import Control
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
@@ -27,7 +27,9 @@ from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.acquisition.user_socket import PATIENCE_S, UserSocket, exchange
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import json_of
-from coupole.viewing.progress import Progress
+
+if TYPE_CHECKING:
+    from coupole.viewing.progress import Progress
 
 VERSION = 1
 Command = Literal["pause", "go-on", "stop", "state"]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import sys
 import traceback
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
@@ -13,22 +15,6 @@ import typer
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
 from coupole.bounded import leave
-from coupole.commands import benching, console, exporting, keeping, planning, run_controls, running
-from coupole.commands.bracketing import bracket, sphere_brdf
-from coupole.commands.calibrate import calibrate_app
-from coupole.commands.commissioning import commission
-from coupole.commands.compare_states import compare
-from coupole.commands.doctor import doctor
-from coupole.commands.dose_ledger import dose
-from coupole.commands.identify import identify
-from coupole.commands.layer import layer
-from coupole.commands.recipe import recipe
-from coupole.commands.reflectance import reflectance_app
-from coupole.commands.register_scans import register
-from coupole.commands.render_scene import render
-from coupole.commands.restore import restore_app
-from coupole.commands.show import show
-from coupole.commands.uncertainty import budget
 from coupole.errors import CoupoleError, Interrupted
 from coupole.viewing import text_outlet
 
@@ -36,57 +22,84 @@ AT_A_CELL = {"acquire", "meter", "live", "devices", "bench", "arm", "commission"
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
 """Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
 
+COMMANDS = {
+    "check": "planning.check",
+    "view": "planning.view",
+    "simulate": "planning.simulate",
+    "acquire": "running.acquire",
+    "pause": "run_controls.pause",
+    "stop": "run_controls.stop",
+    "serve": "console.serve",
+    "queue": "console.queue",
+    "meter": "running.meter",
+    "live": "running.live",
+    "devices": "running.devices",
+    "doctor": "doctor.doctor",
+    "bench": "benching.bench",
+    "arm": "benching.arm",
+    "confirm": "running.confirm",
+    "commission": "commissioning.commission",
+    "sim": "running.sim",
+    "status": "keeping.status",
+    "report": "keeping.report",
+    "verify": "keeping.verify",
+    "archive": "keeping.archive",
+    "export": "exporting.export",
+    "scan": "keeping.scan",
+    "identify": "identify.identify",
+    "register": "register_scans.register",
+    "compare": "compare_states.compare",
+    "dose": "dose_ledger.dose",
+    "render": "render_scene.render",
+    "layer": "layer.layer",
+    "bracket": "bracketing.bracket",
+    "sphere-brdf": "bracketing.sphere_brdf",
+    "recipe": "recipe.recipe",
+    "show": "show.show",
+    "budget": "uncertainty.budget",
+    "schema": "planning.schema",
+    "go-on": "run_controls.go_on",
+    "plan": "planning.plan_app",
+    "calibrate": "calibrate.calibrate_app",
+    "reflectance": "reflectance.reflectance_app",
+    "restore": "restore.restore_app",
+}
+"""Module of `coupole.commands` and function, or group of commands, by command; in the order of `--help`."""
+
 app = typer.Typer(
     name="coupole",
     help="Acquisition controller of La Coupole: a plan in, proven frames out.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
-for command in (
-    planning.check,
-    planning.view,
-    planning.simulate,
-    running.acquire,
-    run_controls.pause,
-    run_controls.stop,
-    console.serve,
-    console.queue,
-    running.meter,
-    running.live,
-    running.devices,
-    doctor,
-    benching.bench,
-    benching.arm,
-    running.confirm,
-    commission,
-    running.sim,
-    keeping.status,
-    keeping.report,
-    keeping.verify,
-    keeping.archive,
-    exporting.export,
-    keeping.scan,
-    identify,
-    register,
-    compare,
-    dose,
-    render,
-    layer,
-    bracket,
-    sphere_brdf,
-    recipe,
-    show,
-    budget,
-    planning.schema,
-):
-    app.command()(command)
-app.command("go-on")(run_controls.go_on)
-plan_app.command("new")(planning.plan_new)
-app.add_typer(plan_app, name="plan")
-app.add_typer(calibrate_app, name="calibrate")
-app.add_typer(reflectance_app, name="reflectance")
-app.add_typer(restore_app, name="restore")
+
+
+class _OnDemand(Mapping[str, Any]):
+    """`COMMANDS` as the command line wants them: a module is imported, and its signatures read, when asked for."""
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __contains__(self, name: object) -> bool:
+        return name in COMMANDS
+
+    def __getitem__(self, name: str) -> Any:
+        return _command(name)
+
+
+@functools.cache
+def _command(name: str) -> Any:
+    module, function = COMMANDS[name].split(".")
+    found = getattr(importlib.import_module(f"coupole.commands.{module}"), function)
+    alone = typer.Typer(callback=lambda: None)
+    if isinstance(found, typer.Typer):
+        alone.add_typer(found, name=name)
+    else:
+        alone.command(name)(found)
+    return typer.main.get_group(alone).commands[name]
 
 
 def _print_version(asked: bool) -> None:
@@ -108,8 +121,10 @@ def _options(
 
 @functools.cache
 def _commands() -> Any:
-    """What `app` describes, made once: each of some thirty signatures is read for it."""
-    return typer.main.get_command(app)
+    """What `app` describes, with all commands; made once."""
+    group: Any = typer.main.get_command(app)
+    group.commands = _OnDemand()
+    return group
 
 
 def main() -> None:

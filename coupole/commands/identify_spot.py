@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from coupole.heritage.analysis.references import References
 
 _FARTHEST_EDGES = 3.0
@@ -79,6 +79,7 @@ def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
 def _channels_at(spot: Spot) -> tuple[np.ndarray, np.ndarray]:
     """[3] diffuse reflectance pi kd of the nearest triangle that was fitted, and its relative uncertainty."""
     import h5py
+    import numpy as np
 
     from coupole.reflectance.new_light.light_kinds import place_of
     from coupole.reflectance.run_result import MATERIALS, OBJECT, RunResult

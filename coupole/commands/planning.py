@@ -14,6 +14,8 @@ from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_
 from coupole.commands.completion import plans, runs, schemas, templates
 from coupole.errors import InputError, PreflightRefused
 
+plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
+
 
 def check(
     plan: Annotated[
@@ -143,6 +145,7 @@ def schema(what: Annotated[str, typer.Argument(help="plan or rig", autocompletio
     print(json.dumps(models[what].model_json_schema(), indent=2))
 
 
+@plan_app.command("new")
 def plan_new(
     name: Annotated[
         str,

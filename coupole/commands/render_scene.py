@@ -11,11 +11,10 @@ import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.errors import InputError, StorageError
-from coupole.plan import yamlfile
-from coupole.plan.yamlfile import Document
 
 if TYPE_CHECKING:
     from coupole.appearance.render.scene_file import Scene
+    from coupole.plan.yamlfile import Document
 
 Progress = Callable[[str, int, int], None]
 
@@ -77,6 +76,7 @@ def _noise(seen: dict[str, Any]) -> str:
 def read_scene(path: Path) -> tuple[Document, Scene]:
     """The scene file, checked; its files are there. Raises InputError with file:line:column."""
     from coupole.appearance.render.scene_file import Scene, files
+    from coupole.plan import yamlfile
 
     document = yamlfile.read(path)
     scene = document.validate(Scene)

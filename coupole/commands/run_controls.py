@@ -51,11 +51,12 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
+    sent = _sent(run, "stop")  # before the imports that only its outcome wants
+
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
     from coupole.viewing.terminal import alarm, make_console, show_status
 
-    sent = _sent(run, "stop")
     for trouble in sent["trouble"]:
         alarm(trouble)
     stopped = Run(Path(sent["run"]))

@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from coupole.errors import InputError
-from coupole.plan import yamlfile
-from coupole.plan.rewriting import named_paths, rewritten
-from coupole.plan.rig import Rig
 
 BOARD = """\
 schema_version: 1
@@ -35,6 +32,10 @@ def with_things(rig_path: Path, things: Sequence[Mapping[str, Any]], path: Path,
     """Write a copy of a simulated cell's rig with more things on the support; its paths are absolute, and its runs
     go to `runs` if that is given. Raises InputError."""
     from ruamel.yaml import YAML
+
+    from coupole.plan import yamlfile
+    from coupole.plan.rewriting import named_paths, rewritten
+    from coupole.plan.rig import Rig
 
     document = yamlfile.read(rig_path)
     written = [(at, value) for at, value in named_paths(document.validate(Rig)) if at in document.value_places]

@@ -30,7 +30,7 @@ from typing import Any
 import coupole
 from coupole.errors import InputError, StorageError
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
-from coupole.storage import frame_file, journal, manifest
+from coupole.storage import journal, manifest
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 from coupole.storage.journal_events import (
     JOURNAL_VERSION,
@@ -228,6 +228,8 @@ def _new_folder(parent: Path, name: str) -> Path:
 
 
 def _settled_bytes(view_file: Path) -> int:
+    from coupole.storage import frame_file
+
     layout = frame_file.read_layout(view_file)
     return layout.frames * layout.frame_bytes if layout.archived else view_file.stat().st_blocks * 512
 

@@ -24,15 +24,14 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from coupole.preflight.exposure_scale import HOW_TO_KNOW
-from coupole.storage.run_status import Status
-from coupole.viewing.progress import Outcome, ViewExposure
-from coupole.viewing.progress import Progress as RunProgress
 from coupole.viewing.text_outlet import terminal_size
 
 if TYPE_CHECKING:
     from coupole.preflight.exposure_advice import Advice
+    from coupole.storage.run_status import Status
     from coupole.viewing.live import Shown
+    from coupole.viewing.progress import Outcome, ViewExposure
+    from coupole.viewing.progress import Progress as RunProgress
 
 _PLAIN_LINE_EVERY_S = 5.0
 _WIDE = 110
@@ -226,6 +225,8 @@ def show_dry_run(
     console: Console, exposures: Mapping[str, ViewExposure], outcome: Outcome, found: dict[str, Any]
 ) -> None:
     """Print the result of a dry run."""
+    from coupole.preflight.exposure_scale import HOW_TO_KNOW
+
     console.print(
         f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
         f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"

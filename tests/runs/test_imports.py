@@ -1,0 +1,87 @@
+"""What commands import, and when: as little as they want, and nothing while devices are open."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cells
+from cells import CellFolder
+from places import REPO
+
+from coupole.commands import cli
+
+OURS = ("coupole", "drivers", "sim")
+HEAVY = {"PIL", "cv2", "embreex", "h5py", "matplotlib", "numba", "numpy", "rich", "ruamel", "scipy", "trimesh"}
+LATE = {"pwd", "encodings.ascii"}
+"""Python's own, that tell who acquires and spell a name: nothing that a stop or a safe end waits for."""
+PICTURE = "PIL"
+"""Writes the report's pictures, when the cell is safe."""
+
+
+def watched(file: Path, *arguments: str | Path) -> subprocess.Popen[str]:
+    """The command, in an interpreter of its own that has imported nothing yet."""
+    program = [sys.executable, REPO / "tests/watched_imports.py", file, *arguments]
+    return subprocess.Popen(
+        [*map(str, program)], cwd=REPO, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def modules(file: Path, when: str) -> set[str]:
+    return set(json.loads(file.read_text())[when])
+
+
+def ours(names: set[str]) -> int:
+    return sum(name.split(".")[0] in OURS for name in names)
+
+
+def heavy(names: set[str]) -> set[str]:
+    return HEAVY & {name.split(".")[0] for name in names}
+
+
+def test_help_imports_the_commands_alone(tmp_path: Path) -> None:
+    ended = cells.finish(watched(tmp_path / "seen", "--help"))
+    assert ended.code == 0, ended.err
+    names = modules(tmp_path / "seen", "end")
+    assert heavy(names) == {"rich"}
+    assert ours(names) <= 67
+
+
+def test_each_command_is_found_where_the_table_has_it() -> None:
+    for command in cli.COMMANDS:
+        found = cells.here(command, "--help")
+        assert found.code == 0, found.err
+        assert f" {command} [OPTIONS]" in found.out
+
+
+def test_an_acquisition_that_is_stopped_imports_nothing_while_its_devices_are_open(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path)
+    cell.write(views=[cells.TOP, cells.SIDE], repeats=4)
+    process = watched(tmp_path / "seen", "acquire", cell.plan, "--yes", "--json")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process.send_signal(signal.SIGINT)
+    ended = cells.finish(process)
+    assert ended.code == 130, ended.err
+    opened, safe, end = (modules(tmp_path / "seen", when) for when in ("opened", "safe", "end"))
+    assert safe - opened <= LATE
+    assert {name.split(".")[0] for name in end - safe} <= {PICTURE}
+    assert ours(opened) <= 262
+    assert heavy(opened) == {"embreex", "h5py", "numba", "numpy", "rich", "ruamel", "scipy"}
+
+    asked = cells.finish(watched(tmp_path / "seen by status", "status", run))
+    assert asked.code == 0, asked.err
+    names = modules(tmp_path / "seen by status", "end")
+    assert heavy(names) == {"numpy", "rich", "ruamel"}
+    assert ours(names) <= 48
+
+
+def test_a_stop_is_sent_before_anything_is_imported_that_only_its_outcome_wants(tmp_path: Path) -> None:
+    ended = cells.finish(watched(tmp_path / "seen", "stop", tmp_path))
+    assert ended.code == 2, ended.err
+    names = modules(tmp_path / "seen", "asked")
+    assert heavy(names) == set()
+    assert ours(names) <= 21

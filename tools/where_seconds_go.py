@@ -1,0 +1,266 @@
+"""Where the seconds of the tests go, by room (a folder of tests) and by kind.
+
+`python tools/where_seconds_go.py [--workers N] [--show] [PATH ...]` runs the tests (all, or these paths) with
+pytest's `--account`. It prints two tables and the dearest tests. The counts stay in `runs/where_seconds_go`;
+`--show` prints them again. Unknown options go to pytest.
+
+CPU seconds, of all processes together:
+
+- *starts* (calls of `Popen`), *imports*, *compile* (numba) and *load* (kernels from numba's cache) are counted
+  inside of the tests' process and of what its nursery forks: worlds and most commands.
+- *world*: the rest of simulated worlds.
+- *browser*: Chromium, its driver, and the calls to it.
+- *mitsuba*: the tests' process during `render` and `load_dict`.
+- *python*: interpreters of their own, with all that they do. Nobody looks inside: imports are among it.
+- *others*: other processes.
+- *work*: the rest of the tests' process and of forked commands.
+
+The room "(workers)" is no test's: start of the tests' processes and of their nurseries, collection of the tests,
+and, in *others*, all that the system counted beyond what was accounted for.
+
+Wall seconds of the tests' process: on a core (*cpu*), waiting for a core (*queue*), blocked while processes of
+the test computed (*processes*: at most their CPU seconds), and blocked otherwise: in the *browser*, *paced* (the
+test has a world or a command), or *still*. With several workers the rooms' wall seconds run side by side.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+KEPT = ROOT / "runs/where_seconds_go"
+DEAREST = 30
+WORKERS = "(workers)"
+
+COUNTED = {
+    "imports": "imports",
+    "numba, compiling": "compile",
+    "numba, loading": "load",
+    "start of processes": "starts",
+    "waiting for processes": "work",
+    "browser": "browser",
+    "Mitsuba": "mitsuba",
+}
+"""Kinds of `tests/kinds_of_time.py`, and their columns."""
+CPU = ("starts", "imports", "compile", "load", "world", "browser", "mitsuba", "python", "others", "work")
+WALL = ("cpu", "queue", "processes", "browser", "paced", "still")
+FORKS = ("world", "command")
+PR_SET_CHILD_SUBREAPER = 36
+
+
+@dataclass
+class Spent:
+    """Seconds by kind."""
+
+    cpu_s: Counter[str] = field(default_factory=Counter)
+    wall_s: Counter[str] = field(default_factory=Counter)
+    tests: int = 0
+
+    def add(self, other: Spent) -> None:
+        self.cpu_s.update(other.cpu_s)
+        self.wall_s.update(other.wall_s)
+        self.tests += other.tests
+
+
+@dataclass
+class Process:
+    """One that a test started, or that one of these asked the nursery for."""
+
+    name: str
+    test: str
+    cpu_s: float = 0.0
+    kinds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def column(self) -> str:
+        if self.name in FORKS:
+            return "world" if self.name == "world" else "work"
+        if self.name.startswith("chrom"):
+            return "browser"
+        return "python" if self.name.startswith(("python", "coupole")) else "others"
+
+
+# -- counting ---------------------------------------------------------------------------------------------
+
+
+def count(paths: list[str], workers: int) -> int:
+    """Run the tests and keep what they spend; pytest's exit code."""
+    shutil.rmtree(KEPT, ignore_errors=True)
+    KEPT.mkdir(parents=True)
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # who outlives its parent is waited for here
+    shared = ["-n", str(workers), "--dist", "loadscope", "--no-loadscope-reorder"] if workers > 1 else []
+    command = [sys.executable, "-m", "pytest", *shared, "--account", str(KEPT), *paths]
+    tests = subprocess.Popen(command, cwd=ROOT)
+    code = 0
+    with (KEPT / "outside.jsonl").open("w") as file:
+        for pid, name, status, cpu_s in buried():
+            if pid == tests.pid:
+                code = tests.returncode = os.waitstatus_to_exitcode(status)
+            else:
+                file.write(json.dumps({"what": "ended", "pid": pid, "name": name, "cpu": cpu_s}) + "\n")
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    ended = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    about = {"ended": ended, "arguments": paths, "workers": workers, "code": code}
+    (KEPT / "about.json").write_text(json.dumps({**about, "cpu_s": used.ru_utime + used.ru_stime}))
+    return code
+
+
+def buried() -> Iterator[tuple[int, str, int, float]]:
+    """Each child, and each that lost its parent, when it ends: pid, name, status, CPU seconds."""
+    while True:
+        try:
+            ended = os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+        except ChildProcessError:
+            return
+        assert ended is not None
+        name = Path(f"/proc/{ended.si_pid}/comm").read_text().strip()
+        pid, status, used = os.wait4(ended.si_pid, 0)
+        yield pid, name, status, used.ru_utime + used.ru_stime
+
+
+# -- adding up --------------------------------------------------------------------------------------------
+
+
+def lines() -> list[dict[str, Any]]:
+    return [json.loads(line) for path in sorted(KEPT.glob("*.jsonl")) for line in path.read_text().splitlines()]
+
+
+def processes(found: list[dict[str, Any]]) -> dict[int, Process]:
+    """Those of tests, by pid; a nursery is nobody's, whichever test was its first."""
+    nurseries = {line["pid"] for line in found if line["what"] == "nursery"}
+    known = {
+        line["pid"]: Process(line["name"], line["test"])
+        for line in found
+        if line["what"] == "process" and line["test"] and line["pid"] not in nurseries
+    }
+    for line in found:  # a command's world is of the command's test
+        if line["what"] == "fork" and line["parent"] in known:
+            known[line["pid"]] = Process("world", known[line["parent"]].test)
+    for line in found:
+        if (process := known.get(line.get("pid", 0))) is None:
+            continue
+        if line["what"] == "ended":
+            process.cpu_s = line["cpu"]
+        if line["what"] == "kinds of process":
+            process.kinds = columns(line["kinds"]["cpu_s"])
+    return known
+
+
+def columns(kinds: dict[str, float]) -> dict[str, float]:
+    """CPU seconds by column, of what is counted by kind."""
+    found: Counter[str] = Counter()
+    for kind, seconds in kinds.items():
+        found[COUNTED[kind]] += seconds
+    return dict(found)
+
+
+def add_cpu(spent: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
+    """What was counted inside, and under `rest` what is beyond it of all that a process used."""
+    counted = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
+    spent.cpu_s.update(counted)
+    spent.cpu_s[rest] += max(0.0, total_s - sum(counted.values()))
+
+
+def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
+    """By test, and what is nobody's."""
+    by_test: dict[str, Spent] = defaultdict(Spent)
+    nobody = Spent()
+    owned: dict[str, list[Process]] = defaultdict(list)
+    for process in processes(found).values():
+        owned[process.test].append(process)
+    for line in found:
+        if line["what"] == "start":
+            nobody.cpu_s["imports"] += line["cpu_s"]
+        if line["what"] == "nursery":
+            add_cpu(nobody, line["cpu"], columns(line["kinds"]["cpu_s"]), "imports")
+        if line["what"] not in ("test", "collection", "between"):
+            continue
+        spent = by_test[line["test"]] if line["test"] else nobody
+        add_cpu(spent, line["cpu"], columns(line["kinds"]["cpu_s"]), "work")
+        spent.wall_s.update(wall(line, owned[line["test"]]))
+        spent.tests += line["what"] == "test"
+    for test, those in owned.items():
+        for process in those:
+            add_cpu(by_test[test], process.cpu_s, process.kinds, process.column)
+    return by_test, nobody
+
+
+def wall(line: dict[str, Any], those: list[Process]) -> dict[str, float]:
+    """The wall seconds of a test by kind; `those` are its processes."""
+    blocked = max(0.0, line["wall"] - line["main"] - line["queued"])
+    kinds = line["kinds"]
+    browser = min(blocked, max(0.0, kinds["wall_s"].get("browser", 0.0) - kinds["cpu_s"].get("browser", 0.0)))
+    computed = min(blocked - browser, sum(process.cpu_s for process in those if process.column != "browser"))
+    rest = blocked - browser - computed
+    paced = any(process.name in FORKS for process in those)
+    return {
+        "cpu": line["main"],
+        "queue": line["queued"],
+        "processes": computed,
+        "browser": browser,
+        "paced" if paced else "still": rest,
+    }
+
+
+# -- printing ---------------------------------------------------------------------------------------------
+
+
+def table(title: str, kinds: tuple[str, ...], rows: list[tuple[str, Counter[str], int]]) -> None:
+    """Seconds of each row by kind, the largest row first, and of all."""
+    print(f"\n{title:28} tests    all" + "".join(f"{kind:>10}" for kind in kinds))
+    whole: Counter[str] = Counter()
+    for name, seconds, tests in sorted(rows, key=lambda row: -row[1].total()):
+        whole.update(seconds)
+        print(f"{name:28}{tests:6}{seconds.total():7.1f}" + "".join(f"{seconds[kind]:10.1f}" for kind in kinds))
+    total = "".join(f"{whole[kind]:10.1f}" for kind in kinds)
+    print(f"{'all':28}{sum(row[2] for row in rows):6}{whole.total():7.1f}{total}")
+
+
+def show() -> None:
+    """Print what was counted last."""
+    about = json.loads((KEPT / "about.json").read_text())
+    by_test, nobody = of_tests(lines())
+    rooms: dict[str, Spent] = defaultdict(Spent)
+    for test, spent in by_test.items():
+        rooms["/".join(test.split("/")[1:2])].add(spent)
+    rooms[WORKERS] = nobody
+    accounted = sum(spent.cpu_s.total() for spent in rooms.values())
+    nobody.cpu_s["others"] += max(0.0, about["cpu_s"] - accounted)
+    what = " ".join(about["arguments"]) or "all tests"
+    print(f"{what}, {about['workers']} at a time, ended {about['ended']}, exit code {about['code']}:")
+    print(f"{about['cpu_s']:.0f} s of CPU, of which {accounted:.0f} s are accounted for")
+    for title, kinds in (("CPU seconds", CPU), ("wall seconds", WALL)):
+        of = "cpu_s" if kinds is CPU else "wall_s"
+        table(title, kinds, [(room, getattr(spent, of), spent.tests) for room, spent in rooms.items()])
+    print(f"\nthe {DEAREST} dearest tests: CPU s, wall s, what most of the CPU was")
+    for test, spent in sorted(by_test.items(), key=lambda one: -one[1].cpu_s.total())[:DEAREST]:
+        most = ", ".join(f"{kind} {used:.1f}" for kind, used in spent.cpu_s.most_common(3) if used >= 0.05)
+        print(f"{spent.cpu_s.total():7.1f}{spent.wall_s.total():7.1f}  {test}  ({most})")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Where the seconds of the tests go, by room and by kind.")
+    parser.add_argument("--workers", type=int, default=1, help="how many tests at a time (tools/test: 6)")
+    parser.add_argument("--show", action="store_true", help="print what was counted last")
+    parser.add_argument("paths", nargs="*", metavar="PATH", help="tests, if not all")
+    given, options = parser.parse_known_args()
+    code = 0 if given.show else count([*given.paths, *options], given.workers)
+    show()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

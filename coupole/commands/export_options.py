@@ -8,15 +8,9 @@ from typing import Annotated
 import typer
 
 from coupole.commands.completion import formats
-from coupole.exchange import COLMAP, CRATE, FORMATS
-from coupole.exchange.of_results import FORMATS as OF_RESULTS
+from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 from coupole.exchange.of_results import OF_MATERIALS
-from coupole.exchange.rti import FORMATS as OF_VIEWS
-from coupole.exchange.rti import OF_RUNS_ONLY
 
-OF_RUNS = (*FORMATS, *OF_VIEWS, COLMAP, CRATE)
-OF_RESULTS_OF_RUNS = (*OF_RESULTS, CRATE)
-OF_PICTURES = tuple(name for name in OF_VIEWS if name not in OF_RUNS_ONLY)
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
 _SHOWN = "How views are shown (relight, iiif)"
 

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.commands.common import JsonOption, RecordsOption, fail, records_named
+from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 from coupole.commands.export_options import (
-    OF_PICTURES,
-    OF_RESULTS_OF_RUNS,
-    OF_RUNS,
     AdaptiveOption,
     AuthorOption,
     BaseUrlOption,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ from coupole.commands.relight_for_the_eye import (
     colour_asked,
     write_relit_for_the_eye,
 )
+from coupole.commands.relit_result import Relit, opened
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -30,23 +30,8 @@ if TYPE_CHECKING:
     from coupole.reflectance.new_light.light_kinds import AnyLight
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
-Say = Callable[[int, int], None]
 _LOOKED_AT = 8
 """Pictures of a video that its white is found by."""
-
-
-@dataclass(frozen=True)
-class Relit:
-    """A result that lights can be put on."""
-
-    picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
-    """[h, w, 3] of lights."""
-    about: dict[str, Any]
-    """What `--json` and a video's comment say of it."""
-    uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
-    """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
-    has_colours: bool = True
-    """False of a camera with one channel."""
 
 
 Several = list[str] | None
@@ -164,7 +149,7 @@ def relight(
         camera = _camera(from_, look_at, size, field_of_view)
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            relit = _open(result, view, fit, camera, samples, uncertain=uncertainty is not None)
+            relit = opened(result, view, fit, camera, samples, uncertain=uncertainty is not None)
             if colour is not None:
                 said = write_relit_for_the_eye(relit, wanted, to, colour, white, bars)
             else:
@@ -250,59 +235,6 @@ def _size_px(text: str) -> tuple[int, int]:
     if not (2 <= int(width) <= 32768 and 2 <= int(height) <= 32768):
         raise InputError(f"--size: expected 2 to 32768 pixels each way, got {text!r}")
     return int(width), int(height)
-
-
-def _open(
-    result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
-) -> Relit:
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
-
-    if (result / run_result.OBJECT).exists():
-        if uncertain:
-            fit = fit or run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
-            relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
-        return _of_runs(result, view, fit, camera, samples)
-    given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
-    for option, value in given:
-        if value is not None:
-            raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
-    return _of_pictures(result, samples)
-
-
-def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
-
-    if camera is not None and view is not None:
-        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
-    simulated = bool(run_result.read_about(result)["simulated"])
-    folder = run_result.RunResult(result)
-    if camera is None:
-        scene = run_relighting.scene_of_view(folder, view, fit)
-    else:
-        scene = run_relighting.scene_from(folder, camera, fit)
-
-    def of_three(made: NDArray[np.float32]) -> NDArray[np.float32]:
-        return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
-
-    return Relit(
-        lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
-        {"fit": scene.fit, "simulated": simulated},
-        lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
-        has_colours=folder.channels == 3,
-    )
-
-
-def _of_pictures(result: Path, samples: int) -> Relit:
-    from coupole.reflectance import picture_result, relighting
-
-    made = picture_result.PictureResult(result)
-    made.about  # noqa: B018  refuses what is no result
-    interpolation = relighting.read_interpolation(result)
-
-    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
-        return relighting.relit_by(made, interpolation, lights, samples, say=say)
-
-    return Relit(picture, {})
 
 
 def _write(

@@ -22,6 +22,7 @@ from coupole.commands.doctor import doctor
 from coupole.commands.dose_ledger import dose
 from coupole.commands.identify import identify
 from coupole.commands.layer import layer
+from coupole.commands.makie_photograph import makie
 from coupole.commands.recipe import recipe
 from coupole.commands.reflectance import reflectance_app
 from coupole.commands.register_scans import register
@@ -75,6 +76,7 @@ for command in (
     layer,
     bracket,
     sphere_brdf,
+    makie,
     recipe,
     show,
     budget,

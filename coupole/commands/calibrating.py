@@ -110,9 +110,9 @@ def calibration(
         flat = flattened(work_with)
 
         @wraps(flat)
-        def run(**options: Any) -> None:
+        def run(*arguments: Any, **options: Any) -> None:
             shared = {name: options.pop(name, default) for name, _, default in common}
-            _calibrate(kind, flat(**options), limits=limits, **shared)
+            _calibrate(kind, flat(*arguments, **options), limits=limits, **shared)
 
         own = inspect.signature(flat)
         added = [

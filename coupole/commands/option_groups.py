@@ -14,23 +14,26 @@ R = TypeVar("R")
 def flattened(command: Callable[..., R]) -> Callable[..., R]:
     """The command with the fields of each parameter that is a dataclass in its place, as typer reads them.
 
-    Fields are annotated as typer's parameters are. Their names are unique in the command. What it gives is called
-    with keywords alone.
+    Fields are annotated as typer's parameters are, and have defaults. Their names are unique in the command.
     """
     own = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
         name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
     }
 
-    @wraps(command)
-    def run(**given: Any) -> R:
-        for name, group in groups.items():
-            given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
-        return command(**given)
-
     parameters: list[inspect.Parameter] = []
     for name, one in own.parameters.items():
         parameters += _of_fields(groups[name]) if name in groups else [one.replace(kind=_KEYWORD)]
+    names = [one.name for one in parameters]
+
+    @wraps(command)
+    def run(*arguments: Any, **options: Any) -> R:
+        given = dict(zip(names, arguments, strict=False)) | options
+        for name, group in groups.items():
+            named = [field.name for field in fields(group) if field.name in given]
+            given[name] = group(**{field: given.pop(field) for field in named})
+        return command(**given)
+
     run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run

@@ -6,6 +6,7 @@ import inspect
 from dataclasses import dataclass
 from typing import Annotated
 
+import pytest
 import typer
 from typer.testing import CliRunner
 
@@ -51,3 +52,8 @@ def test_limits_of_an_option_in_a_group_hold() -> None:
     code, text = ended("vase", "--width-mm", "0")
     assert code == 2
     assert "--width-mm" in text
+
+
+def test_python_calls_it_by_the_fields_as_well(capsys: pytest.CaptureFixture[str]) -> None:
+    pack("vase", 2, height_mm=1.5)  # type: ignore[call-arg]
+    assert capsys.readouterr().out.strip() == "vase 2 3 1.5 False"

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from coupole.appearance.matter import brdf, sphere_map, tabulated
+import sphere_map
+from coupole.appearance.matter import brdf, tabulated
 from coupole.appearance.optics import fresnel, indices
 
 LIGHTS, LIMIT_MS = 10, 2.0

@@ -1,6 +1,8 @@
-"""A contract for import-linter: a package, and all that it may import. Other imports are forbidden."""
+"""Contracts for import-linter: a package may import what is listed for it and nothing else; no circles."""
 
 from __future__ import annotations
+
+from collections import deque
 
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, fields, output
@@ -32,3 +34,39 @@ class AllowListContract(Contract):
     def render_broken_contract(self, check: ContractCheck) -> None:
         for importer, imported in check.metadata["wrong"]:
             output.print_error(f"{importer} imports {imported}, which {self.package} may not use")
+
+
+class NoCirclesContract(Contract):
+    """No module imports itself by way of others. Imports inside functions count, and those for types alone."""
+
+    def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
+        """One line for each circle, with a shortest way round."""
+        circles: list[list[str]] = []
+        for module in sorted(graph.modules):
+            if any(module in circle for circle in circles):
+                continue
+            way = _way_round(graph, module)
+            circles += [way] if way else []
+        return ContractCheck(kept=not circles, metadata={"circles": circles})
+
+    def render_broken_contract(self, check: ContractCheck) -> None:
+        for circle in check.metadata["circles"]:
+            output.print_error(f"a circle: {' imports '.join([*circle, circle[0]])}")
+
+
+def _way_round(graph: ImportGraph, module: str) -> list[str]:
+    """Modules from `module` by their imports back to it, or nothing."""
+    before: dict[str, str] = {}
+    waiting = deque([module])
+    while waiting:
+        importer = waiting.popleft()
+        for imported in sorted(graph.find_modules_directly_imported_by(importer)):
+            if imported == module:
+                way = [importer]
+                while way[-1] != module:
+                    way.append(before[way[-1]])
+                return way[::-1]
+            if imported not in before:
+                before[imported] = importer
+                waiting.append(imported)
+    return []

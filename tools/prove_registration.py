@@ -26,7 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from ray_scanner import RayScanner, tower  # noqa: E402
 
-from coupole.scan.registration.merging import LEVELS_MM, merge  # noqa: E402
+from coupole.scan.registration.merging import merge  # noqa: E402
 from coupole.scan.registration.registering import Registered, register  # noqa: E402
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between  # noqa: E402
 
@@ -53,7 +53,7 @@ def main() -> int:
         placed = [found.scans[k] for k in found.placed]
         poses = [found.first_from_scan[k] for k in found.placed]
         out = Path(tempfile.mkdtemp(dir=folder))
-        merged = merge(placed, poses, "mm", arguments.mesh_mm, LEVELS_MM, out, _say)
+        merged = merge(placed, poses, "mm", arguments.mesh_mm, (5.0, 10.0, 50.0, 250.0), out, _say)
         minutes = (time.monotonic() - started) / 60
     memory = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     print(f"{merged.points:,} points; {merged.triangles:,} triangles; {merged.levels}")

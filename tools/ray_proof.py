@@ -19,7 +19,7 @@ from coupole.geometry import inverse, transform
 from random_cells import SQUARE_MM, SQUARES, THICKNESS_MM, Floats, RandomCell
 from sim.devices.kuka_kinematics import flange_pose
 from sim.render.lens import Lens, distorted
-from sim.strangers.lens_stranger import COMA_CENTROID
+from sim.strangers.lens_stranger import TAPS
 
 ARM_STRANGERS = ("backlash", "sag", "ripple")
 LENS_STRANGERS = ("rational", "prism", "stop", "breathing", "coma")
@@ -27,6 +27,8 @@ LIGHT_STRANGERS = ("lobe", "dies", "primary")
 _FIELD = (-0.9, -0.45, 0.0, 0.45, 0.9)
 """Places in the field, over half its width and height."""
 _DISTANCE_MM = 335.0
+_COMA_CENTROID = float(np.average(np.arange(TAPS) + 0.5, weights=TAPS - (np.arange(TAPS) + 0.5)) / TAPS)
+"""Distance of a comatic spot's centroid from its bright end, over its length."""
 _NEW_STOPS = 5000
 _NEW_VIEWS = 6
 Vector = tuple[str, float, float, float]
@@ -47,7 +49,7 @@ def true_pixels(cell: RandomCell, in_camera_mm: Floats, down: float) -> Floats:
     """[n, 2] where points [n, 3] of the camera frame are seen; with coma, the centroids of their spots."""
     lens = true_lens(cell, down)
     at = distorted(in_camera_mm[:, :2] / in_camera_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
-    return at + COMA_CENTROID * cell.strangers.lens.coma_shift_px(at, cell.size_px)
+    return at + _COMA_CENTROID * cell.strangers.lens.coma_shift_px(at, cell.size_px)
 
 
 def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: Floats) -> Iterator[Vector]:

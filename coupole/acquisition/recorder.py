@@ -151,11 +151,6 @@ class RunRecorder:
         assert self._writer is not None, "begin_view() comes before frames"
         return self._writer
 
-    @property
-    def direct(self) -> bool:
-        """True if the present view is written past the page cache."""
-        return self._view.direct
-
     def put(self, frame: Frame, exposure_us: int) -> int:
         self._unsynced_bytes += frame.pixels.nbytes
         with under_way(DISK, self._file):

@@ -73,7 +73,6 @@ class Component:
     name: str
     factor: float
     """Estimated over stated noise; 1 where it was not to be estimated."""
-    observations: int
     rejected: int
     redundancy: float
     chi2: float
@@ -99,11 +98,6 @@ class Adjusted(Generic[S]):
 
     def factor(self, name: str) -> float:
         return next(component.factor for component in self.components if component.name == name)
-
-    @property
-    def chi2_per_degree(self) -> float:
-        """Over all groups, with the stated noise."""
-        return sum(c.chi2 for c in self.components) / max(sum(c.redundancy for c in self.components), 1e-9)
 
 
 def coverage_factor(degrees: Floats | float, coverage: float = 0.95) -> Floats:
@@ -327,9 +321,7 @@ def _summary(
         told = group.estimated and redundancy >= _LEAST_REDUNDANCY
         redundancies.append(redundancy if told else np.inf)
         size = group.rejects or 1
-        components.append(
-            Component(group.name, float(factors[number]), count // size, (whole - count) // size, redundancy, chi2)
-        )
+        components.append(Component(group.name, float(factors[number]), (whole - count) // size, redundancy, chi2))
     shares = np.asarray(contributions) / np.diag(covariance)
     freedom = np.maximum(np.asarray(redundancies), 1e-9)[:, None]
     degrees = 1.0 / np.maximum(np.sum(shares**2 / freedom, axis=0), 1e-12)

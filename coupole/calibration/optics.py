@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from coupole.calibration.rotations import Floats
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-UNITS = ("px", "px", "px", "px", "", "", "", "", "")
 MODELS = {
     "pinhole": ("fx", "fy", "cx", "cy"),
     "radial": ("fx", "fy", "cx", "cy", "k1"),

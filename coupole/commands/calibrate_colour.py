@@ -9,18 +9,12 @@ import typer
 
 from coupole.calibration.colour.acceptance import COLOUR
 from coupole.commands.calibrate_light import (
-    CameraOption,
-    DarkOption,
-    FlatOption,
-    HandEyeOption,
-    LedsOption,
-    ResponseOption,
-    RigOption,
     Runs,
+    TargetCalibrations,
     lens_of,
     posed,
 )
-from coupole.commands.calibrating import EmissionOption, Work, bar, calibration, emission_of, rig_of
+from coupole.commands.calibrating import Work, bar, calibration, emission_of, rig_of
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,14 +55,8 @@ def colour(
     corners: CornersOption = None,
     white: WhiteOption = None,
     without: WithoutOption = None,
-    rig: RigOption = None,
-    leds: LedsOption = None,
-    hand_eye: HandEyeOption = None,
-    camera: CameraOption = None,
-    dark_record: DarkOption = None,
-    response_record: ResponseOption = None,
-    flat: FlatOption = None,
-    emission: EmissionOption = "lambertian",
+    *,
+    known: TargetCalibrations,
 ) -> Work:
     """Colour profile of the camera under the LEDs, as record and as ICC file, from views of a chart of patches.
 
@@ -83,29 +71,29 @@ def colour(
     from coupole.plan.cell import read_cell
 
     def work(console: Console, request: Request) -> Outcome:
-        known = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
-        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
-        whites = None if white is None else posed(open_light_frames([white]), hand_eye, rig, runs)
-        used = rig or rig_of(runs[0])
+        patches = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
+        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        whites = None if white is None else posed(open_light_frames([white]), known.hand_eye, known.rig, runs)
+        used = known.rig or rig_of(runs[0])
         cell = read_cell(used)
         by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-        files = (*known.files, used, leds or cell.leds_path, hand_eye, camera)
+        files = (*patches.files, used, known.leds or cell.leds_path, known.hand_eye, known.camera)
         setting = ChartSetting(
-            known.chart,
+            patches.chart,
             cell.rig.support.base_from_support.matrix(),
-            by_table if leds is None else calibrated_positions(leds),
-            lens_of(camera, frames),
+            by_table if known.leds is None else calibrated_positions(known.leds),
+            lens_of(known.camera, frames),
             corners_of(corners),
-            dark_record,
-            response_record,
-            flat,
-            emission_of(emission),
+            known.dark_record,
+            known.response_record,
+            known.flat,
+            emission_of(known.emission),
             tuple(path for path in files if path is not None),
         )
         with bar(console, "frames of the chart") as progress:
             seen = see_in_runs(frames, setting, whites, progress)
         with bar(console, "patches left out") as progress:
-            return colour_outcome(seen, known, setting, frames, request, progress)
+            return colour_outcome(seen, patches, setting, frames, request, progress)
 
     return work
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,6 +31,26 @@ RepeatabilityMm = Annotated[float, typer.Option("--repeatability-mm", min=1e-4, 
 RepeatabilityDeg = Annotated[float, typer.Option("--repeatability-deg", min=1e-5, help=_OF_THE_ROBOT)]
 
 
+@dataclass(frozen=True)
+class RobotRepeatability:
+    """From pose to pose, as stated."""
+
+    repeatability_mm: RepeatabilityMm = 0.03
+    repeatability_deg: RepeatabilityDeg = 0.003
+
+
+@dataclass(frozen=True)
+class ScannedStickers:
+    """Their size, where they stand, and how exactly the scanner placed them."""
+
+    diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Of a sticker's bright disk.")] = 6.0
+    nearest_mm: Annotated[float, typer.Option(min=50.0, help="Nearest that a sticker stands to the camera.")] = (
+        200.0
+    )
+    farthest_mm: Annotated[float, typer.Option(min=60.0, help="Farthest that one stands.")] = 900.0
+    scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy of the scanner, as stated.")] = 0.03
+
+
 @calibration("leds", limits=LEDS, lens=False)
 def leds(
     runs: Runs,
@@ -39,8 +59,8 @@ def leds(
     rig: Annotated[
         Path | None, typer.Option("--rig", help="The rig with the dome; the run's own if not given.")
     ] = None,
-    repeatability_mm: RepeatabilityMm = 0.03,
-    repeatability_deg: RepeatabilityDeg = 0.003,
+    *,
+    robot: RobotRepeatability,
     tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
     accept_faults: Annotated[
         bool,
@@ -70,7 +90,9 @@ def leds(
             f"{len(images.seen.led)} spots in {len(images.seen.frames)} images of {len(images.views)} views"
         )
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
-        stated = Stated(tolerance_mm=tolerance_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
+        stated = Stated(
+            tolerance_mm=tolerance_mm, robot_mm=robot.repeatability_mm, robot_deg=robot.repeatability_deg
+        )
         with console.status("adjusting boards, poses, lens and hand-eye"):
             arm = arm_of(cell, hand_eye)
             found = leds_from(images, table, prior, request, stated=stated, arm=arm, accept_faults=accept_faults)
@@ -88,14 +110,9 @@ def mesh(
     rig: Annotated[
         Path | None, typer.Option("--rig", help="The rig, for the mesh's place on the support as plans want it.")
     ] = None,
-    diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Of a sticker's bright disk.")] = 6.0,
-    nearest_mm: Annotated[
-        float, typer.Option(min=50.0, help="Nearest that a sticker stands to the camera.")
-    ] = 200.0,
-    farthest_mm: Annotated[float, typer.Option(min=60.0, help="Farthest that one stands.")] = 900.0,
-    scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy of the scanner, as stated.")] = 0.03,
-    repeatability_mm: RepeatabilityMm = 0.03,
-    repeatability_deg: RepeatabilityDeg = 0.003,
+    *,
+    stickers: ScannedStickers,
+    robot: RobotRepeatability,
 ) -> Work:
     """Pose of a scanned object in the base, by its stickers in six views or more."""
     from coupole.calibration.calibrated_arm import has_axis_zeros
@@ -113,15 +130,17 @@ def mesh(
             sources = sources.with_file(made_with)
         size_px = sources.images[0].read().size_px
         prior = read_posed_camera(hand_eye, camera, sources.about, size_px)
-        depth_mm = (nearest_mm, farthest_mm)
+        depth_mm = (stickers.nearest_mm, stickers.farthest_mm)
         with bar(console, "looking for stickers") as progress:
             images = find_all_stickers(
-                sources, prior.lens, diameter_mm=diameter_mm, depth_mm=depth_mm, progress=progress
+                sources, prior.lens, diameter_mm=stickers.diameter_mm, depth_mm=depth_mm, progress=progress
             )
         console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
         support = _base_from_support(_cell(rig, runs)) if rig is not None else None
         arm = arm_of(_cell(rig, runs), hand_eye) if has_axis_zeros(hand_eye) else None
-        stated = Stated(scanner_mm=scanner_mm, robot_mm=repeatability_mm, robot_deg=repeatability_deg)
+        stated = Stated(
+            scanner_mm=stickers.scanner_mm, robot_mm=robot.repeatability_mm, robot_deg=robot.repeatability_deg
+        )
         found = mesh_from(
             images,
             sources,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -70,6 +71,16 @@ def chromatic(
     return work
 
 
+@dataclass(frozen=True)
+class StatedRobot:
+    """Errors of the robot, as stated."""
+
+    repeatability_mm: Annotated[float, typer.Option(min=1e-4, help="Of the robot, as stated.")] = 0.03
+    repeatability_deg: Annotated[float, typer.Option(min=1e-5, help="Of the robot, as stated.")] = 0.003
+    absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3
+    absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02
+
+
 @calibration("hand-eye", limits=HAND_EYE)
 def hand_eye(
     paths: Paths,
@@ -84,10 +95,8 @@ def hand_eye(
     rig: Annotated[
         Path | None, typer.Option("--rig", help="The rig, whose arm's axes may have zero errors (for runs).")
     ] = None,
-    repeatability_mm: Annotated[float, typer.Option(min=1e-4, help="Of the robot, as stated.")] = 0.03,
-    repeatability_deg: Annotated[float, typer.Option(min=1e-5, help="Of the robot, as stated.")] = 0.003,
-    absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3,
-    absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02,
+    *,
+    robot: StatedRobot,
     model: ModelOption = "brown5",
 ) -> Work:
     """Pose of the camera on the flange, from 10 to 60 images of a board that is not moved."""
@@ -100,9 +109,9 @@ def hand_eye(
         sources, described, found = _look(paths, board, poses, console)
         earlier = _earlier_lens(camera_record, sources, found)
         sources = sources.with_file(camera_record).with_file(rig)
-        robot = RobotNoise(repeatability_mm, repeatability_deg, absolute_mm, absolute_deg)
+        noise = RobotNoise(robot.repeatability_mm, robot.repeatability_deg, robot.absolute_mm, robot.absolute_deg)
         with console.status("adjusting lens, hand-eye, board and the robot's errors"):
-            shown = hand_eye_from(found, sources, described, model, request, robot=robot, arm=arm, lens=earlier)[2]
+            shown = hand_eye_from(found, sources, described, model, request, robot=noise, arm=arm, lens=earlier)[2]
         return _drawn(shown)
 
     return work

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,6 +40,20 @@ HandEyeOption = Annotated[
 LedsOption = Annotated[
     Path | None, typer.Option("--leds", help="A record of `calibrate leds`; the rig's table if not given.")
 ]
+
+
+@dataclass(frozen=True)
+class TargetCalibrations:
+    """Rig, records and emission by which frames of a target of known pose are read."""
+
+    rig: RigOption = None
+    leds: LedsOption = None
+    hand_eye: HandEyeOption = None
+    camera: CameraOption = None
+    dark_record: DarkOption = None
+    response_record: ResponseOption = None
+    flat: FlatOption = None
+    emission: EmissionOption = "lambertian"
 
 
 @calibration("dark", limits=DARK, valid_days=90)
@@ -101,25 +116,15 @@ def flat_field(
 def led_power(
     runs: Runs,
     tile: TileOption,
-    rig: RigOption = None,
-    leds: LedsOption = None,
-    hand_eye: HandEyeOption = None,
-    camera: CameraOption = None,
-    dark_record: DarkOption = None,
-    response_record: ResponseOption = None,
-    flat: FlatOption = None,
-    emission: EmissionOption = "lambertian",
+    known: TargetCalibrations,
 ) -> Work:
     """Power of each LED from views of a white tile of known pose."""
     from coupole.calibration.light.frames import open_light_frames
     from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
-        used = rig or rig_of(runs[0])
-        setting = _setting(
-            frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
-        )
+        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, request, progress)
 
@@ -133,14 +138,7 @@ def drift(
         Path, typer.Option("--led-power", help="A record of `calibrate led-power`.", show_default=False)
     ],
     tile: TileOption,
-    rig: RigOption = None,
-    leds: LedsOption = None,
-    hand_eye: HandEyeOption = None,
-    camera: CameraOption = None,
-    dark_record: DarkOption = None,
-    response_record: ResponseOption = None,
-    flat: FlatOption = None,
-    emission: EmissionOption = "lambertian",
+    known: TargetCalibrations,
 ) -> Work:
     """Drift of LED power from its calibration to a run, by temperature and age, from views of a tile.
 
@@ -150,11 +148,8 @@ def drift(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
-        used = rig or rig_of(runs[0])
-        setting = _setting(
-            frames, tile, used, leds, hand_eye, camera, dark_record, response_record, flat, emission
-        )
+        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, request, progress)
 
@@ -176,18 +171,7 @@ def posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: li
     return frames.seen_through(prior.flange_from_camera, arm_of(read_cell(rig or rig_of(runs[0])), hand_eye))
 
 
-def _setting(
-    frames: LightFrames,
-    tile: Path,
-    rig: Path,
-    leds: Path | None,
-    hand_eye: Path | None,
-    camera: Path | None,
-    dark_record: Path | None,
-    response_record: Path | None,
-    flat: Path | None,
-    emission: str,
-) -> Setting:
+def _setting(frames: LightFrames, tile: Path, rig: Path, known: TargetCalibrations) -> Setting:
     """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
@@ -196,16 +180,17 @@ def _setting(
 
     cell = read_cell(rig)
     by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
+    files = (tile, rig, known.leds or cell.leds_path, known.hand_eye, known.camera)
     return Setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
-        by_table if leds is None else calibrated_positions(leds),
-        lens_of(camera, frames),
-        dark_record,
-        response_record,
-        flat,
-        emission_of(emission),
-        tuple(path for path in (tile, rig, leds or cell.leds_path, hand_eye, camera) if path is not None),
+        by_table if known.leds is None else calibrated_positions(known.leds),
+        lens_of(known.camera, frames),
+        known.dark_record,
+        known.response_record,
+        known.flat,
+        emission_of(known.emission),
+        tuple(path for path in files if path is not None),
     )
 
 

@@ -16,6 +16,7 @@ import typer
 
 from coupole.calibration.acceptance import Allowed, asked, words_of
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.option_groups import flattened
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -92,8 +93,8 @@ def calibration(
 ) -> Callable[[Callable[..., Work]], Callable[..., None]]:
     """Make a command from a function that takes the calibration's options and returns the work to do.
 
-    All commands have `--out`, `--name`, `--valid-days` and `--json` besides; `--limit` where the calibration has
-    `limits`, and `--lens` where records are of one lens.
+    Its options may be in dataclasses (`option_groups`). All commands have `--out`, `--name`, `--valid-days` and
+    `--json` besides; `--limit` where the calibration has `limits`, and `--lens` where records are of one lens.
     """
     words = f"Set an acceptance limit; again for more. Usual are {words_of(limits)}."
     common: list[tuple[str, Any, Any]] = [
@@ -106,12 +107,14 @@ def calibration(
     ]
 
     def command(work_with: Callable[..., Work]) -> Callable[..., None]:
-        @wraps(work_with)
+        flat = flattened(work_with)
+
+        @wraps(flat)
         def run(*arguments: Any, **options: Any) -> None:
             shared = {name: options.pop(name, default) for name, _, default in common}
-            _calibrate(kind, work_with(*arguments, **options), limits=limits, **shared)
+            _calibrate(kind, flat(*arguments, **options), limits=limits, **shared)
 
-        own = inspect.signature(work_with, eval_str=True)
+        own = inspect.signature(flat)
         added = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind_of)
             for name, kind_of, default in common

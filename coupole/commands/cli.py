@@ -54,6 +54,7 @@ COMMANDS = {
     "layer": "layer.layer",
     "bracket": "bracketing.bracket",
     "sphere-brdf": "bracketing.sphere_brdf",
+    "makie": "makie_photograph.makie",
     "recipe": "recipe.recipe",
     "show": "show.show",
     "budget": "uncertainty.budget",

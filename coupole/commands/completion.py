@@ -10,7 +10,7 @@ _PLAN_SAYS, _FIRST_BYTES = "views:", 65536
 
 def formats(incomplete: str) -> list[str]:
     """Formats of `coupole export --to`."""
-    from coupole.commands.export_options import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
+    from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 
     return _beginning({*OF_RUNS, *OF_RESULTS_OF_RUNS, *OF_PICTURES}, incomplete)
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats
-from coupole.exchange import COLMAP, CRATE, FORMATS
-from coupole.exchange.of_results import FORMATS as OF_RESULTS
+from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 from coupole.exchange.of_results import OF_MATERIALS
-from coupole.exchange.rti import FORMATS as OF_VIEWS
-from coupole.exchange.rti import OF_RUNS_ONLY
 
-OF_RUNS = (*FORMATS, *OF_VIEWS, COLMAP, CRATE)
-OF_RESULTS_OF_RUNS = (*OF_RESULTS, CRATE)
-OF_PICTURES = tuple(name for name in OF_VIEWS if name not in OF_RUNS_ONLY)
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
 _SHOWN = "How views are shown (relight, iiif)"
 
@@ -154,3 +150,37 @@ BaseUrlOption = Annotated[
         rich_help_panel=_SHOWN,
     ),
 ]
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """All that only some formats and sources know."""
+
+    views: ViewsOption = None
+    shots: ShotsOption = None
+    fit: FitOption = None
+    triangle: TriangleOption = None
+    adaptive: AdaptiveOption = None
+    refined: RefinedOption = None
+    calibrations: RecordsOption = None
+    sensor_spectra: SensorOption = None
+    led_spectrum: LedsOption = None
+    for_the_eye: EyeOption = False
+    linear: LinearOption = False
+    licence: LicenceOption = None
+    author: AuthorOption = None
+    publisher: PublisherOption = None
+    name: NameOption = None
+    identifier: IdentifierOption = None
+    in_place: InPlaceOption = False
+    basis: BasisOption = None
+    planes: PlanesOption = None
+    base_url: BaseUrlOption = None
+
+    def given(self) -> dict[str, object]:
+        """Those that were given, by their names on the command line without dashes before them."""
+        return {
+            name.replace("_", "-"): value
+            for name, value in vars(self).items()
+            if value is not False and value not in (None, [])
+        }

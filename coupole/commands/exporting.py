@@ -10,32 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, RecordsOption, fail, records_named
-from coupole.commands.export_options import (
-    OF_PICTURES,
-    OF_RESULTS_OF_RUNS,
-    OF_RUNS,
-    AdaptiveOption,
-    AuthorOption,
-    BaseUrlOption,
-    BasisOption,
-    EyeOption,
-    FitOption,
-    IdentifierOption,
-    InPlaceOption,
-    LedsOption,
-    LicenceOption,
-    LinearOption,
-    NameOption,
-    PlanesOption,
-    PublisherOption,
-    RefinedOption,
-    SensorOption,
-    ShotsOption,
-    ToOption,
-    TriangleOption,
-    ViewsOption,
-)
+from coupole.commands.common import JsonOption, fail, records_named
+from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
+from coupole.commands.export_options import ExportOptions, ToOption
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError
 from coupole.exchange import COLMAP, CRATE, FORMATS
 from coupole.exchange.rti import FORMATS as OF_VIEWS
@@ -95,29 +73,11 @@ _OF_COLOUR = ("sensor-spectra", "led-spectrum", "for-the-eye", "linear")
 _OF_A_CRATE = ("licence", "author", "publisher", "name", "identifier", "in-place")
 
 
+@flattened
 def export(
     source: Annotated[Path, typer.Argument(help="A run's folder, or a result's.", show_default=False)],
     to: ToOption,
-    views: ViewsOption = None,
-    shots: ShotsOption = None,
-    fit: FitOption = None,
-    triangle: TriangleOption = None,
-    adaptive: AdaptiveOption = None,
-    refined: RefinedOption = None,
-    calibrations: RecordsOption = None,
-    sensor_spectra: SensorOption = None,
-    led_spectrum: LedsOption = None,
-    for_the_eye: EyeOption = False,
-    linear: LinearOption = False,
-    licence: LicenceOption = None,
-    author: AuthorOption = None,
-    publisher: PublisherOption = None,
-    name: NameOption = None,
-    identifier: IdentifierOption = None,
-    in_place: InPlaceOption = False,
-    basis: BasisOption = None,
-    planes: PlanesOption = None,
-    base_url: BaseUrlOption = None,
+    options: ExportOptions,
     out: Annotated[Path | None, typer.Option("--out", help="Folder; SOURCE/export if not given.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
     as_json: JsonOption = False,
@@ -125,22 +85,11 @@ def export(
     """Write a run's proven frames, its views, or a result of reflectance, as other programs read them."""
     from coupole.viewing.terminal import bytes_text, make_console
 
-    given = {
-        "views": views, "shots": shots, "fit": fit, "triangle": triangle, "adaptive": adaptive,
-        "refined": refined,
-        "calibrations": calibrations, "sensor-spectra": sensor_spectra, "led-spectrum": led_spectrum,
-        "for-the-eye": for_the_eye, "linear": linear, "licence": licence, "author": author,
-        "publisher": publisher, "name": name, "identifier": identifier, "in-place": in_place,
-        "basis": basis, "planes": planes, "base-url": base_url,
-    }  # fmt: skip
-    folder = source if in_place else out or source / "export"
-    options: dict[str, object] = {
-        key: value for key, value in given.items() if value is not False and value not in (None, [])
-    }
-    asked = Asked(source, to, folder, overwrite, options)
+    folder = source if options.in_place else out or source / "export"
+    asked = Asked(source, to, folder, overwrite, options.given())
     console = make_console(quiet=as_json)
     try:
-        if in_place and out is not None:
+        if options.in_place and out is not None:
             raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
         found = _written(asked, console)
     except CoupoleError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,6 +12,7 @@ import typer
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.export_options import LedsOption, SensorOption
 from coupole.commands.identify_spot import asked_spot, identify_spot
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -65,6 +67,17 @@ AtOption = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class SpotOptions:
+    """A spot of a result, and by what the camera's channels become a spectrum's."""
+
+    result: ResultOption = None
+    at: AtOption = None
+    sensor_spectra: SensorOption = None
+    led_spectrum: LedsOption = None
+
+
+@flattened
 def identify(
     spectra: SpectraArgument = None,
     *,
@@ -72,10 +85,7 @@ def identify(
     classes: ClassesOption = None,
     unit: UnitOption = "auto",
     report: PageOption = None,
-    result: ResultOption = None,
-    at: AtOption = None,
-    sensor_spectra: SensorOption = None,
-    led_spectrum: LedsOption = None,
+    spot: SpotOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Which class of pigments each spectrum shows, or that the library has none for it.
@@ -87,11 +97,11 @@ def identify(
 
     console = make_console(quiet=as_json)
     try:
-        spot = asked_spot(result, at, sensor_spectra, led_spectrum)
-        if (spot is None) == (not spectra):
+        asked = asked_spot(spot.result, spot.at, spot.sensor_spectra, spot.led_spectrum)
+        if (asked is None) == (not spectra):
             raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
-        if spot is not None:
-            told = identify_spot(spot, _references(library, classes))
+        if asked is not None:
+            told = identify_spot(asked, _references(library, classes))
             console.print(f"{told['name']}: {told['verdict']}; {told['reason']}", markup=False)
             if as_json:
                 print(json.dumps(told))

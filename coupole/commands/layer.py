@@ -3,39 +3,95 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError, StorageError, reason
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coupole.appearance.matter.glossy_face import Geometry
     from coupole.heritage.analysis.layer_samples import LayerGiven
 
 
+@dataclass(frozen=True)
+class FilmSpectra:
+    """Films of one paint: spectra, grounds and thickness."""
+
+    over_black: Annotated[Path | None, typer.Option(help="Spectrum of the film over black.")] = None
+    over_white: Annotated[Path | None, typer.Option(help="Spectrum of the film over white.")] = None
+    black: Annotated[Path | None, typer.Option(help="Spectrum of the black ground.")] = None
+    white: Annotated[Path | None, typer.Option(help="Spectrum of the white ground.")] = None
+    opaque: Annotated[Path | None, typer.Option(help="Spectrum of an opaque film of the same paint.")] = None
+    thickness_um: Annotated[float | None, typer.Option(min=0.01, help="Of the film; K and S are then per mm.")] = (
+        None
+    )
+    u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Its standard uncertainty.")] = 0.0
+
+    def are_named(self) -> bool:
+        """Whether any was given."""
+        named = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
+        return any(one is not None for one in named)
+
+    def listed(self) -> list[dict[str, Any]]:
+        """As `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
+        films: list[dict[str, Any]] = []
+        for film, ground, kind in ((self.over_black, self.black, "black"), (self.over_white, self.white, "white")):
+            if (film is None) != (ground is None):
+                given, missing = (
+                    (f"--over-{kind}", f"--{kind}") if ground is None else (f"--{kind}", f"--over-{kind}")
+                )
+                raise InputError(f"{given}: needs {missing}, too: the film and the ground that it lies on")
+            if film is not None:
+                films.append({"spectrum": film, "over": ground, "thickness_um": self.thickness_um})
+                films[-1]["u_thickness_um"] = self.u_thickness_um
+        if self.opaque is not None:
+            films.append({"spectrum": self.opaque})
+        if len(films) < 2:
+            raise InputError(
+                "expected --over-black and --over-white, or one of them and --opaque: "
+                "one spectrum cannot tell K from S"
+            )
+        return films
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What a spectrometer sees of a paint."""
+
+    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5
+    geometry: Annotated[str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")] = (
+        "gloss excluded"
+    )
+
+    def known_geometry(self) -> Geometry:
+        """Raises InputError if there is none of that name."""
+        from typing import get_args
+
+        from coupole.appearance.matter.glossy_face import Geometry
+
+        found: Geometry | None = next((one for one in get_args(Geometry) if one == self.geometry), None)
+        if found is None:
+            raise InputError(f"--geometry: expected {', '.join(get_args(Geometry))}; found {self.geometry!r}")
+        return found
+
+
+@flattened
 def layer(
     samples: Annotated[
         Path | None,
         typer.Argument(help="YAML that names all films; or use the options below.", show_default=False),
     ] = None,
-    over_black: Annotated[Path | None, typer.Option(help="Spectrum of the film over black.")] = None,
-    over_white: Annotated[Path | None, typer.Option(help="Spectrum of the film over white.")] = None,
-    black: Annotated[Path | None, typer.Option(help="Spectrum of the black ground.")] = None,
-    white: Annotated[Path | None, typer.Option(help="Spectrum of the white ground.")] = None,
-    opaque: Annotated[Path | None, typer.Option(help="Spectrum of an opaque film of the same paint.")] = None,
-    thickness_um: Annotated[
-        float | None, typer.Option(min=0.01, help="Of the film; K and S are then per mm.")
-    ] = None,
-    u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Its standard uncertainty.")] = 0.0,
+    *,
+    films: FilmSpectra,
     noise: Annotated[float, typer.Option(min=1e-5, max=0.1, help="Of a spectrum's value, standard.")] = 0.005,
-    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5,
-    geometry: Annotated[
-        str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")
-    ] = "gloss excluded",
+    instrument: Instrument,
     bare_grounds: Annotated[
         bool, typer.Option("--bare-grounds", help="The grounds were measured without a glossy face.")
     ] = False,
@@ -55,10 +111,9 @@ def layer(
     console = make_console(quiet=as_json)
     try:
         if samples is None:
-            films = _films(over_black, over_white, black, white, opaque, thickness_um, u_thickness_um)
-            given, folder = _given(films, name or "paint", noise, binder_index, geometry, bare_grounds), Path()
+            given, folder = _given(films.listed(), name or "paint", noise, instrument, bare_grounds), Path()
         else:
-            if any(path is not None for path in (over_black, over_white, black, white, opaque, thickness_um)):
+            if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
             given, folder = read_films(samples)
         document = _solved(given, folder, other_grinding, out)
@@ -83,48 +138,14 @@ def read_films(path: Path) -> tuple[LayerGiven, Path]:
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _films(
-    over_black: Path | None,
-    over_white: Path | None,
-    black: Path | None,
-    white: Path | None,
-    opaque: Path | None,
-    thickness_um: float | None,
-    u_thickness_um: float,
-) -> list[dict[str, Any]]:
-    films: list[dict[str, Any]] = []
-    for film, ground, kind in ((over_black, black, "black"), (over_white, white, "white")):
-        if (film is None) != (ground is None):
-            given, missing = (f"--over-{kind}", f"--{kind}") if ground is None else (f"--{kind}", f"--over-{kind}")
-            raise InputError(f"{given}: needs {missing}, too: the film and the ground that it lies on")
-        if film is not None:
-            films.append({"spectrum": film, "over": ground, "thickness_um": thickness_um})
-            films[-1]["u_thickness_um"] = u_thickness_um
-    if opaque is not None:
-        films.append({"spectrum": opaque})
-    if len(films) < 2:
-        raise InputError(
-            "expected --over-black and --over-white, or one of them and --opaque: "
-            "one spectrum cannot tell K from S"
-        )
-    return films
-
-
-def _given(
-    films: list[dict[str, Any]], name: str, noise: float, index: float, geometry: str, bare: bool
-) -> LayerGiven:
-    from typing import get_args
-
-    from coupole.appearance.matter.glossy_face import Geometry
+def _given(films: list[dict[str, Any]], name: str, noise: float, instrument: Instrument, bare: bool) -> LayerGiven:
     from coupole.heritage.analysis.layer_samples import LayerGiven
 
-    if geometry not in get_args(Geometry):
-        raise InputError(f"--geometry: expected {', '.join(get_args(Geometry))}; found {geometry!r}")
     return LayerGiven.model_validate(
         {
             "name": name,
-            "binder_index": index,
-            "geometry": geometry,
+            "binder_index": instrument.binder_index,
+            "geometry": instrument.known_geometry(),
             "grounds": "bare" if bare else "coated",
             "noise": noise,
             "films": films,

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.layer import Instrument
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError, StorageError, reason
 
 if TYPE_CHECKING:
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
+    from coupole.appearance.matter.glossy_face import Face
+    from coupole.appearance.spectra.light import Observer
     from coupole.heritage.analysis.colour_match import Match
     from coupole.heritage.analysis.recipe_search import Found, Recipe
 
@@ -23,6 +27,7 @@ _FEWER = 3
 """Numbers of paints shown: the chosen one, one less, two less."""
 
 
+@flattened
 def recipe(
     target: Annotated[Path, typer.Argument(help="Spectrum of the colour to match.", show_default=False)],
     palette: Annotated[
@@ -38,15 +43,14 @@ def recipe(
     noise: Annotated[
         float, typer.Option("--noise", min=1e-5, max=0.1, help="Of the target's values, standard.")
     ] = 0.005,
-    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5,
-    geometry: Annotated[
-        str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")
-    ] = "gloss excluded",
+    *,
+    instrument: Instrument,
     observer: Annotated[str, typer.Option(help="10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Paints of a palette whose opaque mixture is a colour: shares, match under lights, cost of one less."""
+    from coupole.appearance.matter.glossy_face import face
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
@@ -54,10 +58,11 @@ def recipe(
         names = [name.strip() for name in light.split(",") if name.strip()]
         if not names:
             raise InputError("--light: expected names of lights, such as D65,A; found none")
-        _refuse_unknown(geometry, observer)
+        geometry, seen_by = instrument.known_geometry(), _known_observer(observer)
         with console.status("mixing"):
-            asked = (at_most, noise, binder_index, geometry, observer)
-            found, matches = _found(target, palette, names, *asked)
+            found, matches = _found(
+                target, palette, names, at_most, noise, face(instrument.binder_index, geometry), seen_by
+            )
         document = _document(found, matches)
         if out is not None:
             _write(out, target.stem, found, matches)
@@ -76,18 +81,15 @@ def recipe(
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _refuse_unknown(geometry: str, observer: str) -> None:
+def _known_observer(name: str) -> Observer:
     from typing import get_args
 
-    from coupole.appearance.matter.glossy_face import Geometry
     from coupole.appearance.spectra.light import Observer
 
-    for name, given, known in (
-        ("--geometry", geometry, get_args(Geometry)),
-        ("--observer", observer, get_args(Observer)),
-    ):
-        if given not in known:
-            raise InputError(f"{name}: expected {', '.join(known)}; found {given!r}")
+    found: Observer | None = next((one for one in get_args(Observer) if one == name), None)
+    if found is None:
+        raise InputError(f"--observer: expected {', '.join(get_args(Observer))}; found {name!r}")
+    return found
 
 
 def _found(
@@ -96,11 +98,9 @@ def _found(
     lights: list[str],
     at_most: int,
     noise: float,
-    index: float,
-    geometry: Any,
-    observer: Any,
+    face: Face,
+    observer: Observer,
 ) -> tuple[Found, list[tuple[Match, ...]]]:
-    from coupole.appearance.matter.glossy_face import face
     from coupole.heritage.analysis.colour_match import matches
     from coupole.heritage.analysis.layer_samples import spectrum_on_grid
     from coupole.heritage.analysis.palette import read_palette
@@ -108,7 +108,7 @@ def _found(
 
     paints = read_palette(palette)
     try:
-        found = find(spectrum_on_grid(target), paints, face(index, geometry), noise, at_most)
+        found = find(spectrum_on_grid(target), paints, face, noise, at_most)
     except InputError as error:
         raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
     return found, [matches(found.target, one.seen, lights, observer) for one in found.recipes]

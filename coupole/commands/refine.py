@@ -3,15 +3,36 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from coupole.commands.common import JsonOption, MeshOption, RecordsOption, fail, records_named
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError
 
 
+@dataclass(frozen=True)
+class StatedUncertainties:
+    """Standard uncertainties that no record states, in mm and degrees."""
+
+    arm_mm: Annotated[
+        float, typer.Option("--arm-mm", min=1e-4, help="Of the flange's position, from view to view.")
+    ] = 0.03
+    arm_deg: Annotated[float, typer.Option("--arm-deg", min=1e-5, help="Of its orientation.")] = 0.003
+    mesh_mm: Annotated[float, typer.Option("--mesh-mm", min=1e-4, help="Of the mesh's place in the cell.")] = 0.1
+    mesh_deg: Annotated[float, typer.Option("--mesh-deg", min=1e-5, help="Of its orientation.")] = 0.02
+    shape_mm: Annotated[
+        float, typer.Option("--shape-mm", min=1e-4, help="Of the mesh's surface along its normals.")
+    ] = 0.03
+    scale_mm: Annotated[
+        float, typer.Option("--scale-mm", min=1.0, help="Over which the surface is off alike.")
+    ] = 20.0
+
+
+@flattened
 def refine(
     runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder for what is found.", show_default=False)],
@@ -20,18 +41,8 @@ def refine(
     search_mm: Annotated[
         float, typer.Option("--search-mm", min=0.1, max=20.0, help="The farthest that views may disagree.")
     ] = 3.0,
-    arm_mm: Annotated[
-        float, typer.Option("--arm-mm", min=1e-4, help="Of the flange's position, from view to view.")
-    ] = 0.03,
-    arm_deg: Annotated[float, typer.Option("--arm-deg", min=1e-5, help="Of its orientation.")] = 0.003,
-    mesh_mm: Annotated[float, typer.Option("--mesh-mm", min=1e-4, help="Of the mesh's place in the cell.")] = 0.1,
-    mesh_deg: Annotated[float, typer.Option("--mesh-deg", min=1e-5, help="Of its orientation.")] = 0.02,
-    shape_mm: Annotated[
-        float, typer.Option("--shape-mm", min=1e-4, help="Of the mesh's surface along its normals.")
-    ] = 0.03,
-    scale_mm: Annotated[
-        float, typer.Option("--scale-mm", min=1.0, help="Over which the surface is off alike.")
-    ] = 20.0,
+    *,
+    stated: StatedUncertainties,
     as_json: JsonOption = False,
 ) -> None:
     """Measure how far apart views put the same spots of the surface, and refine poses, lens and mesh together
@@ -46,7 +57,7 @@ def refine(
     from coupole.viewing import refinement_page
     from coupole.viewing.terminal import make_console, step_bars
 
-    doubts = Doubts(arm_mm, arm_deg, mesh_mm, mesh_deg, shape_mm, scale_mm)
+    doubts = Doubts(**vars(stated))
     request = RefineRequest(tuple(runs), mesh, records_named(calibrations or []), doubts, search_mm)
     console = make_console(quiet=as_json)
     try:

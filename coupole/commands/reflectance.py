@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.commands.common import JobOrStep, JsonOption, MeshOption, RecordsOption, ResultArgument, records_named
+from coupole.commands.common import JobOrStep, JsonOption, ResultArgument
 from coupole.commands.common import fail as fail_with
+from coupole.commands.option_groups import flattened
 from coupole.commands.refine import refine
 from coupole.commands.reflectance_options import (
-    IntensitiesOption,
-    KeepOption,
     LeaveOutOption,
-    LightsOption,
-    MaskOption,
     MemoryOption,
-    NoiseOption,
     OutOption,
-    PicturesOption,
-    PosesOption,
-    RefinedOption,
+    PicturesWithoutRecords,
+    SamplesOfRuns,
     SchedulerOption,
-    SrgbOption,
-    SupportOption,
-    UncalibratedOption,
-    ViewOption,
+    Workers,
+    bytes_of,
 )
 from coupole.commands.relight import relight
 from coupole.errors import CoupoleError, InputError
@@ -61,28 +55,17 @@ reflectance_app = typer.Typer(
 
 
 @reflectance_app.command(JOB)
+@flattened
 def from_runs_or_pictures(
     runs: Annotated[
         list[Path] | None,
         typer.Argument(help="Runs of one object, or no run but --pictures.", show_default=False),
     ] = None,
     out: OutOption = None,
-    mesh: MeshOption = None,
-    calibrations: RecordsOption = None,
-    scan_noise_um: NoiseOption = 30.0,
-    support_reflectance: SupportOption = 0.0,
-    keep_inter_reflection: KeepOption = False,
-    refined: RefinedOption = None,
-    poses: PosesOption = None,
-    memory: MemoryOption = "2GB",
-    scheduler: SchedulerOption = None,
-    pictures: PicturesOption = None,
-    lights: LightsOption = None,
-    srgb: SrgbOption = False,
-    intensities: IntensitiesOption = None,
-    mask: MaskOption = None,
-    uncalibrated: UncalibratedOption = False,
-    view: ViewOption = None,
+    *,
+    samples: SamplesOfRuns,
+    workers: Workers,
+    without: PicturesWithoutRecords,
     leave_out: LeaveOutOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -90,27 +73,22 @@ def from_runs_or_pictures(
 
     A job that was stopped goes on where it was when it is given again.
     """
-    from coupole.reflectance.run_job import RunRequest
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
     try:
         if out is None:
             raise InputError("--out: expected the folder of the result")
-        alone, geometry = (lights, srgb, intensities, mask), (refined, poses)
-        _refuse_mixed(runs or [], pictures, calibrations or [], view, geometry, alone, uncalibrated=uncalibrated)
+        _refuse_mixed(runs or [], samples, without)
+        left_out = _numbers(leave_out)
         with step_bars(console) as say:
-            if uncalibrated and runs:
-                made = _of_uncalibrated(runs[0], view, _numbers(leave_out), out, say)
-            elif pictures is not None:
-                made = _of_pictures(pictures, lights, intensities, mask, _numbers(leave_out), out, say, srgb=srgb)
+            if without.uncalibrated and runs:
+                made = _of_uncalibrated(runs[0], without.view, left_out, out, say)
+            elif without.pictures is not None:
+                made = _of_pictures(without.pictures, without, left_out, out, say)
             else:
-                records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
-                request = RunRequest(
-                    tuple(runs or ()), mesh, records, left_out, scan_noise_um, _bytes(memory), support_reflectance,
-                    keep_inter_reflection, refined, poses,
-                )  # fmt: skip
-                made = _of_runs(request, out, scheduler, say)
+                request = replace(samples.request(runs or [], left_out), memory_bytes=workers.memory_bytes)
+                made = _of_runs(request, out, workers.scheduler, say)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -122,52 +100,32 @@ def from_runs_or_pictures(
         print(json.dumps({name: value for name, value in about.items() if name not in {"inputs", "runs"}}))
 
 
-def _of_pictures(
-    pictures: Path,
-    lights: Path | None,
-    intensities: Path | None,
-    mask: Path | None,
-    left_out: list[int],
-    out: Path,
-    say: Said,
-    *,
-    srgb: bool,
-) -> Made:
+def _of_pictures(pictures: Path, given: PicturesWithoutRecords, left_out: list[int], out: Path, say: Said) -> Made:
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
     from coupole.viewing import reflectance_page
 
-    if lights is None:
+    if given.lights is None:
         raise InputError("--lights: expected the file of the lights' directions")
-    given = read_pictures(pictures, lights, intensities=intensities, mask=mask, srgb=srgb)
-    about = fit_pictures(given, out, left_out=left_out, say=say)
+    read = read_pictures(pictures, given.lights, intensities=given.intensities, mask=given.mask, srgb=given.srgb)
+    about = fit_pictures(read, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _refuse_mixed(
-    runs: list[Path],
-    pictures: Path | None,
-    calibrations: list[Path],
-    view: str | None,
-    geometry: tuple[Path | None, Path | None],
-    of_pictures: tuple[Path | bool | None, ...],
-    *,
-    uncalibrated: bool,
-) -> None:
+def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWithoutRecords) -> None:
     """Raise InputError for options that do not go together."""
-    if bool(runs) == (pictures is not None):
+    if bool(runs) == (without.pictures is not None):
         raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
-    if (uncalibrated and (calibrations or len(runs) != 1)) or (view and not uncalibrated):
+    uncalibrated = without.uncalibrated
+    if (uncalibrated and (samples.calibrations or len(runs) != 1)) or (without.view and not uncalibrated):
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
-    if any(geometry) and (uncalibrated or pictures is not None):
+    if (samples.refined or samples.poses) and (uncalibrated or without.pictures is not None):
         raise InputError("--refined, --poses: are for calibrated runs")
-    if pictures is None and any(of_pictures):
+    if without.pictures is None and any((without.lights, without.srgb, without.intensities, without.mask)):
         raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
 
 
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
-    from dataclasses import replace
-
     from coupole.reflectance import uncalibrated
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
@@ -192,17 +150,6 @@ def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said) -
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 
-def _bytes(text: str) -> int:
-    units = {"GB": 10**9, "MB": 10**6}
-    try:
-        size = float(text[:-2]) * units[text[-2:].upper()]
-    except (KeyError, ValueError) as error:
-        raise InputError(f"--memory: expected a size as 500MB or 4GB, got {text!r}") from error
-    if not 50e6 <= size < 1e15:
-        raise InputError(f"--memory: expected 50MB or more, got {text!r}")
-    return int(size)
-
-
 def _numbers(text: str) -> list[int]:
     words = [word for word in text.replace(" ", "").split(",") if word]
     try:
@@ -212,16 +159,11 @@ def _numbers(text: str) -> list[int]:
 
 
 @reflectance_app.command()
+@flattened
 def extract(
     runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder of the result.", show_default=False)],
-    mesh: MeshOption = None,
-    calibrations: RecordsOption = None,
-    scan_noise_um: NoiseOption = 30.0,
-    support_reflectance: SupportOption = 0.0,
-    keep_inter_reflection: KeepOption = False,
-    refined: RefinedOption = None,
-    poses: PosesOption = None,
+    samples: SamplesOfRuns,
     leave_out: LeaveOutOption = "",
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
@@ -229,15 +171,10 @@ def extract(
     """The first step alone: samples of reflectance of each triangle under each LED, from proven frames."""
 
     def step(say: Said) -> dict[str, Any]:
-        from coupole.reflectance.run_job import RunRequest, extract_runs
+        from coupole.reflectance.run_job import extract_runs
         from coupole.reflectance.run_result import RunResult
 
-        records, left_out = records_named(calibrations or []), tuple(_numbers(leave_out))
-        request = RunRequest(
-            tuple(runs), mesh, records, left_out, scan_noise_um,
-            support_reflectance=support_reflectance, keep_inter_reflection=keep_inter_reflection,
-            refined=refined, poses=poses,
-        )  # fmt: skip
+        request = samples.request(runs, _numbers(leave_out))
         extract_runs(request, out, scheduler=scheduler, say=say)
         return {"views": RunResult(out).summaries}
 
@@ -245,10 +182,10 @@ def extract(
 
 
 @reflectance_app.command()
+@flattened
 def fit(
     result: ResultArgument,
-    memory: MemoryOption = "2GB",
-    scheduler: SchedulerOption = None,
+    workers: Workers,
     as_json: JsonOption = False,
 ) -> None:
     """The second step alone: materials of each triangle, and the slice of reflectance that each view has seen."""
@@ -257,7 +194,7 @@ def fit(
         from coupole.reflectance.run_fits import fit_result
         from coupole.reflectance.run_result import FITS
 
-        fit_result(result, _bytes(memory), scheduler=scheduler, say=say)
+        fit_result(result, workers.memory_bytes, scheduler=workers.scheduler, say=say)
         return {"fits": FITS}
 
     _do(step, as_json=as_json)
@@ -271,7 +208,7 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
         from coupole.reflectance.run_check import check_result
         from coupole.viewing import run_reflectance_page
 
-        about = check_result(result, _bytes(memory), say=say)
+        about = check_result(result, bytes_of(memory), say=say)
         return {**about, "report": str(run_reflectance_page.write(result))}
 
     _do(step, as_json=as_json)
@@ -315,7 +252,7 @@ def cluster(
         from coupole.viewing import cluster_page
 
         told = cluster_result(
-            result, clusters, _bytes(memory), degrees=degrees, without_view=without_view, say=say
+            result, clusters, bytes_of(memory), degrees=degrees, without_view=without_view, say=say
         )
         return {**told, "report": str(cluster_page.write(result, told))}
 

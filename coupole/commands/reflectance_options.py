@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from coupole.commands.common import MeshOption, RecordsOption, records_named
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    from coupole.reflectance.run_job import RunRequest
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the result.", show_default=False)]
 NoiseOption = Annotated[
@@ -89,3 +97,64 @@ LeaveOutOption = Annotated[
         show_default=False,
     ),
 ]
+
+
+@dataclass(frozen=True)
+class SamplesOfRuns:
+    """By what samples of reflectance are taken from frames of runs."""
+
+    mesh: MeshOption = None
+    calibrations: RecordsOption = None
+    scan_noise_um: NoiseOption = 30.0
+    support_reflectance: SupportOption = 0.0
+    keep_inter_reflection: KeepOption = False
+    refined: RefinedOption = None
+    poses: PosesOption = None
+
+    def request(self, runs: Sequence[Path], left_out: Sequence[int]) -> RunRequest:
+        """What these runs are asked for; LEDs that are left out are kept for the check."""
+        from coupole.reflectance.run_job import RunRequest
+
+        return RunRequest(
+            tuple(runs), self.mesh, records_named(self.calibrations or []), tuple(left_out), self.scan_noise_um,
+            support_reflectance=self.support_reflectance, keep_inter_reflection=self.keep_inter_reflection,
+            refined=self.refined, poses=self.poses,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PicturesWithoutRecords:
+    """Pictures under known lights, or a view of a run without records."""
+
+    pictures: PicturesOption = None
+    lights: LightsOption = None
+    srgb: SrgbOption = False
+    intensities: IntensitiesOption = None
+    mask: MaskOption = None
+    uncalibrated: UncalibratedOption = False
+    view: ViewOption = None
+
+
+@dataclass(frozen=True)
+class Workers:
+    """What fits may use of this machine, or the cluster that does them."""
+
+    memory: MemoryOption = "2GB"
+    scheduler: SchedulerOption = None
+
+    @property
+    def memory_bytes(self) -> int:
+        """Raises InputError for another text than a size."""
+        return bytes_of(self.memory)
+
+
+def bytes_of(text: str) -> int:
+    """A size such as 500MB or 4GB. Raises InputError."""
+    units = {"GB": 10**9, "MB": 10**6}
+    try:
+        size = float(text[:-2]) * units[text[-2:].upper()]
+    except (KeyError, ValueError) as error:
+        raise InputError(f"--memory: expected a size as 500MB or 4GB, got {text!r}") from error
+    if not 50e6 <= size < 1e15:
+        raise InputError(f"--memory: expected 50MB or more, got {text!r}")
+    return int(size)

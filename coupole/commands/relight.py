@@ -11,16 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coupole.commands.common import JsonOption, ResultArgument, fail
-from coupole.commands.relight_for_the_eye import (
-    PEAK_QUANTILE,
-    EyeOption,
-    RecordOption,
-    SensorOption,
-    SpectrumOption,
-    bright,
-    colour_asked,
-    write_relit_for_the_eye,
-)
+from coupole.commands.option_groups import flattened
+from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
+from coupole.commands.relit_result import Relit, opened
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -30,23 +23,8 @@ if TYPE_CHECKING:
     from coupole.reflectance.new_light.light_kinds import AnyLight
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
-Say = Callable[[int, int], None]
 _LOOKED_AT = 8
 """Pictures of a video that its white is found by."""
-
-
-@dataclass(frozen=True)
-class Relit:
-    """A result that lights can be put on."""
-
-    picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
-    """[h, w, 3] of lights."""
-    about: dict[str, Any]
-    """What `--json` and a video's comment say of it."""
-    uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
-    """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
-    has_colours: bool = True
-    """False of a camera with one channel."""
 
 
 Several = list[str] | None
@@ -128,29 +106,64 @@ WhiteOption = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class Lighting:
+    """Lights, which are summed, and rays to those with a size."""
+
+    direction: DirectionOption = None
+    led: LedOption = None
+    light_at: LightAtOption = None
+    area: AreaOption = None
+    environment: EnvironmentOption = None
+    lights: LightsOption = None
+    samples: SamplesOption = 256
+
+    def read(self) -> list[AnyLight]:
+        """Raises InputError for a light that is none, and if there is none."""
+        from coupole.reflectance.new_light import light_kinds as kinds
+
+        found: list[AnyLight] = [] if self.lights is None else kinds.read_lights(self.lights)
+        found += [kinds.DistantLight(towards=kinds.way_of(one, "--direction")) for one in self.direction or []]
+        found += [kinds.LedLight(number=one) for one in self.led or []]
+        found += [kinds.PointLight(at_mm=kinds.place_of(one, "--light-at")) for one in self.light_at or []]
+        found += [kinds.area_of(one) for one in self.area or []]
+        found += [kinds.EnvironmentLight(file=one) for one in self.environment or []]
+        if not found:
+            raise InputError(
+                "expected a light: --direction, --led, --light-at, --area, --environment, or --lights with a file"
+            )
+        return found
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """From where a result is seen, and by which fit."""
+
+    view: ViewOption = None
+    from_: FromOption = None
+    look_at: LookAtOption = None
+    size: SizeOption = None
+    field_of_view: FieldOption = None
+    fit: FitOption = None
+
+
+@dataclass(frozen=True)
+class MoreOutput:
+    """What else is written, and what is white."""
+
+    uncertainty: UncertaintyOption = None
+    turn: TurnOption = None
+    white: WhiteOption = None
+
+
+@flattened
 def relight(
     result: ResultArgument,
     to: ToOption,
-    direction: DirectionOption = None,
-    led: LedOption = None,
-    light_at: LightAtOption = None,
-    area: AreaOption = None,
-    environment: EnvironmentOption = None,
-    lights: LightsOption = None,
-    samples: SamplesOption = 256,
-    view: ViewOption = None,
-    from_: FromOption = None,
-    look_at: LookAtOption = None,
-    size: SizeOption = None,
-    field_of_view: FieldOption = None,
-    fit: FitOption = None,
-    uncertainty: UncertaintyOption = None,
-    turn: TurnOption = None,
-    white: WhiteOption = None,
-    for_the_eye: EyeOption = False,
-    sensor_spectra: SensorOption = None,
-    led_spectrum: SpectrumOption = None,
-    colour_record: RecordOption = None,
+    lighting: Lighting,
+    viewpoint: Viewpoint,
+    more: MoreOutput,
+    colours: EyeColours,
     as_json: JsonOption = False,
 ) -> None:
     """Make the picture that lights which were not there would give. Lights that are named together are summed."""
@@ -158,19 +171,19 @@ def relight(
 
     console = make_console(quiet=as_json)
     try:
-        _refuse_target(to, uncertainty, turn, white, for_the_eye=for_the_eye)
-        colour = colour_asked(sensor_spectra, led_spectrum, colour_record, for_the_eye=for_the_eye)
-        wanted = _lights(direction or [], led or [], light_at or [], area or [], environment or [], lights)
-        camera = _camera(from_, look_at, size, field_of_view)
+        _refuse_target(to, more, for_the_eye=colours.for_the_eye)
+        colour, wanted = colours.read(), lighting.read()
+        camera = _camera(viewpoint)
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            relit = _open(result, view, fit, camera, samples, uncertain=uncertainty is not None)
+            uncertain = more.uncertainty is not None
+            relit = opened(result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain)
             if colour is not None:
-                said = write_relit_for_the_eye(relit, wanted, to, colour, white, bars)
+                said = write_relit_for_the_eye(relit, wanted, to, colour, more.white, bars)
             else:
-                said = _write(relit, wanted, to, turn, white, bars)
-            if uncertainty is not None:
-                said |= _write_uncertainty(relit, wanted, uncertainty, bars)
+                said = _write(relit, wanted, to, more.turn, more.white, bars)
+            if more.uncertainty is not None:
+                said |= _write_uncertainty(relit, wanted, more.uncertainty, bars)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -180,45 +193,20 @@ def relight(
         print(json.dumps(said))
 
 
-def _lights(
-    directions: Sequence[str],
-    leds: Sequence[int],
-    points: Sequence[str],
-    areas: Sequence[str],
-    environments: Sequence[Path],
-    file: Path | None,
-) -> list[AnyLight]:
-    from coupole.reflectance.new_light import light_kinds as kinds
-
-    found: list[AnyLight] = [] if file is None else kinds.read_lights(file)
-    found += [kinds.DistantLight(towards=kinds.way_of(one, "--direction")) for one in directions]
-    found += [kinds.LedLight(number=one) for one in leds]
-    found += [kinds.PointLight(at_mm=kinds.place_of(one, "--light-at")) for one in points]
-    found += [kinds.area_of(one) for one in areas]
-    found += [kinds.EnvironmentLight(file=one) for one in environments]
-    if not found:
-        raise InputError(
-            "expected a light: --direction, --led, --light-at, --area, --environment, or --lights with a file"
-        )
-    return found
-
-
-def _refuse_target(
-    to: Path, uncertainty: Path | None, turn: int | None, white: float | None, *, for_the_eye: bool
-) -> None:
+def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
     from coupole.exchange import picture_files, picture_for_the_eye, video_files
 
-    if uncertainty is not None:
-        picture_files.refuse_unknown(uncertainty)
-        if turn is not None:
+    if more.uncertainty is not None:
+        picture_files.refuse_unknown(more.uncertainty)
+        if more.turn is not None:
             raise InputError("--uncertainty: belongs to a picture, not to a video (--turn)")
     if for_the_eye:
         picture_for_the_eye.refuse_unknown(to)
-        if turn is not None:
+        if more.turn is not None:
             raise InputError("--for-the-eye: belongs to a picture, not to a video (--turn)")
-    elif turn is None:
+    elif more.turn is None:
         picture_files.refuse_unknown(to)
-        if white is not None:
+        if more.white is not None:
             raise InputError(
                 "--white: belongs to a video (--turn) or to --for-the-eye; other pictures hold all values"
             )
@@ -226,21 +214,21 @@ def _refuse_target(
         video_files.refuse_unknown(to)
 
 
-def _camera(
-    from_: str | None, look_at: str | None, size: str | None, field_of_view: float | None
-) -> FreeCamera | None:
+def _camera(asked: Viewpoint) -> FreeCamera | None:
     import numpy as np
 
     from coupole.reflectance.new_light.light_kinds import place_of
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
-    if from_ is None:
-        for option, value in (("--look-at", look_at), ("--size", size), ("--field-of-view", field_of_view)):
+    of_it = (("--look-at", asked.look_at), ("--size", asked.size), ("--field-of-view", asked.field_of_view))
+    if asked.from_ is None:
+        for option, value in of_it:
             if value is not None:
                 raise InputError(f"{option}: belongs to a camera anywhere; give its place with --from")
         return None
-    aim = None if look_at is None else np.array(place_of(look_at, "--look-at"))
-    return FreeCamera(np.array(place_of(from_, "--from")), aim, _size_px(size or "1024x768"), field_of_view)
+    aim = None if asked.look_at is None else np.array(place_of(asked.look_at, "--look-at"))
+    place = np.array(place_of(asked.from_, "--from"))
+    return FreeCamera(place, aim, _size_px(asked.size or "1024x768"), asked.field_of_view)
 
 
 def _size_px(text: str) -> tuple[int, int]:
@@ -250,59 +238,6 @@ def _size_px(text: str) -> tuple[int, int]:
     if not (2 <= int(width) <= 32768 and 2 <= int(height) <= 32768):
         raise InputError(f"--size: expected 2 to 32768 pixels each way, got {text!r}")
     return int(width), int(height)
-
-
-def _open(
-    result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
-) -> Relit:
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
-
-    if (result / run_result.OBJECT).exists():
-        if uncertain:
-            fit = fit or run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
-            relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
-        return _of_runs(result, view, fit, camera, samples)
-    given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
-    for option, value in given:
-        if value is not None:
-            raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
-    return _of_pictures(result, samples)
-
-
-def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
-
-    if camera is not None and view is not None:
-        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
-    simulated = bool(run_result.read_about(result)["simulated"])
-    folder = run_result.RunResult(result)
-    if camera is None:
-        scene = run_relighting.scene_of_view(folder, view, fit)
-    else:
-        scene = run_relighting.scene_from(folder, camera, fit)
-
-    def of_three(made: NDArray[np.float32]) -> NDArray[np.float32]:
-        return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
-
-    return Relit(
-        lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
-        {"fit": scene.fit, "simulated": simulated},
-        lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
-        has_colours=folder.channels == 3,
-    )
-
-
-def _of_pictures(result: Path, samples: int) -> Relit:
-    from coupole.reflectance import picture_result, relighting
-
-    made = picture_result.PictureResult(result)
-    made.about  # noqa: B018  refuses what is no result
-    interpolation = relighting.read_interpolation(result)
-
-    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
-        return relighting.relit_by(made, interpolation, lights, samples, say=say)
-
-    return Relit(picture, {})
 
 
 def _write(

@@ -4,6 +4,7 @@ LEDs."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,7 @@ from coupole.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from coupole.commands.relight import Relit
+    from coupole.commands.relit_result import Relit
     from coupole.exchange.camera_colour import CameraColour
     from coupole.reflectance.new_light.light_kinds import AnyLight
 
@@ -42,29 +43,38 @@ RecordOption = Annotated[
 ]
 
 
-def colour_asked(
-    sensor: Path | None, leds: Path | None, record: Path | None, *, for_the_eye: bool
-) -> CameraColour | None:
-    """By a record, or by tables of spectra; None if no picture for the eye is wanted. Raises InputError for what
-    does not go together, and as `camera_colour` and `colour_of_record`."""
-    from coupole.exchange.camera_colour import camera_colour, colour_of_record
+@dataclass(frozen=True)
+class EyeColours:
+    """Pictures for the eye, and by what the camera's channels become colours."""
 
-    if record is not None:
-        if not for_the_eye or sensor is not None or leds is not None:
-            raise InputError("--colour: is for --for-the-eye, in place of --sensor-spectra and --led-spectrum")
-        return colour_of_record(record)
-    tables = {"--sensor-spectra": sensor, "--led-spectrum": leds}
-    if not for_the_eye:
-        if given := [name for name, path in tables.items() if path is not None]:
-            raise InputError(f"{', '.join(given)}: is for --for-the-eye")
-        return None
-    if sensor is None or leds is None:
-        missing = ", ".join(name for name, path in tables.items() if path is None)
-        raise InputError(
-            f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a "
-            "record of `calibrate colour`"
-        )
-    return camera_colour(sensor, leds)
+    for_the_eye: EyeOption = False
+    sensor_spectra: SensorOption = None
+    led_spectrum: SpectrumOption = None
+    colour_record: RecordOption = None
+
+    def read(self) -> CameraColour | None:
+        """By a record, or by tables of spectra; None if no picture for the eye is wanted.
+
+        Raises InputError for what does not go together, and as `camera_colour` and `colour_of_record`."""
+        from coupole.exchange.camera_colour import camera_colour, colour_of_record
+
+        tables = {"--sensor-spectra": self.sensor_spectra, "--led-spectrum": self.led_spectrum}
+        given = [name for name, path in tables.items() if path is not None]
+        if self.colour_record is not None:
+            if not self.for_the_eye or given:
+                raise InputError("--colour: is for --for-the-eye, in place of --sensor-spectra and --led-spectrum")
+            return colour_of_record(self.colour_record)
+        if not self.for_the_eye:
+            if given:
+                raise InputError(f"{', '.join(given)}: is for --for-the-eye")
+            return None
+        if self.sensor_spectra is None or self.led_spectrum is None:
+            missing = ", ".join(name for name, path in tables.items() if path is None)
+            raise InputError(
+                f"--for-the-eye: expected {missing} too, a table of what its maker has measured; or --colour, a "
+                "record of `calibrate colour`"
+            )
+        return camera_colour(self.sensor_spectra, self.led_spectrum)
 
 
 def write_relit_for_the_eye(

@@ -14,6 +14,7 @@ import typer
 
 from coupole.commands.calibrating import EmissionOption, emission_of
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError, StorageError
 
 if TYPE_CHECKING:
@@ -32,6 +33,20 @@ CoverageOption = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class SpotOfObject:
+    """What is measured: a triangle of the mesh, and the light on it."""
+
+    incidence_deg: Annotated[float, typer.Option("--incidence", min=0.0, max=75.0, help="Of the light.")] = 42.0
+    vertex_um: Annotated[float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error.")] = 30.0
+    edge_um: Annotated[float, typer.Option("--edge-um", min=1.0, help="Of the mesh's triangles.")] = 200.0
+    pixels: Annotated[int, typer.Option("--pixels", min=1, help="Of a triangle, per channel.")] = 5
+    contrast: Annotated[
+        float, typer.Option("--contrast", min=0.0, help="Relative change of albedo per mm of the object.")
+    ] = 0.02
+
+
+@flattened
 def budget(
     records: Annotated[
         list[Path] | None,
@@ -49,13 +64,8 @@ def budget(
         list[Path] | None,
         typer.Option("--beside", help="Records of another cell, for a column of their own in the table."),
     ] = None,
-    incidence_deg: Annotated[float, typer.Option("--incidence", min=0.0, max=75.0, help="Of the light.")] = 42.0,
-    vertex_um: Annotated[float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error.")] = 30.0,
-    edge_um: Annotated[float, typer.Option("--edge-um", min=1.0, help="Of the mesh's triangles.")] = 200.0,
-    pixels: Annotated[int, typer.Option("--pixels", min=1, help="Of a triangle, per channel.")] = 5,
-    contrast: Annotated[
-        float, typer.Option("--contrast", min=0.0, help="Relative change of albedo per mm of the object.")
-    ] = 0.02,
+    *,
+    spot: SpotOfObject,
     coverage: CoverageOption = None,
     emission: EmissionOption = "lambertian",
     out: Annotated[Path | None, typer.Option("--out", help="Write this PNG, and HTML and JSON beside it.")] = None,
@@ -71,14 +81,19 @@ def budget(
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
-    start = Known(vertex_mm=vertex_um / 1e3, edge_mm=edge_um / 1e3, pixels=pixels, contrast_per_mm=contrast)
+    start = Known(
+        vertex_mm=spot.vertex_um / 1e3,
+        edge_mm=spot.edge_um / 1e3,
+        pixels=spot.pixels,
+        contrast_per_mm=spot.contrast,
+    )
     try:
         if out is not None:
             _refuse_target(out)
         given = _with_plan(read_records(records or []), plan)
         with console.status("propagating distributions"):
             result = _propagated(
-                given, beside or [], start, Geometry(incidence_deg), emission, coverage or COVERAGES
+                given, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
             )
         if out is not None:
             _write_report(out, result)

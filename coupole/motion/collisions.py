@@ -226,7 +226,7 @@ class CellBodies:
 
     def _required_mm(self, keep_mm: float, reach: Floats) -> float:
         """Clearance of a pair: the rig's, but at least the pair's possible approach under the largest path
-        deviation. `path_deviation_mm` multiplies each axis' deviation by `reach_mm`; the pair moves by the
+        deviation. `deviation_at_rest_mm` multiplies each axis' deviation by `reach_mm`; the pair moves by the
         deviation times its own reach."""
         share = np.divide(reach, self.reach_mm, out=np.zeros(6), where=self.reach_mm > 0.0)
         return max(keep_mm, self._keep.path_tolerance_mm * float(share.max()))

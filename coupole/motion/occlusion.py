@@ -67,11 +67,6 @@ class Occlusion:
     areas_mm2: NDArray[np.float64]
     """[patches] their weights."""
 
-    @property
-    def masks(self) -> NDArray[np.bool_]:
-        """[leds, patches] True where an LED's light reaches the patch."""
-        return np.ascontiguousarray(self.codes.T == REACHED)
-
     def share(self, code: int = REACHED) -> NDArray[np.float64]:
         """[leds] share of the surface seen by the camera that has this code; 0 if the camera sees nothing of
         it."""

@@ -11,15 +11,6 @@ from numpy.typing import NDArray
 PATH_TOLERANCE_MM = 10.0
 
 
-def path_deviation_mm(
-    way_deg: Sequence[NDArray[np.float64]], joints_deg: NDArray[np.float64], reach_mm: NDArray[np.float64]
-) -> float:
-    """Upper bound of the distance of any point of arm and tool from the straight motions of `way_deg` ([6] each),
-    with the axes at `joints_deg` [6]: for the nearest posture of the path, the sum over the axes of the deviation
-    times the greatest distance of any point from that axis, `reach_mm` [6] (`CellBodies.reach_mm`)."""
-    return _nearest(way_deg, joints_deg, reach_mm)[0]
-
-
 def deviation_at_rest_mm(
     way_deg: Sequence[NDArray[np.float64]],
     joints_deg: NDArray[np.float64],
@@ -27,9 +18,13 @@ def deviation_at_rest_mm(
     reach_mm: NDArray[np.float64],
     stopping_s: float,
 ) -> float:
-    """`path_deviation_mm` of the place where the arm comes to rest if it is stopped now: with the speed across the
-    path that the axes have at `speeds_deg_s` [6], kept for `stopping_s`. An arm that is stopped brakes along its
-    path, so its speed along it does not count."""
+    """Upper bound of the distance of any point of arm and tool from the straight motions of `way_deg` ([6] each),
+    at the place where the arm comes to rest if it is stopped now.
+
+    With the axes at `joints_deg` [6]: for the nearest posture of the path, the sum over the axes of the deviation
+    times the greatest distance of any point from that axis, `reach_mm` [6] (`CellBodies.reach_mm`); and the speed
+    across the path that the axes have at `speeds_deg_s` [6], kept for `stopping_s`. An arm that is stopped brakes
+    along its path, so its speed along it does not count."""
     off_mm, along = _nearest(way_deg, joints_deg, reach_mm)
     speeds_mm_s = np.radians(speeds_deg_s) * reach_mm
     length = float(along @ along)

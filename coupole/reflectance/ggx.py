@@ -18,7 +18,6 @@ import math
 
 import numba
 
-KD, KS, ALPHA = range(3)
 UNKNOWNS = 5
 """Of a fit: two tilts of the normal along its `tangents`, and the logarithms of kd, ks and alpha."""
 

@@ -14,8 +14,6 @@ from coupole.reflectance.ggx import lobe
 from coupole.reflectance.light_interpolation import nearest
 from coupole.reflectance.normal_fit import PointMaterials
 
-Floats = NDArray[np.float64]
-
 SUSPECT = 0.05
 """A gain that differs from 1 by more than this is told."""
 _LIT = 0.2

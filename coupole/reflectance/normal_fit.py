@@ -25,8 +25,6 @@ Floats = NDArray[np.float64]
 RANKS = (0.2, 0.8)
 _STARTS = (0.08, 0.2, 0.45)
 """Of alpha; the best end is kept."""
-_FIRST_KS = 0.02
-"""Of kd."""
 _LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 CAUCHY = 0.05

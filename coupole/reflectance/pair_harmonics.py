@@ -22,7 +22,7 @@ from coupole.reflectance.triangle_fit import FEWEST, TriangleSamples
 
 Floats = NDArray[np.float64]
 
-FEWEST_DEGREES, USUAL_DEGREES, MOST_DEGREES = 2, 10, 17
+USUAL_DEGREES, MOST_DEGREES = 10, 17
 TIKHONOV, _LEAST = 0.1, 1e-3
 """Ridge of the highest degrees, over the mean of the normal matrix's diagonal, and of the lowest over that. On a
 simulated glossy surface a tenth and tenfold changed the error, lights and a view left out, by 3 % at most."""

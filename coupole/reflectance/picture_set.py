@@ -55,7 +55,7 @@ class PictureSet:
         """
         picture = read_picture(self.files[number])
         if self.srgb:
-            picture = _decoded(picture)
+            picture = linear_of_srgb(picture)
         if picture.shape[:2] != self.mask.shape or picture.dtype != self.dtype:
             refuse(self.files[number], _differs(picture, self.mask.shape, self.dtype))
         return picture[self.mask]
@@ -116,7 +116,7 @@ def read_pictures(
     )
 
 
-def _decoded(picture: NDArray[Any]) -> NDArray[np.uint16]:
+def linear_of_srgb(picture: NDArray[Any]) -> NDArray[np.uint16]:
     """Linear values, full scale 65535, of sRGB's codes (IEC 61966-2-1)."""
     most = int(np.iinfo(picture.dtype).max)
     codes = np.arange(most + 1) / most

@@ -34,10 +34,7 @@ from coupole.storage import journal, manifest
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 from coupole.storage.journal_events import (
     JOURNAL_VERSION,
-    FaultNoted,
     FrameProven,
-    SessionResumed,
-    SessionStarted,
 )
 from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
@@ -125,16 +122,6 @@ class Run:
     def proven(self) -> dict[ShotId, FrameProven]:
         """Proven shots, by the journal."""
         return {event.shot: event for event in journal.read(self.journal_path) if isinstance(event, FrameProven)}
-
-    def robot_fault(self) -> str:
-        """The fault of the arm that ended the last session; empty if there was none."""
-        found = ""
-        for event in journal.read(self.journal_path):
-            if isinstance(event, SessionStarted | SessionResumed):
-                found = ""
-            elif isinstance(event, FaultNoted) and event.device == "robot":
-                found = event.message
-        return found
 
     def lock(self) -> int:
         """Lock the run for this process. Raises InputError if another process acquires into it."""

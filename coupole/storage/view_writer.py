@@ -91,10 +91,6 @@ class ViewWriter:
         data = os.pread(self._plain_fd, MAX_POSES * POSE_DTYPE.itemsize, self._layout.poses_offset)
         return np.frombuffer(data, POSE_DTYPE)
 
-    @property
-    def free_slots(self) -> int:
-        return len(self._free)
-
     def add_pose(self, arm: ArmState, base_from_camera: Transform) -> int:
         """Store a measured pose; returns its number, by which frames refer to it."""
         if self._poses == MAX_POSES:

@@ -18,7 +18,7 @@ DESCRIPTION = Path(__file__).with_name("gige.xml")
 VERSION_OF_STANDARD, DEVICE_MODE = 0x0, 0x4
 ADDRESS, VENDOR, MODEL, VERSION, SERIAL, DESCRIPTION_URL = 0x24, 0x48, 0x68, 0x88, 0xD8, 0x200
 INTERFACES, STREAMS, CAPABILITIES = 0x600, 0x904, 0x934
-HEARTBEAT_MS, TICKS_HZ_HIGH, TICKS_HZ_LOW = 0x938, 0x93C, 0x940
+HEARTBEAT_MS, TICKS_HZ_LOW = 0x938, 0x940
 CONTROL_PRIVILEGE = 0xA00
 HOST_PORT, PACKET_SIZE, PACKET_DELAY, HOST_ADDRESS = 0xD00, 0xD04, 0xD08, 0xD18
 
@@ -45,10 +45,10 @@ GAIN_DB, BALANCE_RATIO = 0x2040, 0x2050
 REGISTER_BYTES = 0x3000
 DESCRIPTION_PLACE = 0x10000
 
-ACQUISITION_START, FRAME_START = 0, 1
+FRAME_START = 1
 LINE0, SOFTWARE = 0, 1
 CONTINUOUS, SINGLE_FRAME, MULTI_FRAME = 1, 2, 3
-TIMED, TRIGGER_WIDTH = 0, 1
+TRIGGER_WIDTH = 1
 OVERLAP_READ_OUT, OVERLAP_PREVIOUS_FRAME = 1, 2
 PIXEL_FORMATS = frozenset(
     {
@@ -100,11 +100,6 @@ class Registers:
 
     def set_text(self, address: int, text: str, size: int = 32) -> None:
         self.write(address, text.encode().ljust(size, b"\0"))
-
-    def payload_bytes(self) -> int:
-        """Size of an image with the present width, height and pixel format."""
-        bits_per_pixel = self.integer(PIXEL_FORMAT) >> 16 & 0xFF
-        return self.integer(WIDTH) * self.integer(HEIGHT) * bits_per_pixel // 8
 
     def widest(self) -> int:
         """Columns of a whole image with the present binning and decimation."""

@@ -51,14 +51,6 @@ def charuco_board(board: Charuco) -> Surface:
     )
 
 
-def inner_corners_mm(board: Charuco) -> Array:
-    """True chessboard corners [(squares_x - 1)(squares_y - 1), 3] by OpenCV's ids, in the board's frame."""
-    column, row = np.meshgrid(np.arange(1, board.squares_x), np.arange(1, board.squares_y))
-    x = (column - board.squares_x / 2) * board.square_mm
-    y = (board.squares_y / 2 - row) * board.square_mm
-    return np.stack([x, y, np.full(x.shape, board.thickness_mm)], axis=-1).reshape(-1, 3)
-
-
 def opencv_board(board: Charuco) -> Any:
     """The same board for OpenCV's detector.
 

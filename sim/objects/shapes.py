@@ -1,25 +1,16 @@
-"""Shapes for analytic checks and for demonstrations: plane, sphere, sculpted relief."""
+"""Shapes for analytic checks and for demonstrations: sphere, sculpted relief."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from coupole.appearance.shapes.solids import relief, unit_sphere
-from coupole.appearance.shapes.triangles import cells_for, rectangle
 from coupole.errors import InputError
 from sim.objects import appearance
 from sim.objects.surfaces import of_material
 from sim.scene.surface import Material, Surface
 
 _ICOSAHEDRON_FACES = 20
-
-
-def plane(
-    width_mm: float, depth_mm: float, *, triangles: int = 2, material: Material = appearance.SPECTRALON
-) -> Surface:
-    """A flat sheet in z = 0 about the origin, facing up, of at most about `triangles` triangles."""
-    columns, rows = cells_for(triangles, width_mm, depth_mm)
-    return of_material(rectangle(width_mm, depth_mm, columns, rows), material)
 
 
 def sphere(radius_mm: float, *, triangles: int = 20_000, material: Material = appearance.SPECTRALON) -> Surface:

@@ -53,20 +53,6 @@ def sticker(diameter_mm: float = 6.0, *, border_mm: float = 10.0) -> Surface:
     )
 
 
-def with_stickers(
-    surface: Surface,
-    count: int,
-    seed: int = 1,
-    *,
-    diameter_mm: float = 6.0,
-    gap_mm: float = 0.8,
-    where: NDArray[np.bool_] | None = None,
-) -> Surface:
-    """The surface with `count` flat stickers attached; `sticker_poses` gives their true poses."""
-    poses = sticker_poses(surface, count, seed, diameter_mm=diameter_mm, gap_mm=gap_mm, where=where)
-    return stuck_on(surface, poses, diameter_mm=diameter_mm)
-
-
 def stuck_on(surface: Surface, poses: Array, *, diameter_mm: float = 6.0) -> Surface:
     """The surface with a flat sticker at each of `poses` [n, 4, 4]."""
     one = sticker(diameter_mm, border_mm=diameter_mm * _BORDER)

@@ -45,17 +45,6 @@ def defocus_blur_px(objective: Objective, depth_mm: Image, pixel_pitch_um: float
     return np.asarray(0.25 * defocus_px(objective, np.minimum(depth_mm, 1e6), pixel_pitch_um), np.float32)
 
 
-def blurred(image: Image, sigma_px: Image) -> Image:
-    """`image` [h, w] blurred at each pixel by a normal distribution of its own standard deviation [h, w].
-
-    Layers blurred by a few standard deviations are mixed so that the variance is right. The image is continued
-    beyond its border by reflection.
-    """
-    out = np.empty_like(image)
-    _blur(image, sigma_px, 0.0, np.ones((2, 2), np.bool_), out)
-    return out
-
-
 def _blur(image: Image, sigma_px: Image, more_px: float, wanted: NDArray[np.bool_], out: Image) -> None:
     """Fill the pixels of `out` whose place in the Bayer cell is `wanted` [2, 2]; the blur's variance is that of
     `sigma_px` [h, w] and of `more_px` together."""

@@ -27,8 +27,6 @@ class Objective:
     focus_distance_mm: float = 334.0
     """From the lens's principal plane to the plane in focus."""
     f_number: float = 8.0
-    transmission: float = 0.90
-    """Transmittance of the glass, the same for all channels (assumed)."""
     rim_radius: float = 3.0
     """Radius of the front rim over that of the pupil: stopped down to f/8 the rim is far outside (assumed)."""
     rim_shift: float = 4.0
@@ -52,12 +50,6 @@ class Objective:
     def working_f_number(self) -> float:
         """N (1 + m): the cone of light at the sensor narrows with the lens's distance from it."""
         return self.f_number * (1.0 + self.magnification)
-
-
-def illuminance_per_radiance(objective: Objective) -> float:
-    """Illuminance on the sensor's centre, lx, for a luminance of 1 lm/(m^2 sr): pi T/(4 N_w^2), N_w the working
-    f-number."""
-    return float(np.pi * objective.transmission / (4.0 * objective.working_f_number**2))
 
 
 def vignetting(

@@ -96,11 +96,6 @@ class Viewer:
         return View(site, points, triangle, fine, eye, sides, normals, shading, diffuse, material)
 
 
-def tangents(through: Sight) -> NDArray[np.float64]:
-    """[h, w] tangent of the angle between a pixel's ray and the optical axis."""
-    return np.asarray(np.hypot(*slopes(through)))
-
-
 def slopes(through: Sight) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """[h, w] x and y of each pixel's ray at a depth of 1."""
     lens = through.lens

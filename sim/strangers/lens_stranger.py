@@ -18,8 +18,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from sim.render.lens import Lens
 
 TAPS = 6
-COMA_CENTROID = float(np.average((np.arange(TAPS) + 0.5) / TAPS, weights=1.0 - (np.arange(TAPS) + 0.5) / TAPS))
-"""Distance of a comatic spot's centroid from its bright end, over its length."""
 
 
 class LensStranger(BaseModel):

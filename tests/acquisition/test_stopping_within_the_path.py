@@ -17,7 +17,7 @@ from coupole.devices import ArmState
 from coupole.errors import DeviceFault
 from coupole.kinematics import forward
 from coupole.motion.itinerary import Visit, arm_of
-from coupole.motion.path_deviation import PATH_TOLERANCE_MM, path_deviation_mm
+from coupole.motion.path_deviation import PATH_TOLERANCE_MM, deviation_at_rest_mm
 from coupole.motion.path_planner import Leg
 from coupole.preflight.job import Job, read_job
 
@@ -82,7 +82,8 @@ def supervised(job: Job, drift_deg_s: float) -> tuple[Drifting, float]:
     with pytest.raises(DeviceFault, match="comes to rest"):
         supervisor.go(Visit(goal, Leg((goal,), 3.0)))
     arm.now_s += STOPPING_S
-    return arm, path_deviation_mm([arm.home_deg, goal], arm.joints_deg(), job.motion.bodies.reach_mm)
+    reach_mm = job.motion.bodies.reach_mm
+    return arm, deviation_at_rest_mm([arm.home_deg, goal], arm.joints_deg(), np.zeros(6), reach_mm, 0.0)
 
 
 @pytest.mark.parametrize("drift_deg_s", [0.1, 0.3, 0.6])

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from coupole.appearance.matter import brdf, gilding, hemisphere, layered, makie, tabulated
+from coupole.appearance.matter import brdf, hemisphere, layered, makie, tabulated
 from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.matter.glossy_face import InternalReflectance, face
 from coupole.appearance.optics import fresnel, indices
@@ -28,14 +28,6 @@ def of_gold(cosines: Array) -> Array:
     return reflected
 
 
-def gilt_brdf() -> Brdf:
-    bole = InternalReflectance(np.full(BANDS, 0.9))
-    coats = gilding.coats(
-        gilding.gilt(indices.gold(), 30.0, bole, uncovered=0.2), leaf_roughness=0.15, bole_roughness=0.4
-    )
-    return partial(gilding.gilt_brdf, coats=coats)
-
-
 def table_of_gold() -> Brdf:
     source = partial(brdf.ggx, roughness=0.2, fresnel=mirror_all)
     return partial(tabulated.tabulated, table=tabulated.tabulate(source, np.arange(0.0, 90.0, 5.0)))
@@ -52,7 +44,6 @@ BRDFS: dict[str, Brdf] = {
     "lacquered white": partial(
         layered.layered, coat=layered.coat(layered.sheet([], indices.URUSHI), 0.1), body=WHITE
     ),
-    "gilt": gilt_brdf(),
     "tabulated": table_of_gold(),
     "makie": partial(
         makie.makie_brdf,
@@ -157,11 +148,3 @@ def test_paint_under_smooth_lacquer_is_what_saunderson_says() -> None:
         return layered.layered(wi, wo, coat=coat, body=body) - gloss(wi, wo)
 
     assert hemisphere.albedo(diffuse, np.array([1.0]))[0] == pytest.approx(face(1.5).seen(body).values, abs=1e-3)
-
-
-def test_a_gilts_lobes_hold_what_the_smooth_gilt_reflects() -> None:
-    gilded = gilding.gilt(indices.gold(), 20.0, InternalReflectance(np.full(BANDS, 0.5)))
-    specular, diffuse = gilding.reflectances(gilded)
-    f = partial(gilding.gilt_brdf, coats=gilding.coats(gilded, leaf_roughness=0.02, bole_roughness=0.02))
-
-    assert hemisphere.albedo(f, np.array([1.0]))[0] == pytest.approx(specular + diffuse, abs=5e-3)

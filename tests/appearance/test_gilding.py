@@ -123,10 +123,9 @@ def test_the_bole_under_a_leaf_is_as_bright_as_the_tables_of_the_reference_say(
 
 
 def test_the_step_wedge_darkens_the_bole_step_by_step() -> None:
-    wedge = gilding.step_wedge(GOLD, [0.0, 20.0, 50.0, 100.0, 200.0], BOLE)
+    wedge = [gilding.reflectances(gilding.gilt(GOLD, d, BOLE))[1] for d in (0.0, 20.0, 50.0, 100.0, 200.0)]
 
-    assert wedge.shape == (5, 2, 81)
-    assert np.all(np.diff(wedge[:, 1], axis=0) < 0.0)
+    assert np.all(np.diff(wedge, axis=0) < 0.0)
 
 
 def test_a_thin_leaf_is_green_when_light_shines_through_it() -> None:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_bvp
 from scipy.linalg import expm
 
 from coupole.appearance.matter import four_flux, kubelka_munk
 from coupole.appearance.matter.four_flux import Background, Layer
-from coupole.errors import InputError
 
 PER_MM = st.floats(0.0, 40.0)
 SHARE = st.floats(0.0, 0.98)
@@ -88,24 +87,6 @@ def test_reflectance_and_k_over_s_are_inverse(reflectance: float) -> None:
 
 
 @settings(deadline=None, max_examples=40)
-@given(k=st.floats(0.5, 20.0), s=st.floats(2.0, 40.0), h=st.floats(0.02, 0.08), ground=st.floats(0.0, 1.0))
-def test_coefficients_come_back_from_two_samples(k: float, s: float, h: float, ground: float) -> None:
-    seen = kubelka_munk.over(*kubelka_munk.layer(k, s, h), ground)
-    r_inf = kubelka_munk.opaque(k / s)
-    assume(abs(ground - r_inf) > 0.05 and abs(seen - r_inf) > 0.01)
-
-    found_k, found_s = kubelka_munk.coefficients(r_inf, seen, ground, h)
-
-    assert found_k == pytest.approx(k, rel=1e-6)
-    assert found_s == pytest.approx(s, rel=1e-6)
-
-
-def test_a_thin_sample_that_is_lighter_than_the_opaque_one_over_black_is_refused() -> None:
-    with pytest.raises(InputError, match="of one paint"):
-        kubelka_munk.coefficients(0.3, 0.4, 0.0, 0.05)
-
-
-@settings(deadline=None, max_examples=40)
 @given(
     k=PER_MM, s=PER_MM, direct=PER_MM, forward=PER_MM, backward=PER_MM, h=THICKNESS, below=st.tuples(SHARE, SHARE)
 )
@@ -159,13 +140,6 @@ def test_away_from_resonance_the_papers_p_and_q_give_the_same() -> None:
 
     assert up == pytest.approx(rho * p - q * (1.0 - tau * passed), rel=1e-9)
     assert down == pytest.approx(p * (tau - passed) + rho * q * passed, rel=1e-9)
-    assert four_flux.opaque(Layer(k, s, direct, s_i, s_j, h)) == pytest.approx((a - b) * p - q, rel=1e-9)
-
-
-def test_a_thick_layer_under_four_fluxes_needs_no_background() -> None:
-    layer = Layer(1.0, 2000.0, 1.0, 1.0, 1.0, 1e4)
-
-    assert four_flux.reflectances(layer, Background(0.9))[0] == pytest.approx(four_flux.opaque(layer))
 
 
 @settings(deadline=None, max_examples=40)

@@ -121,15 +121,6 @@ def test_absorption_comes_back_from_a_films_transmittance(absorption: float, thi
     assert lacquer.absorption_from(measured, thickness_mm) == pytest.approx(absorption, rel=1e-6, abs=1e-9)
 
 
-def test_a_mirror_at_half_the_angle_sends_the_light_to_the_eye() -> None:
-    off_deg, passed = lacquer.seen_through(
-        unit(0.5, 0.0, 1.0), unit(-0.5, 0.0, 1.0), unit(0.0, 0.0, 1.0), 0.1, np.array([0.0]), 1.53
-    )
-
-    assert off_deg == pytest.approx(0.0, abs=1e-9)
-    assert passed == pytest.approx((1.0 - 0.0436) ** 2, abs=0.005)
-
-
 def test_the_same_seed_gives_the_same_flakes() -> None:
     one, again, other = (nashiji.flakes(Slab(size_mm=(5.0, 5.0), seed=seed)) for seed in (3, 3, 4))
 
@@ -186,28 +177,3 @@ def test_flakes_have_the_density_tilt_and_size_that_were_asked_for() -> None:
     assert np.degrees(np.arctan(np.sqrt(np.mean(np.sum(slopes**2, axis=1))))) == pytest.approx(8.0, rel=0.05)
     radius = np.sqrt(found.half_axes_mm[:, 0] * found.half_axes_mm[:, 1])
     assert np.median(radius) == pytest.approx(0.12, rel=0.02)
-
-
-def test_two_eyes_see_different_flakes_shine() -> None:
-    found = nashiji.flakes(Slab())
-    light = unit(0.1, 0.0, 1.0)
-    # Eyes 65 mm apart at 300 mm.
-    bright = [
-        nashiji.sparkles(found, light, unit(x, 0.0, 300.0), np.array([0.0]), spread_deg=1.0)[:, 0] > 0.3
-        for x in (-32.5, 32.5)
-    ]
-
-    assert min(bright[0].sum(), bright[1].sum()) > 20
-    assert (bright[0] & bright[1]).sum() < 0.2 * bright[0].sum()
-
-
-def test_deep_flakes_are_more_amber_than_shallow_ones() -> None:
-    found = nashiji.flakes(Slab())
-    absorption = lacquer.urushi_absorption()
-    up = unit(0.0, 0.0, 1.0)
-
-    bright = nashiji.sparkles(found, up, up, absorption, spread_deg=90.0)
-
-    blue_over_red = bright[:, 14] / bright[:, 54]
-    deep = found.centres_mm[:, 2] < -0.25
-    assert blue_over_red[deep].max() < blue_over_red[found.centres_mm[:, 2] > -0.1].min()

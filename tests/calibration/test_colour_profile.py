@@ -182,7 +182,6 @@ def test_values_are_read_as_instruments_write_them(tmp_path: Path) -> None:
     for name, text in files.items():
         (tmp_path / name).write_text(text)
         found = read_chart_values(tmp_path / name)
-        assert not found.spectral
         assert np.allclose([lab_of(found.xyz[patch]) for patch in lab], list(lab.values()), atol=1e-9)
     (tmp_path / "x.txt").write_text(cgats.replace("A1 50.0 20.0 -10.0", "A1 50.0 20.0"))
     with pytest.raises(InputError, match=r"x\.txt:6:1: expected 4 fields"):

@@ -84,7 +84,8 @@ def test_frames_of_several_temperatures_give_one_current() -> None:
     found = calibrate_dark(dark_frames(sensor, temperatures_c=(20.0, 30.0)), white_dn=4095)
     assert found.reference_c == 25.0
     _, offset, current = sensor.pattern()
-    warm = found.at(0.3, 31.5) - 64 - (offset + 2 * current * 0.3) / 3.2
+    warm_s = 0.3 * 2.0 ** ((31.5 - 25.0) / found.doubling_k)
+    warm = found.offset_dn + found.current_dn_per_s * warm_s - 64 - (offset + 2 * current * 0.3) / 3.2
     assert abs(float(warm.mean())) < 0.1
 
 

@@ -32,7 +32,6 @@ from coupole.plan.plan import Plan
 from coupole.plan.schedule import build_schedule
 from drivers.camera.raw.driver import RawFiles, Settings
 from drivers.camera.raw.exif import read_exif
-from drivers.camera.raw.order import proven_order
 from drivers.camera.raw.picture import decode
 
 REAL_DNG = SHARED_DATA / "raw/colorchart.dng"
@@ -305,35 +304,6 @@ class TestDecoding:
         path.write_bytes(path.read_bytes()[:300])
         with pytest.raises(ValueError, match="LibRaw says"):
             decode(path)
-
-
-class TestBurstOfFiles:
-    """Files that are there already, and how many edges there were."""
-
-    def test_files_are_put_in_the_order_of_their_numbers_over_the_wrap(self, still: StillCamera) -> None:
-        files = [still.picture(number) for number in (9998, 9999, 1, 2)]
-        assert proven_order(files[::-1], 4) == files
-
-    @pytest.mark.parametrize(
-        ("numbers", "message"),
-        [((42, 43), "3 files for 3 edges"), ((42, 43, 45), "without a gap"), ((42, 43, 44, 45), "there are 4")],
-    )
-    def test_a_missing_or_surplus_file_is_refused(
-        self, still: StillCamera, numbers: tuple[int, ...], message: str
-    ) -> None:
-        files = [still.picture(number) for number in numbers]
-        with pytest.raises(DeviceFault, match=message):
-            proven_order(files, 3)
-
-    def test_numbers_that_contradict_the_capture_times_are_refused(self, still: StillCamera) -> None:
-        files = [still.picture(42, after_s=50.0), still.picture(43, after_s=48.0)]
-        with pytest.raises(DeviceFault, match=r"IMG_0043.DNG taken after IMG_0042.DNG"):
-            proven_order(files, 2)
-
-    def test_one_number_twice_is_refused(self, still: StillCamera) -> None:
-        files = [still.picture(42), still.picture(42, name="DSC_0042.NEF")]
-        with pytest.raises(DeviceFault, match="twice"):
-            proven_order(files, 2)
 
 
 class TestSetting:

@@ -11,7 +11,7 @@ import pytest
 from places import REPO
 from pydantic import BaseModel
 
-from coupole.commands.export_options import OF_RUNS
+from coupole.commands.export_formats import OF_RUNS
 from coupole.exchange.of_results import FORMATS as OF_RESULTS
 from coupole.heritage.restoration import parts_file, restoration_file
 from coupole.heritage.restoration.restoration_file import Stage

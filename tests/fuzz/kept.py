@@ -86,7 +86,6 @@ def read_run(path: Path) -> None:
     readers = (
         lambda: status(run).figures(),
         lambda: verify(run),
-        run.robot_fault,
         run.allocated_bytes,
         run.refuse_old_journal,
         lambda: [frame.read() for frame in open_light_frames([folder]).lit],

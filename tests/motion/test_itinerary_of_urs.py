@@ -12,7 +12,7 @@ from places import REPO
 
 from coupole.geometry import look_at
 from coupole.motion.itinerary import arm_of, plan_itinerary
-from coupole.motion.path_deviation import path_deviation_mm
+from coupole.motion.path_deviation import deviation_at_rest_mm
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job, read_job
 
@@ -76,7 +76,7 @@ def test_a_pose_beyond_its_reach_is_refused() -> None:
 
 def test_the_watch_over_the_way_counts_the_urs_own_reach() -> None:
     here = np.array(job().cell.rig.motion.home_joints_deg)
-    off_mm = path_deviation_mm([here], here + np.eye(6)[0], job().motion.bodies.reach_mm)
+    off_mm = deviation_at_rest_mm([here], here + np.eye(6)[0], np.zeros(6), job().motion.bodies.reach_mm, 0.0)
     assert off_mm > np.radians(1.0) * 1300.0  # the arm's reach, by its data sheet
 
 

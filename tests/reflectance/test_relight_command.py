@@ -53,6 +53,14 @@ def test_a_camera_anywhere_has_the_size_that_is_asked(folder: Path, tmp_path: Pa
     assert (picture > 0).mean() > 0.8
 
 
+def test_a_result_of_a_camera_with_one_channel_makes_a_grey_picture(tmp_path: Path) -> None:
+    write_result(tmp_path / "result", waves(), Coat(ks=(0.1, 0.1, 0.1)), channels=slice(1, 2))
+    picture = made(tmp_path / "result", tmp_path / "a.npy", "--direction", "0,2,2")
+    assert picture.shape == (*cases.SIZE_PX[::-1], 3)
+    assert picture.max() > 0.0
+    np.testing.assert_array_equal(picture, picture[..., :1].repeat(3, axis=2))
+
+
 def test_a_video_turns_the_light_once_and_says_what_it_is(folder: Path, tmp_path: Path) -> None:
     to = tmp_path / "turn.mp4"
     options = ("--direction", "1,0,1", "--turn", "8", "--white", "2", "--to", to, "--json")

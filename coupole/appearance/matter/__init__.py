@@ -6,7 +6,7 @@ Plain functions on arrays, from the papers named in each file. Spectra are [...,
 ====================================  =================================================================
 `fresnel`, `thin_film`, `indices`     one interface, many, and what they are made of
 `kubelka_munk`, `four_flux`           scattering layers under diffuse and under directional light
-`pigments`, `typical`                 mixtures and their fit; typical paints for virtual objects
+`pigments`, `typical`                 one pigment's K and S; typical paints for virtual objects
 `effective_medium`, `gilding`         gold leaf with holes on bole
 `brdf`, `layered`, `tabulated`        reflectance by direction; `hemisphere` adds it up
 `makie`, `nashiji`, `lacquer`         urushi

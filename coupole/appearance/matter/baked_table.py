@@ -102,20 +102,6 @@ def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
     return BakedTable(fields, np.ascontiguousarray(np.moveaxis(table.values, -1, 2)), to_bands)
 
 
-def missed(table: BakedTable, source: Brdf, pairs: int = 400) -> Array:
-    """[directions, channels] what the table misses of its source, over the source's greatest value from that
-    direction of light; light and eye up to 80 degrees from the normal."""
-    random = np.random.default_rng(1)
-    cosines = random.uniform(np.cos(_STEEPEST), 1.0, (2, pairs))
-    wi = directions(cosines[0], np.zeros(pairs))
-    wo = directions(cosines[1], random.uniform(0.0, 2.0 * np.pi, pairs))
-    wo[::2] = wi[::2] * np.array([-1.0, -1.0, 1.0]) + 0.05 * random.normal(size=wi[::2].shape)
-    wo[:, 2] = np.maximum(np.abs(wo[:, 2]), np.cos(_STEEPEST))
-    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
-    peak = np.maximum(source(wi, wi * np.array([-1.0, -1.0, 1.0])), source(wi, wo))
-    return np.asarray(np.abs(table.read()(wi, wo) - source(wi, wo)) / np.maximum(peak, 1e-12))
-
-
 def _back(source: Brdf) -> Array:
     """[nodes] the channels' mean of the reflectance back to the light."""
     theta = 0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2

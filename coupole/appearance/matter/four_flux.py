@@ -94,16 +94,3 @@ def response(layer: Layer) -> tuple[Array, Array, Array, Array, Array]:
     down = forward * (a_s_h * sinh_from_bottom + cosh_from_bottom) + backward * s_h * sinh_from_bottom
     rho, tau = s_h * decay(2.0 * x) / a_over_b, shrink / a_over_b
     return rho, tau, h * up / a_over_b, h * down / a_over_b, np.exp(-m)
-
-
-def opaque(layer: Layer) -> Array:
-    """Diffuse reflectance of an infinitely thick layer for directional light; its thickness is not used.
-
-    R_inf,dir = rho1 p - q, which reduces to rho1 s_i/(mu + bS) + s_j/(mu + bS).
-    """
-    k, s = (np.asarray(v, dtype=float) for v in (layer.absorption, layer.scattering))
-    forward, backward = np.asarray(layer.forward, dtype=float), np.asarray(layer.backward, dtype=float)
-    mu = np.asarray(layer.direct_absorption, dtype=float) + forward + backward
-    b_s = np.sqrt(k * (k + 2.0 * s))
-    rho1 = s / (k + s + b_s)
-    return np.asarray((rho1 * forward + backward) / (mu + b_s))

@@ -11,7 +11,6 @@ under the face of its binder, for thick leaves bulk gold.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +24,7 @@ from coupole.appearance.spectra.grid import Array, Complex, within
 
 @dataclass(frozen=True)
 class Gilt:
-    """A gilded surface, ready for `reflectances` and `gilt_brdf`."""
+    """A gilded surface, ready for `reflectances`."""
 
     leaf: layered.Sheet
     bare: layered.Sheet
@@ -81,30 +80,3 @@ def reflectances(gilded: Gilt) -> tuple[Array, Array]:
         parts.append(share * np.stack([sheet.normal_reflectance, diffuse]))
     specular, diffuse = parts[0] + parts[1]
     return specular, diffuse
-
-
-def step_wedge(index: Complex, thicknesses_nm: Sequence[float], bole: InternalReflectance) -> Array:
-    """Specular and diffuse reflectance [steps, 2, bands] of leaves of several thicknesses: a gilt step wedge."""
-    return np.stack([np.stack(reflectances(gilt(index, d, bole))) for d in thicknesses_nm])
-
-
-@dataclass(frozen=True)
-class GiltCoats:
-    """The two surfaces of a gilt with their roughness."""
-
-    gilded: Gilt
-    leaf: layered.Coat
-    bare: layered.Coat
-
-
-def coats(gilded: Gilt, *, leaf_roughness: float, bole_roughness: float) -> GiltCoats:
-    """Burnished gold has a GGX roughness of about 0.05 to 0.2, bare bole 0.3 and more (assumed)."""
-    return GiltCoats(gilded, layered.coat(gilded.leaf, leaf_roughness), layered.coat(gilded.bare, bole_roughness))
-
-
-def gilt_brdf(wi: Array, wo: Array, *, coats: GiltCoats) -> Array:
-    """BRDF of the gilt: leaf and bare bole by their shares of the surface."""
-    f = coats.gilded.uncovered
-    leaf = layered.layered(wi, wo, coat=coats.leaf, body=coats.gilded.bole)
-    bare = layered.layered(wi, wo, coat=coats.bare, body=coats.gilded.bole)
-    return (1.0 - f) * leaf + f * bare

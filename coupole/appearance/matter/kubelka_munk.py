@@ -54,19 +54,3 @@ def k_over_s(r_inf: ArrayLike) -> Array:
     """K/S of an opaque layer from its (internal) reflectance in 0 < R <= 1 (seed 001, Eq. 6)."""
     r = within("R_inf", r_inf, np.finfo(float).tiny, 1.0)
     return np.asarray((1.0 - r) ** 2 / (2.0 * r))
-
-
-def coefficients(
-    r_inf: ArrayLike, reflectance: ArrayLike, background: ArrayLike, thickness_mm: ArrayLike
-) -> tuple[Array, Array]:
-    """K and S per mm from an opaque layer and one of known thickness on a known background (seed 000, Eqs 5-7).
-
-    The thin layer must show its background: R strictly between the background's reflectance and R_inf.
-    """
-    r_inf = within("R_inf", r_inf, 1e-9, 1.0 - 1e-9)
-    r, ground = within("R", reflectance, 0.0, 1.0), within("Rg", background, 0.0, 1.0)
-    r0 = r_inf * (ground - r) / (ground - r_inf * (1.0 - ground * r_inf + ground * r))
-    left = within("R_inf - R0 of one paint's opaque and thin samples", r_inf - r0, 1e-12, 1.0)
-    logarithm = np.log(r_inf * (1.0 - r0 * r_inf) / left)
-    s = r_inf / (1.0 - r_inf**2) * logarithm / within("h", thickness_mm, 1e-9, 1e12)
-    return s * (1.0 - r_inf) ** 2 / (2.0 * r_inf), s

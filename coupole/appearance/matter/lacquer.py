@@ -36,31 +36,3 @@ def transmittance(
     cosine = fresnel.cos_inside(cos_in_air, 1.0, index).real
     path_mm = within("depth", depth_mm, 0.0, np.inf) / cosine
     return np.exp(-path_mm[..., None] * absorption_per_mm)
-
-
-def seen_through(
-    wi: Array, wo: Array, metal_normal: Array, depth_mm: ArrayLike, absorption_per_mm: Array, index: float
-) -> tuple[Array, Array]:
-    """A mirror at a depth in lacquer: its angle from the mirror condition, and the transmittance of the lacquer.
-
-    `wi`, `wo` [..., 3] are directions in air, `metal_normal` [..., 3] of the mirror, in the surface's frame.
-    Returns the angle in degrees [...] between that normal and the one that reflects wi to wo, and the
-    transmittance [..., bands] along both paths, with absorption and surface (Fresnel).
-    """
-    inside = [_refracted(w, index) for w in (wi, wo)]
-    needed = inside[0] + inside[1]
-    needed = needed / np.linalg.norm(needed, axis=-1, keepdims=True)
-    across = np.linalg.norm(np.cross(needed, metal_normal), axis=-1)
-    off_deg = np.degrees(np.arctan2(across, np.sum(needed * metal_normal, axis=-1)))
-    passed = np.ones(1)
-    for w in (wi, wo):
-        surface = 1.0 - fresnel.reflectance(w[..., 2], index)
-        passed = passed * surface[..., None] * transmittance(depth_mm, w[..., 2], absorption_per_mm, index)
-    return off_deg, passed
-
-
-def _refracted(w: Array, index: float) -> Array:
-    """Direction inside, still pointing up."""
-    flat = w * np.array([1.0, 1.0, 0.0]) / index
-    z = np.sqrt(np.maximum(0.0, 1.0 - np.sum(flat**2, axis=-1)))
-    return np.asarray(flat + z[..., None] * np.array([0.0, 0.0, 1.0]))

@@ -34,7 +34,7 @@ def motif(name: Motif, period_mm: float, edge_mm: float) -> Drawing:
 def picture(path: Path, width_mm: float) -> Drawing:
     """A picture `width_mm` wide about the origin, upright along +y; none beside it.
 
-    Its alpha channel is the share if it has one (as `makie.decompose` makes it), otherwise its grey value over
+    Its alpha channel is the share if it has one (as `coupole makie` makes it), otherwise its grey value over
     white: white is metal. Values are taken as they are, without a transfer function. Raises InputError.
     """
     share = _shares(path)

@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.matter import lacquer
-from coupole.appearance.optics import indices
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -115,29 +113,6 @@ def settled(found: Flakes, tops_mm: Array, frames: Array) -> Flakes:
     """
     centres = tops_mm + found.centres_mm[:, 2:] * frames[:, :, 2]
     return replace(found, centres_mm=centres, slab_from_flake=frames @ found.slab_from_flake)
-
-
-def sparkles(
-    found: Flakes,
-    to_light: Array,
-    to_eye: Array,
-    absorption_per_mm: Array,
-    *,
-    spread_deg: float = 2.0,
-    index: float = indices.URUSHI,
-) -> Array:
-    """Brightness [n, bands] of each flake for a distant light and an eye: 1 is a mirror that meets the eye in air.
-
-    `to_light` [3] and `to_eye` [3] or [n, 3] are unit vectors. A flake's mirror is blurred by `spread_deg`
-    (standard deviation of its facets' normals, with the light's own size in it). Different flakes are bright for
-    the two eyes, the binocular rivalry that causes the paper's depth effect. Mutual shadowing of flakes is left to
-    a renderer.
-    """
-    wi, wo = (np.broadcast_to(w, found.centres_mm.shape) for w in (to_light, to_eye))
-    off_deg, passed = lacquer.seen_through(
-        wi, wo, found.normals, -found.centres_mm[:, 2], absorption_per_mm, index
-    )
-    return np.exp(-0.5 * (off_deg / spread_deg) ** 2)[:, None] * passed
 
 
 def _power(base: Array, exponent: float) -> Array:

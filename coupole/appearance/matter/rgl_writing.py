@@ -16,6 +16,8 @@ from coupole.appearance.matter.brdf import Brdf
 
 _LEAST_DRAWN = 1e-3
 """Of the mean density: nothing that reflects is never drawn."""
+_NDF = 4.0
+"""Over 4 sigma it is 1."""
 _TYPES = {"uint8": 1, "float32": 10}
 
 
@@ -77,6 +79,23 @@ def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArr
     solid_angle = np.maximum(half @ lights.T, 0.0) * (u * np.sin(0.5 * np.pi * u**2))[None, :, None]
     found = values.mean(axis=2) * np.moveaxis(solid_angle, -1, 0)[None]
     return np.asarray(found + _LEAST_DRAWN * found.mean(axis=(2, 3), keepdims=True) + 1e-12, np.float32)
+
+
+def fields_of(
+    theta_i: NDArray[np.float32], rgb: NDArray[np.float32], luminance: NDArray[np.float32], text: str
+) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
+    """Of an isotropic file whose half vectors are not warped, and whose values are not divided by anything."""
+    return {
+        "theta_i": theta_i,
+        "phi_i": np.zeros(1, np.float32),
+        "ndf": np.full((2, 2), _NDF, np.float32),
+        "sigma": np.ones((2, 2), np.float32),
+        "vndf": np.ones((1, len(theta_i), 2, 2), np.float32),
+        "luminance": luminance,
+        "rgb": rgb,
+        "description": np.frombuffer(text.encode(), np.uint8),
+        "jacobian": np.ones(1, np.uint8),
+    }
 
 
 def tensors(fields: Mapping[str, NDArray[Any]]) -> bytes:

@@ -39,11 +39,6 @@ class SpecularTable:
     log_cosines: Array
     """[incidence, theta, cosines, bands]: log f (per steradian) is the sum over k of entry k times cos(k phi)."""
 
-    @property
-    def entries_per_incidence(self) -> int:
-        """Number of entries as the paper counts them."""
-        return int(np.prod(self.log_cosines.shape[1:3]))
-
 
 def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_nodes: int = 7) -> SpecularTable:
     """The table of `source`, a BRDF or a measurement of one, at angles of incidence (increasing, below 90)."""

@@ -48,17 +48,6 @@ def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
     return Niche(gilded, np.concatenate(stone))
 
 
-def nephroid(radius: float, angles: Array) -> Array:
-    """Points [n, 2] where parallel light along +x that a circle's inside reflects once is densest.
-
-    A ray that meets the circle at (cos t, sin t) turns to (-cos 2t, -sin 2t) and touches its neighbour r cos t/2
-    later; the cusp, t = 0, lies halfway between centre and circle (Huygens 1690).
-    """
-    x = np.cos(angles) * (1.0 - 0.5 * np.cos(2.0 * angles))
-    y = np.sin(angles) - 0.5 * np.cos(angles) * np.sin(2.0 * angles)
-    return radius * np.stack([x, y], axis=-1)
-
-
 def _at(outline: Array, y_mm: float) -> Array:
     """Points [n, 3] of an outline [n, 2] of x and z."""
     return np.stack([outline[:, 0], np.full(len(outline), y_mm), outline[:, 1]], axis=1)

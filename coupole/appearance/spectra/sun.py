@@ -24,10 +24,8 @@ WIDTH_DEG = 0.533
 class SunPlace:
     """Where the sun stands for an observer. Azimuths count from north by east."""
 
-    geometric_elevation_deg: float
-    """Of the disk's centre, without air."""
     refracted_elevation_deg: float
-    """As seen through the air: light comes from there."""
+    """Of the disk's centre, as seen through the air: light comes from there."""
     azimuth_deg: float
     day_of_year: int
     pressure_pa: float
@@ -78,7 +76,6 @@ def place(when: datetime, latitude_deg: float, longitude_deg: float, altitude_m:
             f"at {found['apparent_elevation']:.1f} degrees; choose another time"
         )
     return SunPlace(
-        float(found["elevation"]),
         float(found["apparent_elevation"]),
         float(found["azimuth"]),
         int(when.timetuple().tm_yday),

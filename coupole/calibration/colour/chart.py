@@ -131,7 +131,6 @@ class KnownChart:
     """[patches, 3] under D50, Y = 1 for the perfect white."""
     files: tuple[Path, ...]
     """Its description and its values."""
-    from_spectra: bool
 
     @property
     def lab(self) -> Floats:
@@ -167,7 +166,7 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
         listed = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
         has = ", ".join(list(values.xyz)[:6])
         raise InputError(f"{values_path}: has no values of {listed} (it has {has}, ...); set `names` in {path}")
-    known = KnownChart(chart, np.stack([values.xyz[name] for name in names]), (path, values_path), values.spectral)
+    known = KnownChart(chart, np.stack([values.xyz[name] for name in names]), (path, values_path))
     if not known.neutral:
         raise InputError(f"{path}: expected a grey patch of L* above {_LEAST_GREY_LIGHTNESS:g}; found none")
     return known

@@ -37,7 +37,6 @@ class ChartValues:
 
     xyz: Mapping[str, Floats]
     """[3] under D50, Y = 1 for the perfect white."""
-    spectral: bool
 
 
 def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
@@ -61,12 +60,12 @@ def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
         bands.sort()
         table = _numbers(path, rows, [at for _, at in bands])
         xyz = xyz_of_spectra(np.array([nm for nm, _ in bands]), _fractions(path, table, unit))
-        return ChartValues(dict(zip(names, xyz, strict=True)), spectral=True)
+        return ChartValues(dict(zip(names, xyz, strict=True)))
     for columns, turn in ((_LAB, xyz_of), (_XYZ, lambda values: values / 100.0)):
         for wanted in columns:
             if all(one in upper for one in wanted):
                 values = turn(_numbers(path, rows, [upper.index(one) for one in wanted]))
-                return ChartValues(dict(zip(names, values, strict=True)), spectral=False)
+                return ChartValues(dict(zip(names, values, strict=True)))
     raise InputError(
         f"{path}: expected spectra ({_LEAST_BANDS} columns such as SPECTRAL_NM400 or more), LAB_L LAB_A LAB_B or "
         f"XYZ_X XYZ_Y XYZ_Z; found {', '.join(fields[:8])}"

@@ -32,7 +32,6 @@ class SlantedEdge:
     """[2] unit, from dark to light, x right, y down."""
     offset_px: float
     """Of the edge at the middle of the pixels, along the normal, from `middle_px`."""
-    u_offset_px: float
     middle_px: Floats
     """[2]."""
     frequencies: Floats
@@ -86,11 +85,9 @@ def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge"
         raise InputError(
             f"{where}: expected {_REACH_PX:g} pixels or more on either side of the edge; correct its place"
         )
-    noise = float(found.fun @ found.fun) / max(1, len(values) - len(found.x))
-    u_offset = float(np.sqrt(noise * np.linalg.inv(found.jac.T @ found.jac)[1, 1]))
     frequencies, response = _response(away, (values - low) / (high - low))
     normal = np.array([np.cos(angle), np.sin(angle)])
-    return SlantedEdge(normal, float(offset), u_offset, middle, frequencies, response)
+    return SlantedEdge(normal, float(offset), middle, frequencies, response)
 
 
 def _distance(angle: float, offset: float, bend: float, x: Floats, y: Floats) -> Floats:

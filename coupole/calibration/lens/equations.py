@@ -11,7 +11,6 @@ poses share; S_i is the arm's Jacobian), s the relative error of the board's sca
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,10 +42,6 @@ class Poses:
     axis_sensitivity: Floats | None = None
     """[n, 6, axes] step of the flange in its own frame (mm, rad) for each degree of each axis; None if the axes
     were not reported."""
-
-    def only(self, keep: Sequence[int] | np.ndarray[tuple[int], np.dtype[np.intp]]) -> Poses:
-        sensitivity = None if self.axis_sensitivity is None else self.axis_sensitivity[keep]
-        return Poses(self.base_from_flange[keep], sensitivity)
 
 
 @dataclass(frozen=True)

@@ -67,20 +67,6 @@ class Dark:
     levels: tuple[tuple[float, float, float], ...]
     """Exposure (s), temperature (C), mean DN of each frame."""
 
-    def at(self, exposure_s: float, temperature_c: float | None = None) -> Maps:
-        """[H, W] the mean dark frame, DN."""
-        return self.offset_dn + self.current_dn_per_s * np.float32(self._seconds(exposure_s, temperature_c))
-
-    def u_at(self, exposure_s: float, temperature_c: float | None = None) -> Maps:
-        """[H, W] standard uncertainty of the mean dark frame, DN; Student's, with `degrees_of_freedom`."""
-        line = np.array([1.0, self._seconds(exposure_s, temperature_c)])
-        return self.noise_dn * np.float32(np.sqrt(line @ self.cofactor @ line))
-
-    def _seconds(self, exposure_s: float, temperature_c: float | None) -> float:
-        if self.reference_c is None or temperature_c is None:
-            return exposure_s
-        return exposure_s * warmth_of(temperature_c, self.reference_c, self.doubling_k)
-
 
 def calibrate_dark(
     frames: Iterable[DarkFrame],

@@ -78,12 +78,6 @@ class LedPower:
         total: Floats = np.sqrt(self.u_own**2 + together)
         return total
 
-    @property
-    def u_scale(self) -> float:
-        """Relative standard uncertainty of all powers together."""
-        mean = np.nanmean(self.common[self.power > 0], axis=0)
-        return float(np.sqrt(mean @ self.common_covariance @ mean))
-
 
 def prior_of(tile: Tile, places: int = 1) -> Floats:
     """[c] standard uncertainties of the shared figures, by the tile's description."""

@@ -130,12 +130,6 @@ class Tasks:
             self._forget_old()
         return task
 
-    def task(self, number: str) -> Task:
-        """Raises InputError: there is none with this id."""
-        if (found := self._tasks.get(number)) is None:
-            raise InputError(f"no command {number!r}")
-        return found
-
     @property
     def listed(self) -> list[Task]:
         """The newest first."""

@@ -29,8 +29,8 @@ from coupole.reflectance.triangle_fit import TriangleSamples, model_values
 Floats = NDArray[np.float64]
 
 FIT = "ggx_rbf"
-PLANES, MOST_PLANES = 9, 29
-"""By default, and at most: with three shares of GGX they fill whole groups of four bytes."""
+PLANES = 9
+"""By default: with three shares of GGX they fill whole groups of four bytes."""
 SIDE = 48
 """Of a plane's table."""
 _STEPS = 127

@@ -21,12 +21,12 @@ from coupole.appearance.matter.rgl_table import RglTable
 from coupole.appearance.matter.rgl_writing import (
     cosine_weighted,
     drawn_by,
+    fields_of,
     half_vectors,
     nodes_for_linear_reading,
     tensors,
 )
 from coupole.errors import InputError
-from coupole.exchange.of_results.bsdf import fields_of
 from coupole.exchange.of_results.material_tables import Material
 from coupole.exchange.of_results.measured_surface import Floats
 

@@ -61,8 +61,6 @@ class Coefficients:
     scattering: Array
     covariance: Array
     """[n, 2, 2] of K and S."""
-    noise_share: Array
-    """[n, 2], share of each variance that is the spectra's and grounds' noise; the rest is the thicknesses'."""
     chi2: Array
     """[n], squared residuals over their variances; expected is the number of spectra less 2."""
     unlike: Array
@@ -259,21 +257,15 @@ def _with_uncertainty(
     floor = 1e-10 * np.einsum("nii->n", normal)[:, None, None] * np.eye(2)
     gain = np.einsum("nij,nfj,nf->nif", _inverse(normal + floor), jacobian, weight)
     grounds, thicknesses = _effects(k, s, films, face)
-    by_noise = noise**2 * np.einsum("nif,njf->nij", gain, gain)
-    for effect in grounds.values():
-        moved = np.einsum("nif,nf->ni", gain, effect)
-        by_noise = by_noise + moved[:, :, None] * moved[:, None, :]
-    covariance = by_noise.copy()
-    for effect in thicknesses.values():
+    covariance = noise**2 * np.einsum("nif,njf->nij", gain, gain)
+    for effect in (*grounds.values(), *thicknesses.values()):
         moved = np.einsum("nif,nf->ni", gain, effect)
         covariance += moved[:, :, None] * moved[:, None, :]
-    total = np.maximum(np.einsum("nii->ni", covariance), 1e-300)
     missed = y - _seen(k, s, films, face)
     return Coefficients(
         k,
         s,
         covariance,
-        np.einsum("nii->ni", by_noise) / total,
         np.sum(weight * missed**2, axis=1),
         _unlike(y, films, face) / noise**2,
         len(films),

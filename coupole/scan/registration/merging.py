@@ -29,7 +29,6 @@ from coupole.scan.registration.small_motions import applied
 from coupole.scan.registration.viewpoint import Floats
 
 Say = Callable[[str, int, int], None]
-LEVELS_MM = (5.0, 10.0, 50.0, 250.0)
 BLOCK_CELLS = 64
 _REACH_CELLS = 3.0
 """Points farther from a corner say nothing of it."""

@@ -23,7 +23,7 @@ from drivers.camera.aravis.discovery import name_of, open_controlled
 from drivers.camera.aravis.features import Features
 from drivers.camera.aravis.library import ON_CONTROL_LOST, call, is_a, require
 from drivers.camera.aravis.settings import Settings
-from drivers.camera.aravis.stream import Pool, Stream, StreamStatistics
+from drivers.camera.aravis.stream import Pool, Stream
 from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
 from drivers.camera.misuse import misused
@@ -49,7 +49,7 @@ class AravisCamera:
         self._exposure = Exposure(0)
         self._stream: Stream | None = None
         self._counted_before = (0, 0)
-        self._last = (CameraStatistics(-1, 0, 0, -1, 0), StreamStatistics())
+        self._last = CameraStatistics(-1, 0, 0, -1, 0)
         self._raw = self._wide = Pool(1, 1)
         self._armed = threading.Event()
         self._arming = threading.Lock()
@@ -125,10 +125,6 @@ class AravisCamera:
             if name is not None:
                 report[what] = str(self._features.read(name))
         return report
-
-    def temperature_c(self) -> float:
-        """Temperature of sensor or body, as the camera provides. Raises DeviceRefused without thermometer."""
-        return self._features.number("DeviceTemperature")
 
     # -- exposure -----------------------------------------------------------------------------------------
 
@@ -241,7 +237,7 @@ class AravisCamera:
                 return
             try:
                 self._check_link()
-                self._last = (self._statistics(stream), stream.statistics())
+                self._last = self._statistics(stream)
                 self._features.execute("AcquisitionStop")
             finally:
                 stream.close()
@@ -250,7 +246,7 @@ class AravisCamera:
 
     def statistics(self) -> CameraStatistics:
         stream = self._stream
-        return self._statistics(stream) if stream is not None else self._last[0]
+        return self._statistics(stream) if stream is not None else self._last
 
     def _statistics(self, stream: Stream) -> CameraStatistics:
         exposed, over_triggers = counts(self._features, self._settings)
@@ -263,11 +259,6 @@ class AravisCamera:
             since(over_triggers, self._counted_before[1]),
             overflows,
         )
-
-    def stream_statistics(self) -> StreamStatistics:
-        """Counts of frames and packets since `arm`."""
-        stream = self._stream
-        return stream.statistics() if stream is not None else self._last[1]
 
     # -- errors -------------------------------------------------------------------------------------------
 

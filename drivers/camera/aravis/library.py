@@ -87,7 +87,6 @@ _PROTOTYPES: dict[str, tuple[Any, list[Any]]] = {
     "arv_stream_get_statistics": (None, [POINTER, _COUNTS, _COUNTS, _COUNTS]),
     "arv_gv_stream_get_type": (_TYPE, []),
     "arv_gv_stream_socket_buffer_get_type": (_TYPE, []),
-    "arv_gv_stream_get_statistics": (None, [POINTER, _COUNTS, _COUNTS]),
     "arv_buffer_new": (POINTER, [ctypes.c_size_t, POINTER]),
     "arv_buffer_get_status": (_INT, [POINTER]),
     "arv_buffer_get_frame_id": (_U64, [POINTER]),

@@ -87,8 +87,6 @@ class StreamStatistics:
     """Frame ids without a complete image, including those of `failed`."""
     underruns: int = 0
     """Times that libaravis found no free buffer; several may concern one frame."""
-    missing_packets: int = 0
-    resent_packets: int = 0
 
 
 class Stream:
@@ -178,17 +176,13 @@ class Stream:
             return self._final or self._count()
 
     def _count(self) -> StreamStatistics:
-        completed, failed, underruns, resent, missing = (ctypes.c_uint64() for _ in range(5))
+        completed, failed, underruns = (ctypes.c_uint64() for _ in range(3))
         self._library.arv_stream_get_statistics(self._handle, completed, failed, underruns)
-        if self._is_gige:
-            self._library.arv_gv_stream_get_statistics(self._handle, resent, missing)
         return StreamStatistics(
             completed.value,
             self._failed,
             self._skipped + self._failed_since,
             underruns.value - self._underruns_before,
-            missing.value,
-            resent.value,
         )
 
     def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import time
 from collections.abc import Sequence
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coupole.errors import DeviceFault, DeviceLost
-from drivers.camera.raw.exif import read_exif
 
 _NUMBER = re.compile(r"(\d+)$")
 
@@ -27,39 +25,6 @@ def file_number(path: Path, device: str, last_number: int) -> int:
             remedy="Let the camera name its files, and keep others out of the folder.",
         )
     return number
-
-
-def proven_order(
-    paths: Sequence[Path], triggers: int, *, device: str = "camera", last_number: int = 9999
-) -> list[Path]:
-    """The files of one burst in the order in which they were taken, one for each of `triggers`.
-
-    Proven in two ways: numbers follow each other without a gap (also over the wrap), and capture times increase
-    with them, strictly if they have a fraction of a second. Raises DeviceFault for a file that is missing, surplus
-    or out of order, and ValueError for one without capture time.
-    """
-
-    def refuse(expected: str, happened: str) -> DeviceFault:
-        remedy = "Leave out pictures that are not of the burst, or take it again."
-        return DeviceFault(device, expected=expected, happened=happened, remedy=remedy)
-
-    if len(paths) != triggers:
-        raise refuse(f"{triggers} files for {triggers} edges", f"there are {len(paths)}")
-    by_number = {file_number(path, device, last_number): path for path in paths}
-    if len(by_number) != len(paths):
-        raise refuse("one file for each number", "numbers come twice")
-    if not paths:
-        return []
-    starts = [number for number in by_number if (number - 2) % last_number + 1 not in by_number]
-    if len(starts) != 1:
-        raise refuse("numbers without a gap", f"they begin anew at {sorted(starts)}")
-    ordered = [by_number[(starts[0] + step - 1) % last_number + 1] for step in range(triggers)]
-    for earlier, later in itertools.pairwise(ordered):
-        before, after = read_exif(earlier), read_exif(later)
-        whole_seconds = max(before.resolution_us, after.resolution_us) >= 1_000_000
-        if after.taken_ns < before.taken_ns or (after.taken_ns == before.taken_ns and not whole_seconds):
-            raise refuse(f"{later.name} taken after {earlier.name}", "its capture time is not later")
-    return ordered
 
 
 @dataclass(frozen=True)

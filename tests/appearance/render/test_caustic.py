@@ -12,7 +12,7 @@ from coupole.appearance.matter import layered
 from coupole.appearance.optics import indices
 from coupole.appearance.optics.thin_film import Film
 from coupole.appearance.render import by_gold
-from coupole.appearance.render.arcature import arcature, nephroid
+from coupole.appearance.render.arcature import arcature
 from coupole.appearance.render.caustic import Niche, Sun, irradiance, photons
 from coupole.appearance.render.scene_file import Gathered, with_plain_lights
 from coupole.appearance.render.spectra import scaled
@@ -51,13 +51,24 @@ def test_triangles_of_the_niche_face_its_inside_and_the_viewer() -> None:
         assert np.all(np.sum(normals * towards, axis=1) > 0.0)
 
 
+def nephroid(angles: Array) -> Array:
+    """Points [n, 2] where parallel light along +x that the inside of a unit circle reflects once is densest.
+
+    A ray that meets the circle at (cos t, sin t) turns to (-cos 2t, -sin 2t) and touches its neighbour
+    (cos t)/2 later; the cusp, t = 0, lies halfway between centre and circle (Huygens 1690).
+    """
+    x = np.cos(angles) * (1.0 - 0.5 * np.cos(2.0 * angles))
+    y = np.sin(angles) - 0.5 * np.cos(angles) * np.sin(2.0 * angles)
+    return np.stack([x, y], axis=-1)
+
+
 def test_light_reflected_once_by_the_arch_stays_on_its_side_of_the_nephroid(scale: Scale) -> None:
     found = photons(niche(), sun(2.0), OPENING_MM, scale(200_000, 2_000_000), seed=1)
     x, z = ((found.places_mm[:, [0, 2]] - [0.0, HEIGHT_MM]) / RADIUS_MM).T
     at_back = (np.abs(found.places_mm[:, 1] - DEPTH_MM) < 0.5) & (found.bounces == 1) & (z > 0.0)
     # Of each height, the nephroid's branch through the cusp is the farthest that reflected light piles up.
     angles = np.linspace(0.0, np.pi / 2, 400)
-    curve = nephroid(1.0, angles)
+    curve = nephroid(angles)
     for low, high in ((0.02, 0.06), (0.10, 0.14), (0.20, 0.24)):
         band = at_back & (z > low) & (z < high)
         density, edges = np.histogram(x[band], bins=60, range=(-0.2, 1.0))

@@ -5,15 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from board_truth import inner_corners_mm
 from numpy.typing import NDArray
 
 from coupole.geometry import inverse
-from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.objects.charuco import Charuco, charuco_board, opencv_board
 from sim.optics import blur
 from sim.optics.objective import Objective, vignetting
 from sim.optics.sensor import electrons, expose, expose_electrons
 from sim.optics.sensor_model import SensorModel
-from sim.render.camera_view import View, Viewer, tangents
+from sim.render.camera_view import View, Viewer, slopes
 from sim.render.lens import Lens, sight
 from sim.scene.scene import build_scene
 
@@ -29,7 +30,7 @@ LENS = Lens.focused(
 )
 MONO = SensorModel(bayer_pattern="MONO", seed=3)
 WHITE_E = 8_000.0
-FALLOFF = vignetting(Objective(), tangents(sight(LENS))).astype(np.float32)
+FALLOFF = vignetting(Objective(), np.hypot(*slopes(sight(LENS)))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

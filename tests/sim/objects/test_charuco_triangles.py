@@ -5,11 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from board_truth import inner_corners_mm
 from numpy.typing import NDArray
 
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.errors import InputError
-from sim.objects.charuco import Charuco, charuco_board, inner_corners_mm, opencv_board
+from sim.objects.charuco import Charuco, charuco_board, opencv_board
 from sim.scene.surface import Surface
 
 _PIXELS_PER_MM = 10.0

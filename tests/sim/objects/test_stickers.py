@@ -30,7 +30,7 @@ def test_a_sticker_has_the_diameters_asked_for() -> None:
 
 def test_stickers_are_where_the_truth_says() -> None:
     poses = standards.sticker_poses(STONE, 8, seed=3)
-    surface = standards.with_stickers(STONE, 8, seed=3)
+    surface = standards.stuck_on(STONE, poses)
     assert np.allclose(centres_mm(surface, STONE, 8), poses[:, :3, 3], atol=1e-9)
 
 
@@ -81,10 +81,10 @@ def test_stickers_go_where_they_may() -> None:
 
 def test_a_surface_without_room_for_them_is_refused() -> None:
     with pytest.raises(InputError, match="expected room for 50"):
-        standards.with_stickers(standards.spectralon_tile(30.0), 50)
+        standards.sticker_poses(standards.spectralon_tile(30.0), 50)
 
 
 def test_no_stickers_leave_the_surface_as_it_is() -> None:
-    same = standards.with_stickers(STONE, 0)
+    same = standards.stuck_on(STONE, standards.sticker_poses(STONE, 0))
     assert np.array_equal(same.corners_mm, STONE.corners_mm)
     assert surfaces.tint_of(same).shape == (len(STONE.corners_mm), 3)

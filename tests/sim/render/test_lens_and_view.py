@@ -10,7 +10,7 @@ from scenes import BENT, camera_above, quad, scene_of
 
 from coupole.errors import InputError
 from sim.optics.objective import Objective, vignetting
-from sim.render.camera_view import Viewer, tangents
+from sim.render.camera_view import Viewer, slopes
 from sim.render.lens import Lens, distorted, sight
 from sim.scene.scene import build_scene
 from sim.scene.surface import Material, Surface
@@ -54,6 +54,6 @@ def test_a_lens_that_folds_its_image_is_refused() -> None:
 
 
 def test_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
-    falloff = vignetting(Objective(), tangents(sight(LENS)))
+    falloff = vignetting(Objective(), np.hypot(*slopes(sight(LENS))))
     x, y = 0.0 - 79.5, 10.0 - 59.5
     assert falloff[10, 0] == pytest.approx((200.0 / np.sqrt(200.0**2 + x**2 + y**2)) ** 4, rel=1e-6)

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from coupole.appearance.matter import brdf, sphere_map, tabulated
+from coupole.appearance.matter import brdf, tabulated
 from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+
+import sphere_map
 
 EYE = np.array([0.0, -0.6, 0.8])
 LIGHTS = np.array([[0.3, -0.9, 0.4], [-0.8, -0.2, 0.6], [0.1, 0.7, 0.7], [0.0, -0.6, 0.8]])

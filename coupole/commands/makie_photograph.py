@@ -1,0 +1,122 @@
+"""`coupole makie`: a photograph of metal powder on lacquer, taken apart into a drawing for scenes."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from coupole.appearance.matter.makie import Makie
+
+_AROUND_PX = 4
+"""A colour is the mean of the pixels up to this far from the place that is named."""
+_TOLD_FROM = 0.01
+"""Share of clamped pixels from which it is told."""
+
+
+def makie(
+    photograph: Annotated[
+        Path, typer.Argument(help="PNG, TIFF or JPEG of 8 or 16 bits, in sRGB.", show_default=False)
+    ],
+    metal: Annotated[
+        str, typer.Option("--metal", metavar="X,Y", help="A pixel amid metal alone.", show_default=False)
+    ],
+    lacquer: Annotated[
+        list[str],
+        typer.Option(
+            "--lacquer",
+            metavar="X,Y",
+            help="A pixel amid bare lacquer; again for a second and third colour.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The drawing: PNG with alpha.", show_default=False)],
+    linear: Annotated[
+        bool, typer.Option("--linear", help="Values are proportional to light, without sRGB's curve.")
+    ] = False,
+    inside: Annotated[
+        bool,
+        typer.Option("--inside", help="Every pixel is metal and lacquer alone, without shadow: exact for three."),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a photograph of makie apart: alpha is the share of metal, colours are the lacquers' part.
+
+    Take it in diffuse light, so that all of the metal shines alike. X counts columns from the left, Y rows from
+    the top, both from 0.
+    """
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        from coupole.appearance.matter.makie import decompose
+
+        if out.suffix.lower() != ".png":
+            raise InputError(f"--out {out}: expected a name that ends in .png")
+        picture = _linear_values(photograph, linear=linear)
+        colour = _colour_at(picture, metal, "--metal")
+        bare = [_colour_at(picture, place, "--lacquer") for place in lacquer]
+        found = decompose(picture, colour, bare, region="inside" if inside else "anywhere")
+        _write(out, found)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    if as_json:
+        lacquers = [one.tolist() for one in bare]
+        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers, "clamped": found.clamped}
+        print(json.dumps(document))
+        return
+    console.print(f"{out}: {float(found.alpha.mean()):.1%} of the picture is metal", markup=False)
+    if found.clamped > _TOLD_FROM:
+        console.print(
+            f"of {found.clamped:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: noise, "
+            "shadow, or a colour that --metal or --lacquer do not name",
+            markup=False,
+        )
+
+
+def _linear_values(path: Path, *, linear: bool) -> NDArray[np.float64]:
+    """[h, w, 3] proportional to light, 0 to 1."""
+    import numpy as np
+
+    from coupole.reflectance.picture_set import linear_of_srgb, read_picture
+
+    stored = read_picture(path)
+    values = stored if linear else linear_of_srgb(stored)
+    return np.asarray(values / float(np.iinfo(values.dtype).max))
+
+
+def _colour_at(picture: NDArray[np.float64], place: str, option: str) -> NDArray[np.float64]:
+    """[3] mean about a place X,Y."""
+    import numpy as np
+
+    height, width = picture.shape[:2]
+    words = place.split(",")
+    numbers = [int(word) for word in words if word.strip().isascii() and word.strip().isdigit()]
+    if len(words) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
+        raise InputError(f"{option} {place}: expected X,Y of a pixel of a picture of {width} x {height}, from 0")
+    columns, rows = (slice(max(0, number - _AROUND_PX), number + _AROUND_PX + 1) for number in numbers)
+    return np.asarray(picture[rows, columns].mean(axis=(0, 1)))
+
+
+def _write(path: Path, found: Makie) -> None:
+    import numpy as np
+    from PIL import Image
+
+    from coupole.exchange.srgb import srgb
+    from coupole.storage.durable import write_synced
+
+    channels: Any = np.concatenate([srgb(found.residual), found.alpha[..., None]], axis=2)
+    encoded = io.BytesIO()
+    Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(encoded, "PNG")
+    write_synced(path, encoded.getvalue())

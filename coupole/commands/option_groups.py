@@ -1,0 +1,50 @@
+"""Options that travel together, as one value: a command takes a dataclass, the command line has its fields."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from typing import Any, TypeVar, get_type_hints
+
+R = TypeVar("R")
+
+
+def flattened(command: Callable[..., R]) -> Callable[..., R]:
+    """The command with the fields of each parameter that is a dataclass in its place, as typer reads them.
+
+    Fields are annotated as typer's parameters are, and have defaults. Their names are unique in the command.
+    """
+    own = inspect.signature(command, eval_str=True)
+    groups: dict[str, Any] = {
+        name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
+    }
+
+    parameters: list[inspect.Parameter] = []
+    for name, one in own.parameters.items():
+        parameters += _of_fields(groups[name]) if name in groups else [one.replace(kind=_KEYWORD)]
+    names = [one.name for one in parameters]
+
+    @wraps(command)
+    def run(*arguments: Any, **options: Any) -> R:
+        given = dict(zip(names, arguments, strict=False)) | options
+        for name, group in groups.items():
+            named = [field.name for field in fields(group) if field.name in given]
+            given[name] = group(**{field: given.pop(field) for field in named})
+        return command(**given)
+
+    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
+
+
+_KEYWORD = inspect.Parameter.KEYWORD_ONLY
+
+
+def _of_fields(group: Any) -> list[inspect.Parameter]:
+    kinds = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(field.name, _KEYWORD, default=field.default, annotation=kinds[field.name])
+        for field in fields(group)
+    ]

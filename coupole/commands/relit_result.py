@@ -1,0 +1,90 @@
+"""Results of runs and of pictures, opened so that lights can be put on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coupole.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from coupole.reflectance.new_light.light_kinds import AnyLight
+    from coupole.reflectance.new_light.pictured_surface import FreeCamera
+
+Say = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Relit:
+    """A result that lights can be put on."""
+
+    picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
+    """[h, w, 3] of lights."""
+    about: dict[str, Any]
+    """What `--json` and a video's comment say of it."""
+    uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
+    """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
+    has_colours: bool = True
+    """False of a camera with one channel."""
+
+
+def opened(
+    result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
+) -> Relit:
+    """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
+    InputError: no result, or one that has no such view, fit, camera or uncertainty."""
+    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
+
+    if (result / run_result.OBJECT).exists():
+        if uncertain:
+            fit = fit or run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
+            relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
+        return _of_runs(result, view, fit, camera, samples)
+    given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
+    for option, value in given:
+        if value is not None:
+            raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
+    return _of_pictures(result, samples)
+
+
+def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
+    import numpy as np
+
+    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
+
+    if camera is not None and view is not None:
+        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
+    simulated = bool(run_result.read_about(result)["simulated"])
+    folder = run_result.RunResult(result)
+    if camera is None:
+        scene = run_relighting.scene_of_view(folder, view, fit)
+    else:
+        scene = run_relighting.scene_from(folder, camera, fit)
+
+    def of_three(made: NDArray[np.float32]) -> NDArray[np.float32]:
+        return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
+
+    return Relit(
+        lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
+        {"fit": scene.fit, "simulated": simulated},
+        lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
+        has_colours=folder.channels == 3,
+    )
+
+
+def _of_pictures(result: Path, samples: int) -> Relit:
+    from coupole.reflectance import picture_result, relighting
+
+    made = picture_result.PictureResult(result)
+    made.about  # noqa: B018  refuses what is no result
+    interpolation = relighting.read_interpolation(result)
+
+    def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
+        return relighting.relit_by(made, interpolation, lights, samples, say=say)
+
+    return Relit(picture, {})

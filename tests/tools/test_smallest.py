@@ -63,7 +63,7 @@ RUNS = (
     Run("fail_every_call.py --cases 1 --jobs 1 --keep {keep}", r"1 cases, 0 wrong", full=True),
     Run(
         "freeze_at_random.py --freezes 1 --arm rsi --jobs 1 --keep {keep}",
-        r"rsi .* (motion|burst) +1 +0",
+        r"rsi .*(motion|burst) +\W +\d+ +\W +0 ",
         full=True,
     ),
     Run("full_proofs.py --list", r"python tools/prove_clusters\.py --triangles"),

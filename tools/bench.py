@@ -1,5 +1,7 @@
 """Benchmarks against peers, one JSON line each: `python tools/bench.py [check|sequencing|store|matching|rsi ...]`.
 
+`--smallest` runs one round of each at a size of seconds, which shows that it runs, not how fast Coupole is.
+
 Each line has `name`, `value`, `unit`, `peer` (a program measured in the same run, or the limit) and `ratio`
 (Coupole's figure over the peer's; above 1 is better). Values are medians of interleaved rounds; ratios are given
 because absolute times vary from machine to machine and from run to run.
@@ -16,12 +18,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from demo_plan import write_demo_plan
+from smallest import add_smallest
+
 ROOT = Path(__file__).resolve().parent.parent
+SMALL_DEMO = {"lights": {"kind": "every", "every": 40}}
+"""Entries of the demo's plan at the smallest size."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How often and how much is measured."""
+
+    rounds: int
+    frames: int | None
+    """Of `reflectance`."""
+    smallest: bool
 
 
 def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> None:
@@ -38,7 +56,7 @@ def cpu_s() -> float:
 # -- check ------------------------------------------------------------------------------------------------
 
 
-def bench_check(rounds: int) -> None:
+def bench_check(asked: Asked) -> None:
     """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the limit of 3 s and against a
     Python process that only imports numpy, pydantic and h5py."""
     command = [
@@ -50,8 +68,9 @@ def bench_check(rounds: int) -> None:
         "--no-paths",
     ]
     bare = [sys.executable, "-c", "import numpy, pydantic, h5py"]
-    ours, peers = [], []
-    for _ in range(rounds):
+    ours: list[float] = []
+    peers: list[float] = []
+    for _ in range(asked.rounds):
         for argv, times in ((command, ours), (bare, peers)):
             start = time.perf_counter()
             subprocess.run(argv, check=True, capture_output=True, cwd=ROOT)
@@ -64,20 +83,24 @@ def bench_check(rounds: int) -> None:
 # -- sequencing -------------------------------------------------------------------------------------------
 
 
-def bench_sequencing(rounds: int) -> None:
+def bench_sequencing(asked: Asked) -> None:
     """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
     duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.sequencer import Sequencer
     from coupole.acquisition.session import about_run, metadata_of_views
+    from coupole.devices import NO_LED
     from coupole.preflight.job import read_job
     from coupole.storage.run import Run
 
-    job = read_job(ROOT / "configs/plans/demo.yaml")
+    with tempfile.TemporaryDirectory() as folder:
+        plan = ROOT / "configs/plans/demo.yaml"
+        job = read_job(write_demo_plan(ROOT, Path(folder), **SMALL_DEMO) if asked.smallest else plan)
     table_s = job.schedule.bursts[0][0].duration_s
+    leds = len(set(job.schedule.bursts[0][0].table["led"].tolist()) - {NO_LED})
     world_s, machine_s, whole, cpu = [], [], [], []
-    for _ in range(rounds):
+    for _ in range(asked.rounds):
         with tempfile.TemporaryDirectory(dir=ROOT) as folder, open_cell(job.cell, job=job) as cell:
             run = Run.create(Path(folder), "bench", job.inputs, about_run(job, cell))
             recorder = RunRecorder(run, metadata_of_views(job, cell))
@@ -90,7 +113,7 @@ def bench_sequencing(rounds: int) -> None:
             whole.append(outcome.ideal_s / outcome.duration_s)
             recorder.close()
     value = statistics.median(world_s)
-    line("burst_1080_leds", value, "s", "table_time", table_s / value)
+    line(f"burst_{leds}_leds", value, "s", "table_time", table_s / value)
     line("run_of_three_views", statistics.median(whole), "1", "ideal_time", statistics.median(whole))
     line(
         "run_of_three_views_machine_time",
@@ -105,18 +128,18 @@ def bench_sequencing(rounds: int) -> None:
 # -- store ------------------------------------------------------------------------------------------------
 
 
-def bench_store(rounds: int) -> None:
+def bench_store(asked: Asked) -> None:
     """Full-size frames to disk: the view writer and others, and the whole data path of a run."""
     from bench_store import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
 # -- matching ---------------------------------------------------------------------------------------------
 
 
-def bench_matching(rounds: int) -> None:
+def bench_matching(asked: Asked) -> None:
     """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
     is given the clocks' offset and proves nothing; and against the 10 ms per frame at 100 frames/s."""
     from coupole.acquisition.frame_matching import compile_now, match
@@ -132,7 +155,8 @@ def bench_matching(rounds: int) -> None:
     here = random.random(len(log)) > 0.02
     stamps = (log["t_trigger_ns"] * (1 + 3e-5) + 5e9).astype(np.int64)
     frame_ids, stamps = (np.arange(len(log)) + 1)[here], stamps[here]
-    ours, peers = [], []
+    ours: list[float] = []
+    peers: list[float] = []
 
     def pair() -> None:
         nearest = np.searchsorted(log["t_trigger_ns"], stamps - 5_000_000_000)
@@ -142,7 +166,7 @@ def bench_matching(rounds: int) -> None:
         judged = match(log, frame_ids, stamps, complete=True)
         assert np.count_nonzero(judged.step_of_frame >= 0) == len(frame_ids)
 
-    for _ in range(max(rounds, 3) * 20):
+    for _ in range(2 if asked.smallest else max(asked.rounds, 3) * 20):
         for work, times in ((prove, ours), (pair, peers)):
             start = time.perf_counter()
             work()
@@ -155,99 +179,98 @@ def bench_matching(rounds: int) -> None:
 # -- robot and collisions: in separate files ------------------------------------------------------------------
 
 
-def bench_rsi(rounds: int) -> None:
+def bench_rsi(asked: Asked) -> None:
     """Latency of answers to a KUKA controller at 4 ms, against a minimal program in C."""
     from bench_rsi import figures
 
-    for figure in figures(rounds):
+    for figure in figures(asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_collisions(rounds: int) -> None:
+def bench_collisions(asked: Asked) -> None:
     """Collision check of one pose of the arm, against python-fcl."""
     from bench_collisions import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_archive(rounds: int) -> None:
+def bench_archive(asked: Asked) -> None:
     """Compression ratio and speed of archiving a view, and reading from it, against h5py and the file before."""
     from bench_archive import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_codecs(rounds: int) -> None:
+def bench_codecs(asked: Asked) -> None:
     """Packing, compression and Exif against libraries with the same functions: equality of output, and speed."""
     from bench_codecs import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_mesh(rounds: int) -> None:
+def bench_mesh(asked: Asked) -> None:
     """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
     from bench_mesh import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_calibration(rounds: int) -> None:
+def bench_calibration(asked: Asked) -> None:
     """Finding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
     from bench_calibration import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_render(rounds: int) -> None:
+def bench_render(asked: Asked) -> None:
     """Pictures of the simulated dome, against Open3D, Embree and Mitsuba, and memory for a large scan."""
     from bench_render import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_reflectance(rounds: int) -> None:
+def bench_reflectance(asked: Asked) -> None:
     """Frames to samples, fits and relit pictures, against the disk, BLAS, SciPy, Mitsuba and published figures. It
     takes 12 GB of disk and some minutes; `--frames` makes it smaller."""
     from bench_reflectance import figures
 
-    for figure in figures(ROOT, rounds, FRAMES_OF["reflectance"]):
+    for figure in figures(ROOT, asked.rounds, asked.frames, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_console(rounds: int) -> None:
+def bench_console(asked: Asked) -> None:
     """The demo's efficiency while ten people watch it at a console, against that with nobody there; wants an idle
     machine."""
     from bench_console import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_workers(rounds: int) -> None:
+def bench_workers(asked: Asked) -> None:
     """Fits of the demo's samples by two workers of a cluster, against one; for two idle cores. It acquires the
     demo first, and takes 3 GB of disk."""
     from bench_workers import figures
 
-    for figure in figures(ROOT, rounds):
+    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-def bench_urushi(rounds: int) -> None:
+def bench_urushi(asked: Asked) -> None:
     """Sphere maps of gold under ten lights, made anew for each place of the lights."""
     from bench_urushi import figures
 
-    for figure in figures(rounds):
+    for figure in figures(asked.rounds, smallest=asked.smallest):
         line(**figure)
 
 
-FRAMES_OF = {"reflectance": 300}
-BENCHES: dict[str, Callable[[int], None]] = {
+BENCHES: dict[str, Callable[[Asked], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
     "store": bench_store,
@@ -270,14 +293,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"which of {', '.join(BENCHES)}; all if none")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--frames", type=int, help="of `reflectance`; 300 without it")
+    parser.add_argument("--frames", type=int, help="of `reflectance`; 300 by itself")
+    add_smallest(parser, rounds=1)
     parser.add_argument("--json", action="store_true", help="accepted for uniformity: the lines are always JSON")
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(BENCHES):
         parser.error(f"expected some of {', '.join(BENCHES)}; found {', '.join(sorted(unknown))}")
-    FRAMES_OF["reflectance"] = arguments.frames or FRAMES_OF["reflectance"]
+    asked = Asked(arguments.rounds, arguments.frames, arguments.smallest)
     for name in arguments.names or BENCHES:
-        BENCHES[name](arguments.rounds)
+        BENCHES[name](asked)
 
 
 if __name__ == "__main__":

@@ -22,25 +22,28 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-HEIGHT_PX, WIDTH_PX = 3072, 4096
-FRAME_BYTES = HEIGHT_PX * WIDTH_PX * 2
+SIZE_PX, SMALLEST_PX = (4096, 3072), (512, 384)
+"""Width and height of frames."""
 FRAMES, FEW_FRAMES, DISTINCT = 1080, 40, 8
+SMALLEST_FRAMES = 16
 _DATA = "entry/instrument/detector/data"
-TILE = np.s_[1100:1356, 1900:2156]
-"""A window of 256 x 256 that is not aligned with any tile."""
+TILE_PX, TILE_AT = 256, (1900 / 4096, 1100 / 3072)
+"""A window of 256 x 256 that is not aligned with any tile; its first corner as shares of width and height."""
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     """For each codec: ratio, speed, and two readings; peers: plain h5py, and the file before."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
     from coupole.storage.bitshuffle import CODECS
 
-    frames = min(FRAMES, int(shutil.disk_usage(root).free * 0.4 / FRAME_BYTES))
-    drawn = pictures(DISTINCT)
+    drawn = pictures(DISTINCT, SMALLEST_PX if smallest else SIZE_PX)
+    few = SMALLEST_FRAMES if smallest else FEW_FRAMES
+    most = SMALLEST_FRAMES if smallest else FRAMES
+    frames = min(most, int(shutil.disk_usage(root).free * 0.4 / drawn[0].nbytes))
     with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
         for name, codec in CODECS.items():
-            yield from _speeds(Path(folder) / "small.h5", drawn, name, codec, rounds)
+            yield from _speeds(Path(folder) / "small.h5", drawn, few, name, codec, rounds)
         path, kept = Path(folder) / "view.h5", Path(folder) / "kept"
         proven = _write_view(path, drawn, frames)
         for name, codec in CODECS.items():
@@ -53,16 +56,16 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
 
 def _speeds(
-    path: Path, pictures: NDArray[np.uint16], name: str, codec: Any, rounds: int
+    path: Path, pictures: NDArray[np.uint16], frames: int, name: str, codec: Any, rounds: int
 ) -> Iterator[dict[str, Any]]:
     """Ratio and speed for a small view, repeated, interleaved with plain h5py."""
-    proven, kept = _write_view(path, pictures, FEW_FRAMES), path.parent / "kept_small"
+    proven, kept = _write_view(path, pictures, frames), path.parent / "kept_small"
     compress, read_back, plain, cpu_ms = [], [], [], []
     for _ in range(rounds):
         _forget(path)
         used_s = _cpu_s()
         done = _archive(path, proven, codec, kept)
-        cpu_ms.append(1e3 * (_cpu_s() - used_s) / FEW_FRAMES)
+        cpu_ms.append(1e3 * (_cpu_s() - used_s) / frames)
         compress.append(done.pixel_bytes / done.compress_s / 1e6)
         read_back.append(done.pixel_bytes / done.read_back_s / 1e6)
         (kept / path.name).replace(path)
@@ -73,7 +76,7 @@ def _speeds(
         **_figure(f"archive_{name}_compress", ours, "MB/s", "plain_h5py", ours / peer),
         "peer_value": round(peer, 1),
         "both_passes_cpu_ms_per_frame": round(cost_ms, 1),
-        "both_passes_mb_s_per_core": round(FRAME_BYTES / cost_ms / 1e3, 1),
+        "both_passes_mb_s_per_core": round(pictures[0].nbytes / cost_ms / 1e3, 1),
     }
     back = statistics.median(read_back)
     yield _figure(f"archive_{name}_read_back", back, "MB/s", "compress", back / ours)
@@ -94,22 +97,24 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def pictures(count: int) -> NDArray[np.uint16]:
+def pictures(count: int, size_px: tuple[int, int] = SIZE_PX) -> NDArray[np.uint16]:
     """Frames [count, H, W] in page-aligned memory: photons and 13 electrons of read noise at 3.35 electrons per
-    DN, 64 DN black; the light comes from another side in each."""
-    memory = mmap.mmap(-1, count * FRAME_BYTES)
-    drawn = np.frombuffer(memory, np.uint16).reshape(count, HEIGHT_PX, WIDTH_PX)
-    y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX].astype(np.float32)
-    object_here = np.hypot(x - WIDTH_PX / 2, y - HEIGHT_PX / 2) < 1300
+    DN, 64 DN black; the light comes from another side in each. Smaller ones show the object smaller."""
+    width_px, height_px = size_px
+    memory = mmap.mmap(-1, count * width_px * height_px * 2)
+    drawn = np.frombuffer(memory, np.uint16).reshape(count, height_px, width_px)
+    y, x = np.mgrid[:height_px, :width_px].astype(np.float32)
+    scale = width_px / SIZE_PX[0]
+    object_here = np.hypot(x - width_px / 2, y - height_px / 2) < 1300 * scale
     relief = (0.6 + 0.4 * np.sin(x / 37) * np.sin(y / 53)) * object_here
     relief[::2, ::2] *= 0.8
     relief[1::2, ::2] *= 0.6
     random = np.random.default_rng(1)
     for number, picture in enumerate(drawn):
         angle = 2 * np.pi * number / count
-        away = np.hypot(x - WIDTH_PX * (0.5 + 0.2 * np.cos(angle)), y - HEIGHT_PX * (0.5 + 0.2 * np.sin(angle)))
-        electrons = 3.35 * 700 * relief * np.exp(-0.5 * (away / 900) ** 2)
-        noise = random.standard_normal((HEIGHT_PX, WIDTH_PX), np.float32) * np.sqrt(electrons + 13**2)
+        away = np.hypot(x - width_px * (0.5 + 0.2 * np.cos(angle)), y - height_px * (0.5 + 0.2 * np.sin(angle)))
+        electrons = 3.35 * 700 * relief * np.exp(-0.5 * (away / (900 * scale)) ** 2)
+        noise = random.standard_normal((height_px, width_px), np.float32) * np.sqrt(electrons + 13**2)
         picture[:] = np.clip(np.rint((electrons + noise) / 3.35 + 64), 0, 4095)
     return drawn
 
@@ -117,17 +122,21 @@ def pictures(count: int) -> NDArray[np.uint16]:
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
     """Write a view whose frames are all proven; returns the corresponding entries of its journal."""
     from coupole.devices import FrameFormat
+    from coupole.plan.shot_id import ShotId
     from coupole.storage.frame_file_creation import create
     from coupole.storage.journal_events import FrameProven
     from coupole.storage.view_writer import ViewWriter
 
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
-    create(path, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata)
-    writer, proven = ViewWriter(path, {}), []
+    height_px, width_px = pictures.shape[1:]
+    create(path, frames, FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), metadata)
+    writer = ViewWriter(path, {})
+    proven: list[FrameProven] = []
     for number in range(frames):
         slot = writer.put(pictures[number % DISTINCT], frame_id=number, camera_ns=0, exposure_us=8000)
-        shot = f"view/led{number:04d}/e0"
-        proven.append(FrameProven(shot, path.name, slot, number, f"{writer.prove(slot, shot, led=number):016x}"))
+        shot = ShotId.parse(f"view/led{number:04d}/e0")
+        xxh3 = f"{writer.prove(slot, str(shot), led=number):016x}"
+        proven.append(FrameProven(shot=shot, file=path.name, index=slot, frame_id=number, xxh3=xxh3))
     writer.sync()
     writer.close()
     return proven
@@ -138,17 +147,18 @@ def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
     synced, without comparison."""
     from coupole.storage.bitshuffle import tile_shape
 
-    chunks = (1, *tile_shape(HEIGHT_PX, WIDTH_PX))
     _forget(before)
     start_s = time.perf_counter()
     with h5py.File(before) as source, h5py.File(path, "w") as file:
         pixels = source[_DATA]
+        chunks = (1, *tile_shape(*pixels.shape[1:]))
         data = file.create_dataset("d", pixels.shape, np.uint16, chunks=chunks, **codec.filter)
         for number in range(len(pixels)):
             data[number] = pixels[number]
+        size_bytes = pixels.size * pixels.dtype.itemsize
     with path.open("r+b") as written:
         os.fsync(written.fileno())
-    return FEW_FRAMES * FRAME_BYTES / (time.perf_counter() - start_s) / 1e6
+    return float(size_bytes / (time.perf_counter() - start_s) / 1e6)
 
 
 def _forget(path: Path) -> None:
@@ -173,8 +183,9 @@ def _interleaved(
 
 
 def _read_tile(data: h5py.Dataset) -> None:
+    left, top = (round(share * size_px) for share, size_px in zip(TILE_AT, data.shape[:0:-1], strict=True))
     for number in range(len(data)):
-        data[(number, *TILE)]
+        data[number, top : top + TILE_PX, left : left + TILE_PX]
 
 
 def _read_frame(data: h5py.Dataset) -> None:

@@ -24,19 +24,37 @@ from scipy.spatial.transform import Rotation
 LENS = np.array([7120.0, 7121.0, 2047.5, 1535.5, -0.05, 0.02, 2e-4, -3e-4, 0.0])
 SIZE_PX = (4096, 3072)
 PIXEL_PX, ROBOT_MM, ROBOT_DEG, TOLERANCE_MM = 0.05, 0.03, 0.003, 0.05
-_VIEWS_OF_BOARD, _VIEWS_OF_DOME = 45, 150
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    yield _detection(rounds)
-    yield _bundle(rounds)
-    yield _leds(rounds)
+@dataclass(frozen=True)
+class Size:
+    """How much is adjusted."""
+
+    scale: float = 1.0
+    """Of the image of a board, over 4096 x 3072 pixels."""
+    images: int = 45
+    boards: int = 180
+    """Of six LEDs."""
+    views: int = 150
+    """Of the dome."""
+    peers_steps: int | None = None
+    """At most; None: until it has converged."""
+
+
+SMALLEST = Size(scale=0.25, images=8, boards=12, views=40, peers_steps=3)
+
+
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
+    size = SMALLEST if smallest else Size()
+    yield _detection(rounds, size.scale)
+    yield _bundle(rounds, size)
+    yield _leds(rounds, size)
 
 
 # -- boards in images -------------------------------------------------------------------------------------
 
 
-def _detection(rounds: int) -> dict[str, Any]:
+def _detection(rounds: int, scale: float) -> dict[str, Any]:
     """One 12-megapixel image of a ChArUco board, including refinement of the corners in 12 bits."""
     import cv2
 
@@ -46,9 +64,10 @@ def _detection(rounds: int) -> dict[str, Any]:
     board = Board(kind="charuco", corners=(11, 8), square_mm=16.0, marker_mm=12.0)
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     printed = cv2.aruco.CharucoBoard((12, 9), 16.0, 12.0, markers)
-    flat = cv2.resize(printed.generateImage((2880, 2160)), (2880, 2160))
-    turn = np.array([[0.9, -0.2, 900.0], [0.18, 0.92, 250.0]])
-    picture = cv2.warpAffine(flat, turn, SIZE_PX, borderValue=128)
+    flat = printed.generateImage((round(scale * 2880), round(scale * 2160)))
+    turn = np.array([[0.9, -0.2, scale * 900.0], [0.18, 0.92, scale * 250.0]])
+    width_px, height_px = (round(scale * side_px) for side_px in SIZE_PX)
+    picture = cv2.warpAffine(flat, turn, (width_px, height_px), borderValue=128)
     image = np.asarray(cv2.GaussianBlur(picture, (0, 0), 1.0), np.float64) * 14 + 100
     grey = np.asarray(np.clip(image / 16, 0, 255), np.uint8)
 
@@ -57,7 +76,7 @@ def _detection(rounds: int) -> dict[str, Any]:
         return corners, ids
 
     return _compared(
-        "calibration_board_detection_12mp",
+        f"calibration_board_detection_{1e-6 * grey.size:.2g}mp",
         lambda: detect(board, Picture.of_grey(image, white=4095.0)),
         "opencv",
         plain,
@@ -119,8 +138,8 @@ def _scene(
     )
 
 
-def _bundle(rounds: int) -> dict[str, Any]:
-    """Lens, hand-eye and board from 45 images of 88 corners."""
+def _bundle(rounds: int, size: Size) -> dict[str, Any]:
+    """Lens, hand-eye and board from images of 88 corners."""
     from coupole.calibration.lens.board import Sighting
     from coupole.calibration.lens.bundle import RobotNoise, calibrate_hand_eye
     from coupole.calibration.lens.equations import Poses
@@ -129,7 +148,7 @@ def _bundle(rounds: int) -> dict[str, Any]:
     random = np.random.default_rng(1)
     grid = np.array([(x, y, 0.0) for y in range(8) for x in range(11)]) * 16.0
     base_from_board = _pose(np.array([600.0, -50.0, 20.0]), np.array([0.03, 0.05, 0.7]))
-    eyes = [base_from_board @ _towards(random, np.array([80.0, 56.0, 0.0]), 335.0) for _ in range(_VIEWS_OF_BOARD)]
+    eyes = [base_from_board @ _towards(random, np.array([80.0, 56.0, 0.0]), 335.0) for _ in range(size.images)]
     scene = _scene(grid, np.zeros(len(grid), int), base_from_board[None], np.array(eyes), 2)
     sightings = [
         Sighting(
@@ -138,18 +157,24 @@ def _bundle(rounds: int) -> dict[str, Any]:
             grid[scene.point[scene.view == v]],
             scene.pixels[scene.view == v],
         )
-        for v in range(_VIEWS_OF_BOARD)
+        for v in range(size.images)
     ]
     start, robot = Intrinsics(*LENS), RobotNoise(absolute_mm=0.0, absolute_deg=1e-5)
 
     def ours() -> Any:
         return calibrate_hand_eye(sightings, Poses(scene.base_from_flange), lens=start, robot=robot)
 
-    return _compared("calibration_bundle_45_images", ours, "scipy", lambda: _plain(scene, False), rounds)
+    return _compared(
+        f"calibration_bundle_{size.images}_images",
+        ours,
+        "scipy",
+        lambda: _plain(scene, False, size.peers_steps),
+        rounds,
+    )
 
 
-def _leds(rounds: int) -> dict[str, Any]:
-    """1080 LEDs on 180 boards, each seen six times."""
+def _leds(rounds: int, size: Size) -> dict[str, Any]:
+    """LEDs on boards of six, each seen six times."""
     from coupole.calibration.leds.adjustment import adjust_leds
     from coupole.calibration.leds.boards import Boards
     from coupole.calibration.leds.equations import Stated
@@ -157,9 +182,9 @@ def _leds(rounds: int) -> dict[str, Any]:
     from coupole.calibration.optics import NAMES, Intrinsics
     from coupole.calibration.posed_camera import CameraPrior
 
-    scene = _dome()
+    scene = _dome(size.boards, size.views)
     count = len(scene.places_mm)
-    boards = Boards(np.arange(180), scene.body_of, scene.base_from_body, scene.places_mm)
+    known = Boards(np.arange(size.boards), scene.body_of, scene.base_from_body, scene.places_mm)
     seen = LedSightings(
         scene.view,
         scene.point,
@@ -175,21 +200,23 @@ def _leds(rounds: int) -> dict[str, Any]:
             seen,
             scene.point,
             scene.base_from_flange,
-            boards,
+            known,
             scene.base_from_body,
             prior,
             Stated(tolerance_mm=TOLERANCE_MM),
         )
 
-    figure = _compared("calibration_leds_1080_x_6", ours, "scipy", lambda: _plain(scene, True), rounds)
+    figure = _compared(
+        f"calibration_leds_{count}_x_6", ours, "scipy", lambda: _plain(scene, True, size.peers_steps), rounds
+    )
     return {**figure, "leds": count, "spots": len(scene.view), "views": len(scene.base_from_flange)}
 
 
-def _dome() -> _Scene:
+def _dome(boards: int, views: int) -> _Scene:
     """Boards of six on a sphere of 1.5 m; views from near its middle, until each LED has been seen six times."""
     random = np.random.default_rng(3)
-    heights = 0.1 + 0.85 * (np.arange(180) + 0.5) / 180
-    around, ring = np.arange(180) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - heights**2)
+    heights = 0.1 + 0.85 * (np.arange(boards) + 0.5) / boards
+    around, ring = np.arange(boards) * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - heights**2)
     outwards = np.stack([ring * np.cos(around), ring * np.sin(around), heights], axis=1)
     grid = np.array([(60.0 * (c - 1), 60.0 * (r - 0.5), 0.0) for r in range(2) for c in range(3)])
     poses = []
@@ -200,8 +227,8 @@ def _dome() -> _Scene:
         pose[:3] = np.column_stack([x, np.cross(-out, x), -out, 1500 * out])
         poses.append(pose)
     eyes = []
-    for number in range(_VIEWS_OF_DOME):
-        z = outwards[(number * 2) % 180] + random.normal(0, 0.05, 3)
+    for number in range(views):
+        z = outwards[(number * 2) % boards] + random.normal(0, 0.05, 3)
         z /= np.linalg.norm(z)
         x = np.cross(z, random.normal(size=3))
         x /= np.linalg.norm(x)
@@ -209,11 +236,16 @@ def _dome() -> _Scene:
         eye[:3] = np.column_stack([x, np.cross(z, x), z, random.uniform(-400, 400, 3) - 300 * z])
         eyes.append(eye)
     scene = _scene(
-        np.tile(grid, (180, 1)), np.repeat(np.arange(180), 6), np.array(poses), np.array(eyes), 4, TOLERANCE_MM
+        np.tile(grid, (boards, 1)),
+        np.repeat(np.arange(boards), 6),
+        np.array(poses),
+        np.array(eyes),
+        4,
+        TOLERANCE_MM,
     )
     order = np.random.default_rng(5).permutation(len(scene.view))
     rank = np.zeros(len(order), int)
-    seen = np.zeros(1080, int)
+    seen = np.zeros(6 * boards, int)
     for row in order:
         rank[row] = seen[scene.point[row]]
         seen[scene.point[row]] += 1
@@ -233,7 +265,7 @@ def _dome() -> _Scene:
 # -- the peer ---------------------------------------------------------------------------------------------
 
 
-def _plain(scene: _Scene, offsets: bool) -> Any:
+def _plain(scene: _Scene, offsets: bool, steps: int | None) -> Any:
     """The same unknowns in scipy: bodies, views, hand-eye, eight of the lens; offsets of points if requested."""
     bodies, views, points = len(scene.base_from_body), len(scene.base_from_flange), len(scene.places_mm)
     at_view = 6 * bodies
@@ -277,7 +309,9 @@ def _plain(scene: _Scene, offsets: bool) -> Any:
     if offsets:
         own = np.arange(3 * points)
         pattern[rows + 6 * views + own, at_offset + own] = 1
-    return least_squares(residuals, start, jac_sparsity=pattern.tocsr(), x_scale="jac", method="trf")
+    return least_squares(
+        residuals, start, jac_sparsity=pattern.tocsr(), x_scale="jac", method="trf", max_nfev=steps
+    )
 
 
 def _see(points: Any, lens: Any) -> Any:

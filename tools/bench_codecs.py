@@ -6,6 +6,7 @@ conformance tests for the Exif reader. The libraries are those of the dependency
 
 from __future__ import annotations
 
+import importlib.util
 import statistics
 import struct
 import sys
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,14 @@ from numpy.typing import NDArray
 FEWEST_ROUNDS = 9
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     """`same_output` is true if the peer's bytes or pixels equal Coupole's."""
-    rounds = max(rounds, FEWEST_ROUNDS)
-    from bench_archive import pictures
+    from bench_archive import SIZE_PX, SMALLEST_PX, pictures
 
-    frame = pictures(1)[0]
+    if missing := [name for name in ("imagecodecs", "exifread") if importlib.util.find_spec(name) is None]:
+        sys.exit(f"bench codecs: {' and '.join(missing)} not installed; run it by `uv run --group bench`")
+    rounds = rounds if smallest else max(rounds, FEWEST_ROUNDS)
+    frame = pictures(1, SMALLEST_PX if smallest else SIZE_PX)[0]
     yield from _packing(frame, rounds)
     yield from _bitshuffle(frame, rounds)
     yield from _exif(root, rounds)
@@ -40,7 +43,8 @@ def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]
 
     from coupole.storage.packing import pack12, unpack12
 
-    for order, bitorder in (("lsb", "<"), ("msb", None)):
+    orders: tuple[tuple[Literal["lsb", "msb"], str | None], ...] = (("lsb", "<"), ("msb", None))
+    for order, bitorder in orders:
         packed, out = pack12(frame, order), np.empty(frame.size * 3 // 2, np.uint8)
         encode = partial(imagecodecs.packints_encode, frame.reshape(-1), 12, bitorder=bitorder, out=out)
         decode = partial(imagecodecs.packints_decode, packed, np.uint16, 12, bitorder=bitorder)

@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_POSES = 100
+POSES, SMALLEST_POSES = 100, 4
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     """Microseconds per pose, for random poses in the demo's cell."""
     from coupole.preflight.job import read_job
 
     job = read_job(root / "configs/plans/demo.yaml")
     home_deg = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
-    poses_deg = home_deg + np.random.default_rng(3).uniform(-40.0, 40.0, (_POSES, 6))
+    poses = SMALLEST_POSES if smallest else POSES
+    poses_deg = home_deg + np.random.default_rng(3).uniform(-40.0, 40.0, (poses, 6))
 
     def ours() -> None:
         for joints_deg in poses_deg:
@@ -35,7 +36,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         for work, times in zip(works, times_us, strict=True):
             start_s = time.perf_counter()
             work()
-            times.append((time.perf_counter() - start_s) / _POSES * 1e6)
+            times.append((time.perf_counter() - start_s) / poses * 1e6)
     medians_us = [float(np.median(times[1:])) for times in times_us]  # the first round compiles
     name, peer_us = ("trimesh_fcl", medians_us[1]) if len(works) > 1 else ("frame_period_at_100_hz", 10_000.0)
     yield {
@@ -63,6 +64,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
     rig = job.cell.rig
     tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)
     described = described_arm(rig)
+    assert described is not None, "the demo's rig has an arm that is described"
     capsules = [c for c in (*capsules_of(described), *tool) if c.link]
     arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
     base_from_support = rig.support.base_from_support.matrix()

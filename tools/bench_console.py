@@ -20,7 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-WATCHERS = 10
+from demo_plan import write_demo_plan
+
+WATCHERS, SMALLEST_WATCHERS = 10, 2
+SMALLEST = {"kind": "every", "every": 40}
+"""Lights of its plan."""
 _PASSWORD = "a long password"
 _RUNS_TAKE_S = 900.0
 
@@ -111,13 +115,13 @@ def _found(pattern: str, text: str) -> str:
     return match.group(1)
 
 
-def _watchers(url: str) -> None:
-    """Ten of them, until this process is ended; what they saw is printed then."""
+def _watchers(url: str, count: int) -> None:
+    """So many, until this process is told to end; what they saw is printed then."""
 
     async def work() -> None:
         import aiohttp
 
-        until, all_seen = asyncio.Event(), [Seen() for _ in range(WATCHERS)]
+        until, all_seen = asyncio.Event(), [Seen() for _ in range(count)]
         loop = asyncio.get_running_loop()
         loop.add_reader(sys.stdin, until.set)
         async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
@@ -131,17 +135,20 @@ def _watchers(url: str) -> None:
     asyncio.run(work())
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
+    count = SMALLEST_WATCHERS if smallest else WATCHERS
     with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as name:
         folder = Path(name)
-        rig, plan = _cell(root, folder)
+        rig, plan = _cell(root, folder, {"lights": SMALLEST} if smallest else {})
         console = _serve(root, rig, folder)
-        without, watched, seen = [], [], [[0, 0, 0, 0]]
+        without: list[float] = []
+        watched: list[float] = []
+        seen = [[0, 0, 0, 0]]
         try:
             console.ask("POST", "/api/v1/accounts", {"name": "Eve", "password": _PASSWORD, "role": "observer"})
             for _ in range(rounds):
                 without.append(console.acquire(plan)["efficiency"])
-                command = [sys.executable, __file__, console.url]
+                command = [sys.executable, __file__, console.url, str(count)]
                 with subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
                 ) as watchers:
@@ -152,7 +159,7 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
             console.process.wait()
     value, peer = statistics.median(watched), statistics.median(without)
     yield {
-        "name": "efficiency_with_ten_watchers",
+        "name": "efficiency_with_ten_watchers" if count == WATCHERS else f"efficiency_with_{count}_watchers",
         "value": value,
         "unit": "ideal/taken",
         "peer": "nobody_watches",
@@ -164,21 +171,17 @@ def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
     }
 
 
-def _cell(root: Path, folder: Path) -> tuple[Path, Path]:
-    """The demo's cell with a storage folder of its own."""
+def _cell(root: Path, folder: Path, entries: dict[str, Any]) -> tuple[Path, Path]:
+    """The demo's cell with a storage folder of its own; its plan with other entries."""
     from ruamel.yaml import YAML
 
-    yaml = YAML(typ="safe")
-    rig = yaml.load(root / "configs/rigs/sim.yaml")
-    plan = yaml.load(root / "configs/plans/demo.yaml")
+    rig = YAML(typ="safe").load(root / "configs/rigs/sim.yaml")
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
     rig["storage"] |= {"folder": str(folder / "runs")}
     rig.pop("calibrations", None)
-    plan |= {"rig": str(folder / "rig.yaml"), "calibrations": "none"}
-    plan["object"]["mesh"] = str((root / "configs/plans" / plan["object"]["mesh"]).resolve())
-    (folder / "rig.yaml").write_text(json.dumps(rig))
-    (folder / "plan.yaml").write_text(json.dumps(plan))
-    return folder / "rig.yaml", folder / "plan.yaml"
+    path = folder / "rig.yaml"
+    path.write_text(json.dumps(rig))
+    return path, write_demo_plan(root, folder, rig=str(path), calibrations="none", **entries)
 
 
 def _serve(root: Path, rig: Path, folder: Path) -> Console:
@@ -191,4 +194,4 @@ def _serve(root: Path, rig: Path, folder: Path) -> Console:
 
 
 if __name__ == "__main__":
-    _watchers(sys.argv[1])
+    _watchers(sys.argv[1], int(sys.argv[2]))

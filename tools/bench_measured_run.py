@@ -8,6 +8,7 @@ simulator's own, powers are equal, noise is that of a usual sensor.
 from __future__ import annotations
 
 import mmap
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,15 @@ from bench_render import (
     render_leds,
 )
 
-TRIANGLES = 1_150_000
-"""Of the relief; about a million are seen."""
+
+@dataclass(frozen=True)
+class Size:
+    """Of frames, width and height, and of the relief, of which about nine tenths are seen."""
+
+    size_px: tuple[int, int] = FULL
+    triangles: int = 1_150_000
+
+
 LIFT_MM = 6.0
 """Above the dome's support; the camera is as much higher."""
 VIEW, MESH, DARK_FRAMES = "top", "relief.ply", 2
@@ -36,7 +44,7 @@ NOISE = (6.0, 0.4)
 """Variance in the dark, DN^2, and gain, DN/e."""
 
 
-def make_run(root: Path, folder: Path, frames: int) -> Any:
+def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
     """A run with frames under `frames` LEDs, spread over the dome, and some in the dark."""
     import trimesh
 
@@ -47,9 +55,10 @@ def make_run(root: Path, folder: Path, frames: int) -> Any:
     from coupole.storage.run import Run
     from coupole.storage.run_inputs import Inputs
 
-    vertices, faces = relief(TRIANGLES)
+    vertices, faces = relief(size.triangles)
     trimesh.Trimesh(vertices + np.array([0, 0, LIFT_MM]), faces, process=False).export(folder / MESH)
-    by, pose = photographer(root, folder / MESH, FULL)
+    by, pose = photographer(root, folder / MESH, size.size_px)
+    width_px, height_px = size.size_px
     support = pose @ np.linalg.inv(camera_pose())
     pose[:3, 3] -= LIFT_MM * pose[:3, 2]
     leds = _spread(by.leds.ids, frames)
@@ -57,12 +66,13 @@ def make_run(root: Path, folder: Path, frames: int) -> Any:
     inputs = Inputs(root / "configs/plans/demo.yaml", root / "configs/rigs/sim.yaml", ())
     about = {"views": [VIEW], "labels": labels, "simulated": True, "object": None}
     run = Run.create(folder / "runs", "bench", inputs, about)
-    recorder = RunRecorder(run, {"sample": "relief", "simulated": True, **_lens(by)})
+    recorder = RunRecorder(run, {"sample": "relief", "simulated": True, **_lens(by, width_px)})
     recorder.note(SessionStarted(simulated=True))
     recorder.note(ViewBegun(view=VIEW))
     arm = ArmState((0, 0, 0, 0, 0, 0), pose, 1, moving=False)
-    recorder.begin_view(VIEW, len(labels), FrameFormat(FULL[1], FULL[0], 12, "GBRG", 64, 4095), arm, pose, {})
-    pixels = np.frombuffer(mmap.mmap(-1, 2 * FULL[0] * FULL[1]), np.uint16).reshape(FULL[1], FULL[0])
+    recorder.begin_view(VIEW, len(labels), FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), arm, pose, {})
+    memory = mmap.mmap(-1, 2 * width_px * height_px)
+    pixels = np.frombuffer(memory, np.uint16).reshape(height_px, width_px)
     for number, label in enumerate(labels):
         led = int(leds[number]) if number < frames else None
         if led is None:
@@ -88,9 +98,9 @@ def _rows(by: Any, leds: NDArray[np.int64]) -> list[int]:
     return [row[int(led)] for led in leds]
 
 
-def _lens(by: Any) -> dict[str, float]:
+def _lens(by: Any, width_px: int) -> dict[str, float]:
     return {
-        "pixel_pitch_um": SENSOR_WIDTH_MM / FULL[0] * 1e3,
+        "pixel_pitch_um": SENSOR_WIDTH_MM / width_px * 1e3,
         "focal_length_mm": by._camera.focal_length_mm,
         "focus_distance_mm": WORKING_DISTANCE_MM,
         "f_number": by._camera.f_number,
@@ -123,7 +133,7 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     known = np.load(folder / "leds.npz")
     frames = open_light_frames([next((folder / "runs").iterdir())])
     run, shape, count = Run(next((folder / "runs").iterdir())), read_mesh(folder / MESH), len(known["ids"])
-    focal_px, (width, height) = frames.focal_px, FULL
+    focal_px, (width, height) = frames.focal_px, frames.size_px
     equal = np.ones((count, len(channels_of(frames.pattern))))
     about = frames.about
     lens = Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)

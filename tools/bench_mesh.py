@@ -15,51 +15,61 @@ from typing import Any
 
 import numpy as np
 
-TRIANGLES, MOST_TRIANGLES = 10_000_000, 40_000_000
+MILLIONS, MOST_MILLIONS = 10.0, 40.0
+"""Triangles."""
+SMALLEST_MILLIONS = 0.002
 MOST_MEMORY_GB = 8.0
 _FACE = np.dtype([("corners", "u1"), ("indices", "<i4", (3,))])
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
+    millions, most = (SMALLEST_MILLIONS, SMALLEST_MILLIONS) if smallest else (MILLIONS, MOST_MILLIONS)
+    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
+        yield from _times(Path(folder) / "sheet.ply", millions, rounds)
+        for ending in (".ply", ".stl"):
+            yield _memory(Path(folder) / f"large{ending}", most)
+
+
+def _times(path: Path, millions: float, rounds: int) -> Iterator[dict[str, Any]]:
+    """Of reading one file in several ways, interleaved; it is removed."""
     from coupole.scan.mesh_files import read_mesh
     from coupole.scan.scanner_export import read_scan
 
-    with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
-        path = Path(folder) / "sheet.ply"
-        vertices = _write_sheet(path, TRIANGLES)
-        read_mesh(path)  # compiles
-        works: dict[str, Callable[[], Any]] = {
-            "coupole": lambda: read_mesh(path),
-            "numpy": lambda: _plain_numpy(path, vertices),
-            "trimesh": lambda: _trimesh(path),
-            "with_checks": lambda: read_scan(path),
-        }
-        seconds: dict[str, list[float]] = {name: [] for name in works}
-        for _ in range(rounds):
-            for name, work in works.items():
-                started_s = time.perf_counter()
-                work()
-                seconds[name].append(time.perf_counter() - started_s)
-        medians = {name: statistics.median(times) for name, times in seconds.items()}
-        for peer in ("numpy", "trimesh"):
-            yield _figure("mesh_ply_10m_triangles", medians["coupole"], peer, medians[peer])
-        yield _figure(
-            "mesh_ply_10m_triangles_with_all_checks", medians["with_checks"], "trimesh", medians["trimesh"]
-        )
-        path.unlink()
-        for ending in (".ply", ".stl"):
-            path = Path(folder) / f"large{ending}"
-            (_write_sheet if ending == ".ply" else _write_stl)(path, MOST_TRIANGLES)
-            took_s, peak_gb = _in_a_process(path)
-            path.unlink()
-            yield {
-                "name": f"mesh{ending.replace('.', '_')}_40m_triangles_peak_memory",
-                "value": peak_gb,
-                "unit": "GB",
-                "peer": "limit_8_gb",
-                "ratio": MOST_MEMORY_GB / peak_gb,
-                "seconds": round(took_s, 1),
-            }
+    vertices = _write_sheet(path, round(1e6 * millions))
+    read_mesh(path)  # compiles
+    works: dict[str, Callable[[], Any]] = {
+        "coupole": lambda: read_mesh(path),
+        "numpy": lambda: _plain_numpy(path, vertices),
+        "trimesh": lambda: _trimesh(path),
+        "with_checks": lambda: read_scan(path),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(rounds):
+        for name, work in works.items():
+            started_s = time.perf_counter()
+            work()
+            seconds[name].append(time.perf_counter() - started_s)
+    path.unlink()
+    medians = {name: statistics.median(times) for name, times in seconds.items()}
+    name = f"mesh_ply_{millions:g}m_triangles"
+    for peer in ("numpy", "trimesh"):
+        yield _figure(name, medians["coupole"], peer, medians[peer])
+    yield _figure(f"{name}_with_all_checks", medians["with_checks"], "trimesh", medians["trimesh"])
+
+
+def _memory(path: Path, millions: float) -> dict[str, Any]:
+    """Of a process that reads a large file; it is removed."""
+    (_write_sheet if path.suffix == ".ply" else _write_stl)(path, round(1e6 * millions))
+    took_s, peak_gb = _in_a_process(path)
+    path.unlink()
+    return {
+        "name": f"mesh{path.suffix.replace('.', '_')}_{millions:g}m_triangles_peak_memory",
+        "value": peak_gb,
+        "unit": "GB",
+        "peer": "limit_8_gb",
+        "ratio": MOST_MEMORY_GB / peak_gb,
+        "seconds": round(took_s, 1),
+    }
 
 
 def _figure(name: str, ours_s: float, peer: str, peer_s: float) -> dict[str, Any]:

@@ -17,6 +17,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +27,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from bench_measured_run import VIEW, make_run, read_run
+from bench_measured_run import VIEW, Size, make_run, read_run
+from reflectance_peers import scipy_ggx, scipy_harmonics, sgemm_products
 
-FRAMES, FEW_FRAMES = 300, 10
+FRAMES = 300
 LIMIT_S, LIMIT_OVER_READ = 60.0, 1.5
 PAPER_S = 150.0
 """100 to 200 s with ten cores."""
@@ -35,19 +38,39 @@ PAPER_BYTES = {"ggx_normal": 14e6, "sh": 600e6, "rbf": 600e6}
 PAPER_TRIANGLES = 500_000
 PAPER_TIMES = {"ggx_normal": 1.0, "sh": 2.0, "rbf": 6.0}
 """Of making a picture, over GGX's."""
-_FITTED, _BY_SCIPY = 16_384, 256
 _CHUNK = 16 << 20
+FULL_RUN = Size()
 
 
-def figures(root: Path, rounds: int, frames: int = FRAMES) -> Iterator[dict[str, Any]]:
+@dataclass(frozen=True)
+class Scope:
+    """How much is measured."""
+
+    run: Size = FULL_RUN
+    frames: int = FRAMES
+    few_frames: int = 10
+    """Of the run whose memory is compared with that of all frames."""
+    fitted: int = 16_384
+    """Triangles."""
+    by_scipy: int = 256
+
+
+SMALLEST = Scope(Size((256, 192), 2_000), frames=40, few_frames=10, fitted=64, by_scipy=2)
+
+
+def figures(
+    root: Path, rounds: int, frames: int | None = None, *, smallest: bool = False
+) -> Iterator[dict[str, Any]]:
+    scope = SMALLEST if smallest else Scope()
+    scope = replace(scope, frames=frames or scope.frames)
     with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as name:
         folder = Path(name)
-        yield from _memory(root, folder, frames)
+        yield from _memory(root, folder, scope)
         yield from _extraction(folder, rounds)
-        samples = _some_samples(folder)
-        yield from _fits(samples, rounds)
+        samples = _some_samples(folder, scope.fitted)
+        yield from _fits(samples, rounds, scope.by_scipy)
         yield from _representations(samples, rounds)
-        yield from _relit(root, folder, samples, rounds)
+        yield from _relit(root, folder, samples, rounds, scope.run.size_px)
 
 
 def _cores() -> int:
@@ -86,17 +109,19 @@ print(json.dumps(int(peak.split()[1]) * 1024))
 """
 
 
-def _memory(root: Path, folder: Path, frames: int) -> Iterator[dict[str, Any]]:
+def _memory(root: Path, folder: Path, scope: Scope) -> Iterator[dict[str, Any]]:
     """Peak memory of a process that extracts a run of few frames, and of many."""
     peaks = []
-    for count in (FEW_FRAMES, frames):
+    for count in (scope.few_frames, scope.frames):
         shutil.rmtree(folder / "runs", ignore_errors=True)
-        make_run(root, folder, count)
+        make_run(root, folder, count, scope.run)
         script = _ALONE.format(tools=str(root / "tools"), root=str(root), folder=str(folder))
         done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
         peaks.append(json.loads(done.stdout) / 1e9)
     ratio = peaks[0] / peaks[1]
-    yield _figure("extraction_peak_memory", peaks[1], "GB", f"{FEW_FRAMES}_frames", ratio, frames=frames)
+    yield _figure(
+        "extraction_peak_memory", peaks[1], "GB", f"{scope.few_frames}_frames", ratio, frames=scope.frames
+    )
 
 
 def extract(folder: Path, say: Callable[[str, int, int], None]) -> dict[str, Any]:
@@ -127,6 +152,10 @@ def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:
         for _ in work.samples(all_reached, _cores()):
             pass
 
+    def from_disk(work: Callable[[], object]) -> None:
+        _forget(path)
+        work()
+
     def shadows() -> None:
         with ThreadPoolExecutor(_cores()) as pool:
             for first in range(0, len(work.leds), work.together):
@@ -135,10 +164,10 @@ def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:
     next(work.samples(all_reached, 1))  # compiles
     works: dict[str, Callable[[], Any]] = {
         "read": lambda: _read_direct(path, frames * measured.frames.size_px[0] * measured.frames.size_px[1] * 2),
-        "values": lambda: (_forget(path), values()),
+        "values": partial(from_disk, values),
         "seen": lambda: view_pass(measured, geometry, radiometry, measured.views[0], _cores()),
         "shadows": shadows,
-        "whole": lambda: (_forget(path), extract(folder, lambda step, done, of: None)),
+        "whole": partial(from_disk, lambda: extract(folder, lambda step, done, of: None)),
     }
     seconds = _medians(works, rounds)
     used_s = time.process_time()
@@ -184,15 +213,15 @@ def _result(folder: Path) -> Any:
     return RunResult(folder)
 
 
-def _some_samples(folder: Path) -> Any:
+def _some_samples(folder: Path, count: int) -> Any:
     """Of neighbouring triangles in the middle of the view."""
     result = _result(folder)
     view = result.views[0]
     first = len(view.triangles) // 2
-    return result.view_samples(view, slice(first, first + _FITTED))
+    return result.view_samples(view, slice(first, first + count))
 
 
-def _fits(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
+def _fits(samples: Any, rounds: int, by_scipy: int) -> Iterator[dict[str, Any]]:
     """Microseconds a triangle with all cores, three channels."""
     from coupole.reflectance.slice_basis import HARMONICS, RADIAL
     from coupole.reflectance.slice_fit import fit_slices
@@ -206,98 +235,22 @@ def _fits(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
         "rbf": lambda: fit_slices(samples, used, (RADIAL, None)),
         "ggx": lambda: fit_triangles(samples, used, None),
         "ggx_normal": lambda: fit_triangles(samples, used, 30.0),
-        "sgemm": lambda: _sgemm(round(each), count),
+        "sgemm": lambda: sgemm_products(round(each), count, _cores()),
     }
     for work in works.values():
         work()
     us = {name: 1e6 * seconds / count for name, seconds in _medians(works, rounds).items()}
-    few = samples.of_triangles(np.arange(0, count, count // _BY_SCIPY))
+    few = samples.of_triangles(np.arange(0, count, count // by_scipy))
     scipy = {
-        name: 1e6 * _timed(lambda fit=fit: fit(few)) / len(few.values) / _cores()
-        for name, fit in (("sh", _scipy_harmonics), ("ggx", _scipy_ggx))
+        name: 1e6 * _timed(partial(fit, few)) / len(few.values) / _cores()
+        for name, fit in (("sh", scipy_harmonics), ("ggx", scipy_ggx))
     }
     about = {"samples": round(each), "triangles": count, "cores": _cores()}
-    yield _figure("sh_fit", us["sh"], "us", "half_of_sgemm", 2.0 * us["sgemm"] / us["sh"], **about)
+    yield _figure("sh_fit", us["sh"], "us", "half_ofsgemm_products", 2.0 * us["sgemm"] / us["sh"], **about)
     yield _figure("sh_fit", us["sh"], "us", "scipy_on_all_cores", scipy["sh"] / us["sh"], **about)
     yield _figure("rbf_fit", us["rbf"], "us", "twice_sh", 2.0 * us["sh"] / us["rbf"], **about)
     for name in ("ggx", "ggx_normal"):
         yield _figure(f"{name}_fit", us[name], "us", "scipy_on_all_cores", scipy["ggx"] / us[name], **about)
-
-
-def _sgemm(samples: int, count: int) -> None:
-    """The products that the normal equations of as many triangles need: 100 functions with themselves and with
-    three channels."""
-    from scipy.linalg.blas import sgemm
-
-    a = np.asfortranarray(np.random.default_rng(0).random((samples, 100), np.float32))
-    b = np.asfortranarray(np.random.default_rng(1).random((samples, 103), np.float32))
-
-    def some(_: int) -> None:
-        for _ in range(count // _cores()):
-            sgemm(1.0, a, b, trans_a=True)
-
-    with ThreadPoolExecutor(_cores()) as pool:
-        list(pool.map(some, range(_cores())))
-
-
-def _frame_of(samples: Any, triangle: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """[n, 3] directions to the lights in the slice's frame, the axes [3, 3], and which samples are there."""
-    normal, centre = samples.normals[triangle], samples.centres_mm[triangle]
-    across = samples.cameras_mm[0] - centre
-    across -= normal * (across @ normal)
-    axes = np.stack([across, np.cross(normal, across), normal])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    there = np.isfinite(samples.values[triangle]).all(axis=1)
-    light = samples.led_mm[there] - centre
-    return (light / np.linalg.norm(light, axis=1, keepdims=True)) @ axes.T, axes, there
-
-
-def _scipy_harmonics(samples: Any) -> None:
-    """The same normal equations, triangle by triangle."""
-    from scipy.linalg import cho_factor, cho_solve
-    from scipy.special import sph_harm_y_all
-
-    from coupole.reflectance.slice_basis import HARMONICS
-
-    for triangle in range(len(samples.values)):
-        light, _, there = _frame_of(samples, triangle)
-        known = sph_harm_y_all(9, 9, np.arccos(light[:, 2]), np.arctan2(light[:, 1], light[:, 0]))
-        rows = np.concatenate(
-            [
-                part
-                for degree in range(10)
-                for part in (known[degree, : degree + 1].real, known[degree, 1 : degree + 1].imag)
-            ]
-        )
-        rows *= light[:, 2]
-        matrix = rows @ rows.T + np.diag(HARMONICS.penalty)
-        cho_solve(cho_factor(matrix), rows @ samples.values[triangle][there])
-
-
-def _scipy_ggx(samples: Any) -> None:
-    """The same robust problem from the same three starts, normal fitted, triangle by triangle."""
-    from scipy.optimize import least_squares
-
-    for triangle in range(len(samples.values)):
-        light, axes, there = _frame_of(samples, triangle)
-        view = samples.cameras_mm[0] - samples.centres_mm[triangle]
-        view = axes @ (view / np.linalg.norm(view))
-        half = (light + view) / np.linalg.norm(light + view, axis=1, keepdims=True)
-        roots = np.sqrt(np.maximum(samples.values[triangle][there].mean(axis=1), 0.0))
-        kd = float(np.median(roots**2 / np.maximum(light[:, 2], 0.02)))
-
-        def off(x: Any, light: Any = light, view: Any = view, half: Any = half, roots: Any = roots) -> Any:
-            normal = np.array([x[0], x[1], 1.0])
-            normal /= np.linalg.norm(normal)
-            nl, nv, nh = np.maximum(light @ normal, 1e-9), max(normal @ view, 1e-9), half @ normal
-            a2 = np.exp(2 * x[4])
-            d = a2 / (np.pi * (nh**2 * (a2 - 1) + 1) ** 2)
-            s = nl * np.sqrt(a2 + (1 - a2) * nv * nv) + nv * np.sqrt(a2 + (1 - a2) * nl * nl)
-            return np.sqrt(nl * (np.exp(x[2]) + np.exp(x[3]) * 0.5 * d / s)) - roots
-
-        for alpha in (0.08, 0.2, 0.45):
-            start = [0.0, 0.0, np.log(kd), np.log(0.02 * kd), np.log(alpha)]
-            least_squares(off, start, loss="cauchy", f_scale=0.05 * kd**0.5, ftol=1e-5)
 
 
 # -- representations and pictures -----------------------------------------------------------------------------
@@ -333,12 +286,14 @@ def _representations(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
         yield _figure(f"values_{name}_over_ggx", over, "1", "paper", PAPER_TIMES[name] / over, ns_per_value=ns)
 
 
-def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
+def _relit(
+    root: Path, folder: Path, samples: Any, rounds: int, size_px: tuple[int, int]
+) -> Iterator[dict[str, Any]]:
     """A full-size picture under a new light, with shadows, from the materials of some triangles, repeated, in the
     memory of the one before; Mitsuba has one sample for each pixel, and its scene loaded. How long a picture takes
     in new memory is told too: the operating system may need most of that time to clear it."""
     from bench_measured_run import MESH
-    from bench_render import FULL, mitsuba_frame, photographer
+    from bench_render import mitsuba_frame, photographer
     from coupole.reflectance.material_uncertainty import MaterialUncertainty
     from coupole.reflectance.new_light.light_kinds import DistantLight
     from coupole.reflectance.run_relighting import scene_of_view
@@ -349,15 +304,15 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     result = _result(folder)
     found = fit_triangles(samples, np.ones(samples.values.shape[1], np.bool_), 30.0)
     (folder / "fits").mkdir(exist_ok=True)
-    whole = found.at(np.arange(len(result.triangles)) % _FITTED)
+    whole = found.at(np.arange(len(result.triangles)) % len(samples.values))
     count = len(result.triangles)
     certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *whole.kd.shape)))
     nothing = np.zeros(count, np.float32)
     write_materials(result.materials_path("ggx_normal"), [whole], [certain], nothing, 0.0, result.triangles)
     about = {"schema": SCHEMA, "emission": "lambertian", "runs": {}, "mae": {}, "scan_noise_um": 30.0}
     (folder / ABOUT).write_text(json.dumps({**about, "simulated": True, "software": {"coupole": "bench"}}))
-    by, _ = photographer(root, folder / MESH, FULL)
-    mitsuba = mitsuba_frame(folder / MESH, by)
+    by, _ = photographer(root, folder / MESH, size_px)
+    mitsuba = mitsuba_frame(folder / MESH, by, size_px)
     ready = scene_of_view(result, fit="ggx_normal")
     directions = iter(np.random.default_rng(0).normal(0, 0.4, (100, 3)) + np.array([0, 0, 1]))
 
@@ -375,4 +330,5 @@ def _relit(root: Path, folder: Path, samples: Any, rounds: int) -> Iterator[dict
     more = {"triangles": len(result.triangles), "view_ready_s": round(first_s, 3)}
     more["in_new_memory_s"] = round(seconds["in_new_memory"], 3)
     tenth_s = seconds.get("mitsuba", float("nan")) / 10
-    yield _figure("relit_frame_12mp", seconds["ours"], "s", "mitsuba_10_times", tenth_s / seconds["ours"], **more)
+    name = f"relit_frame_{1e-6 * size_px[0] * size_px[1]:.2g}mp"
+    yield _figure(name, seconds["ours"], "s", "mitsuba_10_times", tenth_s / seconds["ours"], **more)

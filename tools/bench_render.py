@@ -13,27 +13,46 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-FULL, SMALL = (4096, 3072), (1024, 768)
+FULL = (4096, 3072)
 SENSOR_WIDTH_MM = 22.528
 WORKING_DISTANCE_MM = 334.0
 SIMULATED_CAMERA_PER_S = 25.0
 RAISED_MM = 10.0
-_LEDS_OF_A_ROUND = 12
-_PIXEL_LEDS_OF_A_ROUND = 4
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+@dataclass(frozen=True)
+class Size:
+    """Of frames, width and height in pixels, and of reliefs, in millions of triangles."""
+
+    full_px: tuple[int, int] = FULL
+    small_px: tuple[int, int] = (1024, 768)
+    medium: float = 1.4
+    large: float = 10.0
+    small: float = 0.1
+    """Of the small frame."""
+    least_rounds: int = 3
+    leds_of_a_round: int = 12
+    pixel_leds_of_a_round: int = 4
+
+
+SMALLEST = Size((128, 96), (64, 48), 0.001, 0.002, 0.001, 1, 2, 1)
+
+
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     """All figures of the renderer."""
-    yield from gbuffer_figures(rounds)
-    yield from frame_figures(root, rounds)
-    yield from pixel_figures(root, rounds)
-    yield memory_figure(root)
+    size = SMALLEST if smallest else Size()
+    yield from gbuffer_figures(rounds, size)
+    yield from frame_figures(root, rounds, size)
+    yield from pixel_figures(root, rounds, size)
+    yield memory_figure(root, size)
 
 
 def relief(triangles: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -85,23 +104,23 @@ def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float
 # -- triangle of each pixel -------------------------------------------------------------------------------
 
 
-def gbuffer_figures(rounds: int) -> Iterator[dict[str, Any]]:
+def gbuffer_figures(rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Seconds for the triangles of 12.6 Mpixel, with and without lens distortion, against ray tracers."""
     from sim.render.lens import Lens, sight
     from sim.render.raster import visible_triangles
 
     pose = camera_pose()
-    focal_px = 1.0 / (1.0 / 35.0 - 1.0 / WORKING_DISTANCE_MM) / SENSOR_WIDTH_MM * FULL[0]
-    straight = sight(Lens(*FULL, focal_px))
-    bent = sight(Lens(*FULL, focal_px, (-0.05, 0.02, 1e-4, -2e-4, 0.01)))
-    for millions in (1.4, 10.0):
+    focal_px = 1.0 / (1.0 / 35.0 - 1.0 / WORKING_DISTANCE_MM) / SENSOR_WIDTH_MM * size.full_px[0]
+    straight = sight(Lens(*size.full_px, focal_px))
+    bent = sight(Lens(*size.full_px, focal_px, (-0.05, 0.02, 1e-4, -2e-4, 0.01)))
+    for millions in (size.medium, size.large):
         corners = corners_of_relief(int(millions * 1e6))
         works: dict[str, Callable[[], Any]] = {
-            "straight": lambda corners=corners: visible_triangles(corners, straight, pose),
-            "bent": lambda corners=corners: visible_triangles(corners, bent, pose),
+            "straight": partial(visible_triangles, corners, straight, pose),
+            "bent": partial(visible_triangles, corners, bent, pose),
         }
         works |= ray_tracers(corners, straight.lens, pose)
-        medians = times_s(works, max(rounds, 3))
+        medians = times_s(works, max(rounds, size.least_rounds))
         for lens in ("straight", "bent"):
             for peer in [name for name in works if name not in ("straight", "bent")]:
                 yield {
@@ -177,34 +196,35 @@ def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], led
         by.render(out, Exposed({led: 0.008}, [], 0.008, 1.0, led, pose))
 
 
-def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Frames per second: each LED's first frame, with its shadow rays; again with cached shadows, in another view
     of the same triangles; again from the same pose, with cached radiance as far as memory allows."""
-    for size, millions in ((FULL, 1.4), (SMALL, 0.1)):
-        label = f"{size[0]}x{size[1]}_{millions:g}_M_triangles"
+    for size_px, millions in ((size.full_px, size.medium), (size.small_px, size.small)):
+        label = f"{size_px[0]}x{size_px[1]}_{millions:g}_M_triangles"
         with tempfile.TemporaryDirectory() as folder:
             mesh = Path(folder) / "mesh.ply"
             write_relief(mesh, int(millions * 1e6))
-            by, pose = photographer(root, mesh, size)
-            peer = mitsuba_frame(mesh, by) if size == FULL else None
+            by, pose = photographer(root, mesh, size_px)
+            peer = mitsuba_frame(mesh, by, size_px) if size_px == size.full_px else None
         nudged = pose.copy()
         nudged[0, 3] += 0.01
-        out = np.zeros((size[1], size[0]), np.uint16)
+        out = np.zeros(size_px[::-1], np.uint16)
         render_leds(by, nudged, out, range(1))
         render_leds(by, pose, out, range(1))
-        first, kept, again, peers = [], [], [], []
+        per_frame: dict[str, list[float]] = {"shadow_rays": [], "shadows_kept": [], "radiance_kept": []}
+        peers: list[float] = []
         for turn in range(rounds):
             if peer is not None:
                 start_s = time.perf_counter()
                 peer(turn)
                 peers.append(time.perf_counter() - start_s)
-            leds = range(1 + turn * _LEDS_OF_A_ROUND, 1 + (turn + 1) * _LEDS_OF_A_ROUND)
-            for times, place in ((first, pose), (kept, nudged), (again, nudged)):
+            first = 1 + turn * size.leds_of_a_round
+            leds = range(first, first + size.leds_of_a_round)
+            for times, place in zip(per_frame.values(), (pose, nudged, nudged), strict=True):
                 render_leds(by, place, out, range(1))  # rasterises the new pose, which is not timed here
                 start_s = time.perf_counter()
                 render_leds(by, place, out, leds)
                 times.append((time.perf_counter() - start_s) / len(leds))
-        per_frame = {"shadow_rays": first, "shadows_kept": kept, "radiance_kept": again}
         peer_s = statistics.median(peers) if peers else None
         for name, each in per_frame.items():
             value = 1.0 / statistics.median(each)
@@ -218,14 +238,11 @@ def frame_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
             }
 
 
-def pixel_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Frames per second at full size with light and shadow on each pixel, each under another LED: the light alone,
     with blur, and with interreflection too, against Mitsuba's and against one radiance for each triangle. Then the
     time of blur alone, against a second."""
-    from sim.optics.blur import through
-    from sim.optics.sensor import electrons
-
-    ways = {
+    ways: dict[str, dict[str, Any]] = {
         "flat": {"shading": "flat"},
         "pixel_direct": {
             "shading": "pixel",
@@ -235,15 +252,16 @@ def pixel_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         "pixel_direct_blurred": {"shading": "pixel", "interreflection": False},
         "pixel": {"shading": "pixel"},
     }
-    out = np.zeros((FULL[1], FULL[0]), np.uint16)
+    out = np.zeros(size.full_px[::-1], np.uint16)
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.ply"
-        write_relief(mesh, 1_400_000)
-        made = {name: photographer(root, mesh, FULL, **settings) for name, settings in ways.items()}
-        peer = mitsuba_frame(mesh, made["flat"][0])
+        write_relief(mesh, int(size.medium * 1e6))
+        made = {name: photographer(root, mesh, size.full_px, **settings) for name, settings in ways.items()}
+        peer = mitsuba_frame(mesh, made["flat"][0], size.full_px)
     times: dict[str, list[float]] = {name: [] for name in (*made, "mitsuba")}
     for turn in range(1 + rounds):
-        leds = range(1 + turn * _PIXEL_LEDS_OF_A_ROUND, 1 + (turn + 1) * _PIXEL_LEDS_OF_A_ROUND)
+        first = 1 + turn * size.pixel_leds_of_a_round
+        leds = range(first, first + size.pixel_leds_of_a_round)
         for name, (by, pose) in made.items():
             if turn == 0:
                 render_leds(by, pose, out, range(1))  # rasterises, and prepares what a pose needs
@@ -259,7 +277,7 @@ def pixel_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         for rival in ("mitsuba", "flat"):
             if rival in frame_s:
                 yield {
-                    "name": f"frames_{FULL[0]}x{FULL[1]}_1.4_M_triangles_{name}",
+                    "name": f"frames_{size.full_px[0]}x{size.full_px[1]}_{size.medium:g}_M_triangles_{name}",
                     "value": 1.0 / frame_s[name],
                     "unit": "1/s",
                     "peer": "mitsuba_scalar_rgb_1_sample" if rival == "mitsuba" else rival,
@@ -267,16 +285,24 @@ def pixel_figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
                     "peer_value": round(1.0 / frame_s[rival], 4),
                 }
     by, pose = made["pixel_direct"]
+    yield _blur_figure(by, pose, max(rounds, size.least_rounds), size)
+
+
+def _blur_figure(by: Any, pose: NDArray[np.float64], rounds: int, size: Size) -> dict[str, Any]:
+    """Seconds of blur alone."""
+    from sim.optics.blur import through
+    from sim.optics.sensor import electrons
+
     look = by._look_from(pose)
     image = electrons(look.view.site, by._led(look, 500), by._falloff, electrons_per_radiance=1.0)
     disk_px, channels = by._disk_px(look), by.sensor.channels()
-    blur_s = times_s(
-        {"ours": lambda: through(by._objective, image, disk_px, channels, pixel_pitch_um=5.5)}, max(rounds, 3)
-    )["ours"]
-    yield {"name": "blur_4096x3072", "value": blur_s, "unit": "s", "peer": "limit_1_s", "ratio": 1.0 / blur_s}
+    blurred = partial(through, by._objective, image, disk_px, channels, pixel_pitch_um=5.5)
+    blur_s = times_s({"ours": blurred}, rounds)["ours"]
+    name = f"blur_{size.full_px[0]}x{size.full_px[1]}"
+    return {"name": name, "value": blur_s, "unit": "s", "peer": "limit_1_s", "ratio": 1.0 / blur_s}
 
 
-def mitsuba_frame(mesh: Path, by: Any) -> Callable[[int], None] | None:
+def mitsuba_frame(mesh: Path, by: Any, size_px: tuple[int, int]) -> Callable[[int], None] | None:
     """A function that moves Mitsuba's LED and renders a frame; None if Mitsuba is not installed."""
     try:
         import mitsuba
@@ -298,7 +324,7 @@ def mitsuba_frame(mesh: Path, by: Any) -> Callable[[int], None] | None:
                 "type": "perspective",
                 "fov": 2 * np.degrees(np.arctan(SENSOR_WIDTH_MM / 2 * (1 / 35.0 - 1 / WORKING_DISTANCE_MM))),
                 "to_world": transform().look_at([0, 0, WORKING_DISTANCE_MM], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": FULL[0], "height": FULL[1], "rfilter": {"type": "box"}},
+                "film": {"type": "hdrfilm", "width": size_px[0], "height": size_px[1], "rfilter": {"type": "box"}},
                 "sampler": {"type": "independent", "sample_count": 1},
             },
         }
@@ -321,27 +347,27 @@ import json, sys, time
 from pathlib import Path
 import numpy as np
 sys.path[:0] = [{tools!r}, {root!r}]
-from bench_render import FULL, photographer, render_leds
+from bench_render import photographer, render_leds
 started = time.perf_counter()
-by, pose = photographer(Path({root!r}), Path({mesh!r}), FULL, shading="pixel")
+by, pose = photographer(Path({root!r}), Path({mesh!r}), {size_px!r}, shading="pixel")
 read_s = time.perf_counter() - started
-render_leds(by, pose, np.zeros(FULL[::-1], np.uint16), range(1))
+render_leds(by, pose, np.zeros({size_px!r}[::-1], np.uint16), range(1))
 peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
 print(json.dumps([int(peak.split()[1]) / 2**20, read_s]))
 """
 
 
-def memory_figure(root: Path) -> dict[str, Any]:
+def memory_figure(root: Path, size: Size) -> dict[str, Any]:
     """Peak memory of a process that reads a binary PLY of 10 million triangles and renders one LED at full size
     by pixel, with blur and interreflection, against the 16 GiB of a laboratory's computer."""
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.ply"
-        write_relief(mesh, 10_000_000)
-        script = _ALONE.format(tools=str(root / "tools"), root=str(root), mesh=str(mesh))
+        write_relief(mesh, int(size.large * 1e6))
+        script = _ALONE.format(tools=str(root / "tools"), root=str(root), mesh=str(mesh), size_px=size.full_px)
         done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     peak, read_s = json.loads(done.stdout)
     return {
-        "name": "peak_memory_10_M_triangles",
+        "name": f"peak_memory_{size.large:g}_M_triangles",
         "value": peak,
         "unit": "GiB",
         "peer": "memory_of_16_GiB",

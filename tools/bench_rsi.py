@@ -24,8 +24,9 @@ from drivers.kuka.rsi.jitter import StandInController, above_the_loop, asked, fr
 from drivers.kuka.rsi.settings import Settings
 
 CYCLE_S = 0.004
-_BLOCK_CYCLES, _BLOCKS = 250, 8
+BLOCK_CYCLES, BLOCKS = 250, 8
 """The responders alternate every second; number of seconds per round."""
+SMALLEST_CYCLES = 50
 _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
 
 
@@ -67,15 +68,16 @@ def neighbours(count: int) -> Iterator[None]:
             process.wait()
 
 
-def figures(rounds: int) -> Iterator[dict[str, Any]]:
+def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     """Latencies in us and fractions of late answers, each with its peer."""
+    cycles, blocks = (SMALLEST_CYCLES, 1) if smallest else (BLOCK_CYCLES, BLOCKS)
     with tempfile.TemporaryDirectory() as folder, above_the_loop():  # busy neighbours have normal priority
         for load, count in (("idle", 0), ("two_busy_neighbours", 2)):
             with our_responder() as ours, c_responder(Path(folder)) as theirs, neighbours(count):
                 both = [ours] if theirs is None else [ours, theirs]
-                for _ in range(rounds * _BLOCKS):
+                for _ in range(rounds * blocks):
                     for controller, _ in both:
-                        controller.ask(_BLOCK_CYCLES)
+                        controller.ask(cycles)
                 yield from compared(load, *both)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import mmap
 import os
 import resource
@@ -18,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,22 +27,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-HEIGHT_PX, WIDTH_PX = 3072, 4096
-FRAME_BYTES = HEIGHT_PX * WIDTH_PX * 2
-FRAMES, DISTINCT = 48, 8
-STREAM_FRAMES = 520
-"""Frames of one burst; the view has two bursts, and its disk space is reused in the next round."""
 STREAM_FRAMES_PER_S = 200
 Writer = Callable[[Path, NDArray[np.uint16], int], None]
 """Writes n frames (the given ones in turn) into a folder, and syncs them."""
 
 
-def figures(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
-    yield from writers(root, rounds)
-    yield from stream(root, rounds)
+@dataclass(frozen=True)
+class Size:
+    """How much is written."""
+
+    height_px: int = 3072
+    width_px: int = 4096
+    frames: int = 48
+    distinct: int = 8
+    """Different frames, which are written in turn."""
+    stream_frames: int = 520
+    """Frames of one burst; the view has two bursts, and its disk space is reused in the next round."""
 
 
-def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+SMALLEST = Size(height_px=192, width_px=256, frames=4, distinct=2, stream_frames=20)
+
+
+def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
+    size = SMALLEST if smallest else Size()
+    yield from writers(root, rounds, size)
+    yield from stream(root, rounds, size)
+
+
+def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Frames per second and CPU time per frame of each writer, in turn."""
     known: dict[str, Writer] = {
         "coupole": _coupole,
@@ -57,24 +71,25 @@ def writers(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         del known[missing]
     seconds: dict[str, list[float]] = {name: [] for name in known}
     cpu_ms: dict[str, list[float]] = {name: [] for name in known}
-    pixels = _pictures()
+    pixels = _pictures(size)
     for _ in range(rounds):
         for name, write in known.items():
             with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
                 used_s, started_s = _cpu_s(), time.perf_counter()
-                write(Path(folder), pixels, FRAMES)
+                write(Path(folder), pixels, size.frames)
                 seconds[name].append(time.perf_counter() - started_s)
-                cpu_ms[name].append(1e3 * (_cpu_s() - used_s) / FRAMES)
+                cpu_ms[name].append(1e3 * (_cpu_s() - used_s) / size.frames)
     ours_s, ours_ms = statistics.median(seconds["coupole"]), statistics.median(cpu_ms["coupole"])
     for name in list(known)[1:]:
         peer_s = statistics.median(seconds[name])
         yield {
             "name": "store_full_size",
-            "value": FRAMES / ours_s,
+            "value": size.frames / ours_s,
             "unit": "frames/s",
             "peer": name,
             "ratio": peer_s / ours_s,
-            "peer_value": round(FRAMES / peer_s, 2),
+            "peer_value": round(size.frames / peer_s, 2),
+            "frame_px": [size.width_px, size.height_px],
             "cpu_ms_per_frame": round(ours_ms, 2),
             "peer_cpu_ms_per_frame": round(statistics.median(cpu_ms[name]), 2),
         }
@@ -84,10 +99,10 @@ def _installed(name: str) -> bool:
     return name.startswith("coupole") or name == "o_direct_copy" or importlib.util.find_spec(name) is not None
 
 
-def _pictures() -> NDArray[np.uint16]:
-    """[DISTINCT, H, W] in page-aligned memory."""
-    memory = mmap.mmap(-1, DISTINCT * FRAME_BYTES)
-    pixels = np.frombuffer(memory, np.uint16).reshape(DISTINCT, HEIGHT_PX, WIDTH_PX)
+def _pictures(size: Size) -> NDArray[np.uint16]:
+    """[distinct, H, W] in page-aligned memory."""
+    shape = (size.distinct, size.height_px, size.width_px)
+    pixels = np.frombuffer(mmap.mmap(-1, 2 * math.prod(shape)), np.uint16).reshape(shape)
     pixels[:] = np.random.default_rng(1).normal(700, 40, pixels.shape).astype(np.uint16)
     return pixels
 
@@ -107,7 +122,8 @@ def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: b
 
     view = folder / "view.h5"
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
-    create(view, frames, FrameFormat(HEIGHT_PX, WIDTH_PX, 12, "GBRG", 64, 4095), metadata, packed=packed)
+    height_px, width_px = pixels.shape[1:]
+    create(view, frames, FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), metadata, packed=packed)
     writer = ViewWriter(view, {})
     keep = partial(writer.put, camera_ns=0, exposure_us=8000)
     with ThreadPoolExecutor(3) as pool:  # as `coupole.acquisition.frame_grabber` does
@@ -120,9 +136,10 @@ def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: b
 
 def _o_direct_copy(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
     fd = os.open(folder / "copy.raw", os.O_WRONLY | os.O_CREAT | os.O_DIRECT)
-    os.posix_fallocate(fd, 0, frames * FRAME_BYTES)
+    frame_bytes = pixels[0].nbytes
+    os.posix_fallocate(fd, 0, frames * frame_bytes)
     for k in range(frames):
-        os.pwrite(fd, pixels[k % len(pixels)].data.cast("B"), k * FRAME_BYTES)
+        os.pwrite(fd, pixels[k % len(pixels)].data.cast("B"), k * frame_bytes)
     os.fdatasync(fd)
     os.close(fd)
 
@@ -132,7 +149,7 @@ def _h5py(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
 
     path = folder / "frames.h5"
     with h5py.File(path, "w") as file:
-        data = file.create_dataset("data", (frames, HEIGHT_PX, WIDTH_PX), np.uint16)
+        data = file.create_dataset("data", (frames, *pixels.shape[1:]), np.uint16)
         for k in range(frames):
             data[k] = pixels[k % len(pixels)]
     _sync(path)
@@ -141,7 +158,7 @@ def _h5py(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
 def _zarr(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
     import zarr
 
-    shape, chunks = (frames, HEIGHT_PX, WIDTH_PX), (1, HEIGHT_PX, WIDTH_PX)
+    shape, chunks = (frames, *pixels.shape[1:]), (1, *pixels.shape[1:])
     data = zarr.create_array(folder / "a.zarr", shape=shape, chunks=chunks, dtype="uint16", compressors=None)
     for k in range(frames):
         data[k] = pixels[k % len(pixels)]
@@ -156,10 +173,11 @@ def _acquire_zarr(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None
             name=name, kind=kind, array_size_px=size_px, chunk_size_px=chunk_px, shard_size_chunks=1
         )
 
+    _, height_px, width_px = pixels.shape
     dimensions = [
         dimension("t", aqz.DimensionType.TIME, 0, 1),
-        dimension("y", aqz.DimensionType.SPACE, HEIGHT_PX, HEIGHT_PX),
-        dimension("x", aqz.DimensionType.SPACE, WIDTH_PX, WIDTH_PX),
+        dimension("y", aqz.DimensionType.SPACE, height_px, height_px),
+        dimension("x", aqz.DimensionType.SPACE, width_px, width_px),
     ]
     array = aqz.ArraySettings(dimensions=dimensions, data_type=aqz.DataType.UINT16)
     stream = aqz.ZarrStream(aqz.StreamSettings(store_path=str(folder / "a.zarr"), arrays=[array]))
@@ -172,7 +190,7 @@ def _acquire_zarr(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None
 def _tensorstore(folder: Path, pixels: NDArray[np.uint16], frames: int) -> None:
     import tensorstore
 
-    shape, chunks = [frames, HEIGHT_PX, WIDTH_PX], [1, HEIGHT_PX, WIDTH_PX]
+    shape, chunks = [frames, *pixels.shape[1:]], [1, *pixels.shape[1:]]
     spec = {
         "driver": "zarr3",
         "kvstore": {"driver": "file", "path": str(folder / "a.zarr")},
@@ -212,22 +230,19 @@ def _sync(path: Path) -> None:
 # -- the stream -------------------------------------------------------------------------------------------
 
 
-def stream(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
+def stream(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Whole bursts of a run, from the first frame to the last proof, and a plain copy of as many bytes."""
-    ours, peers, cpu_ms, lost, megabytes = [], [], [], 0, []
-    pixels = _pictures()
+    bursts: list[Burst] = []
+    peers: list[float] = []
+    pixels = _pictures(size)
     for _ in range(rounds):
         with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
-            burst = _burst(root, Path(folder))
-        ours.append(burst["frames_per_s"])
-        cpu_ms.append(burst["cpu_ms_per_frame"])
-        lost += burst["lost"]
-        megabytes.append(burst["grown_mb"])
+            bursts.append(_burst(root, Path(folder), size))
         with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
             started_s = time.perf_counter()
-            _o_direct_copy(Path(folder), pixels, STREAM_FRAMES)
-            peers.append(STREAM_FRAMES / (time.perf_counter() - started_s))
-    value, peer = statistics.median(ours), statistics.median(peers)
+            _o_direct_copy(Path(folder), pixels, size.stream_frames)
+            peers.append(size.stream_frames / (time.perf_counter() - started_s))
+    value, peer = statistics.median(one.frames_per_s for one in bursts), statistics.median(peers)
     for name, limit in (("o_direct_copy", peer), ("camera_100_frames_per_s", 100.0)):
         yield {
             "name": "stream_full_size",
@@ -236,30 +251,44 @@ def stream(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
             "peer": name,
             "ratio": value / limit,
             "peer_value": round(limit, 2),
-            "frames": rounds * STREAM_FRAMES,
-            "lost": lost,
-            "cpu_ms_per_frame": round(statistics.median(cpu_ms), 2),
-            "memory_grown_mb": round(max(megabytes), 1),
+            "frames": rounds * size.stream_frames,
+            "frame_px": [size.width_px, size.height_px],
+            "lost": sum(one.lost for one in bursts),
+            "cpu_ms_per_frame": round(statistics.median(one.cpu_ms_per_frame for one in bursts), 2),
+            "memory_grown_mb": round(max(one.grown_mb for one in bursts), 1),
         }
 
 
-def _burst(root: Path, folder: Path) -> dict[str, float]:
+@dataclass(frozen=True)
+class Burst:
+    """Figures of a burst."""
+
+    frames_per_s: float
+    cpu_ms_per_frame: float
+    lost: int
+    """Frames, or shots that were taken again."""
+    grown_mb: float
+    """Memory of the process."""
+
+
+def _burst(root: Path, folder: Path, size: Size) -> Burst:
     """Figures of the second burst of a run; in the first one the camera's memory is filled with pictures."""
     from ruamel.yaml import YAML
 
-    from coupole.acquisition.observer import Observer, Progress
+    from coupole.acquisition.observer import Unwatched
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
     from coupole.acquisition.sequencer import Sequencer
     from coupole.acquisition.session import about_run, metadata_of_views
     from coupole.preflight.job import read_job
     from coupole.storage.run import Run
+    from coupole.viewing.progress import Progress
 
     rig = YAML(typ="safe").load(root / "configs/rigs/sim.yaml")
     rig["sensor"] = {
-        "width_px": WIDTH_PX,
-        "height_px": HEIGHT_PX,
-        "pixel_pitch_um": 5.5,
+        "width_px": size.width_px,
+        "height_px": size.height_px,
+        "pixel_pitch_um": 22528.0 / size.width_px,
         "max_frames_per_s": STREAM_FRAMES_PER_S,
     }
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
@@ -273,7 +302,7 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
         "name": "stream",
         "rig": "rig.yaml",
         "views": [{"kind": "joints", "name": "here", "joints_deg": [0, -170, 150, 0, -70, 0]}],
-        "lights": {"kind": "ids", "ids": list(range(STREAM_FRAMES))},
+        "lights": {"kind": "ids", "ids": list(range(size.stream_frames))},
         "exposure": {"kind": "bracket", "exposures_us": [1000, 1001]},
     }
     (folder / "plan.yaml").write_text(json.dumps(plan))
@@ -281,7 +310,7 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
     burst_frames = len(job.schedule.bursts[0][0].labels)
     seen: list[tuple[float, int, float, float]] = []
 
-    class Watch(Observer):
+    class Watch(Unwatched):
         def progress(self, progress: Progress) -> None:
             seen.append((time.perf_counter(), progress.proven, _cpu_s(), _resident_mb()))
 
@@ -294,12 +323,12 @@ def _burst(root: Path, folder: Path) -> dict[str, float]:
             recorder.close()
     second = [row for row in seen if row[1] > burst_frames]
     (first_s, first, cpu_before_s, mb_before), (last_s, last, cpu_after_s, mb_after) = second[0], second[-1]
-    return {
-        "frames_per_s": (last - first) / (last_s - first_s),
-        "cpu_ms_per_frame": 1e3 * (cpu_after_s - cpu_before_s) / (last - first),
-        "lost": outcome.lost_transfers + outcome.reshot,
-        "grown_mb": mb_after - mb_before,
-    }
+    return Burst(
+        frames_per_s=(last - first) / (last_s - first_s),
+        cpu_ms_per_frame=1e3 * (cpu_after_s - cpu_before_s) / (last - first),
+        lost=outcome.lost_transfers + outcome.reshot,
+        grown_mb=mb_after - mb_before,
+    )
 
 
 def _resident_mb() -> float:

@@ -22,15 +22,16 @@ _HORIZON_Z = 0.1
 _NORMALS = 20_000
 
 
-def figures(rounds: int) -> Iterator[dict[str, Any]]:
+def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     gold = fresnel.of_index(indices.gold()[[54, 34, 14]])
-    for roughness in (0.25, 0.1, 0.05):
+    maps, nodes = (1, 20) if smallest else (20 * rounds, 60)
+    for roughness in (0.25,) if smallest else (0.25, 0.1, 0.05):
         source = partial(brdf.ggx, roughness=roughness, fresnel=gold)
-        table = tabulated.tabulate(source, np.arange(0.0, 88.1, 2.5), theta_nodes=60)
+        table = tabulated.tabulate(source, np.arange(0.0, 88.1, 2.5), theta_nodes=nodes)
         random = np.random.default_rng(1)
         eye = _unit(np.array([0.0, -0.5, 0.8]))
         took_ms = []
-        for _ in range(20 * rounds + 1):
+        for _ in range(maps + 1):
             lights, power = (
                 _unit(random.normal(size=(LIGHTS, 3)) + 1.2 * eye),
                 random.uniform(0.5, 2.0, (LIGHTS, 3)),

@@ -86,9 +86,8 @@ def report(day: Day, wrong: list[str]) -> int:
             table.add_row(who, what, *(f"{value:,.0f}" for value in (first, last, max(values), last - first)))
             if last - first > most + (KEPT_BYTES * labels if (who, what) == ("controller", "bytes") else 0):
                 wrong.append(f"{who}: {what} grew by {last - first:,.0f}")
-    first, last = warm[0], warm[-1]
-    for what in first["on disk"]:
-        sizes = [sample["on disk"][what] for sample in (first, last)]
+    for what in warm[0]["on disk"]:
+        sizes = [sample["on disk"][what] for sample in (warm[0], warm[-1])]
         a_frame = (sizes[1] - sizes[0]) / max(1, labels)
         table.add_row("on disk", f"{what}, bytes", *(f"{size:,}" for size in sizes), "", f"{a_frame:.1f} a frame")
     console.print(table)

@@ -25,8 +25,7 @@ from scipy.spatial.transform import Rotation
 from coupole.appearance.render.led_squares import Leds, read_leds
 from coupole.calibration.record import Record, content_sha256, read_record, write_record
 from coupole.geometry import abc_from_rotation
-from coupole.plan.cell import Cell
-from coupole.plan.reading import read_cell
+from coupole.plan.cell import Cell, read_cell
 from sim.optics.objective import Objective, vignetting
 from sim.optics.sensor_model import SensorModel
 from sim.render.emitter import LED_SIDE_MM, irradiance_of_each, squares

@@ -41,7 +41,9 @@ class Materials:
 def ggx(of: Materials, lit: Lit) -> Array:
     """[n, 3] kd + ks D V: Walter and others 2007, Heitz 2014."""
     nl, nv, nh, _ = _cosines(of, lit)
-    return np.pi * nl[:, None] * (of.diffuse + (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None] * of.specular)
+    lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None]
+    shown: Array = np.pi * nl[:, None] * (of.diffuse + lobe * of.specular)
+    return shown
 
 
 def gltf(of: Materials, lit: Lit) -> Array:
@@ -50,7 +52,8 @@ def gltf(of: Materials, lit: Lit) -> Array:
     fresnel = of.specular + (1.0 - of.specular) * (1.0 - vh[:, None]) ** 5
     lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None]
     base = of.diffuse / np.pi
-    return np.pi * nl[:, None] * ((1.0 - fresnel.max(axis=1, keepdims=True)) * base + fresnel * lobe)
+    shown: Array = np.pi * nl[:, None] * ((1.0 - fresnel.max(axis=1, keepdims=True)) * base + fresnel * lobe)
+    return shown
 
 
 def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
@@ -64,7 +67,8 @@ def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
     more = 1.0 + fresnel * (1.0 - white) / white
     lobe = _d(nh, of.alpha) * _v(nl, nv, of.alpha) * fresnel * more
     through = (1.0 - once * more)[:, None] * of.diffuse / np.pi
-    return np.pi * nl[:, None] * (lobe[:, None] * of.specular + through)
+    shown: Array = np.pi * nl[:, None] * (lobe[:, None] * of.specular + through)
+    return shown
 
 
 def lab_differences(found: Array, wanted: Array) -> Array:
@@ -90,13 +94,15 @@ def _cosines(of: Materials, lit: Lit) -> tuple[Array, Array, Array, Array]:
 
 
 def _d(nh: Array, alpha: Array) -> Array:
-    return alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1.0) + 1.0) ** 2)
+    density: Array = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1.0) + 1.0) ** 2)
+    return density
 
 
 def _v(nl: Array, nv: Array, alpha: Array) -> Array:
     """Smith's shadowing with correlated heights, over 4 nl nv."""
     a2 = alpha**2
-    return 0.5 / (nl * np.sqrt(nv**2 * (1.0 - a2) + a2) + nv * np.sqrt(nl**2 * (1.0 - a2) + a2))
+    share: Array = 0.5 / (nl * np.sqrt(nv**2 * (1.0 - a2) + a2) + nv * np.sqrt(nl**2 * (1.0 - a2) + a2))
+    return share
 
 
 def _fresnel(cosine: Array, f0: Array | float) -> Array:
@@ -105,7 +111,8 @@ def _fresnel(cosine: Array, f0: Array | float) -> Array:
     ior = (1.0 + root) / (1.0 - root)
     g = np.sqrt(ior**2 - 1.0 + cosine**2)
     near, far = g - cosine, g + cosine
-    return 0.5 * (near / far) ** 2 * (1.0 + ((far * cosine - 1.0) / (near * cosine + 1.0)) ** 2)
+    share: Array = 0.5 * (near / far) ** 2 * (1.0 + ((far * cosine - 1.0) / (near * cosine + 1.0)) ** 2)
+    return share
 
 
 def _albedos(f0: float | None) -> Array:

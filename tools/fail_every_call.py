@@ -65,7 +65,7 @@ def case_of(line: dict[str, Any]) -> Case:
 
 def begin_job(parent_pid: int) -> None:
     """Have this process fork its worlds, and end soon after the one that started it, also if that is killed."""
-    client._launch = Nursery().start  # type: ignore[assignment] # as the tests do
+    client._launch = Nursery().start  # as the tests do
 
     def look() -> None:
         while os.getppid() == parent_pid:

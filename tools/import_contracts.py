@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
+from typing import cast
 
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, fields, output
@@ -20,7 +22,7 @@ class AllowListContract(Contract):
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
         """One line for each import that is not allowed."""
-        allowed = {str(self.package), *(self.allowed_modules or ())}
+        allowed = {str(self.package), *map(str, cast(Iterable[object], self.allowed_modules or ()))}
         own = {str(self.package), *graph.find_descendants(str(self.package))}
         wrong = [
             (importer, imported)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -44,9 +45,11 @@ def main() -> None:
 
 def surface(cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices [n, 3] and triangles [m, 3], outwards counter-clockwise."""
-    from skimage.measure import marching_cubes
+    from skimage import measure
 
-    axes = [np.arange(low, high, cell_mm, np.float32) for low, high in zip(LOW_MM, HIGH_MM, strict=True)]
+    marching_cubes: Any = measure.marching_cubes  # without types
+    corners_mm = zip(LOW_MM.tolist(), HIGH_MM.tolist(), strict=True)
+    axes = [np.arange(low, high, cell_mm, dtype=np.float32) for low, high in corners_mm]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     points, faces, _, _ = marching_cubes(_whole(grid), 0.0, spacing=(cell_mm,) * 3, gradient_direction="descent")
     return points.astype(float) + LOW_MM, faces.astype(np.int64)
@@ -84,7 +87,7 @@ def bodies(p: Field) -> dict[str, Field]:
 def _pedestal(x: Field, y: Field, z: Field) -> Field:
     across = np.sqrt((x / 1.35) ** 2 + (y - 5.0) ** 2)
     profile = 78.0 - 9.0 * _ramp(z, 12, 20) + 7.0 * _ramp(z, 34, 44)
-    return np.maximum(across - profile, np.abs(z - 24.0) - 24.0)
+    return np.asarray(np.maximum(across - profile, np.abs(z - 24.0) - 24.0))
 
 
 def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
@@ -96,13 +99,13 @@ def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
     body = _joined(chest, _segment(side, (18, 12, 186), (106, 14, 146), 36.0, 40.0), 30.0) + folds
     edge = np.abs(x) - (26.0 + 0.42 * np.maximum(200.0 - z, 0.0) + 4.0 * np.sin(0.09 * z))
     opened = _cut(body, np.maximum(edge, y + 20.0), 7.0)
-    return np.maximum(opened, 46.0 - z)
+    return np.asarray(np.maximum(opened, 46.0 - z))
 
 
 def _border(p: Field, turn: Field) -> Field:
     x, y, z = np.moveaxis(p, -1, 0)
     ring = np.sqrt((np.sqrt((x / 1.12) ** 2 + (y + 4.0) ** 2) - 57.0) ** 2 + ((z - 213.0 + 0.18 * -y) * 0.75) ** 2)
-    return ring - 6.5 - 0.9 * np.cos(30.0 * turn)
+    return np.asarray(ring - 6.5 - 0.9 * np.cos(30.0 * turn))
 
 
 def _skin(p: Field, side: Field) -> Field:
@@ -161,7 +164,7 @@ def _crown(x: Field, y: Field, z: Field) -> Field:
     stem = np.abs(along) - 4.5
     leaf = np.minimum(np.hypot(along, (z - 392.0) * 0.62) - 8.5, np.hypot(np.abs(along) - 11.5, z - 386.0) - 6.5)
     leaves = np.maximum(np.minimum(np.maximum(stem, np.abs(z - 380.0) - 12.0), leaf), np.abs(across - 80.0) - 3.4)
-    return np.minimum(np.minimum(band, rims), leaves)
+    return np.asarray(np.minimum(np.minimum(band, rims), leaves))
 
 
 # -- distances and how they are joined ------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
+from PIL.PngImagePlugin import PngImageFile, PngInfo
 
 from coupole.appearance.render import studio
 from coupole.commands import restore
@@ -78,6 +78,7 @@ def _smaller(path: Path, to: Path) -> None:
     """The same picture at most 940 pixels wide, with the same texts."""
     chunks = PngInfo()
     with Image.open(path) as picture:
+        assert isinstance(picture, PngImageFile), f"{path} is no PNG"
         for keyword, words in picture.text.items():
             chunks.add_itxt(keyword, words)
         small = picture.convert("RGB")

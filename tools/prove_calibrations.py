@@ -43,6 +43,7 @@ from cell_proof import Judged, Proof, prove_cell
 from coupole.errors import CoupoleError
 from random_cells import Postures, postures
 from ray_proof import LIGHT_STRANGERS
+from smallest import add_smallest
 from strange_cells import STRANGERS
 
 SETTINGS = ("width", "images", "samples", "led_boards", "absolute", "stranger")
@@ -90,6 +91,7 @@ def main() -> None:
     parser.add_argument("--stranger", choices=STRANGERS, help="a cause without a term in any calibration")
     parser.add_argument("--keep", type=Path, help="file of finished cells, one line of JSON each")
     parser.add_argument("--json", action="store_true")
+    add_smallest(parser, cells=1, width=768, images=20, led_boards=8, samples=2)
     arguments = parser.parse_args()
     settings = {name: getattr(arguments, name) for name in SETTINGS}
     done, failed = kept(arguments.keep, settings), list[str]()
@@ -130,11 +132,7 @@ def main() -> None:
                 f"{verdict.name:32} covered {verdict.covered:6.1%}  rms(error/u) {verdict.rms_over_u:5.2f}  "
                 f"median error {verdict.median_error:.3g}, u {verdict.median_u:.3g}  ({verdict.values} values)"
             )
-    for name, (median, most) in accuracies(proofs).items():
-        if arguments.json:
-            print(json.dumps({"name": name, "median": median, "percent_95": most}))
-        else:
-            print(f"{name:32} median {median:.4f}, 95 % of cells below {most:.4f}")
+    tell_accuracies(proofs, as_json=arguments.json)
     if failed:
         sys.exit("\n".join(failed))
 
@@ -172,6 +170,14 @@ def tell_refused(proofs: Sequence[Proof], *, as_json: bool) -> None:
         print(f"{reasons.total()} of {len(proofs)} cells refused:")
         for reason, cells in reasons.most_common():
             print(f"  {cells}: {reason}")
+
+
+def tell_accuracies(proofs: Sequence[Proof], *, as_json: bool) -> None:
+    for name, (median, most) in accuracies(proofs).items():
+        if as_json:
+            print(json.dumps({"name": name, "median": median, "percent_95": most}))
+        else:
+            print(f"{name:32} median {median:.4f}, 95 % of cells below {most:.4f}")
 
 
 def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:

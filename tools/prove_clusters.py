@@ -40,6 +40,7 @@ from coupole.reflectance.run_job import RunRequest, reflectance_of  # noqa: E402
 from coupole.reflectance.run_result import RunResult  # noqa: E402
 from drawn_records import Scale, draw_records  # noqa: E402
 from reflectance_cells import OLD_VIEWS  # noqa: E402
+from smallest import add_smallest  # noqa: E402
 
 CLUSTERS, TRIANGLES_FOR_EACH, MOST_RATIO = 1000, 417, 1.3
 SLOW, PATIENCE_S = 0.5, 60.0
@@ -91,6 +92,7 @@ def main() -> int:
     parser.add_argument("--waves", type=int, choices=(1, 3), default=1, help="of colour")
     parser.add_argument("--every", type=int, default=12, help="LEDs are lit, of the dome's 1080")
     parser.add_argument("--keep", type=Path, help="folder for run and result")
+    add_smallest(parser, every=60)
     arguments = parser.parse_args()
     fine = None if arguments.triangles is None else Fine(arguments.triangles)
     with tempfile.TemporaryDirectory(prefix="coupole-clusters-") as scratch:
@@ -158,7 +160,8 @@ def _colours(vertices_mm: NDArray[np.float64], waves: int) -> NDArray[np.uint8]:
     phases = [2 * np.pi * s / w for s, w in zip(along, WAVES_MM, strict=True)]
     linear = MIDDLE + HALF * np.sin(np.stack(phases if waves == 3 else phases[:1] * 3, axis=1))
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.round(255 * srgb).astype(np.uint8)
+    codes: NDArray[np.uint8] = np.round(255 * srgb).astype(np.uint8)
+    return codes
 
 
 def _say(step: str, done: int, of: int) -> None:

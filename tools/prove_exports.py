@@ -19,6 +19,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -38,6 +39,7 @@ from coupole.exchange.of_results.measured_surface import MeasuredSurface, read_s
 from coupole.exchange.of_results.merl import SCALES, SIZE  # noqa: E402
 from coupole.reflectance.run_job import RunRequest, reflectance_of  # noqa: E402
 from export_models import Lit, Materials, ggx, gltf, lab_differences, openpbr  # noqa: E402
+from smallest import add_smallest  # noqa: E402
 
 LIGHTS, TRIANGLES = 12, 8
 LOSSLESS = ("ply", "exr", "alta", "bird")
@@ -54,6 +56,7 @@ def main() -> int:
     parser.add_argument("result", type=Path, nargs="?")
     parser.add_argument("--pixels", type=int, default=4000)
     parser.add_argument("--write", action="store_true", help="put the table into the documentation")
+    add_smallest(parser, pixels=100)
     arguments = parser.parse_args()
     lines = ["| `--to` | relative error, median | 95 % | dE00, mean | 95 % |", "|---|---|---|---|---|"]
     worst = 0.0
@@ -109,7 +112,8 @@ def _compared(result: Path, folder: Path, count: int) -> dict[str, Row]:
         with console.status(name):
             export_result(result, to, folder / name, triangles=chosen, most_error=most_error)
             rows = [_of_table(surface, folder / name, number, evaluate, random) for number in chosen]
-            found[name] = tuple(np.concatenate(part) for part in zip(*rows, strict=True))
+            values, true = zip(*rows, strict=True)
+            found[name] = np.concatenate(values), np.concatenate(true)
     for to in ("alta", "bird"):
         export_result(result, to, folder / to, triangles=chosen)
         found[to] = _of_samples(surface, folder / to, chosen, to)
@@ -143,7 +147,7 @@ def _lit(surface: MeasuredSurface, count: int, random: np.random.Generator) -> L
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def _of_surface(surface: MeasuredSurface, lit: Lit) -> Materials:
@@ -158,8 +162,8 @@ def _read_ply(folder: Path, lit: Lit) -> np.ndarray:
     faces = trimesh.load(folder / "surface.ply", process=False).metadata["_ply_raw"]["face"]["data"]
     names = ("kd_r", "kd_g", "kd_b", "ks_r", "ks_g", "ks_b", "alpha", "nx", "ny", "nz")
     columns = {name: np.ravel(faces[name]).astype(float)[lit.triangles] for name in names}
-    three = [np.stack([columns[f"{name}_{c}"] for c in "rgb"], axis=1) for name in ("kd", "ks")]
-    return ggx(Materials(np.stack([columns[f"n{c}"] for c in "xyz"], 1), *three, columns["alpha"]), lit)
+    kd, ks = (np.stack([columns[f"{name}_{c}"] for c in "rgb"], axis=1) for name in ("kd", "ks"))
+    return ggx(Materials(np.stack([columns[f"n{c}"] for c in "xyz"], 1), kd, ks, columns["alpha"]), lit)
 
 
 def _read_exr(folder: Path, lit: Lit) -> np.ndarray:
@@ -169,7 +173,7 @@ def _read_exr(folder: Path, lit: Lit) -> np.ndarray:
         mine = lit.views == view
         here = lit.of(mine)
 
-        def pixels(part: str, names: str, parts: dict = parts, here: Lit = here) -> np.ndarray:
+        def pixels(part: str, names: str, parts: dict[str, Any] = parts, here: Lit = here) -> np.ndarray:
             planes = [parts[part][name].pixels[here.rows, here.columns] for name in names]
             return np.stack(planes, axis=1).astype(float)
 
@@ -190,7 +194,9 @@ def _read_gltf(folder: Path, lit: Lit) -> np.ndarray:
 
     def texels(texture: int) -> np.ndarray:
         png = block(document["images"][document["textures"][texture]["source"]]["bufferView"])
-        return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].reshape(-1, 3) / 255.0
+        bgr = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert bgr is not None, "a texture is no picture"
+        return bgr[..., ::-1].reshape(-1, 3) / 255.0
 
     row = np.searchsorted(_known(folder), lit.triangles)
     normals = np.frombuffer(block(1), "<f4").reshape(-1, 3, 3)[row, 0].astype(float) @ Y_UP
@@ -292,7 +298,7 @@ def _merl(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
     at = (np.sqrt(theta_h / (np.pi / 2)) * 90, theta_d / (np.pi / 2) * 90, phi_d / np.pi * 180)
     rows = tuple(np.minimum(values.astype(int), most - 1) for values, most in zip(at, SIZE, strict=True))
     f = np.stack([table[channel][rows] * SCALES[channel] for channel in range(3)], axis=1)
-    return np.pi * f * light[:, 2:]
+    return np.asarray(np.pi * f * light[:, 2:])
 
 
 def _of_samples(surface: MeasuredSurface, folder: Path, chosen: tuple[int, ...], to: str) -> Row:

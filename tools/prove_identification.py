@@ -21,13 +21,14 @@ from coupole.heritage.analysis.pigment_classes import shipped_classes
 from coupole.heritage.analysis.references import Rate, References, make_references, measured
 from coupole.heritage.analysis.spectral_features import BANDS_NM
 from coupole.heritage.analysis.unmixing import unmix
+from smallest import add_smallest
 
 DEVELOPED_ON = "KremerHistorical.rs"
 TESTED_ON = ("GamblinConservationColors.rs", "oilpaint/oilpaint.rs")
-_SEED, _MIXTURES = 7, 100
+_SEED = 7
 
 
-def develop(references: References) -> None:
+def develop(references: References, mixtures: int) -> None:
     """Print rates of the library by itself, and of mixtures of two of its spectra."""
     first = references.reflectance[0]
     of_bands = references.of_bands("", first)
@@ -38,7 +39,7 @@ def develop(references: References) -> None:
     )
     print(f"class left out, unknown: {rates.unknown}; threshold {of_bands.model.threshold:.3f}")
     _calibration(references)
-    _mixtures(references)
+    _mixtures(references, mixtures)
 
 
 def _calibration(references: References) -> None:
@@ -53,7 +54,7 @@ def _calibration(references: References) -> None:
         print(f"stated {low:.2f} to {high:.2f}: mean {stated[inside].mean():.2f}, right {rate}")
 
 
-def _mixtures(references: References) -> None:
+def _mixtures(references: References, mixtures: int) -> None:
     """Opaque mixtures of two spectra of different classes, with noise of 0.001; and single ones, each as if the
     library lacked it, or its class."""
     random = np.random.default_rng(_SEED)
@@ -62,7 +63,7 @@ def _mixtures(references: References) -> None:
     ratio = kubelka_munk.k_over_s(values)
     verdicts: Counter[str] = Counter()
     count = 0
-    while count < _MIXTURES:
+    while count < mixtures:
         pair = random.choice(len(values), 2, replace=False)
         if classes[pair[0]] == classes[pair[1]]:
             continue
@@ -76,8 +77,9 @@ def _mixtures(references: References) -> None:
         count += 1
     print("mixtures of two, both in the library:", ", ".join(f"{k} {v}" for k, v in sorted(verdicts.items())))
     rows = np.arange(len(values))
-    for what, kept in (("it", lambda row: rows != row), ("its class", lambda row: classes != classes[row])):
-        settled = [unmix(values[row], values[kept(row)], classes[kept(row)]) for row in rows]
+    for what, groups in (("it", rows), ("its class", classes)):
+        kept = [groups != groups[row] for row in rows]
+        settled = [unmix(values[row], values[kept[row]], classes[kept[row]]) for row in rows]
         seen = sum(found is not None and found.is_settled for found in settled)
         print(f"mixture seen in a single pigment, {what} left out: {Rate(seen, len(rows))}")
 
@@ -85,7 +87,8 @@ def _mixtures(references: References) -> None:
 def test(references: References, folder: Path) -> None:
     """Print the four rates of the test set, and each verdict that counts against one."""
     classes = set(references.class_of)
-    inside, outside = [], []
+    inside: list[tuple[Measured, str]] = []
+    outside: list[tuple[Measured, str]] = []
     for name in TESTED_ON:
         spectra = read_library(folder / name)
         table = shipped_classes(spectra)
@@ -115,13 +118,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pigments", type=Path)
     parser.add_argument("--test", action="store_true")
+    parser.add_argument("--mixtures", type=int, default=100, help="of two spectra")
+    add_smallest(parser, mixtures=2)
     asked = parser.parse_args()
     spectra = read_library(asked.pigments / DEVELOPED_ON)
     references = make_references(spectra, shipped_classes(spectra))
     if asked.test:
         test(references, asked.pigments)
     else:
-        develop(references)
+        develop(references, asked.mixtures)
 
 
 if __name__ == "__main__":

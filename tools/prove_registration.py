@@ -29,6 +29,7 @@ from ray_scanner import RayScanner, tower  # noqa: E402
 from coupole.scan.registration.merging import merge  # noqa: E402
 from coupole.scan.registration.registering import Registered, register  # noqa: E402
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between  # noqa: E402
+from smallest import add_smallest  # noqa: E402
 
 SCANS = 167
 RADIUS_MM, HEIGHT_MM, STATUES, FACETS = 4000.0, 8000.0, 700, 1500
@@ -42,6 +43,7 @@ def main() -> int:
     parser.add_argument("--across", type=int, default=570, help="rays along each side of a scan's field")
     parser.add_argument("--mesh-mm", type=float, default=10.0)
     parser.add_argument("--keep", type=Path, help="folder for scans, mesh and clouds")
+    add_smallest(parser, scans=12, across=200, mesh_mm=40.0)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="coupole-registration-") as scratch:
         folder = arguments.keep or Path(scratch)

@@ -117,7 +117,8 @@ def _itinerary(folder: Path, template: str) -> Floats:
 
 
 def _some(joints_deg: Floats, count: int) -> Floats:
-    return joints_deg[np.unique(np.linspace(0, len(joints_deg) - 1, count).astype(int))]
+    chosen: Floats = joints_deg[np.unique(np.linspace(0, len(joints_deg) - 1, count).astype(int))]
+    return chosen
 
 
 # -- a cell and its truth ---------------------------------------------------------------------------------
@@ -285,4 +286,4 @@ class Photographs:
 
     @property
     def white_dn(self) -> int:
-        return (1 << self.camera["bit_depth"]) - 1
+        return (1 << int(self.camera["bit_depth"])) - 1

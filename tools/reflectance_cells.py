@@ -96,7 +96,8 @@ def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36
         if ended.code:
             raise RuntimeError(f"{material}: {ended.err}")
         runs.append(cell.run_folder)
-    return Acquired(material, *runs, mesh)
+    old, new = runs
+    return Acquired(material, old, new, mesh)
 
 
 def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
@@ -106,7 +107,7 @@ def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale |
     request = RunRequest((acquired.old,), scanned, records, scan_noise_um=noise_um)
     about = reflectance_of(request, folder / "old")
     result, truth = RunResult(folder / "old"), Truth.of(acquired, folder / "old")
-    inside = sum(_inside(result, view, noise_um, truth) for view in result.views)
+    inside = np.sum([_inside(result, view, noise_um, truth) for view in result.views], axis=0)
     materials = result.materials("ggx_normal")
     known = np.isfinite(materials.alpha)
     true_normals = truth.normals[result.triangles]

@@ -28,6 +28,7 @@ from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.preflight.job import Job, motion_of, read_job, schedule_of
 from replay_cell import ReplayCell, Touch, motion
+from smallest import add_smallest
 
 ROOT = Path(__file__).resolve().parents[1]
 DEMO = ROOT / "configs/plans/demo.yaml"
@@ -193,6 +194,7 @@ def main() -> int:
     parser.add_argument("--meshes", type=Path)
     parser.add_argument("--check-meshes", action="store_true", help="preflight uses the links' meshes as well")
     parser.add_argument("--arm", choices=RIGS, default="kr10", help="arm of the simulated cell")
+    add_smallest(parser, plans=1)
     asked = parser.parse_args()
     rig = ROOT / f"configs/rigs/{RIGS[asked.arm]}.yaml"
     found = run(asked.plans, asked.seed, asked.meshes, rig, check_meshes=asked.check_meshes, tell=True)

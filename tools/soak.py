@@ -28,6 +28,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "runs")]
 
 from soaking import growths, soak  # noqa: E402
 
+from smallest import add_smallest  # noqa: E402
+
 GROWTH_BYTES, GROWTH_FILES = 50e6, 10
 """How much a process may grow over the whole soak, after its warm-up."""
 WRONG = ("mislabelled", "twice", "lost")
@@ -40,6 +42,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the faults")
     parser.add_argument("--speed", type=float, default=20.0, help="pace while the controller waits")
     parser.add_argument("--keep", type=Path, default=ROOT / "runs" / "proofs" / "soak.jsonl", help="what was done")
+    add_smallest(parser, shots=1)
     options = parser.parse_args()
     options.keep.parent.mkdir(parents=True, exist_ok=True)
     kept = [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []

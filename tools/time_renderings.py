@@ -17,6 +17,7 @@ from pathlib import Path
 from coupole.appearance.render.rendering import Spectral, opened
 from coupole.appearance.render.scene_file import Bands, FieldOfView, Scene
 from coupole.commands.render_scene import read_scene
+from smallest import add_smallest
 
 SCENES = Path(__file__).parent.parent / "configs" / "scenes"
 NOISES = {"gilt-step-wedge-d65": 0.05, "sunset-gilding": 0.1, "nashiji-stereo": 0.1}
@@ -46,10 +47,11 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=1200, help="Pixels along each side.")
     parser.add_argument("--step", type=int, nargs="+", default=[5], choices=[5, 10, 20, 40], help="nm.")
     parser.add_argument("--samples", type=int, default=512, help="Paths through a pixel, at most.")
+    add_smallest(parser, size=8, step=[40], samples=4)
     wanted = parser.parse_args()
     print(f"{os.cpu_count()} cores; load before: {os.getloadavg()[0]:.1f}")
     print(f"| {' | '.join(_HEAD)} |\n|{'---|' * len(_HEAD)}", flush=True)
-    for text in wanted.scenes or list(NOISES):
+    for text in wanted.scenes or list(NOISES)[: 1 if wanted.smallest else None]:
         name, _, given = text.partition("=")
         noise = float(given) if given else NOISES.get(name, 0.1)
         for step_nm in wanted.step:

@@ -1,0 +1,42 @@
+"""The option that every bench and proof has: `--smallest`, a size of seconds.
+
+It shows that a tool still runs to its end and prints its figures, not what they are worth;
+`tests/tools/test_smallest.py` runs every one of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+
+class _Smallest(argparse.Action):
+    """Sets the destination to True, and other options to the values that are small."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, values: dict[str, Any], **about: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=False, **about)
+        self._values = values
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option: str | None = None,
+    ) -> None:
+        vars(namespace).update({self.dest: True, **self._values})
+
+
+def add_smallest(parser: argparse.ArgumentParser, **values: Any) -> None:
+    """Give a parser `--smallest`, which sets other options, by their destinations; those that come after it on
+    the command line still count."""
+    known = {action.dest for action in parser._actions}
+    assert known.issuperset(values), f"{sorted(set(values) - known)}: the parser has no such option"
+    told = " ".join(f"--{name.replace('_', '-')} {_shown(value)}" for name, value in values.items())
+    said = "a size of seconds: shows that it runs, no more" + (f" (with {told})" if told else "")
+    parser.add_argument("--smallest", action=_Smallest, values=values, help=said)
+
+
+def _shown(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)

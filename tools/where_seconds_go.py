@@ -34,7 +34,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -65,14 +65,20 @@ PR_SET_CHILD_SUBREAPER = 36
 class Spent:
     """Seconds by kind."""
 
-    cpu_s: Counter[str] = field(default_factory=Counter)
-    wall_s: Counter[str] = field(default_factory=Counter)
+    cpu_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     tests: int = 0
 
     def add(self, other: Spent) -> None:
-        self.cpu_s.update(other.cpu_s)
-        self.wall_s.update(other.wall_s)
+        add_up(self.cpu_s, other.cpu_s)
+        add_up(self.wall_s, other.wall_s)
         self.tests += other.tests
+
+
+def add_up(into: dict[str, float], more: Mapping[str, float]) -> None:
+    """Seconds by kind to those that are there."""
+    for kind, seconds in more.items():
+        into[kind] += seconds
 
 
 @dataclass
@@ -161,7 +167,7 @@ def processes(found: list[dict[str, Any]]) -> dict[int, Process]:
 
 def columns(kinds: dict[str, float]) -> dict[str, float]:
     """CPU seconds by column, of what is counted by kind."""
-    found: Counter[str] = Counter()
+    found: dict[str, float] = defaultdict(float)
     for kind, seconds in kinds.items():
         found[COUNTED[kind]] += seconds
     return dict(found)
@@ -170,7 +176,7 @@ def columns(kinds: dict[str, float]) -> dict[str, float]:
 def add_cpu(spent: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
     """What was counted inside, and under `rest` what is beyond it of all that a process used."""
     counted = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
-    spent.cpu_s.update(counted)
+    add_up(spent.cpu_s, counted)
     spent.cpu_s[rest] += max(0.0, total_s - sum(counted.values()))
 
 
@@ -190,7 +196,7 @@ def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
             continue
         spent = by_test[line["test"]] if line["test"] else nobody
         add_cpu(spent, line["cpu"], columns(line["kinds"]["cpu_s"]), "work")
-        spent.wall_s.update(wall(line, owned[line["test"]]))
+        add_up(spent.wall_s, wall(line, owned[line["test"]]))
         spent.tests += line["what"] == "test"
     for test, those in owned.items():
         for process in those:
@@ -218,15 +224,17 @@ def wall(line: dict[str, Any], those: list[Process]) -> dict[str, float]:
 # -- printing ---------------------------------------------------------------------------------------------
 
 
-def table(title: str, kinds: tuple[str, ...], rows: list[tuple[str, Counter[str], int]]) -> None:
+def table(title: str, kinds: tuple[str, ...], rows: list[tuple[str, dict[str, float], int]]) -> None:
     """Seconds of each row by kind, the largest row first, and of all."""
     print(f"\n{title:28} tests    all" + "".join(f"{kind:>10}" for kind in kinds))
-    whole: Counter[str] = Counter()
-    for name, seconds, tests in sorted(rows, key=lambda row: -row[1].total()):
-        whole.update(seconds)
-        print(f"{name:28}{tests:6}{seconds.total():7.1f}" + "".join(f"{seconds[kind]:10.1f}" for kind in kinds))
+    whole: dict[str, float] = defaultdict(float)
+    for name, seconds, tests in sorted(rows, key=lambda row: -sum(row[1].values())):
+        add_up(whole, seconds)
+        print(
+            f"{name:28}{tests:6}{sum(seconds.values()):7.1f}" + "".join(f"{seconds[kind]:10.1f}" for kind in kinds)
+        )
     total = "".join(f"{whole[kind]:10.1f}" for kind in kinds)
-    print(f"{'all':28}{sum(row[2] for row in rows):6}{whole.total():7.1f}{total}")
+    print(f"{'all':28}{sum(row[2] for row in rows):6}{sum(whole.values()):7.1f}{total}")
 
 
 def show() -> None:
@@ -237,7 +245,7 @@ def show() -> None:
     for test, spent in by_test.items():
         rooms["/".join(test.split("/")[1:2])].add(spent)
     rooms[WORKERS] = nobody
-    accounted = sum(spent.cpu_s.total() for spent in rooms.values())
+    accounted = sum(sum(spent.cpu_s.values()) for spent in rooms.values())
     nobody.cpu_s["others"] += max(0.0, about["cpu_s"] - accounted)
     what = " ".join(about["arguments"]) or "all tests"
     print(f"{what}, {about['workers']} at a time, ended {about['ended']}, exit code {about['code']}:")
@@ -246,9 +254,10 @@ def show() -> None:
         of = "cpu_s" if kinds is CPU else "wall_s"
         table(title, kinds, [(room, getattr(spent, of), spent.tests) for room, spent in rooms.items()])
     print(f"\nthe {DEAREST} dearest tests: CPU s, wall s, what most of the CPU was")
-    for test, spent in sorted(by_test.items(), key=lambda one: -one[1].cpu_s.total())[:DEAREST]:
-        most = ", ".join(f"{kind} {used:.1f}" for kind, used in spent.cpu_s.most_common(3) if used >= 0.05)
-        print(f"{spent.cpu_s.total():7.1f}{spent.wall_s.total():7.1f}  {test}  ({most})")
+    for test, spent in sorted(by_test.items(), key=lambda one: -sum(one[1].cpu_s.values()))[:DEAREST]:
+        dearest = Counter(spent.cpu_s).most_common(3)
+        most = ", ".join(f"{kind} {used:.1f}" for kind, used in dearest if used >= 0.05)
+        print(f"{sum(spent.cpu_s.values()):7.1f}{sum(spent.wall_s.values()):7.1f}  {test}  ({most})")
 
 
 def main() -> int:

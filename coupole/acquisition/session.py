@@ -277,10 +277,7 @@ def _acquire(
             note_unread(recorder)
             recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
-            if left_behind():
-                sequencer.give_up(recorder.committed)
-            else:
-                sequencer.conclude(recorder.committed)
+            (sequencer.give_up if left_behind() else sequencer.conclude)(recorder.committed)
             found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, ended)
 

@@ -77,12 +77,14 @@ class Control:
     stood_at_s: float = -math.inf
     """When that thread last found that it had not run for a while, monotonic s."""
     signal_number: int = signal.SIGINT
-    """The signal that set `stop`."""
+    """The signal that set `stop`, or as whose the session ends."""
+    stopped_by: str = ""
+    """What set `stop`, in words; empty: the signal."""
 
-    def stop_by(self, number: int) -> None:
-        """Stop for this signal; the first one counts."""
+    def stop_by(self, number: int, what: str = "") -> None:
+        """Stop for this signal, or for `what` as if by it; the first one counts."""
         if not self.stop.is_set():
-            self.signal_number = number
+            self.signal_number, self.stopped_by = number, what
             self.stop.set()
 
     def toggle_pause(self) -> None:
@@ -114,7 +116,7 @@ class Control:
     def interrupted(self) -> Interrupted:
         """The error that ends a stopped session."""
         word = "stopped by the operator" if self.signal_number == signal.SIGINT else "stopped"
-        name = signal.Signals(self.signal_number).name
+        name = self.stopped_by or signal.Signals(self.signal_number).name
         if self.held_because and not self.can_stand:
             why = f"{self.held_because}; this cannot stand and go on, so it was ended"
             return Interrupted(why, self.signal_number)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from coupole.acquisition.observer import Control
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
 from coupole.acquisition.safeguard import Safeguard, unsure
-from coupole.acquisition.user_socket import PATIENCE_S, UserSocket, exchange
+from coupole.acquisition.user_socket import PATIENCE_S, Gone, UserSocket, exchange
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import json_of
 
@@ -85,7 +85,7 @@ class RunControl:
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}
 
-    def _answer(self, line: bytes) -> State:
+    def _answer(self, line: bytes, gone: Gone) -> State:
         try:
             request = json_of(line, "request")
             version, command = request["version"], request["command"]
@@ -99,9 +99,10 @@ class RunControl:
             case "pause":
                 self._control.pause.set()
             case "go-on":
-                self._control.let_go_on()
+                if not self._control.stands and not gone():  # which waits for the word of what was frozen
+                    self._control.let_go_on()
             case "stop":
-                self._control.stop_by(signal.SIGINT)
+                self._control.stop_by(signal.SIGINT, "`coupole stop`, or the console")
                 return {**self.state(), "trouble": unsure(self._halt(), _SAFE_WITHIN_S)}
             case _:
                 return {"version": VERSION, "error": "expected the command pause, go-on, stop or state"}
@@ -111,17 +112,34 @@ class RunControl:
 # -- the side of whoever asks ---------------------------------------------------------------------------------
 
 
-def ask(run: Path, command: Command) -> State:
-    """Send a command to the process that acquires into `run`; its state after it.
+def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: None) -> State:
+    """Send a command to the process that acquires into `run`; its state after it. `say` is told within 2 s why it
+    does not answer, and of a command that is given up without an answer what becomes of it.
 
     Raises InputError: none does, on this machine and by this user, or it does not answer.
     """
     try:
-        return _exchange(named_after(run, "sock"), command)
+        with _told_if_given_up(command, say):
+            return _exchange(
+                named_after(run, "sock"), command, say=lambda why: say(f"{run}: no answer yet: {why}")
+            )
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
+
+
+@contextlib.contextmanager
+def _told_if_given_up(command: Command, say: Callable[[str], object]) -> Iterator[None]:
+    try:
+        yield
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise
+    except BaseException:
+        if command != "state":
+            later = "is not obeyed later" if command == "go-on" else "is obeyed as soon as the process runs again"
+            say(f"given up without an answer: `coupole {command}` {later}")
+        raise
 
 
 def running() -> list[State]:
@@ -141,8 +159,10 @@ def _running() -> Iterator[State]:
             yield {**about, "state": "silent", "trouble": [str(error)]}
 
 
-def _exchange(path: Path, command: Command, patience_s: float = PATIENCE_S) -> State:
-    found = exchange(path, {"version": VERSION, "command": command}, patience_s)
+def _exchange(
+    path: Path, command: Command, patience_s: float = PATIENCE_S, say: Callable[[str], object] = lambda _: None
+) -> State:
+    found = exchange(path, {"version": VERSION, "command": command}, patience_s, say)
     if "error" in found:
         raise ValueError(found["error"])
     return found

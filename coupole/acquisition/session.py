@@ -243,7 +243,7 @@ def _acquire(
     remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
 
     def stop() -> None:
-        control.stop_by(signal.SIGINT)
+        control.stop_by(signal.SIGINT, "the key q")
         cell.halt()
 
     keys = {"p": control.toggle_pause, "q": stop}

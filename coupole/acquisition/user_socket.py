@@ -9,27 +9,33 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from coupole.errors import InputError
 from coupole.intake.plain_data import json_of
+from coupole.storage.stopped_process import is_stopped
 
 LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
+_SAID_AFTER_S = 1.5
+Gone = Callable[[], bool]
+"""Whether whoever asked has closed the connection."""
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
 
 
 class UserSocket:
     """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
 
-    def __init__(self, path: Path, answer: Callable[[bytes], Mapping[str, Any]]) -> None:
-        """`answer` makes an answer of a request's line. What lies at the path was left by a process that was
-        killed: the caller knows that none is alive."""
+    def __init__(self, path: Path, answer: Callable[[bytes, Gone], Mapping[str, Any]]) -> None:
+        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. What lies at the
+        path was left by a process that was killed: the caller knows that none is alive."""
         self.path, self._answer = path, answer
 
     def __enter__(self) -> UserSocket:
@@ -67,13 +73,19 @@ class UserSocket:
         with connection, contextlib.suppress(OSError):
             connection.settimeout(PATIENCE_S)
             if peer_uid(connection) in (os.getuid(), 0):
-                answer = self._answer(_line(connection, LONGEST_REQUEST_BYTES))
+                line = _line(connection, LONGEST_REQUEST_BYTES)
+                answer = self._answer(line, lambda: _hung_up(connection))
                 connection.sendall(json.dumps(answer).encode() + b"\n")
 
 
 def peer_uid(connection: socket.socket) -> int:
     """The user at the other end."""
     return _peer(connection)[1]
+
+
+def peer_pid(connection: socket.socket) -> int:
+    """The process at the other end; of a server the one that listens."""
+    return _peer(connection)[0]
 
 
 def _peer(connection: socket.socket) -> tuple[int, int, int]:
@@ -83,13 +95,30 @@ def _peer(connection: socket.socket) -> tuple[int, int, int]:
     return pid, uid, gid
 
 
-def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENCE_S) -> dict[str, Any]:
-    """The answer to a request. Raises OSError, and ValueError for what is no answer."""
+def _hung_up(connection: socket.socket) -> bool:
+    """Whether the other end is closed; one that only sends nothing more is not."""
+    poll = select.poll()
+    poll.register(connection, 0)
+    return any(what & (select.POLLHUP | select.POLLERR) for _, what in poll.poll(0))
+
+
+def exchange(
+    path: Path,
+    request: Mapping[str, Any],
+    patience_s: float = PATIENCE_S,
+    say: Callable[[str], object] = lambda _: None,
+) -> dict[str, Any]:
+    """The answer to a request; `say` is told, within 2 s, why there is none yet. Raises OSError, and ValueError
+    for what is no answer."""
+    begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(patience_s)
         connection.connect(str(path))
         try:
             connection.sendall(json.dumps(request).encode() + b"\n")
+            if not select.select([connection], [], [], min(patience_s, _SAID_AFTER_S))[0]:
+                say(_silence(_peer(connection)[0], time.monotonic() - begun_s))
+                connection.settimeout(max(0.001, begun_s + patience_s - time.monotonic()))
             answer = _line(connection, _LONGEST_ANSWER_BYTES)
         except TimeoutError as error:
             raise TimeoutError(_silence(_peer(connection)[0], patience_s)) from error
@@ -102,16 +131,12 @@ def exchange(path: Path, request: Mapping[str, Any], patience_s: float = PATIENC
 
 def _silence(pid: int, patience_s: float) -> str:
     """Why a process does not answer."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
-    except (OSError, IndexError):
-        state = ""
-    if state in ("T", "t"):
+    if is_stopped(pid):
         return (
             f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "
             f"switches lamps off; `kill -CONT {pid}` lets the process run again, and a run then asks a person"
         )
-    return f"nothing within {patience_s:g} s from process {pid}"
+    return f"nothing within {patience_s:.2g} s from process {pid}"
 
 
 def _line(connection: socket.socket, longest_bytes: int) -> bytes:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, fail
+from coupole.commands.common import JsonOption, fail, person_named
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -56,8 +56,7 @@ def commission(
     from coupole.preflight.commissioned import STEPS, record_path
     from coupole.viewing.terminal import make_console
 
-    if not name.strip():
-        raise InputError("--name: expected the name of the person at the cell")
+    name = person_named(name, "the person at the cell")
     step = next((one for one in STEPS if one == only), None)
     if only is not None and step is None:
         raise InputError(f"--only: expected one of {', '.join(STEPS)}; found {only!r}")
@@ -68,11 +67,11 @@ def commission(
         raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
 
     try:
-        with borrowed(cell, f"commission, {name.strip()}"):
+        with borrowed(cell, f"commission, {name}"):
             record = commission_cell(
                 cell,
                 console,
-                name=name.strip(),
+                name=name,
                 only=step,
                 board=board,
                 person_at=lambda opened: (

@@ -35,6 +35,10 @@ RecordsOption = Annotated[
 RunPath = Annotated[Path, typer.Argument(help="The run's folder.", show_default=False, autocompletion=runs)]
 
 
+LONGEST_NAME = 200
+"""Characters of a person's name; the console takes no longer one either."""
+
+
 class JobOrStep(TyperGroup):
     """A first word that is a step's name is the step; anything else belongs to the main job."""
 
@@ -86,6 +90,17 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
     else:
         return None
     return cell if is_served(cell) else None
+
+
+def person_named(name: str, who: str) -> str:
+    """A person's name as `--name` gives it, without blanks around it. Raises InputError: none, or no name."""
+    if not (found := name.strip()):
+        raise InputError(f"--name: expected the name of {who}")
+    if len(found) > LONGEST_NAME:
+        raise InputError(
+            f"--name: expected a person's name of at most {LONGEST_NAME} characters; found {len(found)}"
+        )
+    return found
 
 
 def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:

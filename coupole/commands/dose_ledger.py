@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption
+from coupole.commands.common import JsonOption, person_named
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,9 +56,10 @@ def dose(
         ledger.enter(add, note.strip())
     if warn_above is not None and not _sent(cell, object_id, "warning", {"above_lux_h": warn_above}):
         ledger.warn_above(warn_above)
-    said = {"dose_lux_h": budget, "name": name.strip(), "reason": reason.strip()}
+    who = person_named(name, "who says so") if budget is not None else ""
+    said = {"dose_lux_h": budget, "name": who, "reason": reason.strip()}
     if budget is not None and not _sent(cell, object_id, "budget", said):
-        ledger.set_budget(budget, name, reason)
+        ledger.set_budget(budget, who, reason)
     history, others = ledger.read(), similar_ids(ledger.folder, object_id)
     show_dose(make_console(quiet=as_json), ledger, history, others)
     if as_json:

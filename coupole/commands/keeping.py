@@ -101,7 +101,11 @@ def verify(
             )
         )
     if found.bad:
-        raise ChecksumMismatch(f"{len(found.bad)} of {found.frames} frames and {found.listed} files are not right")
+        counted = "1 thing is" if len(found.bad) == 1 else f"{len(found.bad)} things are"
+        raise ChecksumMismatch(
+            f"{counted} not right (above); read back were {found.frames} frames, and {found.listed} files that "
+            "the manifest lists"
+        )
     if found.missing:
         raise UnprovenError(
             f"{len(found.missing)} frames of the plan are missing; go on with `{opened.go_on_command}`"

@@ -133,9 +133,13 @@ def running_run(run: Path | None) -> State:
 
     if run is not None:
         return ask(run, "state")
-    found = [state for state in running() if state["run"]]
+    answers = running()
+    found = [state for state in answers if state["run"]]
     if not found:
-        raise InputError("no run is being acquired by this user on this machine")
+        silent = [why for state in answers for why in state.get("trouble", ())]
+        raise InputError(
+            "; ".join(["no run is being acquired by this user on this machine that answers", *silent])
+        )
     if len(found) > 1:
         folders = "\n".join(f"  {state['run']}" for state in found)
         raise InputError(f"several runs are being acquired; name one of\n{folders}")
@@ -145,9 +149,10 @@ def running_run(run: Path | None) -> State:
 def _sent(run: Path | None, command: Command, *, until: str = "") -> State:
     """State after a command, or once it is `until`. Raises InputError: the run is not being acquired, or ended."""
     from coupole.acquisition.run_control import ask
+    from coupole.viewing.terminal import alarm
 
-    folder = Path(running_run(run)["run"])
-    state = ask(folder, command)
+    folder = run or Path(running_run(run)["run"])
+    state = ask(folder, command, alarm)
     while until and state["state"] != until:
         time.sleep(_LOOK_EVERY_S)
         state = ask(folder, "state")

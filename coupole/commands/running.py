@@ -8,7 +8,16 @@ from typing import Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of, served_cell, shipped_rig
+from coupole.commands.common import (
+    JsonOption,
+    PlanPath,
+    RigOption,
+    fail,
+    person_named,
+    plan_of,
+    served_cell,
+    shipped_rig,
+)
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError
 
@@ -186,24 +195,22 @@ def confirm(
     """A named person's word that, after a fault of the arm, its cause is found, the cell is clear and the arm may
     move again.
     """
-    from coupole.errors import InputError
     from coupole.plan.cell import read_cell
     from coupole.storage.arm_faults import faults_of
     from coupole.viewing.terminal import make_console
 
-    if not name.strip():
-        raise InputError("--name: expected the name of the person who has been to the cell")
+    name = person_named(name, "the person who has been to the cell")
     console, faults = make_console(quiet=as_json), faults_of(read_cell(rig))
     standing = faults.standing()
     for fault in standing:
         console.print(f"{fault.t}  {fault.message}", markup=False)
     if standing:
-        faults.confirm(name.strip(), note)
-        console.print(f"confirmed by {name.strip()}: the arm may move again", markup=False)
+        faults.confirm(name, note)
+        console.print(f"confirmed by {name}: the arm may move again", markup=False)
     else:
         console.print("no fault of the arm stands; nothing to confirm")
     if as_json:
-        print(json.dumps({"confirmed": [fault.model_dump() for fault in standing], "name": name.strip()}))
+        print(json.dumps({"confirmed": [fault.model_dump() for fault in standing], "name": name}))
 
 
 def sim(

@@ -20,6 +20,7 @@ from coupole.console.command_line.client import service_socket
 from coupole.console.people.accounts import Account, Accounts, Role
 from coupole.console.people.audit import Audit
 from coupole.console.people.sessions import Control, Session, Sessions
+from coupole.console.people.still_wanted import Attention
 from coupole.console.plans.drafts import Desk
 from coupole.console.plans.entering import Entering
 from coupole.console.plans.object_files import ObjectFiles
@@ -69,10 +70,14 @@ def serve(
         url = f"{'https' if tls else 'http'}://{in_url(host)}:{port}"
         known_as = [host, *names, *(["localhost", "127.0.0.1"] if is_here(host) else [])]
         with _parts(cell, folder, plans, origins_of(url, known_as), f"coupole_session_{port}") as service:
-            tell({"url": url, "token": service.accounts.first_token, "pid": os.getpid()})
             app = make_app(service)
             add_screens(app, service)
-            asyncio.run(run_servers(app, listening, service_socket(cell), context))
+            told = {"url": url, "token": service.accounts.first_token, "pid": os.getpid()}
+            asyncio.run(
+                run_servers(
+                    app, listening, service_socket(cell), context, lambda: tell(told), service.attention.beat
+                )
+            )
 
 
 @contextlib.contextmanager
@@ -103,6 +108,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             accounts=accounts,
             sessions=Sessions(holds=accounts.holds),
             control=control,
+            attention=Attention(),
             audit=audit,
             queue=queue,
             acquisitions=acquisitions,

@@ -13,6 +13,7 @@ import os
 import re
 import threading
 from collections.abc import Callable, Iterable
+from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -118,9 +119,12 @@ def _synced_sha256(path: Path, stop: threading.Event) -> str:
     return digest.hexdigest()
 
 
-def problems(run: Path, progress: Progress = lambda done, total: None) -> dict[str, str]:
-    """What is wrong with each listed file that is missing or has changed, by its name."""
+def problems(
+    run: Path, progress: Progress = lambda done, total: None, *, only: AbstractSet[str] | None = None
+) -> dict[str, str]:
+    """What is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
     listed, found = read(run), {}
+    listed = {name: digest for name, digest in listed.items() if only is None or name in only}
     for done, (name, digest) in enumerate(listed.items()):
         progress(done, len(listed))
         try:

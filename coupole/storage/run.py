@@ -40,6 +40,7 @@ from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
 from coupole.storage.run_json import RUN_JSON, SCHEMA_VERSION, read_description
 from coupole.storage.run_readme import readme
+from coupole.storage.stopped_process import holder_of
 
 _LOCK_TRIALS, _LOCK_NAP_S = 20, 0.01
 
@@ -159,6 +160,11 @@ class Run:
         return False
 
     @property
+    def holder(self) -> int | None:
+        """The process that acquires into the run, or archives it; None if there is none, or it cannot be told."""
+        return holder_of(self.folder / RUN_JSON)
+
+    @property
     def report_path(self) -> Path:
         """The page that its conclusion writes; it may be missing."""
         return self.folder / "report.html"
@@ -196,6 +202,13 @@ class Run:
         """Raise InputError unless plan, rig and the files they name mean what those meant that the run began
         with."""
         if changed := changes_since(self.about, self.folder, inputs):
+            own = {RUN_JSON, *(name for name in manifest.read(self.folder) if name.startswith("inputs/"))}
+            if altered := manifest.problems(self.folder, only=own):
+                raise InputError(
+                    f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
+                    f"{'; '.join(altered.values())}. What the plan and the rig were is known from them alone: put "
+                    "back what was there (from a copy of the run), or start a new run."
+                )
             raise InputError(
                 f"{self.folder}: cannot be resumed, because this changed since the run began: "
                 f"{'; '.join(changed)}. Put the old value or file back, go on with the run's own copies by "

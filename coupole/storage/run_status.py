@@ -30,6 +30,7 @@ from coupole.storage.journal_events import (
     ViewSealed,
 )
 from coupole.storage.run import Run
+from coupole.storage.stopped_process import is_stopped
 
 RUNNING, PAUSED, CREATED = "running", "paused", "created"
 KILLED = "its last session has no end: it was killed, or the power failed"
@@ -80,9 +81,11 @@ class Status:
     """Proven and expected frames of each view."""
     last_event: str = ""
     dose_lux_h: float = 0.0
+    """Light on the object in all sessions."""
     dose_budget_lux_h: float | None = None
     """What the object may receive in its life, as the last session began; None: no budget, or not known."""
-    """Light on the object in all sessions."""
+    stopped_pid: int | None = None
+    """The process that has the run, where that is stopped (Ctrl-Z, SIGSTOP)."""
     go_on: str = ""
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
 
@@ -123,6 +126,8 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         found.state = RUNNING
     if not in_use and found.state in (RUNNING, PAUSED):
         found.state, found.reason = "interrupted", KILLED
+    holder = run.holder if in_use else None
+    found.stopped_pid = holder if holder and is_stopped(holder) else None
     if found.frames_left and not in_use:
         found.go_on = run.go_on_command
     return found

@@ -204,10 +204,17 @@ class RunObserver:
 def show_status(console: Console, status: Status) -> None:
     """Progress of a run; only what failed is red."""
     colour = {"done": "green", "failed": "red"}.get(status.state, "yellow")
+    stopped = ", but stopped" if status.stopped_pid else ""
     console.print(
-        f"[{colour}]{status.state}[/]: {status.proven} of {status.shots} shots proven, {status.darks_proven} dark "
-        f"frames, {status.reshot} re-shot; last event {status.last_event or 'none'}"
+        f"[{colour}]{status.state}{stopped}[/]: {status.proven} of {status.shots} shots proven, "
+        f"{status.darks_proven} dark frames, {status.reshot} re-shot; last event {status.last_event or 'none'}"
     )
+    if status.stopped_pid:
+        console.print(
+            f"  its process {status.stopped_pid} is stopped (Ctrl-Z, SIGSTOP): nothing goes on; `kill -CONT "
+            f"{status.stopped_pid}` lets it run again, and the run then asks a person (`coupole go-on`)",
+            markup=False,
+        )
     if status.reason and status.reason not in status.faults:
         console.print(f"  {status.reason}", markup=False)
     console.print(f"  proof: {status.proof}")

@@ -170,7 +170,7 @@ def test_a_frozen_process_is_told_from_one_that_hangs(tmp_path: Path) -> None:
 import time
 from pathlib import Path
 from coupole.acquisition.user_socket import UserSocket
-with UserSocket(Path({str(path)!r}), lambda line: time.sleep(60)):
+with UserSocket(Path({str(path)!r}), lambda line, gone: time.sleep(60)):
     time.sleep(60)
 """
     with subprocess.Popen([sys.executable, "-c", serve]) as served:
@@ -189,3 +189,31 @@ def test_without_a_folder_for_its_socket_a_run_is_acquired_all_the_same(
     monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / ("long" * 30))
     with RunControl(tmp_path, tmp_path / "rig.yaml", Control(), list, lambda: None) as control:
         assert "will not reach this run" in control.trouble
+
+
+def test_who_has_gone_before_the_word_is_heard_does_not_end_a_pause(tmp_path: Path) -> None:
+    serve = f"""
+import time
+from pathlib import Path
+from coupole.acquisition import runtime_folder
+from coupole.acquisition.observer import Control
+from coupole.acquisition.run_control import RunControl
+runtime_folder._BASE = Path({str(runtime_folder._BASE)!r})
+control = Control()
+control.pause.set()
+with RunControl(Path({str(tmp_path)!r}), Path("rig.yaml"), control, list, lambda: None):
+    print("serves", flush=True)
+    time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", serve], stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None
+        assert served.stdout.readline() == "serves\n"
+        (path,) = runtime_folder.runtime_folder().glob("*.sock")
+        served.send_signal(signal.SIGSTOP)
+        with socket.socket(socket.AF_UNIX) as gone:
+            gone.connect(str(path))
+            gone.sendall(b'{"version": 1, "command": "go-on"}\n')
+        served.send_signal(signal.SIGCONT)
+        assert ask(tmp_path, "state")["state"] == "pausing"
+        assert ask(tmp_path, "go-on")["state"] == "running", "one who waits is heard"
+        served.kill()

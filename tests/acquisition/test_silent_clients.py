@@ -16,7 +16,7 @@ MUCH = 8 * 1024**2
 def test_clients_that_send_or_read_nothing_hold_up_no_other_and_not_the_end(tmp_path: Path) -> None:
     path = tmp_path / "socket"
     with ExitStack() as silent:
-        with UserSocket(path, lambda asked: {"asked": asked.decode(), "much": "x" * MUCH}):
+        with UserSocket(path, lambda asked, _: {"asked": asked.decode(), "much": "x" * MUCH}):
             for request in [b"", b'"part', b'"state"\n'] * 4:  # fewer than the socket's backlog
                 client = silent.enter_context(socket.socket(socket.AF_UNIX))
                 client.settimeout(30)

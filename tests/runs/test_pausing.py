@@ -54,6 +54,7 @@ def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None
     assert cells.safe(world)
     stopped = cells.here("stop", run, "--json")
     assert (stopped.code, stopped.document["state"]) == (0, "interrupted"), stopped.err
+    assert stopped.document["reason"].startswith("stopped by the operator (`coupole stop`")
     assert cells.safe(world)
     assert cells.finish(process).code == 130
     ended = cells.here("go-on", run)
@@ -78,3 +79,33 @@ def test_a_run_is_followed_from_another_terminal_and_stopped_in_a_burst(
     assert seen.code == 0
     assert "interrupted: " in seen.err
     assert f"--resume {run}" in " ".join(seen.err.split())
+
+
+def test_a_word_that_was_given_up_while_the_run_was_stopped_is_not_obeyed_later(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, world = standing
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    assert cells.here("pause", run).code == 0
+    paused_at = cells.frame_lines(run)
+    process.send_signal(signal.SIGSTOP)
+    asked = cells.start("go-on", run)
+    assert asked.stderr is not None
+    assert f"process {process.pid} is stopped" in asked.stderr.readline()
+    shown = cells.here("status", run)
+    assert f"process {process.pid} is stopped" in shown.err
+    assert f"kill -CONT {process.pid}" in " ".join(shown.err.split())
+    asked.send_signal(signal.SIGINT)
+    ended = cells.finish(asked)
+    assert (ended.code, "is not obeyed later" in ended.err) == (130, True)
+    process.send_signal(signal.SIGCONT)
+    end_s = time.monotonic() + 2.0
+    while time.monotonic() < end_s:
+        assert cells.safe(world)
+        assert cells.here("status", run, "--json").document["state"] == "paused"
+    assert cells.frame_lines(run) == paused_at
+    assert "is stopped" not in cells.here("status", run).err
+    assert cells.here("stop", run).code == 0
+    assert cells.finish(process).code == 130

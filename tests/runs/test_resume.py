@@ -358,3 +358,22 @@ def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion(
     process.kill()
     cells.finish(process)
     cells.wait_until(lambda: cells.safe(world), "the arm at rest")
+
+
+@pytest.mark.parametrize("name", ["run.json", "inputs/plan.yaml"])
+def test_a_run_whose_own_files_were_changed_names_them_and_no_command_that_does_not_help(
+    killed: Killed, tmp_path: Path, name: str
+) -> None:
+    _, run = killed.copy(tmp_path)
+    about = json.loads((run / "run.json").read_text())
+    path = run / name if name == "run.json" else run / about["plan"]["stored"]
+    text = path.read_text()
+    changed = text.replace("8000", "9000")
+    assert changed != text
+    path.write_text(changed)
+    refused = cells.here("acquire", "--resume", run, "--yes")
+    assert refused.code == 2
+    said = " ".join(refused.err.split())
+    assert f"{path.relative_to(run)}: is not what manifest.sha256 lists" in said
+    assert "put back what was there" in said
+    assert "own copies by" not in said

@@ -47,7 +47,7 @@ from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import ask_to_begin, identity_printer
 from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
-from coupole.acquisition.user_socket import UserSocket
+from coupole.acquisition.user_socket import Gone, UserSocket
 from coupole.bounded import NOW, on_disk, refuse_overdue
 from coupole.errors import CoupoleError, DeviceError, InputError, StorageError
 from coupole.plan.cell import Cell
@@ -58,6 +58,8 @@ from coupole.viewing.terminal import alarm
 
 _LOOK_EVERY_S = 0.1
 _STOPPED_WITHIN_S = 4.0
+_BEGIN = (SelfTestAsked, DriveAsked, JogAsked, FrameAsked, MeterAsked)
+"""What may move the arm or light the object."""
 
 
 class BenchService:
@@ -85,14 +87,17 @@ class BenchService:
             self._asked_s = time.monotonic()
         return time.monotonic() - self._asked_s
 
-    def answer(self, line: bytes) -> dict[str, Any]:
-        """The answer to a request; an `error` with its `kind` where it was not obeyed."""
+    def answer(self, line: bytes, gone: Gone) -> dict[str, Any]:
+        """The answer to a request; an `error` with its `kind` where it was not obeyed. Nothing moves or shines for
+        who is `gone`."""
         stops = self.works.stops
         try:
             request = read_request(line)
             self._asked_s = time.monotonic()
             if self._ending or self.closing.is_set():
                 raise InputError("the bench is closing")
+            if isinstance(request, _BEGIN) and gone():
+                raise InputError("whoever asked has gone: not begun")
             return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
@@ -113,7 +118,7 @@ class BenchService:
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
         """The same for a caller in this process."""
-        return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode())
+        return self.answer(json.dumps({"version": VERSION, "command": command, **fields}).encode(), lambda: False)
 
     def _obey(self, request: Request, stops: int) -> dict[str, Any]:
         """`stops` of the works before the request was read."""

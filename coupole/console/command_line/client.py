@@ -5,23 +5,35 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import select
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.runtime_folder import named_after
+from coupole.acquisition.user_socket import peer_pid
+from coupole.console.command_line.owner import owner_of
+from coupole.console.people.still_wanted import begins_nothing
 from coupole.errors import InputError
 from coupole.intake.plain_data import json_of
 from coupole.plan.cell import Cell
+from coupole.storage.stopped_process import is_stopped
+from coupole.viewing.terminal import alarm
 
 _PATIENCE_S = 30.0
+_SAID_AFTER_S, _PROBED_EVERY_S, _LOOK_EVERY_S = 1.5, 5.0, 0.1
 PREFLIGHT_S = 1800.0
 """Patience with the preflight of a plan that is entered."""
 
 
 class NotServed(InputError):
     """No console of the cell is served on this machine by this user."""
+
+
+class GivenUp(InputError):
+    """Whoever waited for an answer does not any more."""
 
 
 def service_socket(cell: Cell) -> Path:
@@ -40,32 +52,124 @@ class _Local(http.client.HTTPConnection):
         self.sock.connect(self._path)
 
 
+def _never() -> bool:
+    return False
+
+
 def call(
-    cell: Cell, method: str, path: str, asked: dict[str, Any] | None = None, *, patience_s: float = _PATIENCE_S
+    cell: Cell,
+    method: str,
+    path: str,
+    asked: dict[str, Any] | None = None,
+    *,
+    patience_s: float = _PATIENCE_S,
+    given_up: Callable[[], bool] = _never,
 ) -> Any:
-    """What the service answers. Raises NotServed; InputError: it refuses, with its words, or does not answer."""
-    try:
-        place = str(service_socket(cell))
-    except (OSError, InputError) as error:
-        raise NotServed(f"{cell.document.path}: no console can be served here: {error}") from error
+    """What the service answers; a person is told on standard error if it does not within 2 s. Raises NotServed;
+    GivenUp; InputError: it refuses, with its words, or does not answer."""
+    rig, end_s = cell.document.path, time.monotonic() + patience_s
+    place = _place(cell)
     connection = _Local(place, patience_s)
     try:
         body = None if asked is None else json.dumps(asked)
+        _connected(cell, connection, end_s, given_up)
         connection.request(method, path, body, {"Content-Type": "application/json"} if body else {})
+        with _told_if_given_up(rig, begins_nothing(method, path)):
+            _await(connection.sock, place, rig, end_s, given_up)
         reply = connection.getresponse()
         found = json_of(reply.read(), "its answer", allow_nan=True)
-    except (FileNotFoundError, ConnectionRefusedError) as error:
-        raise NotServed(
-            f"{cell.document.path}: no console of this cell is served on this machine by this user; "
-            f"`coupole serve {cell.document.path}` does"
-        ) from error
+    except (NotServed, GivenUp):
+        raise
     except (OSError, ValueError, InputError) as error:
-        raise InputError(f"{cell.document.path}: its console does not answer: {error}") from error
+        raise InputError(f"{rig}: its console does not answer: {error}") from error
     finally:
         connection.close()
     if reply.status >= 400:
         raise InputError(str(found.get("detail", found)))
     return found
+
+
+def _place(cell: Cell) -> str:
+    try:
+        return str(service_socket(cell))
+    except (OSError, InputError) as error:
+        raise NotServed(f"{cell.document.path}: no console can be served here: {error}") from error
+
+
+def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[], bool]) -> None:
+    """Connect, waiting for a console that has the cell and does not listen yet. Raises NotServed: none has it."""
+    rig, begun_s, said = cell.document.path, time.monotonic(), False
+    while True:
+        try:
+            connection.connect()
+        except (FileNotFoundError, ConnectionRefusedError) as error:
+            owner = owner_of(cell)
+            if owner is None:
+                raise NotServed(
+                    f"{rig}: no console of this cell is served on this machine by this user; "
+                    f"`coupole serve {rig}` does"
+                ) from error
+            if time.monotonic() > end_s:
+                raise InputError(f"process {owner} has this cell, but does not listen") from error
+            if not said and time.monotonic() - begun_s > _SAID_AFTER_S:
+                said = True
+                alarm(f"{rig}: its console does not listen yet: {_state_of(owner)}; waiting for it")
+        else:
+            return
+        if given_up():
+            raise GivenUp(f"{rig}: given up")
+        time.sleep(_LOOK_EVERY_S)
+
+
+def _await(sock: socket.socket, place: str, rig: Path, end_s: float, given_up: Callable[[], bool]) -> None:
+    """Wait for an answer. Raises TimeoutError, GivenUp."""
+    pid, begun_s, probed_s, said = peer_pid(sock), time.monotonic(), 0.0, False
+    while not select.select([sock], [], [], _LOOK_EVERY_S)[0]:
+        now_s = time.monotonic()
+        if given_up():
+            raise GivenUp(f"{rig}: given up")
+        if now_s > end_s:
+            raise TimeoutError(_state_of(pid))
+        if said or now_s - begun_s < _SAID_AFTER_S:
+            continue
+        silent = is_stopped(pid)
+        if not silent and now_s - probed_s > _PROBED_EVERY_S:
+            probed_s, silent = now_s, not _answers(place)
+        if silent:
+            said = True
+            alarm(f"{rig}: its console does not answer: {_state_of(pid)}; waiting for it")
+
+
+def _answers(place: str) -> bool:
+    """Whether a console answers at all: one that makes a preflight answers others meanwhile."""
+    probe = _Local(place, _LOOK_EVERY_S * 4)
+    try:
+        probe.request("GET", "/api/v1/token")
+        return probe.getresponse().status > 0
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        probe.close()
+
+
+def _state_of(pid: int) -> str:
+    if is_stopped(pid):
+        return f"process {pid} is stopped (Ctrl-Z, SIGSTOP); `kill -CONT {pid}` lets it run again"
+    return f"process {pid} runs, but gives no answer"
+
+
+@contextlib.contextmanager
+def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
+    """Say what becomes of a request whose answer nobody awaits any more."""
+    try:
+        yield
+    except BaseException:
+        if not counts_anyway:
+            alarm(
+                f"{rig}: given up without an answer: what was asked will not be carried out, unless the console "
+                f"had begun it before it fell silent; `coupole queue {rig}` shows what is in its queue"
+            )
+        raise
 
 
 def is_served(cell: Cell) -> bool:

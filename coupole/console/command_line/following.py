@@ -20,7 +20,7 @@ from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import ask_to_begin, refuse
 from coupole.acquisition.run_control import State, ask
 from coupole.acquisition.signals import obeyed_by
-from coupole.console.command_line.client import NotServed, call
+from coupole.console.command_line.client import GivenUp, NotServed, call
 from coupole.errors import CoupoleError, DeviceError, InputError, Interrupted
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
@@ -86,7 +86,10 @@ class _Followed:
 
     def enter(self, asked: dict[str, Any]) -> None:
         try:
-            self._entry = call(self._cell, "POST", "/api/v1/queue", {**asked, "now": True})
+            begin = {**asked, "now": True}
+            self._entry = call(self._cell, "POST", "/api/v1/queue", begin, given_up=self._control.stop.is_set)
+        except GivenUp:
+            raise self._control.interrupted() from None
         except InputError as error:
             rig, plan = self._cell.document.path, asked.get("plan") or f"--resume {asked['resume']}"
             raise InputError(

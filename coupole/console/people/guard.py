@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from coupole.console.people.accounts import Account, Role
 from coupole.console.people.permission import NotAllowed
 from coupole.console.people.sessions import Session
+from coupole.console.people.still_wanted import begins_nothing, hung_up
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
 
@@ -65,6 +66,8 @@ def guard(app: FastAPI, service: Service) -> None:
             ambient = not is_command_line(request) and not bearer_of(request)
             if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
                 return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
+        if not begins_nothing(request.method, request.url.path) and (unwanted := why_unwanted(request, service)):
+            return _no(409, unwanted)
         response: Response = await call_next(request)
         if not request.url.path.startswith(_STATIC) and "Cache-Control" not in response.headers:
             response.headers["Cache-Control"] = "no-store"
@@ -129,6 +132,13 @@ def _foreign(request: Request, service: Service) -> Response | None:
 
 def _no(code: int, why: str) -> Response:
     return JSONResponse({"detail": why}, code)
+
+
+def why_unwanted(request: Request, service: Service) -> str:
+    """Why nothing is begun for a request: whoever asked has gone, or it may have lain here long; else empty."""
+    if hung_up(request.state.connection):
+        return "whoever asked has gone: not begun"
+    return service.attention.refusal()
 
 
 def is_command_line(request: Request | WebSocket) -> bool:

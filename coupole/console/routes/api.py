@@ -23,6 +23,7 @@ from coupole.console.people.guard import (
     is_of_this_machine,
     session_of,
     sign_in_page,
+    why_unwanted,
 )
 from coupole.console.people.permission import NotAllowed, allow
 from coupole.console.plans.plan_queue import Entry
@@ -120,6 +121,8 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         def may_still() -> None:
             if session_of(request, service) is None:
                 raise NotAllowed(401, "the session is over: sign in again")
+            if unwanted := why_unwanted(request, service):
+                raise NotAllowed(409, unwanted)
             allow(service, who, Role.OPERATOR, "queue", acts=True)
 
         enter = partial(service.entering.enter, asked, who.name, by_command_line=here, may_still=may_still)

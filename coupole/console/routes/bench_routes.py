@@ -13,6 +13,7 @@ from fastapi.responses import FileResponse
 from coupole.console.people.accounts import Account, Role
 from coupole.console.people.guard import account_here, address_of, is_of_this_machine, session_of
 from coupole.console.people.permission import NotAllowed, allow
+from coupole.console.people.still_wanted import HELD_STOOD_STILL_S
 from coupole.console.routes.messages import Text
 from coupole.console.service_parts import Service
 from coupole.errors import CoupoleError, InputError
@@ -89,6 +90,8 @@ class _Hold:
         """Press or renew. Raises NotAllowed, InputError."""
         if not isinstance(asked, dict) or set(asked) != _RENEWED:
             raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
+        if unwanted := self._service.attention.refusal(HELD_STOOD_STILL_S):
+            raise NotAllowed(409, unwanted)
         allow(self._service, self._who(), Role.OPERATOR, "move by hand", acts=True)
         goes_on = {"hold": self._number} if self._number is not None else {}
         self._asked = {**asked, "from": address_of(self._socket)}

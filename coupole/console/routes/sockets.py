@@ -8,7 +8,7 @@ import os
 import socket
 import ssl
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +19,18 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from coupole.errors import InputError
 
 _STOP_WITHIN_S = 2
+_BEAT_S = 0.1
 
 
-class _OfThisUser(H11Protocol):
+class _Known(H11Protocol):
+    """HTTP whose requests know their `connection`, a socket, in their state."""
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self.app_state = {**self.app_state, "connection": transport.get_extra_info("socket")}
+
+
+class _OfThisUser(_Known):
     """HTTP on a Unix socket, with processes of this user alone. Their number stands for the client's port."""
 
     def connection_made(self, transport: Any) -> None:
@@ -36,10 +45,18 @@ class _OfThisUser(H11Protocol):
         self.client = "command line", pid
 
 
-async def run_servers(app: FastAPI, listening: socket.socket, path: Path, tls: ssl.SSLContext | None) -> None:
+async def run_servers(
+    app: FastAPI,
+    listening: socket.socket,
+    path: Path,
+    tls: ssl.SSLContext | None,
+    tell: Callable[[], object],
+    beat: Callable[[], object],
+) -> None:
+    """Serve until a signal ends it: `tell` is called once both places listen, `beat` again and again."""
     page, line = uvicorn.Server(_config(app, lifespan="on")), uvicorn.Server(_config(app, lifespan="off"))
     page.config.ssl_context_factory = (lambda *_: tls) if tls else None
-    line.config.http = _OfThisUser
+    page.config.http, line.config.http = _Known, _OfThisUser
     path.unlink(missing_ok=True)
     with socket.socket(socket.AF_UNIX) as local:
         local.bind(str(path))
@@ -47,11 +64,23 @@ async def run_servers(app: FastAPI, listening: socket.socket, path: Path, tls: s
         try:
             page_task = asyncio.create_task(page.serve(sockets=[listening]))
             line_task = asyncio.create_task(line.serve(sockets=[local]))
-            await asyncio.wait({page_task, line_task}, return_when=asyncio.FIRST_COMPLETED)
+            beating = asyncio.create_task(_beat(lambda: page.started and line.started, tell, beat))
+            await asyncio.wait({page_task, line_task, beating}, return_when=asyncio.FIRST_COMPLETED)
+            beating.cancel()
             page.should_exit = line.should_exit = True
             await asyncio.gather(page_task, line_task)
         finally:
             path.unlink(missing_ok=True)
+
+
+async def _beat(listens: Callable[[], bool], tell: Callable[[], object], beat: Callable[[], object]) -> None:
+    while not listens():
+        beat()
+        await asyncio.sleep(_BEAT_S)
+    tell()
+    while True:
+        beat()
+        await asyncio.sleep(_BEAT_S)
 
 
 def _config(app: FastAPI, lifespan: Literal["on", "off"]) -> uvicorn.Config:

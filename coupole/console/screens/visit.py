@@ -141,6 +141,8 @@ class Visit:
         account = self.account
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
+        if acts and (unwanted := self.service.attention.refusal()):
+            raise NotAllowed(409, f"{action}: {unwanted}")
         allow(self.service, account, role, action, acts=acts)
 
     @property

@@ -1,0 +1,27 @@
+"""Which process has a cell's console, whether or not it listens.
+
+Whoever asks takes no lock itself, so that a console which begins is never in its way.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from coupole.plan.cell import Cell
+from coupole.storage.stopped_process import holder_of
+
+
+def console_lock(cell: Cell) -> Path:
+    """The file that a cell's console has locked, with its process in it."""
+    return cell.state_folder / "console" / "lock"
+
+
+def owner_of(cell: Cell) -> int | None:
+    """The process of a cell's console; None if none has it, or that cannot be told."""
+    lock = console_lock(cell)
+    holder = holder_of(lock)
+    try:
+        said = lock.read_text(encoding="ascii") if holder else ""
+    except OSError:
+        return None
+    return holder if f'"pid": {holder}}}' in said else None

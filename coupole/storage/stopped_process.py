@@ -1,0 +1,33 @@
+"""Processes of this machine as Linux tells of them: which one has locked a file, and whether one is stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_LOCKS = Path("/proc/locks")
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether it is stopped by Ctrl-Z or SIGSTOP; false too if there is no such process."""
+    try:
+        state = (
+            Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[0]
+        )
+    except (OSError, IndexError):
+        return False
+    return state in ("T", "t")
+
+
+def holder_of(file: Path) -> int | None:
+    """The process that has locked a file alone (flock), found without a lock of one's own; None if there is none,
+    or that cannot be told."""
+    try:
+        inode = file.stat().st_ino
+        lines = _LOCKS.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    for line in lines:  # 1: FLOCK  ADVISORY  WRITE 4711 08:01:131 0 EOF
+        words = line.split()
+        if words[1] == "FLOCK" and words[3] == "WRITE" and words[5].rpartition(":")[2] == str(inode):
+            return int(words[4])
+    return None

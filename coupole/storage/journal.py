@@ -59,7 +59,7 @@ def append_lines(path: Path, lines: list[str]) -> None:
     """Write and sync lines of `Journal.take` after whatever the journal has; raises DiskFull or StorageError."""
     file = LineFile(path)
     try:
-        head = [event_line(JournalBegun(t=json.loads(lines[0])["t"]))] if file.was_empty else []
+        head = [event_line(JournalBegun(t=json_of(lines[0].encode(), str(path))["t"]))] if file.was_empty else []
         file.append([*head, *lines])
     finally:
         file.close()

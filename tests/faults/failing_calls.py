@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -331,13 +331,16 @@ def wrong_in_the_dose(cell: CellFolder, world: World) -> list[str]:
     return []
 
 
-def wrong_in_the_journal(run: Path, ended: Ended) -> list[str]:
+def wrong_in_the_journal(run: Path, ended: Ended, codes: Set[int] = frozenset()) -> list[str]:
+    """`codes`: other exit codes that the session may have had, where one event came while another ended it."""
     stops = cells.events(run, "stop")
     if not stops:
         return [] if not cells.events(run) else ["the journal has no line of the session's end"]
     done = stops[-1]["outcome"] == "done"
-    expected = {0: "done", 130: "interrupted", 143: "interrupted", 129: "interrupted"}.get(ended.code, "failed")
-    if stops[-1]["outcome"] != expected and not (ended.code in {1, 4, 129, 130, 143} and done):  # while it closed
+    outcomes = {0: "done", 130: "interrupted", 143: "interrupted", 129: "interrupted"}
+    expected = {outcomes.get(code, "failed") for code in {ended.code, *codes}}
+    while_it_closed = done and ended.code in {1, 4, 129, 130, 143}
+    if stops[-1]["outcome"] not in expected and not while_it_closed:
         return [f"the journal says {stops[-1]['outcome']}, the exit code was {ended.code}"]
     proven = len({event["shot"] for event in cells.events(run, "frame")})
     return (

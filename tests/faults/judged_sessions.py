@@ -225,7 +225,8 @@ def run_events(folder: Path, events: tuple[Event, ...]) -> MeanwhileCase:
             case.wrong += wrong_in_the_dose(cell, world)
     if run is not None:
         if ended.code != -signal.SIGKILL:
-            case.wrong += wrong_in_the_journal(run, ended)
+            both = _allowed(case) - {0} if len(case.reached) > 1 else set()
+            case.wrong += wrong_in_the_journal(run, ended, both)
         case.wrong += _wrong_in_the_times(run, case, from_utc.timestamp(), lasted_s)
     case.wrong += wrong_after_resuming(cell, run, ended)
     case.took_s = round(time.monotonic() - begun_s, 2)

@@ -8,9 +8,10 @@ import importlib
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperGroup
 
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
@@ -67,13 +68,6 @@ COMMANDS = {
 }
 """Module of `coupole.commands` and function, or group of commands, by command; in the order of `--help`."""
 
-app = typer.Typer(
-    name="coupole",
-    help="Acquisition controller of La Coupole: a plan in, proven frames out.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-
 
 class _OnDemand(Mapping[str, Any]):
     """`COMMANDS` as the command line wants them: a module is imported, and its signatures read, when asked for."""
@@ -103,6 +97,23 @@ def _command(name: str) -> Any:
     return typer.main.get_group(alone).commands[name]
 
 
+class _Commands(TyperGroup):
+    """The whole command line."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = cast("Any", _OnDemand())
+
+
+app = typer.Typer(
+    name="coupole",
+    cls=_Commands,
+    help="Acquisition controller of La Coupole: a plan in, proven frames out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
 def _print_version(asked: bool) -> None:
     if asked:
         print(f"coupole {coupole.__version__}")
@@ -120,14 +131,6 @@ def _options(
         text_outlet.install()
 
 
-@functools.cache
-def _commands() -> Any:
-    """What `app` describes, with all commands; made once."""
-    group: Any = typer.main.get_command(app)
-    group.commands = _OnDemand()
-    return group
-
-
 def main() -> None:
     """Entry point: runs a command and turns Coupole's errors into messages and exit codes."""
     text_outlet.keep_standard_places()
@@ -140,7 +143,7 @@ def main() -> None:
 def _ended() -> int:
     """Run the command; its exit code."""
     try:
-        code = _commands()(standalone_mode=False)
+        code = app(standalone_mode=False)
     except CoupoleError as error:
         _say(error)
         code = error.exit_code

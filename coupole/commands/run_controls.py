@@ -149,7 +149,12 @@ def running_run(run: Path | None) -> State:
 def _sent(run: Path | None, command: Command, *, until: str = "") -> State:
     """State after a command, or once it is `until`. Raises InputError: the run is not being acquired, or ended."""
     from coupole.acquisition.run_control import ask
-    from coupole.viewing.terminal import alarm
+
+    def alarm(message: str) -> None:
+        """Of a run that does not answer."""
+        from coupole.viewing import terminal
+
+        terminal.alarm(message)
 
     folder = run or Path(running_run(run)["run"])
     state = ask(folder, command, alarm)

@@ -17,7 +17,7 @@ from bench import BENCHES
 from full_proofs import PROOFS
 
 DOCS = (REPO / "README.md", *sorted((REPO / "docs").rglob("*.md")))
-TOOL = re.compile(r"(?<!\.)tools/([a-z_0-9]+(?:\.py)?)(?![\w/.])")
+TOOL = re.compile(r"(?<!\.)(?<!tests/)tools/([a-z_0-9]+(?:\.py)?)(?![\w/.<])")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 
 

@@ -181,4 +181,6 @@ def test_a_resume_refuses_the_runs_own_copy_if_it_was_edited(done: Path, tmp_pat
     kept.write_text(kept.read_text().replace("8000", "16000"))
     resumed = cells.here("acquire", "--resume", run, "--json", "--yes")
     assert resumed.code == 2
-    assert without_blanks("exposure_us was 8000, is 16000") in without_blanks(resumed.document["error"])
+    assert without_blanks("inputs/plan.yaml: is not what manifest.sha256") in without_blanks(
+        resumed.document["error"]
+    )

@@ -154,7 +154,7 @@ def test_a_kept_table_that_was_edited_is_no_pattern_for_todays(
     stored = next(entry["stored"] for entry in finished.about["files"] if entry["path"].endswith("dome.csv"))
     for path in (finished.folder / stored, tmp_path / "dome.csv"):
         path.write_text("something else\n")
-    with pytest.raises(InputError, match=r"dome\.csv is another file"):
+    with pytest.raises(InputError, match=r"inputs/others/dome\.csv: is not what manifest"):
         finished.refuse_changes(replace(inputs, files=InputFiles()))
 
 

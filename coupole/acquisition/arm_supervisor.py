@@ -63,6 +63,7 @@ class ArmSupervisor:
         `tell_lapse` is told of a motion that was braked because nobody had looked at it."""
         self._stand, self._tell_lapse = stand, tell_lapse
         self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
+        self._halt = cell.halt
         self._motion, self._paths = rig.motion, motion
         self._arm = arm_of(rig)
         self._settled: SettledPose | None = None
@@ -134,7 +135,7 @@ class ArmSupervisor:
         """The motion was braked, or is to be: come to rest, then wait for a person unless the lapse was short.
         Raises what has another cause."""
         lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
-        if self._control.stop.is_set() or not (self._control.stands or lapse_s):
+        if self._control.stop.is_set() or not (self.was_held(error) or lapse_s):
             raise error
         self._robot.stop()
         if lapse_s:
@@ -149,9 +150,13 @@ class ArmSupervisor:
                 raise error
             self._stand()
 
-    @property
-    def held(self) -> bool:
-        """See `Control.stands`."""
+    def was_held(self, error: BaseException) -> bool:
+        """Whether this came because the session is to stand (`Control.stands`). Where that is still to be heard,
+        lights go off and the arm stops first."""
+        if not isinstance(error, DeviceError):
+            return isinstance(error, Held)
+        if self._control.awaits_word:
+            self._halt()
         return self._control.stands
 
     def await_return(self, moved: ArmMovedError) -> SettledPose:

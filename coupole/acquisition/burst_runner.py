@@ -16,7 +16,6 @@ from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
 from coupole.acquisition.host_burst import HostBurst
-from coupole.acquisition.observer import Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import Verdict
@@ -161,7 +160,7 @@ class BurstRunner:
             if burst.panel:
                 box.panel(burst.panel, False)
         except BaseException as error:
-            if isinstance(error, ArmMovedError | Held) or (isinstance(error, DeviceError) and self._arm.held):
+            if isinstance(error, ArmMovedError) or self._arm.was_held(error):
                 box.lights_off()
                 self._upload = None  # that has ended it: `fire` uploads anew
                 camera.disarm()

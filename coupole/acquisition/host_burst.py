@@ -18,7 +18,6 @@ from typing import Protocol
 import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
-from coupole.acquisition.observer import Held
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
@@ -30,7 +29,6 @@ from coupole.devices import (
     FrameFormat,
     StepRecord,
 )
-from coupole.errors import DeviceError
 from coupole.plan.bursts import Burst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.step_fields import step_fields
@@ -129,7 +127,7 @@ class HostBurst:
             if not reason:
                 self._prove(kept)
         except BaseException as error:
-            if isinstance(error, ArmMovedError | Held) or (isinstance(error, DeviceError) and self._arm.held):
+            if isinstance(error, ArmMovedError) or self._arm.was_held(error):
                 raise  # `_fire_one` has switched the light off
             self._cell.make_safe()
             raise

@@ -105,7 +105,8 @@ class Control:
     def hold(self, why: str) -> None:
         """Stand at once, wherever the session is; the first reason counts until it stands."""
         if not self.can_stand:
-            self.held_because = why
+            if not self.stop.is_set():  # else another reason came first
+                self.held_because = why
             self.stop_by(signal.SIGINT)
             return
         if not self.held.is_set():
@@ -127,10 +128,16 @@ class Control:
         """True while the session is to stand, and does not yet: devices fail then because they were stopped, or
         because this process was. If it did not run for a while, this waits for the word of the thread that hears
         of SIGCONT: whether it was frozen, or the machine only busy."""
-        now_s = time.monotonic()
-        if now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S:
+        if self.awaits_word:
             self.held.wait(HEARD_WITHIN_S)
         return self.held.is_set()
+
+    @property
+    def awaits_word(self) -> bool:
+        """Whether `stands` would wait: this process did not run for a while, and it is not known yet why."""
+        now_s = time.monotonic()
+        late = now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S
+        return late and not self.held.is_set()
 
     def go_on(self) -> None:
         """Raise Interrupted if the session is to stop, Held if it is to stand: to be called before each command

@@ -216,8 +216,8 @@ class Sequencer:
                 begin(self._arm.await_return(moved))
                 verdict = Verdict(NOTHING_TO_MATCH, [])
                 attempt += 1
-            except (Held, DeviceError):
-                if not self._arm.held or self._control.stop.is_set():
+            except (Held, DeviceError) as error:
+                if not self._arm.was_held(error) or self._control.stop.is_set():
                     raise
                 verdict = Verdict(NOTHING_TO_MATCH, [])  # what was cut short is no attempt
             done = self._recorder.proven()

@@ -162,7 +162,7 @@ class Cell:
             attend=lambda: None,
             hurry=lambda seconds: None,
             heard_at_rest=self.heard_at_rest,
-            held=False,
+            was_held=lambda error: False,
             await_news=self.await_news,
         )
         dose: Any = SimpleNamespace(

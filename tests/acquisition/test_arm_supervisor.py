@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -89,7 +90,7 @@ def supervised(monkeypatch: pytest.MonkeyPatch) -> Callable[[Arm], ArmSupervisor
         bodies = SimpleNamespace(reach_mm=REACH_MM)
         motion = SimpleNamespace(bodies=bodies, itinerary=lambda views, start_deg: found)
         job: Any = SimpleNamespace(cell=SimpleNamespace(rig=rig), motion=motion)
-        cell: Any = SimpleNamespace(robot=arm, clock=arm)
+        cell: Any = SimpleNamespace(robot=arm, clock=arm, halt=lambda: arm.done.append("halt"))
         supervisor = ArmSupervisor(job.cell.rig, job.motion, cell, Control())
         supervisor.itinerary([])
         return supervisor
@@ -117,6 +118,22 @@ def test_nobody_is_sent_to_the_cell_while_the_arm_may_move_on_by_itself(
     (text,) = told
     assert ("See that the cell is clear, then go on" in text) == asks == bool(stood)
     assert ("It may move on by itself at any moment: keep clear of it" in text) != asks
+
+
+@pytest.mark.parametrize(("late_s", "done"), [(0.0, ["move"]), (2.0, ["move", "halt"])])
+def test_on_a_machine_so_busy_that_it_may_have_been_frozen_all_is_halted_before_that_is_waited_for(
+    supervised: Supervise, late_s: float, done: list[str]
+) -> None:
+    arm = Arm()
+    supervisor = supervised(arm)
+
+    def fails() -> None:
+        supervisor._control.pulse_s = time.monotonic() - late_s
+        raise DeviceLost("robot", expected="an answer", happened="none came", remedy="None.")
+
+    with pytest.raises(DeviceLost):
+        supervisor.go(VISIT, meanwhile=fails)
+    assert arm.done == done
 
 
 VISIT: Any = SimpleNamespace(leg=SimpleNamespace(waypoints=[THERE_DEG]))

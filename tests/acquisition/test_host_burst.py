@@ -152,7 +152,7 @@ class Cell:
             raise DoseBudgetReached("too much")
 
     def fire(self, burst: Burst) -> Verdict:
-        arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None, held=False)
+        arm = SimpleNamespace(attend=lambda: None, await_news=lambda: None, was_held=lambda error: False)
         robot = SimpleNamespace(measured=lambda: None)
         cell = SimpleNamespace(ledbox=self, camera=self, clock=self, robot=robot, make_safe=lambda: None)
         note = lambda *given, **more: self.noted.append(given)  # noqa: E731

@@ -76,7 +76,7 @@ def supervised(job: Job, drift_deg_s: float) -> tuple[Drifting, float]:
     """Drive an arm that drifts; returns it and its greatest deviation when it is at rest, mm."""
     arm = Drifting(job, drift_deg_s)
     goal = arm.home_deg - np.array((0.0, 0.0, 60.0, 0.0, 0.0, 0.0))
-    cell: Any = SimpleNamespace(robot=arm, clock=arm)
+    cell: Any = SimpleNamespace(robot=arm, clock=arm, halt=lambda: None)
     supervisor = ArmSupervisor(job.cell.rig, job.motion, cell, Control())
     supervisor._from_deg = arm.home_deg
     with pytest.raises(DeviceFault, match="comes to rest"):

@@ -32,7 +32,8 @@ BESIDE_MM = (60.0, -90.0)
 def rig(
     folder: Path, things: list[dict[str, Any]], *, hours_shone: float, ambient_c: float, warm_k: float = 0.0
 ) -> Path:
-    """The imperfect cell with small frames, faster than life."""
+    """The imperfect cell with small frames, faster than life; slower where boards cool while a session begins, of
+    which a busy machine makes several seconds."""
     content: dict[str, Any] = YAML(typ="safe").load(cells.REPO / "configs/rigs/sim-imperfect.yaml")
     content["sensor"] |= {"width_px": 256, "height_px": 192, "pixel_pitch_um": 88.0}
     content["dome"]["leds"] = str(cells.REPO / "configs/domes/coupole.csv")
@@ -40,7 +41,7 @@ def rig(
     content["storage"]["folder"] = str(folder / "runs")
     boards = {"ambient_c": ambient_c, "warm_k": warm_k, "thermal_time_constant_s": COOLING_S}
     settings = content["world"]["settings"]
-    settings |= {"speed": 20.0, "things": things, "ledbox": boards}
+    settings |= {"speed": 5.0 if warm_k else 20.0, "things": things, "ledbox": boards}
     settings["leds"] = {"hours_shone": hours_shone}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "rig.yaml"

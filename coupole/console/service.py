@@ -20,7 +20,7 @@ from coupole.console.command_line.client import service_socket
 from coupole.console.people.accounts import Account, Accounts, Role
 from coupole.console.people.audit import Audit
 from coupole.console.people.sessions import Control, Session, Sessions
-from coupole.console.people.still_wanted import Attention
+from coupole.console.people.still_wanted import LoopWatch
 from coupole.console.plans.drafts import Desk
 from coupole.console.plans.entering import Entering
 from coupole.console.plans.object_files import ObjectFiles
@@ -75,7 +75,7 @@ def serve(
             told = {"url": url, "token": service.accounts.first_token, "pid": os.getpid()}
             asyncio.run(
                 run_servers(
-                    app, listening, service_socket(cell), context, lambda: tell(told), service.attention.beat
+                    app, listening, service_socket(cell), context, lambda: tell(told), service.loop_watch.beat
                 )
             )
 
@@ -108,7 +108,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
             accounts=accounts,
             sessions=Sessions(holds=accounts.holds),
             control=control,
-            attention=Attention(),
+            loop_watch=LoopWatch(),
             audit=audit,
             queue=queue,
             acquisitions=acquisitions,

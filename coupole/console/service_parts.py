@@ -12,7 +12,7 @@ from coupole.console.cell.calibration_status import CalibrationStatus
 from coupole.console.people.accounts import Accounts
 from coupole.console.people.audit import Audit
 from coupole.console.people.sessions import Control, Session, Sessions
-from coupole.console.people.still_wanted import Attention
+from coupole.console.people.still_wanted import LoopWatch
 from coupole.console.plans.drafts import Desk
 from coupole.console.plans.entering import Entering
 from coupole.console.plans.object_files import ObjectFiles
@@ -39,7 +39,7 @@ class Service:
     accounts: Accounts
     sessions: Sessions
     control: Control
-    attention: Attention
+    loop_watch: LoopWatch
     audit: Audit
     queue: PlanQueue
     acquisitions: Acquisitions

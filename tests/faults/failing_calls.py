@@ -97,20 +97,26 @@ class Failure:
             return
         self.event_ns = clock.now_ns()
         self.on_event()
+        fail(self.kind, device, method, clock)
         match self.kind:
-            case "error":
-                raise DeviceError(device, expected="an answer", happened="an error was put in", remedy="None.")
-            case "unexpected":
-                raise UnexpectedError(f"put into {device}.{method}")
-            case "hang":
-                clock.sleep(HANG_S)
-                raise DeviceTimeout(device, expected="an answer", happened="it hung", remedy="None.")
             case "world":
                 os.kill(self.world_pid, signal.SIGKILL)
             case "sigkill":
                 os.kill(os.getpid(), signal.SIGKILL)
             case name:
                 os.kill(os.getpid(), SIGNALS[name])
+
+
+def fail(kind: str, device: str, method: str, clock: Any) -> None:
+    """What a call of a device may raise; nothing for other kinds."""
+    match kind:
+        case "error":
+            raise DeviceError(device, expected="an answer", happened="an error was put in", remedy="None.")
+        case "unexpected":
+            raise UnexpectedError(f"put into {device}.{method}")
+        case "hang":
+            clock.sleep(HANG_S)
+            raise DeviceTimeout(device, expected="an answer", happened="it hung", remedy="None.")
 
 
 class Watched:

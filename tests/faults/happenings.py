@@ -22,14 +22,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-from failing_calls import HANG_S, LASTS_S, SIGNALS, SPEED, UnexpectedError, Watched
+from failing_calls import LASTS_S, SIGNALS, SPEED, Watched, fail
 from freezing import FROZEN, frozen_pid
 from never_returning import LIMITS_S
 
 from coupole import bounded
 from coupole.acquisition import conclusion, opened_cell, safeguard
 from coupole.commands import cli
-from coupole.errors import DeviceError, DeviceTimeout
 
 STOPPED_S = (0.2, 2.0, 20.0)
 """Of the machine's time."""
@@ -86,14 +85,8 @@ class Happenings:
             self._stop(kind, call)
             return
         self._tell(kind, call)
+        fail(kind, device, method, clock)
         match kind:
-            case "error":
-                raise DeviceError(device, expected="an answer", happened="an error was put in", remedy="None.")
-            case "unexpected":
-                raise UnexpectedError(f"put into {call}")
-            case "hang":
-                clock.sleep(HANG_S)
-                raise DeviceTimeout(device, expected="an answer", happened="it hung", remedy="None.")
             case "never":
                 while True:
                     os.open(self.folder / "fifo", os.O_RDONLY)  # nobody ever writes

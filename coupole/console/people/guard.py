@@ -138,7 +138,7 @@ def why_unwanted(request: Request, service: Service) -> str:
     """Why nothing is begun for a request: whoever asked has gone, or it may have lain here long; else empty."""
     if hung_up(request.state.connection):
         return "whoever asked has gone: not begun"
-    return service.attention.refusal()
+    return service.loop_watch.refusal()
 
 
 def is_command_line(request: Request | WebSocket) -> bool:

@@ -39,7 +39,7 @@ def _now_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)  # goes on while the machine sleeps
 
 
-class Attention:
+class LoopWatch:
     """Knows for how long the console's loop did not run: the loop beats, anybody asks, from any thread."""
 
     def __init__(self, now_s: Callable[[], float] = _now_s) -> None:

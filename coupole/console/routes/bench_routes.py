@@ -90,7 +90,7 @@ class _Hold:
         """Press or renew. Raises NotAllowed, InputError."""
         if not isinstance(asked, dict) or set(asked) != _RENEWED:
             raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
-        if unwanted := self._service.attention.refusal(HELD_STOOD_STILL_S):
+        if unwanted := self._service.loop_watch.refusal(HELD_STOOD_STILL_S):
             raise NotAllowed(409, unwanted)
         allow(self._service, self._who(), Role.OPERATOR, "move by hand", acts=True)
         goes_on = {"hold": self._number} if self._number is not None else {}

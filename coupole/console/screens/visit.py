@@ -141,7 +141,7 @@ class Visit:
         account = self.account
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
-        if acts and (unwanted := self.service.attention.refusal()):
+        if acts and (unwanted := self.service.loop_watch.refusal()):
             raise NotAllowed(409, f"{action}: {unwanted}")
         allow(self.service, account, role, action, acts=acts)
 

@@ -109,12 +109,14 @@ class CellFolder:
         if self.write_now:
             self.write()
 
-    def moved_by_ur(self, model: str) -> None:
-        """From now on the arm is a UR, where the rig that comes with it has it."""
+    def moved_by_ur(self, model: str, *, patient: bool = True) -> None:
+        """From now on the arm is a UR, where the rig that comes with it has it; `patient` with a busy machine."""
         shipped = YAML(typ="safe").load(
             REPO / f"configs/rigs/{'sim-ur' if model == 'ur10e' else 'sim-' + model}.yaml"
         )
         self.rig_data |= {key: shipped[key] for key in ("robot", "motion", "support")}
+        if patient:
+            self.rig_data["robot"]["settings"] |= {"attention_s": 0.5, "watchdog_s": 0.5}
         self.rig_data["arm"] = str(REPO / f"configs/robots/{model}.yaml")
 
     @property

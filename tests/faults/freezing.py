@@ -89,7 +89,7 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
     """Two views of 54 LEDs, a slow motion to each; a burst lasts longer than the box's watchdog."""
     cell = CellFolder(folder, speed=1.0)
     if arm == "ur":
-        cell.moved_by_ur("ur10e")
+        cell.moved_by_ur("ur10e", patient=False)
     else:
         cell.rig_data["robot"] = _SETTINGS[arm]
     cell.rig_data["motion"] |= {"speed_fraction": 0.1}

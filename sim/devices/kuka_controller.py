@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from enum import Enum
 
 from coupole.geometry import Transform
+from sim.devices.host_port import HostPort
 from sim.devices.kuka_axes import Axes
 from sim.devices.kuka_corrections import Corrections
 from sim.devices.kuka_kinematics import PoseErrors
@@ -86,10 +87,16 @@ class KukaController:
         self._sent_s = 0.0
         """Machine time of the last packet."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        host, port = settings.sends_to.rsplit(":", 1)
+        self._host_port = HostPort(settings.sends_to)
+        host, port = self.sends_to.rsplit(":", 1)
         self._socket.connect((host, int(port)))  # connected, so that a closed port is reported at once
         self._socket.setblocking(False)
         self._timer = reactor.after(0.0, self._cycle)
+
+    @property
+    def sends_to(self) -> str:
+        """`host:port` of the client: the settings' own, with port 0 replaced by a free one."""
+        return self._host_port.address
 
     @property
     def joints_deg(self) -> tuple[float, ...]:
@@ -149,6 +156,7 @@ class KukaController:
     def close(self) -> None:
         self._timer.cancel()
         self._socket.close()
+        self._host_port.close()
 
     def _cycle(self) -> None:
         """One interpolation cycle."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import secrets
-import socket
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Protocol, assert_never
 
@@ -75,14 +72,13 @@ def build(
     match settings:
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
-            sends_to = _with_free_port(settings.sends_to)
-            settings = settings.model_copy(update={"sends_to": sends_to})
+            kuka = kuka_controller.KukaController(reactor, settings, tell, stranger)
             paced = settings.lock_step or reactor.clock.speed != 1.0
             declared = {"declared_cycle_ms": settings.cycle_ms} if paced else {}
             # Whom a rehearsed rig names as its controller is not here.
             here = {"controller": "127.0.0.1", "any_controller_by": ""}
-            endpoint = {"listen": sends_to, "sends_to": sends_to, **alike, **declared, **here}
-            return kuka_controller.KukaController(reactor, settings, tell, stranger), endpoint
+            endpoint = {"listen": kuka.sends_to, "sends_to": kuka.sends_to, **alike, **declared, **here}
+            return kuka, endpoint
         case kuka_eki_controller.Settings():
             eki = kuka_eki_controller.KukaEkiController(reactor, settings, stranger)
             theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
@@ -92,23 +88,3 @@ def build(
             return ur, {"host": ur.address}
         case _:
             assert_never(settings)
-
-
-_PORTS = range(20_000, 32_000)
-"""Below those that the system hands out by itself: nobody gets one by chance before the driver binds it."""
-
-
-def _with_free_port(address: str) -> str:
-    """The UDP address, with port 0 replaced by a free port."""
-    host, port = address.rsplit(":", 1)
-    while port == "0":
-        drawn = secrets.choice(_PORTS)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind((host, drawn))
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
-            else:
-                port = str(drawn)
-    return f"{host}:{port}"

@@ -1,0 +1,49 @@
+"""The UDP port on which a simulated KUKA controller looks for its host."""
+
+from __future__ import annotations
+
+import errno
+import secrets
+import socket
+
+_PORTS = range(20_000, 32_000)
+"""Below those that the system hands out by itself: nobody gets one by chance before the driver binds it."""
+
+
+class HostPort:
+    """An address to which the arm of one world only sends, until it is closed or its process ends.
+
+    The host binds the port itself, so no world can. Two arms that sent to one port would both reach whichever host
+    is there: it moves the arm that it hears first, and its own camera looks from where its own arm stands. So the
+    port is claimed by the name of a socket (unix(7), abstract), which the kernel gives to one process at a time.
+    """
+
+    def __init__(self, address: str) -> None:
+        """`host:port`; port 0 stands for a free one. Raises OSError (EADDRINUSE) if another world has this one."""
+        self._host, port = address.rsplit(":", 1)
+        while not (claim := self._claim(int(port) or secrets.choice(_PORTS), probe=port == "0")):
+            if port != "0":
+                raise OSError(errno.EADDRINUSE, "the arm of another simulated cell sends to this port", address)
+        self._socket, self._port = claim
+
+    @property
+    def address(self) -> str:
+        return f"{self._host}:{self._port}"
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def _claim(self, port: int, *, probe: bool) -> tuple[socket.socket, int] | None:
+        """None if another world has it, or, if `probe`, any other program."""
+        claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            claim.bind(f"\0coupole-arm-sends-to-{port}")
+            if probe:
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+                    udp.bind((self._host, port))
+        except OSError as error:
+            claim.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
+            return None
+        return claim, port

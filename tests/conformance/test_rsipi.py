@@ -32,6 +32,8 @@ from drivers.kuka.rsi.driver import KukaRsi, Settings
 HOME_DEG = np.array([0.0, -90.0, 90.0, 0.0, 90.0, 0.0])
 _ECHO_PORT = 50000
 """Where the echo server binds; it cannot be told another."""
+_ANSWER_S = 0.1
+"""A packet may stay without an answer: no driver is there yet."""
 _UNTOLD = 50
 """Late answers that it counts, but may no longer tell: it notices a stall after the stall."""
 _CLIENT = """
@@ -154,27 +156,26 @@ def echo_server(config: Path, cycle_ms: int) -> Iterator[subprocess.Popen[str]]:
 @contextmanager
 def bad_network(port: int, driver_port: int) -> Iterator[None]:
     """Between the controller, which sends to `port` of 127.0.0.1, and the driver: packets are doubled, held back
-    and repeated long after."""
+    and repeated long after. Each has its answer before the next is passed on, however busy this machine is: the
+    driver leaves all but the newest of several packets unanswered, and this controller counts such a cycle when it
+    hears its client again, not when it passes, as a KUKA does."""
     over = threading.Event()
 
     def relay(near: socket.socket, far: socket.socket) -> None:
-        controller, packets = None, []
+        passed: list[bytes] = []
         while not over.is_set():
-            for link in select.select([near, far], [], [], 0.05)[0]:
-                data, address = link.recvfrom(65535)
-                if link is far:
-                    if controller is not None:
-                        near.sendto(data, controller)
-                    continue
-                controller = address
-                packets.append(data)
-                if len(packets) % 100 == 50:
-                    time.sleep(0.03)
-                far.sendto(data, ("127.0.0.2", driver_port))
-                if len(packets) % 7 == 0:
-                    far.sendto(data, ("127.0.0.2", driver_port))
-                if len(packets) % 40 == 39:
-                    far.sendto(packets[-30], ("127.0.0.2", driver_port))
+            if not select.select([near], [], [], 0.05)[0]:
+                continue
+            data, controller = near.recvfrom(65535)
+            passed.append(data)
+            if len(passed) % 100 == 50:
+                time.sleep(0.03)
+            for repeated in (data, *[data] * (len(passed) % 7 == 0), *passed[-30:-29] * (len(passed) % 40 == 39)):
+                far.sendto(repeated, ("127.0.0.2", driver_port))
+            wait_s = _ANSWER_S
+            while select.select([far], [], [], wait_s)[0]:
+                near.sendto(far.recv(65535), controller)
+                wait_s = 0.0
 
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,

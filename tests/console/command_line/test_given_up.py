@@ -16,6 +16,7 @@ import cells
 import pytest
 from cells import CellFolder
 from served import Browser, Served, served
+from websockets.sync.client import connect
 
 SAID_WITHIN_S = 2.0
 NOT_LATER_S = 2.0
@@ -143,3 +144,16 @@ def test_a_console_that_does_not_listen_yet_is_waited_for_and_named(tmp_path: Pa
     finally:
         process.kill()
         cells.finish(process)
+
+
+def test_a_button_that_was_pressed_while_the_console_was_stopped_moves_nothing(
+    stopped_at_will: tuple[CellFolder, Served, Browser],
+) -> None:
+    _, service, engineer = stopped_at_will
+    place = f"{service.url.replace('http', 'ws')}/api/v1/bench/hold"
+    headers = {"Cookie": engineer.cookie, "Origin": service.url}
+    with connect(place, additional_headers=headers) as button:
+        with frozen(service.process.pid):
+            button.send(json.dumps({"axis": "A1", "direction": 1, "share": 0.1}))
+            time.sleep(1.5)
+        assert "the console stood still for 1." in json.loads(button.recv(cells.PATIENCE_S))["ended"]

@@ -7,8 +7,11 @@ import hashlib
 import json
 import os
 import pty
+import subprocess
 import termios
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,6 +167,7 @@ def test_a_byte_that_changed_on_disk_fails_verify_with_six_and_names_the_shot(ce
     assert verified.document["ok"] is False
     assert len(verified.document["bad"]) == 1
     assert "top/led0700/e0" in verified.document["bad"][0]
+    assert "1 thing is not right (above); read back were " in verified.err
 
 
 # -- what the operator sees -----------------------------------------------------------------------------------
@@ -178,9 +182,9 @@ def test_without_a_terminal_the_run_is_told_in_plain_lines(cell: CellFolder) -> 
     assert "done: 2 of 2 shots proven, 0 re-shot" in ended.err
 
 
-def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> None:
-    """The key p, pressed twice, pauses and goes on."""
-    cell.write(lights={"kind": "every", "every": 4})
+@contextmanager
+def on_a_terminal(cell: CellFolder) -> Iterator[tuple[subprocess.Popen[str], int, bytearray]]:
+    """`acquire` on a terminal of its own: the process, the person's end of the terminal, and what it has shown."""
     terminal, terminal_end = pty.openpty()
     shown = bytearray()
 
@@ -199,19 +203,41 @@ def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> N
         "acquire", cell.plan, stdin=terminal_end, stderr=terminal_end, env=environment,
         start_new_session=True, preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     )  # fmt: skip
-    cells.wait_until(lambda: b"keys: p pauses" in shown, "the keys")
-    os.write(terminal, b"p")
-    cells.wait_until(lambda: cells.events(cell.run_folder, "pause"), "the pause")
-    os.write(terminal, b"p")
-    cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end")
-    cells.wait_until(lambda: termios.tcgetattr(terminal_end) == modes, "the terminal as it was")
-    os.close(terminal_end)
-    ended = cells.finish(process)
-    watcher.join()
-    os.close(terminal)
-    assert ended.code == 0
+    try:
+        cells.wait_until(lambda: b"keys: p pauses" in shown, "the keys")
+        yield process, terminal, shown
+        cells.wait_until(lambda: cells.events(cell.run_folder, "stop"), "the end")
+        cells.wait_until(lambda: termios.tcgetattr(terminal_end) == modes, "the terminal as it was")
+    finally:
+        process.terminate()  # nothing, where it has ended
+        os.close(terminal_end)
+        cells.finish(process)
+        watcher.join()
+        os.close(terminal)
+
+
+def test_on_a_terminal_there_are_bars_with_view_and_rates(cell: CellFolder) -> None:
+    """The key p, pressed twice, pauses and goes on."""
+    cell.write(lights={"kind": "every", "every": 4})
+    with on_a_terminal(cell) as (process, terminal, shown):
+        os.write(terminal, b"p")
+        cells.wait_until(lambda: cells.events(cell.run_folder, "pause"), "the pause")
+        os.write(terminal, b"p")
+        assert process.wait(cells.PATIENCE_S) == 0
     for words in ("\x1b[", "view top", "frames/s", "MB/s", "lux.h", " left", "continued", "282/282"):
         assert words in shown.decode()
+
+
+def test_the_key_q_stops_the_run_safely_and_is_named_as_what_stopped_it(cell: CellFolder) -> None:
+    cell.write(lights={"kind": "every", "every": 4})
+    with on_a_terminal(cell) as (process, terminal, shown):
+        cells.wait_until(lambda: cells.events(cell.run_folder, "frame"), "a frame")
+        os.write(terminal, b"q")
+        assert process.wait(cells.PATIENCE_S) == 130
+    assert cells.events(cell.run_folder, "stop")[-1]["outcome"] == "interrupted"
+    assert "the key q" in shown.decode()
+    assert cell.acquire("--resume", cell.run_folder).code == 0
+    cells.assert_each_shot_proven_once(cell.run_folder)
 
 
 # -- kinds of plans -------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -188,7 +187,7 @@ def _show_live(
             server.shutdown()
             server.server_close()
     if control.stop.is_set():  # what failed then was ended by `halt`
-        if control.signal_number != signal.SIGINT or control.held_because:  # Ctrl-C is how a live view ends
+        if not control.stopped_by_hand:
             raise control.interrupted()
     elif failures:
         raise failures[0]

@@ -114,6 +114,11 @@ class Control:
         self.pause.set()
         self.held.set()
 
+    @property
+    def stopped_by_hand(self) -> bool:
+        """Stopped by Ctrl-C, and by nothing else: how a live view or a bench ends as it should."""
+        return self.stop.is_set() and self.signal_number == signal.SIGINT and not self.held_because
+
     def interrupted(self) -> Interrupted:
         """The error that ends a stopped session."""
         word = "stopped by the operator" if self.signal_number == signal.SIGINT else "stopped"

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from coupole.acquisition.observer import Control
 from coupole.acquisition.runtime_folder import named_after, runtime_folder
 from coupole.acquisition.safeguard import Safeguard, unsure
-from coupole.acquisition.user_socket import PATIENCE_S, Gone, UserSocket, exchange
+from coupole.acquisition.user_socket import PATIENCE_S, Gone, UserSocket, exchange, told_if_given_up
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import json_of
 
@@ -111,6 +111,13 @@ class RunControl:
 
 # -- the side of whoever asks ---------------------------------------------------------------------------------
 
+_OBEYED_LATER = "given up without an answer: `coupole {}` is obeyed as soon as the process runs again"
+_WHEN_GIVEN_UP = {
+    "pause": _OBEYED_LATER.format("pause"),
+    "stop": _OBEYED_LATER.format("stop"),
+    "go-on": "given up without an answer: `coupole go-on` is not obeyed later",
+}
+
 
 def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: None) -> State:
     """Send a command to the process that acquires into `run`; its state after it. `say` is told within 2 s why it
@@ -118,28 +125,14 @@ def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: No
 
     Raises InputError: none does, on this machine and by this user, or it does not answer.
     """
+    path = named_after(run, "sock")
     try:
-        with _told_if_given_up(command, say):
-            return _exchange(
-                named_after(run, "sock"), command, say=lambda why: say(f"{run}: no answer yet: {why}")
-            )
+        with told_if_given_up(_WHEN_GIVEN_UP.get(command, ""), say):
+            return _exchange(path, command, say=lambda why: say(f"{run}: no answer yet: {why}"))
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
-
-
-@contextlib.contextmanager
-def _told_if_given_up(command: Command, say: Callable[[str], object]) -> Iterator[None]:
-    try:
-        yield
-    except (FileNotFoundError, ConnectionRefusedError):
-        raise
-    except BaseException:
-        if command != "state":
-            later = "is not obeyed later" if command == "go-on" else "is obeyed as soon as the process runs again"
-            say(f"given up without an answer: `coupole {command}` {later}")
-        raise
 
 
 def running() -> list[State]:

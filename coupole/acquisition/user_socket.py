@@ -14,7 +14,8 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +128,19 @@ def exchange(
     except InputError as error:
         raise ValueError(str(error)) from error
     return found
+
+
+@contextmanager
+def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]:
+    """`say` is told `words`, if there are any, when a request ends without an answer of whoever is there."""
+    try:
+        yield
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise
+    except BaseException:
+        if words:
+            say(words)
+        raise
 
 
 def _silence(pid: int, patience_s: float) -> str:

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -86,7 +87,7 @@ def arm(
     try:
         cell = read_cell(rig)
         if is_in_use(cell):
-            found = _driven(lambda command, **fields: ask_bench(cell, command, **fields), goal, control, yes=yes)
+            found = _driven(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
         else:
             lies = object_of or plan
             what = read_job(lies, rig) if lies else cell
@@ -98,6 +99,10 @@ def arm(
     console.print(f"the arm is at {found['to']}", markup=False)
     if as_json:
         print(json.dumps(found))
+
+
+def _say(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)
 
 
 def _driven(asked: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
@@ -117,7 +122,10 @@ def _driven(asked: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str
             time.sleep(_LOOK_EVERY_S)
             work = obeyed(asked("state"))["work"]
     except BaseException:
-        asked("stop")
+        try:
+            asked("stop")
+        except InputError as silent:
+            _say(str(silent))
         raise
     if work["state"] != "done":
         raise DeviceError(

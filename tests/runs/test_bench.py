@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -326,6 +327,30 @@ def test_asked_to_close_it_makes_all_safe_and_ends(asked: Bench, world: World) -
     assert asked.process.wait(cells.PATIENCE_S) == 0
     assert cells.safe(world)
     assert not asked.path.exists()
+
+
+def test_a_stopped_bench_is_named_by_who_asks_it_moves_nothing_later_and_says_why_it_ended(
+    cell: CellFolder, world: World
+) -> None:
+    stopped = cells.start("bench", cell.rig, "--yes", "--json")
+    assert stopped.stdout is not None
+    assert stopped.stdout.readline()
+    before_deg = joints_deg(world)
+    stopped.send_signal(signal.SIGSTOP)
+    try:
+        driven = cells.start("arm", cell.rig, "home", "--yes")
+        assert driven.stderr is not None
+        assert f"no answer of its bench yet: process {stopped.pid} is stopped" in driven.stderr.readline()
+        driven.send_signal(signal.SIGINT)
+        given_up = cells.finish(driven)
+    finally:
+        stopped.send_signal(signal.SIGCONT)
+    assert given_up.code == 130
+    assert "given up without an answer: `plan_path` is not obeyed later" in given_up.err
+    ended = cells.finish(stopped)
+    assert ended.code == 130
+    assert "the program did not run for" in ended.err
+    assert np.allclose(joints_deg(world), before_deg, atol=0.01)
 
 
 def test_no_light_outlasts_a_bench_that_is_killed(asked: Bench, cell: CellFolder, world: World) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from coupole.acquisition.cell_bench.bench_requests import VERSION
 from coupole.acquisition.runtime_folder import named_after
-from coupole.acquisition.user_socket import exchange
+from coupole.acquisition.user_socket import PATIENCE_S, exchange, told_if_given_up
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 
-_PATIENCE_S = 120.0
+_LONG_PATIENCE_S = 120.0
 """A path among many bodies, or a long exposure, takes a while."""
+_AT_ONCE = {"state", "stop", "jog", "drive"}
+"""Commands whose answer does not wait for what they begin or end."""
 
 
 def bench_socket(cell: Cell) -> Path:
@@ -20,16 +23,28 @@ def bench_socket(cell: Cell) -> Path:
     return named_after(cell.state_folder, "bench")
 
 
-def ask_bench(cell: Cell, command: str, **fields: Any) -> dict[str, Any]:
-    """The bench's answer; one that was not obeyed has an `error`. Raises InputError: there is no bench."""
+def ask_bench(
+    cell: Cell, command: str, *, say: Callable[[str], object] = lambda _: None, **fields: Any
+) -> dict[str, Any]:
+    """The bench's answer; one that was not obeyed has an `error`. `say` is told within 2 s why it does not answer,
+    and of a command that is given up what becomes of it. Raises InputError: there is no bench, or it is silent."""
+    patience_s = PATIENCE_S if command in _AT_ONCE else _LONG_PATIENCE_S
+    rig, request = cell.document.path, {"version": VERSION, "command": command, **fields}
+    becomes = "is obeyed as soon as it runs again" if command == "stop" else "is not obeyed later"
     try:
-        return exchange(bench_socket(cell), {"version": VERSION, "command": command, **fields}, _PATIENCE_S)
+        with told_if_given_up(f"given up without an answer: `{command}` {becomes}", say):
+            return exchange(
+                bench_socket(cell),
+                request,
+                patience_s,
+                lambda why: say(f"{rig}: no answer of its bench yet: {why}"),
+            )
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(
-            f"{cell.document.path}: no bench of this user holds this cell on this machine (`coupole bench`)"
+            f"{rig}: no bench of this user holds this cell on this machine (`coupole bench`)"
         ) from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{cell.document.path}: its bench does not answer: {error}") from error
+        raise InputError(f"{rig}: its bench does not answer: {error}") from error
 
 
 def obeyed(answer: dict[str, Any]) -> dict[str, Any]:

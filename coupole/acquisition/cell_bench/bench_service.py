@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -242,7 +241,7 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
 def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool) -> None:
     """Hold the cell's devices until `close` is asked, a signal comes, or nobody has asked for a while.
 
-    Raises InputError, DeviceError, Interrupted (SIGTERM, SIGHUP).
+    Raises InputError, DeviceError, Interrupted (SIGTERM, SIGHUP, or the process did not run for a while).
     """
     control = Control()
     path = bench_socket(what.cell if isinstance(what, Job) else what)
@@ -268,5 +267,5 @@ def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_afte
                 console.print(f"nobody has asked for {leave_after_s:g} s: closed")
                 break
         service.closing.set()
-    if control.stop.is_set() and control.signal_number != signal.SIGINT:  # Ctrl-C is how a bench ends
+    if control.stop.is_set() and not control.stopped_by_hand:
         raise control.interrupted()

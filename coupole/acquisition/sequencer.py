@@ -175,6 +175,7 @@ class Sequencer:
             for index, burst in enumerate(left):
                 following = left[index + 1] if index + 1 < len(left) else None
                 self._acquire_burst(burst, following, begin)
+                self._ahead_s -= _expected_s(burst)
             self._recorder.note(ViewSealed(view=view.name))
         except BaseException:
             self._cell.make_safe()  # before the disk, which may take its time
@@ -198,7 +199,6 @@ class Sequencer:
         If an arm that was pushed springs back, `begin` is called again for the frames after that. It is never
         driven back: a person may be what pushed it.
         """
-        self._ahead_s -= _expected_s(burst)
         todo = burst
         attempt = 0
         while attempt <= self._job.plan.reshoot_limit:
@@ -270,18 +270,13 @@ class Sequencer:
 
     def _tell(self, burst: Burst, step: int) -> None:
         label = burst.labels[min(step, len(burst.labels) - 1)]
-        self._observer.progress(
-            Progress(
-                self._view_name,
-                self._view_number,
-                len(self._job.schedule.views),
-                len(self._recorder.proven()),
-                self._job.schedule.frames,
-                str(label.light) if label else "dark",
-                self._dose.lux_h_after(step),
-                self._ahead_s + _expected_s(burst) - float(burst.table["period_us"][:step].sum()) / 1e6,
-            )
-        )
+        left_s = self._ahead_s - float(burst.table["period_us"][:step].sum()) / 1e6
+        self._tell_figures(str(label.light) if label else "dark", self._dose.lux_h_after(step), left_s)
+
+    def _tell_figures(self, light: str, dose_lux_h: float, left_s: float) -> None:
+        schedule, proven = self._job.schedule, len(self._recorder.proven())
+        place = (self._view_name, self._view_number, len(schedule.views))
+        self._observer.progress(Progress(*place, proven, schedule.frames, light, dose_lux_h, left_s))
 
     def _wait_while_paused(self) -> None:
         control = self._control
@@ -295,6 +290,7 @@ class Sequencer:
             control.held.clear()
         self._recorder.note(Paused())
         self._recorder.commit(now=True)
+        self._tell_figures("dark", self._dose.lux_h_in_all, self._ahead_s)
         self._observer.note("paused: lights are off, the arm is at rest; the key p or `coupole go-on` continues")
         control.paused.set()
         try:

@@ -81,6 +81,28 @@ def test_a_run_is_followed_from_another_terminal_and_stopped_in_a_burst(
     assert f"--resume {run}" in " ".join(seen.err.split())
 
 
+def test_who_asks_a_run_that_was_frozen_in_a_burst_is_told_the_figures_of_its_journal(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, world = standing
+    process = cell.start_acquire()
+    run = cell.run_folder
+    cells.wait_until(
+        lambda: len(cells.events(run, "burst")) > 1 and world.ask("state")["shining"], "a burst's light"
+    )
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(2.0)
+    process.send_signal(signal.SIGCONT)
+    cells.wait_until(lambda: cells.events(run, "pause"), "the hold")
+    told = cells.here("pause", run, "--json").document
+    noted = cells.here("status", run, "--json").document
+    assert told["state"] == noted["state"] == "paused"
+    assert told["proven"] == noted["proven"] + noted["darks_proven"] == cells.frame_lines(run)
+    assert told["dose_lux_h"] == pytest.approx(noted["dose_lux_h"], rel=1e-6)
+    assert cells.here("stop", run).code == 0
+    assert cells.finish(process).code == 130
+
+
 def test_a_word_that_was_given_up_while_the_run_was_stopped_is_not_obeyed_later(
     standing: tuple[CellFolder, World],
 ) -> None:

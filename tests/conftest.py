@@ -16,6 +16,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells leave it for 
 
 import pytest
 from cells import CellFolder
+from compiled_once import compile_each_kernel_once
 from hypothesis import HealthCheck, settings
 from nursery import NURSERY
 from skip_budget import over_budget
@@ -23,6 +24,7 @@ from xdist.scheduler.loadscope import LoadScopeScheduling
 
 from sim.world import client
 
+compile_each_kernel_once()
 client._launch = NURSERY.start  # type: ignore[assignment] # for what runs in the tests' own process
 
 unhurried: Any = {

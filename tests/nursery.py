@@ -27,6 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from compiled_once import compile_each_kernel_once
 from fork_account import ForkAccount
 from numba.core.dispatcher import Dispatcher
 from numba.np.ufunc import parallel
@@ -134,6 +135,7 @@ NURSERY = Nursery()
 
 def serve(line: socket.socket, account: ForkAccount | None = None) -> None:
     """Fork a world or a command for each message, until the line is closed."""
+    compile_each_kernel_once()
     for module in WORLDS_IMPORT:
         importlib.import_module(module)
     signal.signal(signal.SIGCHLD, account.bury if account else signal.SIG_IGN)  # nobody waits for them here

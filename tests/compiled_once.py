@@ -1,0 +1,43 @@
+"""Numba's kernels, each compiled by one process while the others wait for what it leaves in the cache.
+
+Six workers and their worlds begin at once with the same kernels. Without this each of them compiles what all of
+them are about to find in the cache.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import Dispatcher
+
+
+def compile_each_kernel_once() -> None:
+    """In this process, and in those that it forks."""
+    compiles = Dispatcher.compile
+
+    @functools.wraps(compiles)
+    def compile_alone(kernel: Any, *signature: Any) -> Any:
+        with _alone(kernel):
+            return compiles(kernel, *signature)  # which looks into the cache first
+
+    Dispatcher.compile = compile_alone
+
+
+@contextmanager
+def _alone(kernel: Any) -> Iterator[None]:
+    """Only this process compiles the kernel; it may compile those that this one calls, meanwhile. The compiler's
+    own lock comes first: processes then wait for each other in the order of calls, which has no circles."""
+    if kernel.stats.cache_path is None:
+        yield
+        return
+    folder = Path(kernel.stats.cache_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    with global_compiler_lock, (folder / f"{kernel.py_func.__qualname__}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

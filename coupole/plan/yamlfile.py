@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
-from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from coupole.errors import InputError, Problem
 from coupole.intake.input_files import InputFiles
 from coupole.plan.validation_messages import KeyPath, Mistake, key_text, mistakes_of
+from coupole.plan.yaml_graph import graph
 
 M = TypeVar("M", bound=BaseModel)
 Place: TypeAlias = tuple[int, int]
@@ -202,7 +202,7 @@ def _decoded(path: Path, raw: bytes) -> str:
 def compose(path: Path, text: str) -> Node | None:
     """The graph of YAML nodes, None when the file has no content."""
     try:
-        return _graph(text)
+        return graph(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place: Place = (mark.line + 1, mark.column + 1) if mark else (0, 0)
@@ -216,15 +216,6 @@ def compose(path: Path, text: str) -> Node | None:
         raise InputError([_problem_after(path, before, f"not valid YAML: {reason}")]) from error
     except RecursionError as error:
         raise InputError([Problem(str(path), 0, 0, "", f"nested deeper than {MAX_DEPTH} levels")]) from error
-
-
-@functools.lru_cache(maxsize=4)
-def _graph(text: str) -> Node | None:
-    """A text is composed once to be read and once to be rewritten; nobody changes the nodes."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
-    root: Node | None = yaml.compose(text)
-    return root
 
 
 def _problem_after(path: Path, before: str, message: str) -> Problem:

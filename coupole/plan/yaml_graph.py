@@ -1,0 +1,72 @@
+"""The graph of nodes of a YAML text.
+
+ruamel.yaml reads YAML 1.2 in Python, and takes 30 to 80 ms for an arm's or a rig's file. libyaml (by PyYAML) takes
+1 ms, but reads YAML 1.1. So plain texts are composed by libyaml: printable ASCII without anchors, aliases, tags,
+directives, escapes, block scalars, complex keys, several documents and empty values. Of these both make the same
+nodes at the same places, once scalars are resolved by ruamel's rules; a property test holds that. All other texts,
+and all that libyaml refuses, are ruamel's: its graph, or its error with its place, counts.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+
+import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+_COMMENT_LINES = re.compile(r"^ *#.*$", re.MULTILINE)
+_NOT_PLAIN = re.compile(r"[^\n\x20-\x7e]|[&*!@`\\|>?]|^%|^---|^\.\.\.", re.MULTILINE)
+_resolver = YAML(typ="safe", pure=True).resolver
+
+
+@functools.lru_cache(maxsize=4)
+def graph(text: str) -> Node | None:
+    """None when the text has no content. A text is composed once to be read and once to be rewritten; nobody
+    changes the nodes. Raises ruamel.yaml's YAMLError, and RecursionError."""
+    return _composed_quickly(text) or composed_by_ruamel(text)
+
+
+def composed_by_ruamel(text: str) -> Node | None:
+    """The same, of any text."""
+    reader = YAML(typ="safe", pure=True)
+    reader.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
+    root: Node | None = reader.compose(text)
+    return root
+
+
+def _composed_quickly(text: str) -> Node | None:
+    """By libyaml; None if that is not here, refuses the text, or might mean something else by it."""
+    if not yaml.__with_libyaml__ or _NOT_PLAIN.search(_COMMENT_LINES.sub("", text)):
+        return None
+    ends = text.endswith("\n")
+    try:
+        root = yaml.compose(text if ends else text + "\n", Loader=yaml.CSafeLoader)
+        # Where the text just ends, so does an open block.
+        whole = ends or (isinstance(root, yaml.CollectionNode) and root.flow_style)
+        return _converted(root) if root is not None and whole else None
+    except (yaml.YAMLError, _EmptyError):
+        return None
+
+
+class _EmptyError(Exception):
+    """A value that is not there: the two libraries place it differently."""
+
+
+def _converted(node: yaml.Node) -> Node:
+    """ruamel's node for PyYAML's, with the tag that ruamel gives it. Raises _EmptyError."""
+    marks = node.start_mark, node.end_mark
+    if isinstance(node, yaml.ScalarNode):
+        if node.start_mark.index == node.end_mark.index:
+            raise _EmptyError
+        plain = not node.style
+        tag = _resolver.resolve(ScalarNode, node.value, (plain, not plain))
+        return ScalarNode(tag, node.value, *marks, style=node.style or None)
+    kind = SequenceNode if isinstance(node, yaml.SequenceNode) else MappingNode
+    inner = (
+        [_converted(one) for one in node.value]
+        if isinstance(node, yaml.SequenceNode)
+        else [(_converted(key), _converted(value)) for key, value in node.value]
+    )
+    return kind(_resolver.resolve(kind, None, (True, True)), inner, *marks, flow_style=node.flow_style)

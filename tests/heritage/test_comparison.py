@@ -6,7 +6,6 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import colour
 import numpy as np
 import pytest
 import trimesh
@@ -127,6 +126,8 @@ def test_uncertainties_hold_by_a_stated_noise(head: Head, before: Path, tmp_path
 
 
 def test_colour_differences_are_those_of_another_library() -> None:
+    import colour
+
     srgb = np.random.default_rng(0).integers(0, 256, (200, 2, 3)).astype(np.uint8)
     mine = de00_of(lab_of(srgb[:, 0]), lab_of(srgb[:, 1]))
     white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]

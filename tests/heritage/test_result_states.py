@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import colour
 import h5py
 import numpy as np
 import pytest
@@ -51,6 +50,8 @@ def compared(before: Path, after: Path) -> Comparison:
 
 
 def test_a_repainted_patch_is_found_in_its_place_and_by_its_difference(before: Path, tmp_path: Path) -> None:
+    import colour
+
     found = compared(before, made(tmp_path / "after", 2, painted=True, u_kd=0.01))
     assert found.recoloured is not None
     assert found.de00 is not None
@@ -83,6 +84,8 @@ def test_two_measurements_of_one_state_are_the_same(before: Path, tmp_path: Path
 
 
 def test_covariances_of_lab_are_those_of_many_draws() -> None:
+    import colour
+
     rng = np.random.default_rng(0)
     u_alone, u_common = np.array([[0.02, 0.01, 0.03]]), np.array([0.02])
     lab, covariance = lab_of_kd(KD[None], u_alone, u_common)

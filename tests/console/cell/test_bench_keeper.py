@@ -20,7 +20,6 @@ from coupole.console.cell.lending import Lending
 from coupole.console.plans.plan_files import PlanFiles
 from coupole.console.plans.plan_queue import PlanQueue
 from coupole.console.processes import tasks
-from coupole.console.screens.focus_screen import LIVE_S, why_live_ends
 from coupole.errors import InputError
 from coupole.plan.cell import read_cell
 
@@ -114,6 +113,8 @@ def test_whatever_the_cell_is_lent_for_is_interrupted_as_by_a_key() -> None:
 
 
 def test_live_pictures_end_with_the_page_with_a_stop_and_when_nobody_touches_it() -> None:
+    from coupole.console.screens.focus_screen import LIVE_S, why_live_ends
+
     usual: dict[str, Any] = {"watched": True, "untouched_s": 59.0, "stopped": False}
     assert LIVE_S == 60.0
     assert why_live_ends(**usual) == ""

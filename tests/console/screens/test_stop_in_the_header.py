@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from coupole.console.routes.messages import StateNow
-from coupole.console.screens.frame import can_be_stopped, light_words
 
 
 @pytest.mark.parametrize(
@@ -25,6 +24,8 @@ from coupole.console.screens.frame import can_be_stopped, light_words
 def test_stop_can_be_pressed_whenever_something_may_move_or_light(
     so: dict[str, Any], stops: bool, dark: bool
 ) -> None:
+    from coupole.console.screens.frame import can_be_stopped, light_words
+
     usual: dict[str, Any] = {"state": "idle", "lent_to": "", "devices": {}, "queue": [], "run": None, "object": ""}
     now = StateNow.model_construct(**{**usual, "dose_before": 0.0, "dose": 0.0, "dose_budget": None, **so})
     assert can_be_stopped(now) is stops

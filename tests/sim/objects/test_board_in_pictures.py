@@ -30,7 +30,11 @@ LENS = Lens.focused(
 )
 MONO = SensorModel(bayer_pattern="MONO", seed=3)
 WHITE_E = 8_000.0
-FALLOFF = vignetting(Objective(), np.hypot(*slopes(sight(LENS)))).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def falloff() -> NDArray[np.float32]:
+    return vignetting(Objective(), np.hypot(*slopes(sight(LENS)))).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -67,20 +71,22 @@ def misses_px(frame: NDArray[np.uint16], base_from_camera: NDArray[np.float64]) 
 
 
 def test_corners_of_a_supersampled_frame_are_found_to_a_tenth_of_a_pixel(
-    base_from_camera: NDArray[np.float64],
+    base_from_camera: NDArray[np.float64], falloff: NDArray[np.float32]
 ) -> None:
     view = view_of_board(base_from_camera, 4)
     frame = np.empty((768, 1024), np.uint16)
-    light = (view.site, view.diffuse, FALLOFF)
+    light = (view.site, view.diffuse, falloff)
     expose(frame, *light, model=MONO, electrons_per_radiance=WHITE_E, frame=1)
     misses = misses_px(frame, base_from_camera)
     assert np.sqrt(np.mean(misses**2)) < 0.14
     assert np.abs(misses.mean(axis=0)).max() < 0.06
 
 
-def test_blur_leaves_the_corners_in_place(base_from_camera: NDArray[np.float64]) -> None:
+def test_blur_leaves_the_corners_in_place(
+    base_from_camera: NDArray[np.float64], falloff: NDArray[np.float32]
+) -> None:
     view = view_of_board(base_from_camera, 1)
-    image = electrons(view.site, view.diffuse, FALLOFF, electrons_per_radiance=WHITE_E)
+    image = electrons(view.site, view.diffuse, falloff, electrons_per_radiance=WHITE_E)
     lens = Objective(f_number=4.0)
     disk_px = blur.defocus_blur_px(lens, np.full(view.site.shape, 380.0, np.float32), PITCH_UM)
     soft = blur.through(lens, image, disk_px, MONO.channels(), pixel_pitch_um=PITCH_UM)

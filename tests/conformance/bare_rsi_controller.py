@@ -10,6 +10,8 @@ not there when the cycle ends is a missed one. Until the first answer it repeats
 start the program once the driver waits for it.
 """
 
+import contextlib
+import os
 import re
 import socket
 import threading
@@ -175,6 +177,8 @@ class BareRsiController:
     # the cycle
 
     def _run(self) -> None:
+        with contextlib.suppress(OSError):  # a controller answers to no other work, if this user may have that
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         try:
             due_s = time.monotonic()
             while not self._over.is_set() and not self.faulted and not self.ended_by_stop:

@@ -93,7 +93,7 @@ OWN_WORDS = re.compile(r"json\.loads\(\w+\.model_dump_json\(|json\.loads\(json\.
 """Not of a file: what the program itself has just written."""
 READERS = {
     "coupole/intake/plain_data.py",
-    "coupole/plan/yamlfile.py",
+    "coupole/plan/yaml_graph.py",
     # write YAML anew with its comments, from a text that yamlfile has read
     "coupole/commands/simulated_support.py",
     "coupole/console/plans/plan_fields.py",

@@ -54,7 +54,7 @@ def cell_in(folder: Path, hours: float, leds: int, speed: float) -> CellFolder:
     cell = CellFolder(folder, speed=speed)
     cell.rig_data["ledbox"]["settings"]["watchdog_s"] = min(60.0, 4 * speed)
     cell.join()
-    view_s = (leds + 12) * (EXPOSURE_US * 1e-6 + 0.03) + 4.0
+    view_s = (leds + 12) * (EXPOSURE_US * 1e-6 + 0.001) + 6.0  # as measured
     poses = (TOP, SIDE, LOW)
     views = [{**poses[k % 3], "name": f"v{k:04d}"} for k in range(max(2, round(hours * 3600.0 / view_s)))]
     cell.write(

@@ -9,7 +9,7 @@ from long_day import WORLD, Watcher, cell_in, wrong_at_the_end
 
 def test_a_watched_run_has_true_labels_loses_nothing_and_a_false_label_is_seen(tmp_path: Path) -> None:
     """Three views of 36 LEDs in a world that runs fast only while the command waits."""
-    cell = cell_in(tmp_path, 0.0125, 36, 50.0)
+    cell = cell_in(tmp_path, 0.015, 36, 50.0)
     with cell.world(**WORLD) as world:
         watcher = Watcher(cell, world, seed=1)
         for _ in watcher.follow():

@@ -116,7 +116,7 @@ class Control:
 
     @property
     def stopped_by_hand(self) -> bool:
-        """Stopped by Ctrl-C, and by nothing else: how a live view or a bench ends as it should."""
+        """Stopped as by Ctrl-C, and not by a hold: so a live view or a bench ends as it should."""
         return self.stop.is_set() and self.signal_number == signal.SIGINT and not self.held_because
 
     def interrupted(self) -> Interrupted:

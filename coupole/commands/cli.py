@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
 from coupole.bounded import leave
-from coupole.errors import CoupoleError, Interrupted
+from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
 AT_A_CELL = {"acquire", "meter", "live", "devices", "bench", "arm", "commission", "confirm", "calibrate", "sim"}
@@ -157,14 +157,25 @@ def _ended() -> int:
         if hasattr(error, "exit_code") and hasattr(error, "show"):
             error.show()
             code = error.exit_code
+        elif isinstance(error, OSError) and (why := text_outlet.full_stdout()):
+            code = _not_taken(why)
         else:
             with contextlib.suppress(OSError):
                 traceback.print_exception(error)
                 print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
             code = 1
+    if why := text_outlet.full_stdout():
+        code = _not_taken(why)
     with contextlib.suppress(SignalReceived):  # a signal more: nothing is waited for
         text_outlet.finish()
     return int(code or 0)
+
+
+def _not_taken(why: str) -> int:
+    """Tell that standard output does not have the whole document; the exit code."""
+    error = StorageError(f"standard output: {why}; what was printed there is not complete")
+    _say(error)
+    return error.exit_code
 
 
 def _say(error: CoupoleError) -> None:

@@ -14,6 +14,7 @@ import fcntl
 import math
 import os
 import re
+import stat
 import time
 import uuid
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from coupole.errors import InputError, StorageError
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Name
 from coupole.storage.ledger_lines import (
+    NO_FILE,
     Asked,
     BudgetSet,
     History,
@@ -105,19 +107,26 @@ class Ledger:
         self._append(LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2))
 
     def enter(self, dose_lux_h: float, note: str) -> None:
-        """Light that others have given, in a photographer's studio for example."""
+        """Light that others have given, in a photographer's studio for example. Raises InputError: no figure."""
+        self._refuse_no_figure("light", dose_lux_h)
         self._append(LightEntered(dose_lux_h=dose_lux_h, note=note))
 
     def set_budget(self, dose_lux_h: float, name: str, reason: str = "") -> None:
         """The object may receive so much in its life, by this person's word. Raises InputError without a name."""
         if not name.strip():
             raise InputError(f"object {self.object_id}: expected the name of the person who sets its light budget")
-        if not (math.isfinite(dose_lux_h) and dose_lux_h >= 0):
-            raise InputError(f"object {self.object_id}: expected a budget of 0 lux.h or more, found {dose_lux_h}")
+        self._refuse_no_figure("a budget", dose_lux_h)
         self._append(BudgetSet(dose_lux_h=dose_lux_h, name=name.strip(), reason=reason.strip()))
 
     def warn_above(self, dose_lux_h: float | None) -> None:
+        """Raises InputError: no figure."""
+        if dose_lux_h is not None:
+            self._refuse_no_figure("a limit", dose_lux_h)
         self._append(WarningSet(dose_lux_h=dose_lux_h))
+
+    def _refuse_no_figure(self, what: str, dose_lux_h: float) -> None:
+        if not (math.isfinite(dose_lux_h) and dose_lux_h >= 0):
+            raise InputError(f"object {self.object_id}: expected {what} of 0 lux.h or more, found {dose_lux_h}")
 
     def prove_writable(self) -> None:
         """Raise StorageError now if lines could not be appended later."""
@@ -144,6 +153,8 @@ class Ledger:
         except OSError as error:
             raise StorageError(f"{self.path}: cannot write the dose ledger: {error.strerror}") from error
         try:
+            if not stat.S_ISREG(os.fstat(lock).st_mode):
+                raise StorageError(f"{self.path}: cannot write the dose ledger: {NO_FILE}")
             self._take(lock)
             file = LineFile(self.path)
             try:

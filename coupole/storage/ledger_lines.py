@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, BinaryIO, ClassVar, Literal, TypeAlias
@@ -16,6 +18,7 @@ BY_HAND = "by hand"
 """In place of a run's name, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
 _TAIL_BYTES = 256
+NO_FILE = "a pipe or a device, expected a file"
 Amount = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
 
@@ -178,11 +181,21 @@ class Asked:
 def read_lines(path: Path) -> list[bytes]:
     """Lines of a file; none if there is no file. Raises StorageError."""
     try:
-        return path.read_bytes().split(b"\n")
+        with _opened(path) as file:
+            return file.read().split(b"\n")
     except FileNotFoundError:
         return []
     except OSError as error:
         raise _unreadable(path, error) from error
+
+
+def _opened(path: Path) -> BinaryIO:
+    """A file for reading. Raises OSError, also for a pipe or a device, which is not waited for."""
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, NO_FILE)
+    return file
 
 
 def history_of(texts: list[bytes]) -> History:
@@ -207,7 +220,7 @@ class Reading:
         """With the complete lines that came since; all of them anew if the file is another one now. Raises
         StorageError."""
         try:
-            with path.open("rb") as file:
+            with _opened(path) as file:
                 return self._with_rest(path, file)
         except FileNotFoundError:
             self._refuse_loss(path, "was removed")

@@ -111,9 +111,15 @@ _installed: dict[str, Outlet] = {}
 
 def keep_standard_places() -> None:
     """Standard streams that are closed lead nowhere: a device or a pipe that is opened must not take their place
-    and be given text. To be called before anything is opened."""
-    for fd in range(3):
+    and be given text, and who writes need not ask whether there is one. To be called before anything is opened.
+
+    Standard output keeps what it could not write (PYTHONUNBUFFERED would drop it): see `full_stdout`."""
+    for fd, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         _lead_nowhere_if_closed(fd)
+        stream = getattr(sys, name)
+        if stream is None or (fd == 1 and isinstance(getattr(stream, "buffer", None), io.FileIO)):
+            stream = open(fd, mode, buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
+            setattr(sys, name, stream)
 
 
 def install() -> None:
@@ -137,8 +143,21 @@ def install() -> None:
                 line_buffering=True,
             ),
         )
-    if sys.stdin is None:
-        sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115  to the end of the process
+
+
+def full_stdout() -> str:
+    """Why standard output does not take what was written to it; empty if it does, or if its reader has gone. What
+    it did not take is dropped."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return ""
+    except OSError as error:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.stdout.flush()
+        return error.strerror or str(error)
+    return ""
 
 
 def unread() -> Unread | None:
@@ -177,9 +196,9 @@ def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE
 
 
 def _is(stream: object, fd: int) -> bool:
-    """Whether a stream leads to a descriptor; one that was closed when the process began does now."""
+    """Whether a stream leads to a descriptor."""
     try:
-        return stream is None or stream.fileno() == fd  # type: ignore[attr-defined]
+        return bool(stream.fileno() == fd)  # type: ignore[attr-defined]
     except (AttributeError, OSError, ValueError):
         return False
 

@@ -16,6 +16,8 @@ _LONG_PATIENCE_S = 120.0
 """A path among many bodies, or a long exposure, takes a while."""
 _AT_ONCE = {"state", "stop", "jog", "drive"}
 """Commands whose answer does not wait for what they begin or end."""
+_GIVEN_UP = "given up without an answer: nothing moves or shines by it later"
+_STOP_GIVEN_UP = "given up without an answer: the bench obeys the stop as soon as it runs again"
 
 
 def bench_socket(cell: Cell) -> Path:
@@ -30,9 +32,8 @@ def ask_bench(
     and of a command that is given up what becomes of it. Raises InputError: there is no bench, or it is silent."""
     patience_s = PATIENCE_S if command in _AT_ONCE else _LONG_PATIENCE_S
     rig, request = cell.document.path, {"version": VERSION, "command": command, **fields}
-    becomes = "is obeyed as soon as it runs again" if command == "stop" else "is not obeyed later"
     try:
-        with told_if_given_up(f"given up without an answer: `{command}` {becomes}", say):
+        with told_if_given_up(_STOP_GIVEN_UP if command == "stop" else _GIVEN_UP, say):
             return exchange(
                 bench_socket(cell),
                 request,

@@ -63,7 +63,9 @@ def close_complete(run: Run, console: Console) -> float:
 
 def conclude(run: Run, console: Console) -> None:
     """Write the report and enter in the manifest what is complete. Never raises: the run itself has ended. A disk
-    that hung in the session is not asked again."""
+    that hung in the session is not asked again; a folder that is lost leaves nothing to conclude."""
+    if run.is_lost:
+        return
     try:
         if call := hangs(DISK):
             raise StorageError(f"{call}: the disk does not answer")

@@ -120,6 +120,7 @@ class RunRecorder:
         base_from_camera: Transform,
         collections: Collections,
     ) -> None:
+        self._refuse_moved()
         path = self._run.view_path(view)
         allocated_bytes = (frames + SPARE_SLOTS) * frame_format.frame_bytes
         with under_way(DISK, str(path), allocated_bytes / _SLOWEST_ALLOCATION_BYTES_S):
@@ -182,15 +183,42 @@ class RunRecorder:
             committing, self._committing = self._committing, None
             committing.result()
         if now:
-            self._commit(self._writer, *self._taken())
+            self._commit_in_place(self._writer, *self._taken())
         elif self._committing is None and time.monotonic() - self._committed_s > COMMIT_EVERY_S:
             self._committed_s = time.monotonic()
-            self._committing = self._committer.submit(self._commit, self._writer, *self._taken())
+            self._committing = self._committer.submit(self._commit_in_place, self._writer, *self._taken())
 
     def _taken(self) -> tuple[list[str], list[ShotId]]:
         """Lines that are to be written, and the shots that they prove."""
         shots, self._uncommitted = self._uncommitted, []
         return self._journal.take(), shots
+
+    def _commit_in_place(self, writer: ViewWriter | None, lines: list[str], shots: list[ShotId]) -> None:
+        """Raises StorageError after that if the run's folder is no longer at its path."""
+        self._commit(writer, lines, shots)
+        self._refuse_moved()
+
+    def _refuse_moved(self) -> None:
+        before = self._run.folder
+        with under_way(DISK, str(before)):
+            self._follow_folder()
+        if self._run.is_lost:
+            raise StorageError(
+                f"{before}: the run's folder or its journal was removed or replaced while frames were taken. "
+                "Put back what was there, then resume the run; if it is gone, begin a new one."
+            )
+        if self._run.folder != before:
+            raise StorageError(
+                f"{before}: the run's folder was moved while frames were taken; it is {self._run.folder} now, "
+                "with all that is proven. Resume it there."
+            )
+
+    def _follow_folder(self) -> None:
+        """Have the run know where its folder is, if that was moved: the journal that is open goes with it."""
+        if not self._journal.is_at_its_path:
+            place = self._journal.place
+            self._run.is_lost = place is None
+            self._run.folder = place.parent if place else self._run.folder
 
     def _commit(self, writer: ViewWriter | None, lines: list[str], shots: list[ShotId]) -> None:
         """Frames first, then the journal lines that refer to them."""
@@ -232,6 +260,7 @@ class RunRecorder:
         if self._committing is not None:
             self._committing.result()
         self._commit(self._writer, lines, shots)
+        self._follow_folder()
 
     def close(self) -> None:
         """Release everything; frames that were not committed remain unproven. Nothing is released that a thread

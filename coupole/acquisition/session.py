@@ -318,6 +318,9 @@ def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> No
         f"{ended}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
         f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
     )
+    if run.is_lost:
+        console.print(f"  frames  lost with {run.folder}, unless that is found")
+        return
     console.print(f"  frames  {run.folder / 'views'}")
     if ended != "done":
         console.print(f"  go on   {run.go_on_command}")

@@ -107,9 +107,11 @@ def verify(
             "the manifest lists"
         )
     if found.missing:
-        raise UnprovenError(
-            f"{len(found.missing)} frames of the plan are missing; go on with `{opened.go_on_command}`"
-        )
+        goes_on = f"go on with `{opened.go_on_command}`"
+        if opened.in_use:
+            at_work = f"process {opened.holder}" if opened.holder else "another process"
+            goes_on = f"{at_work} is at work on this run: verify it again when that has ended"
+        raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; {goes_on}")
 
 
 def _show_verified(console: Console, run: Run, found: Verification) -> None:

@@ -51,6 +51,16 @@ class Journal:
         self._file.append([*self._head, *lines])
         self._head = []
 
+    @property
+    def is_at_its_path(self) -> bool:
+        """False if the journal, or its run's folder, was moved, removed or replaced since it was opened."""
+        return self._file.is_at_its_path
+
+    @property
+    def place(self) -> Path | None:
+        """Where it is now; None if it was removed, or that is not told."""
+        return self._file.place
+
     def close(self) -> None:
         self._file.close()
 

@@ -58,5 +58,22 @@ class LineFile:
                 os.ftruncate(self._fd, start)
             raise disk_error(self._path, error) from error
 
+    @property
+    def is_at_its_path(self) -> bool:
+        """False if the file was moved, removed or replaced since it was opened."""
+        try:
+            return os.path.samestat(os.fstat(self._fd), self._path.stat())
+        except OSError:
+            return False
+
+    @property
+    def place(self) -> Path | None:
+        """Where the file is now, as the kernel has it (proc(5)); None if it was removed, or that is not told."""
+        try:
+            found = Path(f"/proc/self/fd/{self._fd}").readlink()
+            return found if os.path.samestat(os.fstat(self._fd), found.stat()) else None
+        except OSError:
+            return None
+
     def close(self) -> None:
         os.close(self._fd)

@@ -51,6 +51,8 @@ class Run:
     def __init__(self, folder: Path) -> None:
         """Open an existing run. Raises InputError if there is none, or its run.json is wrong."""
         self.folder = folder.resolve()
+        self.is_lost = False
+        """In a session its folder or journal was removed or replaced: nothing more is written at its path."""
         self.about = read_description(folder)
 
     @staticmethod

@@ -52,6 +52,10 @@ def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None
     assert (paused.code, paused.document["state"], paused.document["pid"]) == (0, "paused", process.pid)
     assert cells.events(run, "pause")
     assert cells.safe(world)
+    verified = cells.here("verify", run)
+    assert verified.code == 5
+    assert f"process {process.pid} is at work on this run: verify it again when that has ended" in verified.err
+    assert "--resume" not in verified.err
     stopped = cells.here("stop", run, "--json")
     assert (stopped.code, stopped.document["state"]) == (0, "interrupted"), stopped.err
     assert stopped.document["reason"].startswith("stopped by the operator (`coupole stop`")

@@ -1,0 +1,85 @@
+"""A run's folder that is moved, replaced or removed while frames are taken."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cells
+import pytest
+from cells import CellFolder
+
+from sim.world.client import World
+
+OTHERS = b"of another run"
+
+
+@pytest.fixture
+def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
+    """A cell whose world outlives its controllers, and a plan of several bursts in two views."""
+    cell = CellFolder(tmp_path, speed=2.0)
+    cell.join()
+    cell.write(views=[cells.TOP, cells.SIDE], lights=cells.SOME_LIGHTS, repeats=2)
+    with cell.world() as world:
+        yield cell, world
+
+
+def leave(place: Path) -> None: ...
+
+
+def give_to_another(place: Path) -> None:
+    """Another run's folder gets the name."""
+    other = place.parent.parent / "other"
+    other.mkdir()
+    for name in ("report.html", "manifest.sha256"):
+        (other / name).write_bytes(OTHERS)
+    place.symlink_to(other)
+
+
+@pytest.mark.parametrize("then", [leave, give_to_another])
+@pytest.mark.parametrize("ending", [None, signal.SIGTERM], ids=["by itself", "by a signal"])
+def test_a_moved_run_ends_and_says_where_it_is_and_nothing_is_written_where_it_was(
+    standing: tuple[CellFolder, World], then: Callable[[Path], None], ending: signal.Signals | None
+) -> None:
+    cell, world = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    moved = run.with_name(f"{run.name}-moved")
+    run.rename(moved)
+    then(run)
+    if ending:
+        process.send_signal(ending)
+    ended = cells.finish(process)
+    assert ended.code in ({6, 143} if ending else {6}), ended
+    assert cells.safe(world)
+    if ended.code == 6:
+        assert f"{run}: the run's folder was moved while frames were taken; it is {moved} now" in ended.err
+    assert f"  frames  {moved}/views" in ended.err
+    assert f"  go on   coupole acquire --resume {moved}\n" in ended.err
+    assert cells.events(moved)[-1]["event"] == "stop"
+    assert (moved / "report.html").is_file()
+    if then is give_to_another:
+        assert {path.name: path.read_bytes() for path in run.iterdir()} == dict.fromkeys(
+            ("report.html", "manifest.sha256"), OTHERS
+        )
+        run.unlink()
+    assert not run.exists()
+    assert cell.acquire("--resume", moved).code == 0
+    cells.assert_each_shot_proven_once(moved)
+
+
+def test_a_run_whose_folder_is_removed_ends_and_does_not_make_another(standing: tuple[CellFolder, World]) -> None:
+    cell, world = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    shutil.rmtree(run)
+    ended = cells.finish(process)
+    assert ended.code == 6, ended
+    assert cells.safe(world)
+    assert "was removed or replaced while frames were taken" in ended.err
+    assert "--resume" not in ended.err
+    assert not run.exists()

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from ipaddress import IPv4Address
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
+from beside import beside
 from eki_cell import EkiCell
 from pydantic import ValidationError
 from robot_conformance import AWAY_DEG
@@ -176,14 +178,8 @@ def knock(host: str, port: int, over: threading.Event) -> None:
 @contextmanager
 def a_stranger_knocks(address: str) -> Iterator[None]:
     host, port = address.rsplit(":", 1)
-    over = threading.Event()
-    thread = threading.Thread(target=knock, args=(host, int(port), over))
-    thread.start()
-    try:
+    with beside(partial(knock, host, int(port))):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def test_a_controller_named_in_the_rig_is_the_only_client_let_in(tmp_path: Path) -> None:

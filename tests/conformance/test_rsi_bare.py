@@ -13,12 +13,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
 from bare_rsi_controller import BareRsiController, packet_of
+from beside import beside
 from cells import wait_until
 
 from coupole.clock import SystemClock
@@ -151,9 +153,8 @@ def stranger(
 ) -> Iterator[None]:
     """Somebody at another address whose packets look right; `on_answer` is called once one is answered, `on_many`
     when many have been sent without an answer."""
-    over = threading.Event()
 
-    def speak(link: socket.socket) -> None:
+    def speak(link: socket.socket, over: threading.Event) -> None:
         unanswered = 0
         for ipoc in itertools.count(5000, 4):
             try:
@@ -175,13 +176,8 @@ def stranger(
         link.bind(("127.0.0.3", 0))
         link.connect(("127.0.0.1", port))
         link.settimeout(0.02)
-        thread = threading.Thread(target=speak, args=(link,))
-        thread.start()
-        try:
+        with beside(partial(speak, link)):
             yield
-        finally:
-            over.set()
-            thread.join()
 
 
 def test_one_packet_of_a_stranger_that_came_first_is_named_when_opening_fails(port: int) -> None:

@@ -17,11 +17,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
+from beside import beside
 from cells import REPO, CellFolder, wait_until
 
 from coupole.clock import SystemClock
@@ -159,9 +161,8 @@ def bad_network(port: int, driver_port: int) -> Iterator[None]:
     and repeated long after. Each has its answer before the next is passed on, however busy this machine is: the
     driver leaves all but the newest of several packets unanswered, and this controller counts such a cycle when it
     hears its client again, not when it passes, as a KUKA does."""
-    over = threading.Event()
 
-    def relay(near: socket.socket, far: socket.socket) -> None:
+    def relay(near: socket.socket, far: socket.socket, over: threading.Event) -> None:
         passed: list[bytes] = []
         while not over.is_set():
             if not select.select([near], [], [], 0.05)[0]:
@@ -183,13 +184,8 @@ def bad_network(port: int, driver_port: int) -> Iterator[None]:
     ):
         near.bind(("127.0.0.1", port))
         far.bind(("127.0.0.2", 0))
-        thread = threading.Thread(target=relay, args=(near, far))
-        thread.start()
-        try:
+        with beside(partial(relay, near, far)):
             yield
-        finally:
-            over.set()
-            thread.join()
 
 
 @pytest.mark.parametrize("cycle_ms", [12, pytest.param(4, marks=pytest.mark.full)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,11 +25,17 @@ def standing(tmp_path: Path) -> Iterator[tuple[CellFolder, World]]:
         yield cell, world
 
 
-def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, World]) -> None:
-    cell, world = standing
+def under_way(cell: CellFolder) -> tuple[subprocess.Popen[str], Path]:
+    """A run that has proven frames."""
     process = cell.start_acquire()
     run = cell.run_folder
     cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    return process, run
+
+
+def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, World]) -> None:
+    cell, world = standing
+    process, run = under_way(cell)
     process.send_signal(signal.SIGUSR1)
     cells.wait_until(lambda: cells.events(run, "pause"), "the pause")
     assert cells.here("status", run, "--json").document["state"] == "paused"
@@ -45,9 +52,7 @@ def test_a_run_pauses_between_bursts_and_goes_on(standing: tuple[CellFolder, Wor
 
 def test_a_paused_run_can_be_stopped(standing: tuple[CellFolder, World]) -> None:
     cell, world = standing
-    process = cell.start_acquire()
-    run = cell.run_folder
-    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process, run = under_way(cell)
     paused = cells.here("pause", run, "--json")
     assert (paused.code, paused.document["state"], paused.document["pid"]) == (0, "paused", process.pid)
     assert cells.events(run, "pause")
@@ -111,9 +116,7 @@ def test_a_word_that_was_given_up_while_the_run_was_stopped_is_not_obeyed_later(
     standing: tuple[CellFolder, World],
 ) -> None:
     cell, world = standing
-    process = cell.start_acquire()
-    run = cell.run_folder
-    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process, run = under_way(cell)
     assert cells.here("pause", run).code == 0
     paused_at = cells.frame_lines(run)
     process.send_signal(signal.SIGSTOP)

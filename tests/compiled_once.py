@@ -16,6 +16,9 @@ from typing import Any
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 
+_compiling: set[Path] = set()
+"""Locks that this process has; whoever has the compiler's lock may ask."""
+
 
 def compile_each_kernel_once() -> None:
     """In this process, and in those that it forks."""
@@ -36,8 +39,16 @@ def _alone(kernel: Any) -> Iterator[None]:
     if kernel.stats.cache_path is None:
         yield
         return
-    folder = Path(kernel.stats.cache_path)
-    folder.mkdir(parents=True, exist_ok=True)
-    with global_compiler_lock, (folder / f"{kernel.py_func.__qualname__}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    path = Path(kernel.stats.cache_path) / f"{kernel.py_func.__qualname__}.lock"
+    with global_compiler_lock:
+        if path in _compiling:  # one that calls itself
+            yield
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            _compiling.add(path)
+            try:
+                yield
+            finally:
+                _compiling.remove(path)

@@ -19,8 +19,14 @@ def solved(a):
     return np.linalg.solve(a, a)
 
 @njit(cache=True)
+def steps(x):  # of a float: calls itself with an integer, another signature
+    if x <= 0:
+        return 0
+    return steps(int(x) - 1) + 1
+
+@njit(cache=True)
 def kernel(a):
-    return np.sort(solved(a).ravel()).sum()
+    return np.sort(solved(a).ravel()).sum() + steps(3.5)
 """
 USE = """
 import sys

@@ -260,11 +260,11 @@ def state_of(pid: int) -> str:
 
 def children(pid: int) -> list[int]:
     """Processes that a process started and that run still."""
-    return [
-        int(word)
-        for task in Path(f"/proc/{pid}/task").iterdir()
-        for word in (task / "children").read_text().split()
-    ]
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a thread that has just ended
+            found += map(int, (task / "children").read_text().split())
+    return found
 
 
 # -- what a run left ------------------------------------------------------------------------------------------

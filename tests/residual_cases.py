@@ -9,9 +9,10 @@ import h5py
 import numpy as np
 from relight_cases import BASE_FROM_SUPPORT, moved, unit, write_result, write_sources
 
+from coupole.reflectance.fits import SLICES
 from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.new_light.pictured_surface import surface_of_view
-from coupole.reflectance.run_result import SLICES, RunResult
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices, write_materials
 from coupole.reflectance.slice_fit import fit_slices
 from coupole.reflectance.triangle_fit import fit_triangles, model_values

@@ -52,6 +52,8 @@ class _RunningBurst:
     """Frames already passed to the recorder."""
     started_ns: int | None = None
     """When the box was told to run the table, on the rig's clock; None until then."""
+    runs_since_ns: int | None = None
+    """When the box had answered that it runs it."""
     panel_since_ns: int | None = None
     """When the panel was switched on; None without one."""
 
@@ -152,6 +154,7 @@ class BurstRunner:
                 box.panel(burst.panel, True)
             running.started_ns = started_ns = clock.now_ns()
             box.start(burst.table)
+            running.runs_since_ns = clock.now_ns()
             if following is not None:
                 self.prepare(following)
             self._arm.hurry(burst.duration_s - _LAST_STRETCH_S)
@@ -161,7 +164,7 @@ class BurstRunner:
                 box.panel(burst.panel, False)
         except BaseException as error:
             if isinstance(error, ArmMovedError) or self._arm.was_held(error):
-                box.lights_off()
+                self._cell.switch_off()
                 self._upload = None  # that has ended it: `fire` uploads anew
                 camera.disarm()
                 self._end(running, camera=None)
@@ -251,7 +254,7 @@ class BurstRunner:
 
     def _end(self, running: _RunningBurst, camera: CameraStatistics | None) -> None:
         """Record dose and figures, release unproven frames, commit the proven ones."""
-        log, grabber, dark_ns = running.log, running.grabber, self._cell.clock.now_ns()
+        log, grabber, dark_ns = running.log, running.grabber, self._dark_ns(running)
         grabber.stop()
         for frame in range(grabber.count):
             if frame not in running.proven:
@@ -273,6 +276,14 @@ class BurstRunner:
             camera=None if camera is None else vars(camera),
             hottest_board_c=_hottest_c(log),
         )
+
+    def _dark_ns(self, running: _RunningBurst) -> int:
+        """Until when the burst may have given light: until now, or until the box had switched all off before, as
+        it does when somebody suspends the program. An answer to a call that was made before the table ran says
+        nothing of it."""
+        since_ns, now_ns = running.runs_since_ns, self._cell.clock.now_ns()
+        offs = self._cell.switched_off_ns if since_ns is not None else ()
+        return next((dark_ns for told_ns, dark_ns in offs if told_ns >= (since_ns or 0)), now_ns)
 
     def _note(
         self,

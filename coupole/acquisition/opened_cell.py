@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from coupole.preflight.job import Job
 
 _LONGEST_WATCHDOG_S = 60.0
-_WORLD_STARTS_S, _OPENS_S = 180.0, 30.0
+_WORLD_STARTS_S, _OPENS_S = 900.0, 30.0
+_SLOW_START_S = 15.0
 
 
 @dataclass
@@ -53,15 +55,23 @@ class OpenedCell:
     """False if the lights were not confirmed to be off at the end."""
     made_safe: bool = False
     """`make_safe` was called: nothing may be lit or moved any more."""
+    switched_off_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=16))
+    """On the rig's clock, the newest last: when the box was told to switch the lights off, and had answered."""
     _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _done: threading.Event = field(default_factory=threading.Event, repr=False)
 
     def halt(self) -> list[Safeguard]:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
         return [
-            Safeguard("lights off", self.ledbox.lights_off),
+            Safeguard("lights off", self.switch_off),
             Safeguard("arm stopped", self.robot.stop),
         ]
+
+    def switch_off(self) -> None:
+        """Lights off, and since when they are is noted."""
+        begun_ns = self.clock.now_ns()
+        self.ledbox.lights_off()
+        self.switched_off_ns.append((begun_ns, self.clock.now_ns()))
 
     def make_safe(self) -> None:
         """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails
@@ -177,5 +187,19 @@ def _get_world(cell: Cell, job: Job | None, sensor: Sensor, *, dry_run: bool, sp
     with (
         frozen(world_config(cell, job, sensor, dry_run=dry_run, speed=speed), cell.files) as config,
         under_way("world", "start", _WORLD_STARTS_S),
+        _told_if_slow(),
     ):
         return world_class.start(config)
+
+
+@contextmanager
+def _told_if_slow() -> Iterator[None]:
+    """Whoever waits for a simulated cell hears what for."""
+    words = "the simulated cell compiles its code, once on a machine: a minute or two, longer on a busy one ..."
+    timer = threading.Timer(_SLOW_START_S, alarm, (words,))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

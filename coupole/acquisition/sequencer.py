@@ -151,6 +151,7 @@ class Sequencer:
         self.outcome.ideal_s += visit.leg.duration_s + dwell_s + sum(burst.duration_s for burst in left)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
+        self._recorder.commit(now=True)  # what the arm is about to do is on the disk before it moves
         self._burst_runner.prepare(left[0])
         settled = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
         self._ahead_s -= self._motion_s(visit)

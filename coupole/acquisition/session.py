@@ -44,6 +44,7 @@ from coupole.errors import (
     DeviceError,
     Interrupted,
     PreflightRefused,
+    StorageError,
 )
 from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.schedule import Schedule
@@ -280,6 +281,17 @@ def _acquire(
             (sequencer.give_up if left_behind() else sequencer.conclude)(recorder.committed)
             found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, ended)
+            _say_what_comes_first(job, faults)
+
+
+def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
+    """A run whose arm is in a fault is not resumed before a person has confirmed it."""
+    with contextlib.suppress(StorageError):
+        if bounded(faults.standing):
+            alarm(
+                f"  first   coupole confirm {job.cell.document.path} --name NAME   "
+                "(the arm is in a fault: find the cause, see that the cell is clear)"
+            )
 
 
 def _refuse_unsafe_end(cell: OpenedCell) -> None:

@@ -1,4 +1,4 @@
-"""Values that the shell completes: formats, templates, plans and runs."""
+"""Values that the shell completes: formats, fits, templates, plans and runs."""
 
 from __future__ import annotations
 
@@ -13,6 +13,21 @@ def formats(incomplete: str) -> list[str]:
     from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 
     return _beginning({*OF_RUNS, *OF_RESULTS_OF_RUNS, *OF_PICTURES}, incomplete)
+
+
+def fits(incomplete: str) -> list[tuple[str, str]]:
+    """Fits of `coupole reflectance relight --fit`, with what they are."""
+    from coupole.reflectance.fits import FITS, RELIT
+
+    titles = {name: fit.title for name, fit in FITS.items()}
+    return [(name, titles.get(name, "of clusters")) for name in RELIT if name.startswith(incomplete)]
+
+
+def materials(incomplete: str) -> list[tuple[str, str]]:
+    """Fits that `coupole export --fit` takes."""
+    from coupole.reflectance.fits import MATERIALS
+
+    return [(name, title) for name, title in fits(incomplete) if name in MATERIALS]
 
 
 def templates(incomplete: str) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from coupole.commands.common import RecordsOption
-from coupole.commands.completion import formats
+from coupole.commands.completion import formats, materials
 from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 from coupole.exchange.of_results import OF_MATERIALS
 
@@ -37,7 +37,10 @@ ShotsOption = Annotated[
 FitOption = Annotated[
     str | None,
     typer.Option(
-        "--fit", help="Of results: ggx or ggx_normal; without it what missed least.", rich_help_panel=_PARTS
+        "--fit",
+        autocompletion=materials,
+        help="Of results: ggx or ggx_normal; without it what missed least.",
+        rich_help_panel=_PARTS,
     ),
 ]
 TriangleOption = Annotated[

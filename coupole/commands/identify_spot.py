@@ -81,11 +81,12 @@ def _channels_at(spot: Spot) -> tuple[np.ndarray, np.ndarray]:
     import h5py
     import numpy as np
 
+    from coupole.reflectance.fits import GGX_NORMAL
     from coupole.reflectance.new_light.light_kinds import place_of
-    from coupole.reflectance.run_result import MATERIALS, OBJECT, RunResult
+    from coupole.reflectance.run_result import OBJECT, RunResult
 
     result = RunResult(spot.result)
-    name = MATERIALS[1]
+    name = GGX_NORMAL.name
     for path in (spot.result / OBJECT, result.materials_path(name)):
         if not path.is_file():
             raise InputError(f"{path}: is not there; expected a fitted result of runs")

@@ -191,11 +191,11 @@ def fit(
     """The second step alone: materials of each triangle, and the slice of reflectance that each view has seen."""
 
     def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.fits import FITS
         from coupole.reflectance.run_fits import fit_result
-        from coupole.reflectance.run_result import FITS
 
         fit_result(result, workers.memory_bytes, scheduler=workers.scheduler, say=say)
-        return {"fits": FITS}
+        return {"fits": list(FITS)}
 
     _do(step, as_json=as_json)
 

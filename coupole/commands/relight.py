@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coupole.commands.common import JsonOption, ResultArgument, fail
+from coupole.commands.completion import fits
 from coupole.commands.option_groups import flattened
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
 from coupole.commands.relit_result import Relit, opened
@@ -82,6 +83,7 @@ FitOption = Annotated[
     str | None,
     typer.Option(
         "--fit",
+        autocompletion=fits,
         help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; without it the one "
         "that missed least in the check (of the first two with --uncertainty).",
     ),

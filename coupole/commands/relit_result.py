@@ -38,11 +38,11 @@ def opened(
 ) -> Relit:
     """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
     InputError: no result, or one that has no such view, fit, camera or uncertainty."""
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
+    from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
 
     if (result / run_result.OBJECT).exists():
         if uncertain:
-            fit = fit or run_relighting.best_fit(run_result.RunResult(result), run_result.MATERIALS)
+            fit = fit or run_relighting.best_fit(run_result.RunResult(result), fits.MATERIALS)
             relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
         return _of_runs(result, view, fit, camera, samples)
     given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coupole.reflectance.extraction.sample_codes import BY_UNKNOWN
+from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import CONTRADICTED, SAMPLES, RunResult, ViewSamples
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
@@ -98,7 +99,7 @@ class Found:
 
 def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
     """By `ggx_normal`."""
-    materials = result.materials("ggx_normal", np.searchsorted(result.triangles, view.triangles[rows]))
+    materials = result.materials(GGX_NORMAL.name, np.searchsorted(result.triangles, view.triangles[rows]))
     samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
     with h5py.File(view.path, "r") as file:
         dark = contradicted(samples, materials, file["u_own"][rows], beside)

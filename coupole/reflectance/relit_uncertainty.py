@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.reflectance.fits import MATERIALS
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.new_light.light_kinds import AnyLight
 from coupole.reflectance.new_light.shading import Picture, coats_of
 from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, materials_of
-from coupole.reflectance.run_result import MATERIALS, RunResult
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import refuse_without_uncertainty
 from coupole.reflectance.triangle_fit import TriangleMaterials
 

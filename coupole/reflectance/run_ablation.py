@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.fits import FITS, MATERIALS, SLICES
 from coupole.reflectance.least_squares import one_thread
 from coupole.reflectance.result_folder import read_settings
-from coupole.reflectance.run_result import FITS, SLICES, RunResult
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.slice_basis import fewer
 from coupole.reflectance.slice_fit import fit_slices, slice_values
-from coupole.reflectance.triangle_fit import TriangleSamples, fit_triangles, model_values
+from coupole.reflectance.triangle_fit import TriangleSamples
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import write_synced
 
@@ -140,8 +141,7 @@ def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)
     given = replace(case.samples, values=values.astype(np.float32))
     models = {
-        "ggx": model_values(given, fit_triangles(given, used, None, threads=1)),
-        "ggx_normal": model_values(given, fit_triangles(given, used, noise_um, threads=1)),
+        name: fit.values(given, fit.fit(given, used, noise_um, threads=1)) for name, fit in MATERIALS.items()
     }
     made = {name: np.full(values.shape, np.nan, np.float32) for name in SLICES} | models
     for view in range(len(given.cameras_mm)):
@@ -153,9 +153,9 @@ def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]
             view_of=given.view_of[mine] * 0,
             cameras_mm=given.cameras_mm[view][None],
         )
-        for name, kind in SLICES.items():
-            model = None if kind.over is None else models[kind.over][:, mine]
-            basis = fewer(kind.basis, variant.coefficients)
+        for name, fit in SLICES.items():
+            model = None if fit.over is None else models[fit.over.name][:, mine]
+            basis = fewer(fit.basis, variant.coefficients)
             coefficients = fit_slices(seen, used[mine], (basis, model), threads=1)[0]
             made[name][:, mine] = slice_values(seen, coefficients, basis, model)
     wanted = case.samples.values[:, case.held]

@@ -22,11 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.reflectance.fits import FITS, GGX, MATERIALS
 from coupole.reflectance.material_uncertainty import relative_uncertainty
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_pictures import held_out, read_check_frames
-from coupole.reflectance.run_result import ABOUT, FITS, MATERIALS, SCHEMA, RunResult, ViewSamples
+from coupole.reflectance.run_result import ABOUT, SCHEMA, RunResult, ViewSamples
 from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
 from coupole.reflectance.triangle_fit import TriangleSamples
 from coupole.storage.disk_errors import disk_error
@@ -214,7 +215,7 @@ def _about(
         **settings,
         "views": views,
         "triangles": len(result.triangles),
-        "not_fitted": int(np.count_nonzero(~np.isfinite(result.materials("ggx").alpha))),
+        "not_fitted": int(np.count_nonzero(~np.isfinite(result.materials(GGX.name).alpha))),
         "samples": sum(view["samples"] for view in views),
         "residual": {name: _median(values[np.isfinite(values)]) for name, values in left.items()},
         "mae": {name: missed.mae for name, missed in check.pictures.items()},

@@ -21,6 +21,7 @@ from coupole.reflectance.clustering import (
     nearest_cluster,
     pool_samples,
 )
+from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.pair_harmonics import USUAL_DEGREES, fit_pairs, pair_values
 from coupole.reflectance.result_folder import complete, read_settings
 from coupole.reflectance.run_pictures import held_out
@@ -35,7 +36,7 @@ FEWEST_TO_BORROW = 4
 """Samples that tell which cluster a triangle belongs to."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
 """Of clusters whose number is not given: as the paper has them, and some for small objects."""
-_FROM = "ggx_normal"
+_FROM = GGX_NORMAL.name
 _WAYS = ("own", "clustered", "harmonics", "borrowed")
 """To make what a triangle shows, each judged by itself."""
 

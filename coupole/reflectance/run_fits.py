@@ -1,4 +1,4 @@
-"""The fits of a result of runs, each a file of its own, and what they give in a direction."""
+"""Makes the fits of a result of runs, each a file of its own; and what they give in a direction."""
 
 from __future__ import annotations
 
@@ -16,16 +16,24 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.contradictions import Found, find, leave_out
+from coupole.reflectance.fits import (
+    CLUSTERED,
+    FITS,
+    GGX_NORMAL,
+    MATERIALS,
+    MaterialFit,
+    ViewFit,
+    fitted_together,
+)
 from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
 from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
-from coupole.reflectance.run_result import MATERIALS, SLICES, RunResult, ViewSamples
+from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.run_result_files import begin_slices, write_materials
-from coupole.reflectance.slice_fit import fit_slices, slice_values
+from coupole.reflectance.slice_fit import fit_slices
 from coupole.reflectance.triangle_fit import (
     TriangleMaterials,
     TriangleSamples,
-    fit_triangles,
     joined,
     model_values,
     recoloured,
@@ -34,9 +42,6 @@ from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
 
 Floats = NDArray[np.float64]
-
-TOGETHER = (("sh",), ("rbf", "ggx_rbf"))
-"""Names in `SLICES` that share their functions, fitted in one pass."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +69,9 @@ def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, sa
         with workshop(scheduler) as shop:
             shop.refuse_blind(result.folder, SETTINGS)
             clear_remains(out)
-            for name in MATERIALS:
-                if not result.materials_path(name).exists():
-                    _fit_materials(result, job, name, shop, say)
+            for fit in MATERIALS.values():
+                if not result.materials_path(fit.name).exists():
+                    _fit_materials(result, job, fit, shop, say)
             _leave_out(result, job, shop, say)
             _fit_slices(RunResult(result.folder), job, shop, say)
             shop.everywhere(_opened.cache_clear)
@@ -80,45 +85,39 @@ def predicted(
     """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
     their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
-    if name == "clusters":
-        own = result.materials("ggx_normal", places)
+    if name == CLUSTERED:
+        own = result.materials(GGX_NORMAL.name, places)
         return model_values(samples, result.clusters.at(own, samples.normals, places))
-    kind = SLICES.get(name)
-    material = name if kind is None else kind.over
-    model = None
-    if material is not None:
-        model = model_values(samples, result.materials(material, places))
-    if kind is None:
-        assert model is not None
-        return model
-    coefficients = result.slices(name, view, rows)
-    return slice_values(samples, coefficients, kind.basis, model)
+    fit = FITS[name]
+    if isinstance(fit, MaterialFit):
+        return fit.values(samples, result.materials(name, places))
+    return fit.values(samples, result.slices(name, view, rows), _under(result, fit, view, rows, samples))
 
 
-def _fit_materials(result: RunResult, job: _Job, name: str, shop: Workshop, say: Said) -> None:
+def _fit_materials(result: RunResult, job: _Job, made: MaterialFit, shop: Workshop, say: Said) -> None:
     parts: list[TriangleMaterials] = []
     uncertain: list[MaterialUncertainty] = []
     blocks = list(result.blocks(job.memory_bytes, shop.most_rows(len(result.triangles))))
-    fit = partial(_materials_block, job, name == "ggx_normal", shop.threads)
+    fit = partial(_materials_block, job, made, shop.threads)
     for block, found in zip(blocks, shop.map(fit, blocks), strict=True):
         parts.append(found)
-        say(f"fit {name}", block.stop, len(result.triangles))
-    if name == "ggx_normal":
+        say(f"fit {made.name}", block.stop, len(result.triangles))
+    if made.fits_normals:
         whole = joined(parts)
         normals = unbiased_normals(whole, *_mesh(result), job.noise_um)
         parts = [replace(part, normals=normals[block]) for part, block in zip(parts, blocks, strict=True)]
     tasks = list(zip(blocks, parts, strict=True))
-    finish = partial(_uncertain_block, job, name == "ggx_normal", shop.threads)
+    finish = partial(_uncertain_block, job, made, shop.threads)
     for number, (block, (materials, one)) in enumerate(zip(blocks, shop.map(finish, tasks), strict=True)):
         parts[number] = materials
         uncertain.append(one)
-        say(f"uncertainty of {name}", block.stop, len(result.triangles))
+        say(f"uncertainty of {made.name}", block.stop, len(result.triangles))
     u_triangle = np.concatenate([result.u_triangles(block) for block in blocks])
 
     def write(path: Path) -> None:
         write_materials(path, parts, uncertain, u_triangle, result.u_shared, result.triangles)
 
-    complete(result.materials_path(name), write)
+    complete(result.materials_path(made.name), write)
 
 
 def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
@@ -129,28 +128,28 @@ def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
     return across / np.maximum(twice, 1e-300)[:, None], corners.mean(axis=1), 0.5 * twice
 
 
-def _materials_block(job: _Job, fitted_normals: bool, threads: int | None, block: slice) -> TriangleMaterials:
+def _materials_block(job: _Job, made: MaterialFit, threads: int | None, block: slice) -> TriangleMaterials:
     result = _opened(job.folder, job.token)
     used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
-    return fit_triangles(result.samples(block), used, job.noise_um if fitted_normals else None, threads=threads)
+    return made.fit(result.samples(block), used, job.noise_um, threads)
 
 
 def _uncertain_block(
-    job: _Job, fitted_normals: bool, threads: int | None, task: tuple[slice, TriangleMaterials]
+    job: _Job, made: MaterialFit, threads: int | None, task: tuple[slice, TriangleMaterials]
 ) -> tuple[TriangleMaterials, MaterialUncertainty]:
     """Materials of a block with the normals that they shall have: fitted ones without what they have in common."""
     block, materials = task
     result = _opened(job.folder, job.token)
     used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
     samples = result.samples(block)
-    if fitted_normals:
+    if made.fits_normals:
         materials = recoloured(samples, used, materials, materials.normals, threads=threads)
     return materials, covariances(
         samples,
         used,
         materials,
         job.noise_um,
-        fitted_normals=fitted_normals,
+        fitted_normals=made.fits_normals,
         middle_mm=result.middle_mm,
         threads=threads,
     )
@@ -186,57 +185,56 @@ def _blocks_of_views(
 def _fit_slices(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
     """All views in one go: no worker waits for the last block of each."""
     tasks = []
-    for names in TOGETHER:
+    for together in fitted_together():
         left = [
             number
             for number, view in enumerate(result.views)
-            if not all(result.slices_path(name, view).exists() for name in names)
+            if not all(result.slices_path(fit.name, view).exists() for fit in together)
         ]
-        tasks += [(names, *block) for block in _blocks_of_views(result, left, job.memory_bytes, shop)]
+        tasks += [(together, *block) for block in _blocks_of_views(result, left, job.memory_bytes, shop)]
     done = zip(tasks, shop.map(partial(_slices_block, job, shop.threads), tasks), strict=True)
-    for (names, number), blocks in groupby(done, key=lambda one: one[0][:2]):
-        fits = ((rows, found) for (_, _, rows), found in blocks)
-        _write_slices(result, names, result.views[number], fits, say)
+    for (together, number), blocks in groupby(done, key=lambda one: one[0][:2]):
+        found = ((rows, coefficients) for (_, _, rows), coefficients in blocks)
+        _write_slices(result, together, result.views[number], found, say)
 
 
 def _write_slices(
     result: RunResult,
-    names: Sequence[str],
+    fits: Sequence[ViewFit],
     view: ViewSamples,
-    fits: Iterable[tuple[slice, list[NDArray[np.float32]]]],
+    of_fits: Iterable[tuple[slice, list[NDArray[np.float32]]]],
     say: Said,
 ) -> None:
     with ExitStack() as files:
         coefficients = []
-        for name in names:
-            path = result.slices_path(name, view)
+        for fit in fits:
+            path = result.slices_path(fit.name, view)
             make_folder(path.parent)
             part = files.enter_context(in_the_making(path))
             file = files.enter_context(h5py.File(part, "w"))
-            coefficients.append(begin_slices(file, SLICES[name], view, result.channels))
-        for rows, of_names in fits:
-            for data, found in zip(coefficients, of_names, strict=True):
+            coefficients.append(begin_slices(file, fit, view, result.channels))
+        for rows, of_rows in of_fits:
+            for data, found in zip(coefficients, of_rows, strict=True):
                 data[rows] = found
-            say(f"fit {', '.join(names)} of {view.view}", rows.stop, len(view.triangles))
+            say(f"fit {', '.join(fit.name for fit in fits)} of {view.view}", rows.stop, len(view.triangles))
 
 
 def _slices_block(
-    job: _Job, threads: int | None, task: tuple[Sequence[str], int, slice]
+    job: _Job, threads: int | None, task: tuple[Sequence[ViewFit], int, slice]
 ) -> list[NDArray[np.float32]]:
-    names, number, rows = task
+    together, number, rows = task
     result = _opened(job.folder, job.token)
     view = result.views[number]
     samples = result.view_samples(view, rows)
-    fits = [(SLICES[name].basis, _under(result, name, view, rows, samples)) for name in names]
+    fits = [(fit.basis, _under(result, fit, view, rows, samples)) for fit in together]
     return fit_slices(samples, ~np.isin(view.leds, job.left_out), *fits, threads=threads)
 
 
 def _under(
-    result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
+    result: RunResult, fit: ViewFit, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32] | None:
     """What the material gives that a fit is added to."""
-    over = SLICES[name].over
-    return None if over is None else predicted(result, over, view, rows, samples)
+    return None if fit.over is None else predicted(result, fit.over.name, view, rows, samples)
 
 
 @lru_cache(maxsize=1)

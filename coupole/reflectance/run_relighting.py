@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -12,6 +12,16 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.motion.packet_rays import PacketMesh
+from coupole.reflectance.fits import (
+    ANYWHERE,
+    CLUSTERED,
+    FITS,
+    GGX_NORMAL,
+    MATERIALS,
+    PAIR_HARMONICS,
+    RELIT,
+    ViewFit,
+)
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.new_light.beams import Beam, Lighting, lighting_of
 from coupole.reflectance.new_light.light_kinds import AnyLight
@@ -35,35 +45,29 @@ from coupole.reflectance.new_light.shading import (
 )
 from coupole.reflectance.new_light.shadow_edges import reached
 from coupole.reflectance.pair_harmonics import pair_values
-from coupole.reflectance.run_result import FITS, MATERIALS, SLICES, RunResult, ViewSamples, read_about
-from coupole.reflectance.slice_fit import slice_values
+from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
 Say = Callable[[int, int], None]
 SAMPLES = 256
 """Beams of an area or an environment."""
-CLUSTERED = "clusters"
-HARMONICS = "harmonics"
-"""Of both directions, of clusters."""
-ANYWHERE = (*MATERIALS, CLUSTERED, HARMONICS)
-"""Fits that hold from everywhere; the others hold for the view that they were fitted to."""
 _FAR_MM = 1e5
 """Where distant light is for a slice."""
 _TRIANGLES = 1 << 13
 
 
-def best_fit(result: RunResult, among: Sequence[str] = FITS) -> str:
+def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
     """The one that missed least under the LEDs kept for the check; GGX with its normal if none were."""
     known = read_about(result.folder)["mae"].items()
     missed = {name: mae for name, mae in known if mae is not None and name in among}
-    return min(missed, key=missed.__getitem__, default="ggx_normal")
+    return min(missed, key=missed.__getitem__, default=GGX_NORMAL.name)
 
 
 @dataclass(frozen=True)
 class Slices:
     """A fit to one view by itself."""
 
-    name: str
+    fit: ViewFit
     coefficients: NDArray[np.float32]
     under: TriangleMaterials | None
     """What they are added to."""
@@ -175,7 +179,7 @@ def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) 
     under = None
     if reflecting.under is not None:
         under = model_values(light, reflecting.under.at(np.arange(part.start, part.start + len(light.values))))
-    return slice_values(light, reflecting.coefficients[part], SLICES[reflecting.name].basis, under)
+    return reflecting.fit.values(light, reflecting.coefficients[part], under)
 
 
 def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
@@ -190,15 +194,13 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
     surface = surface_of_view(result, mine)
     order = (mine, *(one for one in result.views if one is not mine))
     mesh = PacketMesh(result.corners_mm, compact=False)
-    if name in ANYWHERE:
+    made = FITS.get(name)
+    if not isinstance(made, ViewFit):
         return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, mesh)
     if not result.slices_path(name, mine).exists():
         raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
-    over, coefficients = SLICES[name].over, result.slices(name, mine)
-    slices = Slices(name, coefficients, None)
-    if over is not None:
-        slices = Slices(name, coefficients, materials_of(result, over, surface))
-    return RelitScene(result, name, surface, slices, order, mesh)
+    under = None if made.over is None else materials_of(result, made.over.name, surface)
+    return RelitScene(result, name, surface, Slices(made, result.slices(name, mine), under), order, mesh)
 
 
 def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
@@ -216,12 +218,12 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
 
 
 def _refuse_unknown(fit: str | None) -> None:
-    if fit is not None and fit not in (known := (*FITS, CLUSTERED, HARMONICS)):
-        raise InputError(f"--fit: expected one of {', '.join(known)}; got {fit!r}")
+    if fit is not None and fit not in RELIT:
+        raise InputError(f"--fit: expected one of {', '.join(RELIT)}; got {fit!r}")
 
 
 def _from_anywhere(result: RunResult, name: str, surface: Surface) -> Coats | Pairs:
-    if name != HARMONICS:
+    if name != PAIR_HARMONICS:
         return coats_of(materials_of(result, name, surface))
     normals = materials_of(result, CLUSTERED, surface).normals
     places = np.searchsorted(result.triangles, surface.triangles)
@@ -231,7 +233,7 @@ def _from_anywhere(result: RunResult, name: str, surface: Surface) -> Coats | Pa
 def materials_of(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
     """Of the surface's triangles. Raises InputError if there are none."""
     places = np.searchsorted(result.triangles, surface.triangles)
-    own = "ggx_normal" if name == CLUSTERED else name
+    own = GGX_NORMAL.name if name == CLUSTERED else name
     if not result.materials_path(own).exists():
         raise InputError(f"{result.folder}: has no fit {own}; `coupole reflectance fit {result.folder}` makes it")
     materials = result.materials(own, places)

@@ -17,31 +17,12 @@ from numpy.typing import NDArray
 from coupole.errors import InputError, Problem, reason
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.cluster_file import Clusters, read_clusters
+from coupole.reflectance.fits import MATERIALS, SLICES
 from coupole.reflectance.ggx import UNKNOWNS
-from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples
 
 SCHEMA = "coupole-reflectance-run/1"
 ABOUT, REPORT, OBJECT = "result.json", "report.html", "object.h5"
-MATERIALS = ("ggx", "ggx_normal")
-"""Fits to the samples of all views: GGX with the mesh's normals, and with normals that are fitted too."""
-
-
-@dataclass(frozen=True)
-class SliceKind:
-    """A fit to the samples of each view by itself."""
-
-    basis: Basis
-    over: str | None = None
-    """The material that it is added to; it was fitted to what that left."""
-
-
-SLICES = {
-    "sh": SliceKind(HARMONICS),
-    "rbf": SliceKind(RADIAL),
-    "ggx_rbf": SliceKind(RESIDUAL, over="ggx_normal"),
-}
-FITS = (*MATERIALS, *SLICES)
 FRAMES = "samples/frames"
 """Folder of the pictures that the fits are compared with."""
 Block = slice | NDArray[np.int64]
@@ -317,7 +298,7 @@ class RunResult:
         one that an earlier version made."""
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
-            if file["coefficients"].shape[-1] != COUNT + (SLICES[name].over is not None):
+            if file["coefficients"].shape[-1] != SLICES[name].coefficients:
                 raise InputError(f"{path}: an earlier version made it; make the result anew")
             return np.asarray(file["coefficients"][rows], np.float32)
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.reflectance.fits import ViewFit
 from coupole.reflectance.material_uncertainty import MaterialUncertainty
-from coupole.reflectance.run_result import FIELDS, LOWER, UNCERTAIN, SliceKind, ViewSamples
-from coupole.reflectance.slice_basis import COUNT, centres
+from coupole.reflectance.run_result import FIELDS, LOWER, UNCERTAIN, ViewSamples
+from coupole.reflectance.slice_basis import centres
 from coupole.reflectance.triangle_fit import TriangleMaterials
 
 
@@ -52,21 +53,21 @@ def write_materials(
         )
 
 
-def begin_slices(file: h5py.File, kind: SliceKind, view: ViewSamples, channels: int) -> h5py.Dataset:
+def begin_slices(file: h5py.File, fit: ViewFit, view: ViewSamples, channels: int) -> h5py.Dataset:
     """Describe a fit of a view in a new file; where its coefficients [triangles, channels, ...] go."""
-    shape = (len(view.triangles), channels, COUNT + (kind.over is not None))
+    shape = (len(view.triangles), channels, fit.coefficients)
     data = file.create_dataset("coefficients", shape, np.float32, fillvalue=np.nan, track_times=False)
     data.attrs["told"] = "[triangles of the view, channels, coefficients] 1/sr; NaN where too few samples are"
-    if kind.over is not None:
+    if fit.over is not None:
         data.attrs["last"] = "the share of the fit `added_to` that is in the sum"
     data.attrs["basis"] = (
         "real spherical harmonics, orthonormal, degrees 0 to 9, order by order"
-        if kind.basis.harmonic
+        if fit.basis.harmonic
         else "-r to each of `centres`, then 1, x, y, z"
     )
     data.attrs["frame"] = "z the mesh's normal, x towards the camera along the surface"
-    data.attrs["added_to"] = kind.over or ""
-    if not kind.basis.harmonic:
+    data.attrs["added_to"] = fit.over.name if fit.over else ""
+    if not fit.basis.harmonic:
         file.create_dataset("centres", data=centres(), track_times=False)
     return data
 

@@ -91,7 +91,7 @@ class ArmFaults:
             raise DeviceFault(
                 "robot",
                 expected="the word of a person who has been to the cell",
-                happened=f"since {standing[-1].t} the arm is in a fault: {standing[-1].message}",
+                happened=f"since {standing[-1].t} the arm is in a fault: {standing[-1].message.rstrip('.')}",
                 remedy=f"Find the cause, see that the cell is clear, then say `coupole confirm {rig} --name NAME` "
                 "(`--yes` does not).",
             )

@@ -11,13 +11,11 @@ from typing import Any
 
 from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
+from coupole.reflectance.fits import FITS
 from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE
-from coupole.viewing.run_reflectance_page import TOLD
 
 PAGE = "ablation.html"
-_COLOURS = {"sh": "#0072b2", "rbf": "#d55e00", "ggx_rbf": "#009e73", "ggx": "#999999", "ggx_normal": "#cc79a7"}
-"""Okabe and Ito's, which the colour-blind tell apart."""
 
 
 def write(folder: Path, told: dict[str, Any]) -> Path:
@@ -42,9 +40,10 @@ def _page(name: str, told: dict[str, Any]) -> Iterator[str]:
     for setting, steps in told["mae"].items():
         yield f"<h2>{html.escape(setting)}</h2><table><tr><th>"
         yield "".join(f"<th>{value:g}" for value, _ in steps)
-        for fit, text in TOLD.items():
-            yield f"<tr><th>{html.escape(text)}"
-            yield "".join("<td>" if of[fit] is None else f"<td>{100 * of[fit]:.3f}" for _, of in steps)
+        for fit in FITS.values():
+            yield f"<tr><th>{html.escape(fit.title)}"
+            errors = [of[fit.name] for _, of in steps]
+            yield "".join("<td>" if error is None else f"<td>{100 * error:.3f}" for error in errors)
         yield "</table>"
     yield (
         "<p>Published (seed 003, 6.3 and 6.4): with half of the photos radial functions miss least of the three "
@@ -60,9 +59,10 @@ def _drawn(mae: dict[str, Any]) -> bytes:
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     for ax, (setting, steps) in zip(figure.subplots(1, len(mae), sharey=True), mae.items(), strict=True):
-        for fit, text in TOLD.items():
-            known = [(value, 100 * of[fit]) for value, of in steps if of[fit] is not None]
-            ax.plot(*zip(*known, strict=True) if known else ([], []), marker="o", label=text, color=_COLOURS[fit])
+        for name, fit in FITS.items():
+            known = [(value, 100 * of[name]) for value, of in steps if of[name] is not None]
+            places = zip(*known, strict=True) if known else ([], [])
+            ax.plot(*places, marker="o", label=fit.title, color=fit.colour)
         ax.set_xlabel(setting)
         ax.set_yscale("log")
         ax.spines[["top", "right"]].set_visible(False)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.extraction.lamp_sight import lit_on
+from coupole.reflectance.fits import FITS, GGX, GGX_NORMAL, MATERIALS
 from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_pictures import read_check_frames
-from coupole.reflectance.run_result import FITS, MATERIALS, REPORT, RunResult, read_about
+from coupole.reflectance.run_result import REPORT, RunResult, read_about
 from coupole.reflectance.triangle_fit import FEWEST
 from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE, display, figure, grey
@@ -28,15 +29,6 @@ LEAST_KS = 0.004
 """A tenth of a dielectric's: below it the roughness says nothing."""
 _VARIANCES = [0, 2, 5, 9, 14]
 """Places in the lower half of a covariance."""
-TOLD = {
-    "ggx": "GGX, mesh's normals",
-    "ggx_normal": "GGX, normals fitted",
-    "sh": "spherical harmonics",
-    "rbf": "radial functions",
-    "ggx_rbf": "GGX, normals fitted, with radial functions of what is left",
-}
-
-
 PUBLISHED = (
     ("the paper, scanner of 30 um", (-10.66, 14.00), (-15.23, 22.42), "57 to 74 % without vertices"),
     ("the paper, scanner of 20 um", (-8.11, 9.51), None, ""),
@@ -74,7 +66,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         if mae is not None:
             psnr_db = about["held_out_psnr_db"][name]
             off = f"off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
-            yield f"{TOLD[name]}: under the LEDs kept for the check {off}"
+            yield f"{FITS[name].title}: under the LEDs kept for the check {off}"
     if interval := about["median_interval_percent"]:
         yield (
             f"95 % interval of the median sample: {_bounds([interval['low'], interval['high']])}, if the mesh's "
@@ -158,7 +150,7 @@ def _material_uncertainty(about: dict[str, Any]) -> Iterator[str]:
     )
     for name, known in about["material_uncertainty"].items():
         if known["normal_deg"] is not None:
-            yield f"<tr><th>{TOLD[name]}<td>{known['normal_deg']:.2f}"
+            yield f"<tr><th>{FITS[name].title}<td>{known['normal_deg']:.2f}"
             each = (known[f"{field}_percent"] for field in ("kd", "ks", "alpha"))
             yield "".join("<td>" if percent is None else f"<td>{percent:.1f} %" for percent in each)
             inside = about["held_out_inside"][name]
@@ -184,7 +176,7 @@ def _missed(about: dict[str, Any]) -> Iterator[str]:
     for name, mae in about["mae"].items():
         if mae is not None:
             psnr_db, of_triangles = about["held_out_psnr_db"][name], about["mae_of_triangles"][name]
-            yield f"<tr><th>{TOLD[name]}<td>{100 * mae:.3f}<td>{psnr_db:.1f}<td>{100 * of_triangles:.3f}"
+            yield f"<tr><th>{FITS[name].title}<td>{100 * mae:.3f}<td>{psnr_db:.1f}<td>{100 * of_triangles:.3f}"
     if (noise := about["mae_of_noise"]) is not None:
         yield f"<tr><th>the camera's noise alone<td>{100 * noise:.3f}"
     yield "</table><p>Pictures are compared by blocks of 2 x 2 pixels, one pixel of each channel (seed 003, 6.3)."
@@ -211,7 +203,7 @@ def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iter
     for name in FITS:
         made = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)
         off = np.where(shown, np.abs(made - measured), 0.0).mean(axis=2)
-        yield figure(TOLD[name], display(_rgb(np.nan_to_num(np.where(shown, made, 0.0))), white))
+        yield figure(FITS[name].title, display(_rgb(np.nan_to_num(np.where(shown, made, 0.0))), white))
         yield figure("off", grey(np.nan_to_num(off) / (0.1 * white)))
 
 
@@ -223,9 +215,9 @@ def _fields(path: Path) -> dict[str, NDArray[Any]]:
 def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]:
     with h5py.File(path, "r") as file:
         seen, triangles = file["seen"][()], file["triangles"][()]
-    found = fits["ggx_normal"]
+    found = fits[GGX_NORMAL.name]
     row = np.searchsorted(found["triangles"], triangles)
-    mesh, fitted = fits["ggx"]["normals"][row], found["normals"][row]
+    mesh, fitted = fits[GGX.name]["normals"][row], found["normals"][row]
     kd, ks = (_rgb(found[name][row]) for name in ("kd", "ks"))
     uncertain = np.sqrt(found["covariance"][row][:, _VARIANCES])
     yield figure("normals of the mesh", _picture(seen, 0.5 + 0.5 * mesh))

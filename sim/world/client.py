@@ -10,13 +10,15 @@ import sys
 from pathlib import Path
 from typing import IO, Any
 
-from coupole.errors import DeviceError, DeviceLost, DeviceTimeout
+from coupole.errors import DeviceLost, DeviceTimeout
 from sim.world.clock import SharedClock
 from sim.world.config import Config, Settings
 
 __all__ = ["Config", "Settings", "World"]
 
-_START_TIMEOUT_S = 180.0
+_START_TIMEOUT_S = 900.0
+"""At its first start on a machine a world compiles its code: a minute or two, on a busy machine many."""
+_ANSWER_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 5.0
 
 
@@ -42,9 +44,11 @@ class World:
         process.stdin.flush()
         try:
             return World(_first_line(process.stdout), process)
-        except DeviceError:
+        except BaseException:
             process.kill()
             process.wait()
+            process.stdin.close()
+            process.stdout.close()
             raise
 
     @staticmethod
@@ -65,7 +69,7 @@ class World:
         """Send a command on the control connection: `state`, `light`, `fault`, `exposures`, `edges`, `reset_robot`
         or `stop`."""
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
-            link.settimeout(_START_TIMEOUT_S)
+            link.settimeout(_ANSWER_TIMEOUT_S)
             try:
                 link.connect(self.endpoints["control"]["address"])
                 link.send(json.dumps({"do": do, **arguments}).encode())

@@ -303,11 +303,11 @@ def main() -> int:
     config = Config.model_validate_json(sys.stdin.readline())
     for number in _ENDING:
         signal.signal(number, lambda *_: sys.exit(0))  # until there is a world to stop
+    threading.Thread(target=_end_when_parent_is_gone, daemon=True).start()
     with world_folder() as folder:
         world = World(config, folder)
         for number in _ENDING:
             signal.signal(number, lambda *_: world.reactor.stop())
-        threading.Thread(target=_stop_when_parent_is_gone, args=(world.reactor,), daemon=True).start()
         print(json.dumps(world.endpoints), flush=True)
         try:
             world.reactor.run()
@@ -316,11 +316,12 @@ def main() -> int:
     return 0
 
 
-def _stop_when_parent_is_gone(reactor: Reactor) -> None:
+def _end_when_parent_is_gone() -> None:
+    """As a signal does it, so that a world in the making ends too: its code may be compiled for minutes."""
     with contextlib.suppress(OSError):
         while os.read(sys.stdin.fileno(), 4096):
             pass
-    reactor.stop()
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 if __name__ == "__main__":

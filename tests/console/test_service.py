@@ -146,6 +146,24 @@ def test_a_session_that_has_signed_out_and_those_of_a_removed_account_are_over(s
     assert tom.get("/api/v1/state").status == 401
 
 
+def test_numbers_that_no_lamp_gives_are_refused_and_logged(staffed: Staffed) -> None:
+    """NaN had ended in an internal error that no log told of; true had been one lux hour."""
+    ada = staffed.signed_in("Ada")
+    for value in (float("nan"), float("inf"), -1, True, "5", 1e30):
+        for what, more in (("light", {"note": "x"}), ("budget", {})):
+            path = f"/api/v1/objects/relief/{what}"
+            assert ada.post(path, {"dose_lux_h": value, **more}).status == 422, (what, value)
+            last = staffed.audit()[-1]
+            assert (last["name"], last["asked"], last["status"]) == ("Ada", f"POST {path}", 422)
+    assert ada.get("/api/v1/objects/relief/light").document["dose_lux_h"] == 0
+
+
+def test_no_two_accounts_look_alike(staffed: Staffed) -> None:
+    for name in ("ada", "ADA", "Ada ", "\uff21da"):
+        wanted = {"name": name, "password": PASSWORD, "role": "observer"}
+        assert staffed.engineer.post("/api/v1/accounts", wanted).status == 422, name
+
+
 # -- requests that are forged ---------------------------------------------------------------------------------
 
 

@@ -14,7 +14,8 @@ from residual_cases import write_backscatter
 from scipy.interpolate import RegularGridInterpolator
 
 from coupole.exchange.look.residual_planes import SIDE, residual_blocks, residual_planes
-from coupole.reflectance.run_result import SLICES, RunResult
+from coupole.reflectance.fits import SLICES
+from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.slice_fit import slice_values
 from coupole.reflectance.triangle_fit import model_values
 

@@ -55,6 +55,7 @@ def test_a_frozen_process_of_the_arm_ends_the_run_with_a_fault_and_the_arm_at_re
         assert seen.wrong == [], seen
         assert not world.ask("state")["arm_moving"]
     assert ended.code == 4
+    assert f"first   coupole confirm {cell.rig} --name NAME" in ended.err
     assert cells.events(cell.run_folder, "fault")[0]["device"] == "robot"
     assert not cells.alive(pid)
 

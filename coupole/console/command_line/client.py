@@ -32,6 +32,10 @@ class NotServed(InputError):
     """No console of the cell is served on this machine by this user."""
 
 
+class NoAnswer(InputError):
+    """The console does not answer, or ended before it did."""
+
+
 class GivenUp(InputError):
     """Whoever waited for an answer does not any more."""
 
@@ -66,7 +70,7 @@ def call(
     given_up: Callable[[], bool] = _never,
 ) -> Any:
     """What the service answers; a person is told on standard error if it does not within 2 s. Raises NotServed;
-    GivenUp; InputError: it refuses, with its words, or does not answer."""
+    GivenUp; NoAnswer; InputError: it refuses, with its words."""
     rig, end_s = cell.document.path, time.monotonic() + patience_s
     place = _place(cell)
     connection = _Local(place, patience_s)
@@ -81,7 +85,7 @@ def call(
     except (NotServed, GivenUp):
         raise
     except (OSError, ValueError, InputError) as error:
-        raise InputError(f"{rig}: its console does not answer: {error}") from error
+        raise NoAnswer(f"{rig}: its console does not answer: {error}") from error
     finally:
         connection.close()
     if reply.status >= 400:
@@ -110,10 +114,16 @@ def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[
                     f"`coupole serve {rig}` does"
                 ) from error
             if time.monotonic() > end_s:
-                raise InputError(f"process {owner} has this cell, but does not listen") from error
+                raise InputError(
+                    f"process {owner} has this cell, but does not listen by the name of {rig}: name the rig that "
+                    "it serves, if that is another one"
+                ) from error
             if not said and time.monotonic() - begun_s > _SAID_AFTER_S:
                 said = True
-                alarm(f"{rig}: its console does not listen yet: {_state_of(owner)}; waiting for it")
+                alarm(
+                    f"{rig}: a console has this cell and does not listen by this rig's name: {_state_of(owner)}. "
+                    "It may be starting, or be that of another rig with the same storage folder; waiting for it"
+                )
         else:
             return
         if given_up():

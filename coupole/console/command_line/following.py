@@ -20,8 +20,8 @@ from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import ask_to_begin, refuse
 from coupole.acquisition.run_control import State, ask
 from coupole.acquisition.signals import obeyed_by
-from coupole.console.command_line.client import GivenUp, NotServed, call
-from coupole.errors import CoupoleError, DeviceError, InputError, Interrupted
+from coupole.console.command_line.client import GivenUp, NoAnswer, NotServed, call
+from coupole.errors import CoupoleError, DeviceError, DeviceLost, InputError, Interrupted, reason
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.checking import preflight_of
@@ -30,7 +30,7 @@ from coupole.storage.run import Run
 from coupole.viewing.keys import obeyed
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Progress
-from coupole.viewing.terminal import RunObserver
+from coupole.viewing.terminal import RunObserver, alarm
 
 _LOOK_EVERY_S, _TRIALS = 0.3, 50
 _PROGRESS_LINE = re.compile(r"view \S+ \(\d+/\d+\) .* frames proven, ")
@@ -104,12 +104,25 @@ class _Followed:
         number = self._entry.get("id")
         for _ in range(_TRIALS if number else 0):
             for method, path in (("POST", f"/api/v1/queue/{number}/stop"), ("DELETE", f"/api/v1/queue/{number}")):
-                with contextlib.suppress(InputError):
+                try:
                     call(self._cell, method, path)
+                except (NotServed, NoAnswer):
+                    if self._run is not None:  # which goes on without the console
+                        with contextlib.suppress(InputError):
+                            ask(self._run, "stop")
+                            return
+                except InputError:
+                    continue
+                else:
                     return
             if self._ended:
                 return
             time.sleep(_LOOK_EVERY_S)
+
+    @property
+    def _run(self) -> Path | None:
+        """That of the entry, once it has one."""
+        return Path(self._entry["run"]) if self._entry.get("run") else None
 
     @property
     def _ended(self) -> bool:
@@ -129,17 +142,29 @@ class _Followed:
         self._conclude(figures, found)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:
-        """Until the entry has ended. Raises Interrupted: it was taken out before it began; InputError: the console
+        """Until the entry has ended. Raises Interrupted: it was taken out before it began; DeviceLost: the console
         has ended, and after it what it had begun."""
+        told = False
         while not self._ended:
             try:
                 yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
-            except NotServed as error:
+            except (NotServed, NoAnswer) as error:
+                run = self._run or "RUN"
+                if self._state() is None and self._control.stop.is_set():
+                    raise self._control.interrupted() from None
                 if self._state() is None:
-                    run = self._entry["run"] or "RUN"
-                    raise InputError(
-                        f"the console has ended: `coupole status {run}` says what became of the run"
+                    raise DeviceLost(
+                        "console",
+                        expected="it to tell how the run ends",
+                        happened=reason(error),
+                        remedy=f"`coupole status {run}` says what became of it, `coupole stop {run}` stops it.",
                     ) from error
+                if not told:
+                    told = True
+                    alarm(
+                        "the console is gone; the run GOES ON, with its arm and lamps. Ctrl-C and q stop it "
+                        f"still, as does `coupole stop {run}`"
+                    )
                 self._show_progress()
             except InputError:
                 if self._control.stop.is_set():
@@ -149,16 +174,16 @@ class _Followed:
 
     def _state(self) -> State | None:
         try:
-            return ask(Path(self._entry["run"]), "state") if self._entry["run"] else None
+            return ask(self._run, "state") if self._run is not None else None
         except InputError:
             return None
 
     def _pause_or_go_on(self) -> None:
         state = self._state()
-        if state is not None:
+        if state is not None and self._run is not None:
             with contextlib.suppress(InputError):
                 paused = state["state"] in ("paused", "pausing")
-                ask(Path(self._entry["run"]), "go-on" if paused else "pause")
+                ask(self._run, "go-on" if paused else "pause")
 
     def _say(self, said: str) -> None:
         """What is new of it, in whole lines."""

@@ -9,6 +9,7 @@ import re
 import secrets
 import threading
 import time
+import unicodedata
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -21,7 +22,7 @@ from coupole.intake.plain_data import read_json
 from coupole.storage.durable import make_folder, write_synced
 
 SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
-_NAME = re.compile(r"[^\W_][\w .'-]{0,63}", re.UNICODE)
+_NAME = re.compile(r"[^\W_](?:[\w .'-]{0,62}[\w.'-])?", re.UNICODE)
 _MOST_FAILURES, _MOST_FROM_ELSEWHERE, _MOST_KEPT, _FORGOTTEN_AFTER_S = 5, 30, 1000, 60.0
 
 
@@ -95,15 +96,17 @@ class Accounts:
     def add(self, name: str, password: str, role: Role) -> Account:
         """A new account, on the disk when this returns. Raises InputError, StorageError."""
         if not _NAME.fullmatch(name):
-            raise InputError("name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first")
+            raise InputError(
+                "name: expected at most 64 letters, digits, spaces, dots, hyphens; a letter first, no space last"
+            )
         if name == FIRST_ENGINEER.name:
             raise InputError(f"name: {name} is whoever signs in with the token")
         if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
             raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
         hashed = self._hasher.hash(password)
         with self._lock:
-            if name in self._stored:
-                raise InputError(f"name: {name} has an account already")
+            if alike := [known for known in self._stored if _seen(known) == _seen(name)]:
+                raise InputError(f"name: {alike[0]} has an account already")
             self._keep({**self._stored, name: {"role": role.word, "password": hashed}})
             if role is Role.ENGINEER:
                 self.first_token = ""
@@ -173,6 +176,11 @@ class Accounts:
 def _key(kept: dict[str, Any]) -> str:
     """Differs for each account, as its password is hashed with a salt of its own."""
     return hashlib.sha256(kept["password"].encode()).hexdigest()
+
+
+def _seen(name: str) -> str:
+    """As a reader sees it: two that differ by capitals, width or spaces alone are one person in a log."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
 def _has_engineer(stored: dict[str, dict[str, Any]]) -> bool:

@@ -3,6 +3,7 @@ page, or twice; what was asked and would change something is logged, with its an
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI, Request, Response, WebSocket
+from fastapi.encoders import jsonable_encoder
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -40,13 +43,17 @@ def guard(app: FastAPI, service: Service) -> None:
 
     @app.middleware("http")
     async def logged(request: Request, call_next: Callable[[Request], Any]) -> Response:
-        response: Response = await check(request, call_next)
-        if request.method not in _READING:
-            session = getattr(request.state, "session", None)
-            name = session.account.name if session else ""
-            asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
-            log = (name, asked, response.status_code, address_of(request), about)
-            await to_thread.run_sync(service.audit.note, *log)
+        status = 500  # if it raises
+        try:
+            response: Response = await check(request, call_next)
+            status = response.status_code
+        finally:
+            if request.method not in _READING:
+                session = getattr(request.state, "session", None)
+                name = session.account.name if session else ""
+                asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
+                log = (name, asked, status, address_of(request), about)
+                await to_thread.run_sync(service.audit.note, *log)
         return response
 
     async def check(request: Request, call_next: Callable[[Request], Any]) -> Response:
@@ -78,10 +85,20 @@ def guard(app: FastAPI, service: Service) -> None:
         return response
 
     app.add_middleware(_WebSocketGuard, service=service)
+    _answer_errors(app)
+
+
+def _answer_errors(app: FastAPI) -> None:
+    """In words, with their status."""
 
     @app.exception_handler(InputError)
     async def wrong(_: Request, error: InputError) -> Response:
         return JSONResponse({"detail": str(error), "problems": [asdict(one) for one in error.problems]}, 422)
+
+    @app.exception_handler(RequestValidationError)
+    async def malformed(_: Request, error: RequestValidationError) -> Response:
+        told = json.dumps(jsonable_encoder(error.errors()))
+        return JSONResponse({"detail": json.loads(told, parse_constant=str)}, 422)  # JSON has no NaN to tell of
 
     @app.exception_handler(CoupoleError)
     async def failed(_: Request, error: CoupoleError) -> Response:

@@ -11,6 +11,10 @@ from coupole.console.plans.plan_queue import Entry
 Text = Annotated[str, Field(max_length=2000)]
 
 
+MOST_LUX_H = 1e9
+"""A hundred thousand years in a museum at 50 lux are half of it; more is a slip of the finger."""
+
+
 class Asked(BaseModel):
     """Unknown keys are errors."""
 
@@ -66,7 +70,7 @@ class Lease(Asked):
 class Light(Asked):
     """Light that an object was given elsewhere."""
 
-    dose_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
     """In lux hours."""
     note: Annotated[str, Field(min_length=1, max_length=2000)]
     """What that light was."""
@@ -75,7 +79,7 @@ class Light(Asked):
 class Budget(Asked):
     """What an object may receive in its life."""
 
-    dose_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
     """In lux hours."""
     name: Annotated[str, Field(max_length=200)] = ""
     """Whose word it is; empty: of who asks."""
@@ -86,7 +90,7 @@ class Budget(Asked):
 class Warn(Asked):
     """When an object's ledger warns."""
 
-    above_lux_h: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None
+    above_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)] | None
     """Of a total above this; null: of none."""
 
 

@@ -18,8 +18,9 @@ from coupole.exchange.look.look_samples import samples_of_result
 from coupole.exchange.look.residual_planes import PLANES, residual_blocks, residual_fit
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
+from coupole.reflectance.fits import MATERIALS
 from coupole.reflectance.run_relighting import best_fit
-from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
+from coupole.reflectance.run_result import RunResult, read_about
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]

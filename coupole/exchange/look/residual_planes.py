@@ -21,14 +21,14 @@ from scipy.linalg import eigh
 from coupole.exchange.look.look_blocks import Block, block_of
 from coupole.exchange.material_values import red_green_blue
 from coupole.geometry import apply, inverse
-from coupole.reflectance.run_result import SLICES, RunResult, ViewSamples
+from coupole.reflectance.fits import SLICES
+from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.slice_basis import COUNT, functions
-from coupole.reflectance.slice_fit import slice_values
 from coupole.reflectance.triangle_fit import TriangleSamples, model_values
 
 Floats = NDArray[np.float64]
 
-FIT = "ggx_rbf"
+FIT = SLICES["ggx_rbf"]
 PLANES = 9
 """By default: with three shares of GGX they fill whole groups of four bytes."""
 SIDE = 48
@@ -61,8 +61,8 @@ class ResidualPlanes:
 
 def residual_fit(result: RunResult) -> str | None:
     """The material that residuals are added to; None where a view has no such fit."""
-    whole = all(result.slices_path(FIT, view).exists() for view in result.views)
-    return SLICES[FIT].over if whole and result.views else None
+    whole = all(result.slices_path(FIT.name, view).exists() for view in result.views)
+    return FIT.over.name if FIT.over and whole and result.views else None
 
 
 def residual_blocks(
@@ -88,7 +88,7 @@ def residual_blocks(
 
 def residual_planes(result: RunResult, view: ViewSamples, count: int) -> ResidualPlanes:
     """`count` planes of a view's residuals."""
-    coefficients = result.slices(FIT, view)
+    coefficients = result.slices(FIT.name, view)
     known = np.flatnonzero(np.isfinite(coefficients).all(axis=(1, 2)))
     channels = coefficients.shape[1]
     some = np.random.default_rng(0).permutation(known)
@@ -152,7 +152,7 @@ def _functions(directions: Floats) -> Floats:
     """[COUNT, n]"""
     rows = np.empty((COUNT, len(directions)))
     x, y, z = np.ascontiguousarray(directions.T)
-    functions(SLICES[FIT].basis.harmonic, x, y, z, rows)
+    functions(FIT.basis.harmonic, x, y, z, rows)
     return rows
 
 
@@ -174,8 +174,7 @@ def _missed(
     rows: NDArray[np.int64],
 ) -> tuple[float, float]:
     """`missed` and `energy` of `ResidualPlanes`, of some rows of the view's file, under distant lights."""
-    over = SLICES[FIT].over
-    assert over is not None
+    assert FIT.over is not None
     samples = result.view_samples(view, slice(None), np.zeros(len(view.leds), np.bool_))
     half = _half_sphere(_DIRECTIONS // 2)
     middle_mm = samples.centres_mm[rows].mean(axis=0) if len(rows) else np.zeros(3)
@@ -189,11 +188,11 @@ def _missed(
         np.ones(len(rows)),
     )
     places = np.searchsorted(result.triangles, view.triangles[rows])
-    model = np.nan_to_num(model_values(lights, result.materials(over, places)))
-    fit = slice_values(lights, coefficients, SLICES[FIT].basis, model)
+    model = np.nan_to_num(model_values(lights, result.materials(FIT.over.name, places)))
+    fit = FIT.values(lights, coefficients, model)
     roots = (codes[3:].astype(np.float64) - 128.0) / _STEPS
     short = np.einsum("pn,pck->nck", roots * np.abs(roots), scaled)
     shares = (codes[: coefficients.shape[1]].T - 1.0) / _SHARE_STEPS
     shown = np.concatenate([short, shares[:, :, None]], axis=2).astype(np.float32)
-    page = slice_values(lights, shown, SLICES[FIT].basis, model)
+    page = FIT.values(lights, shown, model)
     return float(np.sum((page - fit) ** 2)), float(np.sum((fit - model) ** 2))

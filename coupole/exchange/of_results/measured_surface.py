@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
+from coupole.reflectance.fits import MATERIALS
 from coupole.reflectance.run_relighting import best_fit
-from coupole.reflectance.run_result import MATERIALS, RunResult, read_about
+from coupole.reflectance.run_result import RunResult, read_about
 
 Floats = NDArray[np.float64]
 _LEAST_PASSED = 0.05
@@ -28,7 +29,7 @@ class MeasuredSurface:
 
     result: RunResult
     fit: str
-    """The materials are those of this fit, one of `run_result.MATERIALS`."""
+    """The materials are those of this fit, one of `fits.MATERIALS`."""
     about: dict[str, Any]
     """result.json"""
     vertices_mm: Floats

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -111,6 +112,26 @@ def test_a_run_of_a_terminal_is_the_consoles_and_is_stopped_resumed_killed_and_o
     whole = cells.about(run)["expected"]["frames"]
     assert whole - cells.frame_lines(run) <= again["needs"]["frames"] < whole
     assert standing.engineer.post(f"/api/v1/queue/{again['id']}", method="DELETE").status == 200
+
+
+def test_a_run_whose_console_is_killed_goes_on_which_is_said_and_ctrl_c_stops_it_still(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=2.0)
+    cell.join()
+    cell.write(lights=cells.SOME_LIGHTS, repeats=40)
+    with cell.world() as world, served(cell) as service:
+        follower = cells.start("acquire", cell.plan, "--yes")
+        run = cell.run_folder
+        cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+        service.process.kill()
+        service.process.wait()
+        time.sleep(1.0)
+        follower.send_signal(signal.SIGINT)
+        ended = cells.finish(follower)
+        assert (ended.code, "the run GOES ON" in ended.err) == (130, True), ended.err
+        assert f"coupole stop {run}" in ended.err
+        cells.wait_until(lambda: cells.events(run, "stop"), "the run's end")
+        assert cells.safe(world)
+    assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
 
 
 def test_the_cell_is_lent_to_a_process_until_that_ends(standing: Standing) -> None:

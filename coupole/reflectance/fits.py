@@ -1,0 +1,99 @@
+"""The fits of a result of runs: an object for each, and one registry that all who name fits read.
+
+A new fit is an object in `MATERIALS` or `SLICES`, and the kernel that it calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
+from coupole.reflectance.slice_fit import slice_values
+from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What reports and charts call a fit."""
+
+    name: str
+    """Of its file or folder in `fits/`, and of `--fit`."""
+    title: str
+    colour: str
+    """In charts: Okabe and Ito's, which the colour-blind tell apart."""
+
+
+@dataclass(frozen=True)
+class MaterialFit(Fit):
+    """A material for each triangle, fitted to the samples of all views; holds from everywhere."""
+
+    fits_normals: bool
+
+    def fit(
+        self, samples: TriangleSamples, used: NDArray[np.bool_], noise_um: float, threads: int | None
+    ) -> TriangleMaterials:
+        """From the samples `used` [samples]; `noise_um` of the mesh's vertices."""
+        return fit_triangles(samples, used, noise_um if self.fits_normals else None, threads=threads)
+
+    def values(self, samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
+        """[b, samples, channels] f cos_i, 1/sr, that materials give."""
+        return model_values(samples, materials)
+
+
+@dataclass(frozen=True)
+class ViewFit(Fit):
+    """Coefficients for each triangle, fitted to the samples of one view; holds for that view."""
+
+    basis: Basis
+    over: MaterialFit | None = None
+    """What it is added to; it was fitted to what that leaves."""
+
+    @property
+    def coefficients(self) -> int:
+        """Of each channel; the last one is the share of `over`, if there is one."""
+        return COUNT + (self.over is not None)
+
+    def values(
+        self, samples: TriangleSamples, coefficients: NDArray[np.float32], under: NDArray[np.float32] | None
+    ) -> NDArray[np.float32]:
+        """[b, samples, channels] f cos_i, 1/sr, with the values of `over` if there is one."""
+        return slice_values(samples, coefficients, self.basis, under)
+
+
+_F = TypeVar("_F", bound=Fit)
+
+
+def _named(*fits: _F) -> dict[str, _F]:
+    return {fit.name: fit for fit in fits}
+
+
+GGX = MaterialFit("ggx", "GGX, mesh's normals", "#999999", fits_normals=False)
+GGX_NORMAL = MaterialFit("ggx_normal", "GGX, normals fitted", "#cc79a7", fits_normals=True)
+MATERIALS = _named(GGX, GGX_NORMAL)
+"""By name, in the order in which they are made."""
+SLICES = _named(
+    ViewFit("sh", "spherical harmonics", "#0072b2", HARMONICS),
+    ViewFit("rbf", "radial functions", "#d55e00", RADIAL),
+    ViewFit(
+        "ggx_rbf", "GGX, normals fitted, with radial functions of what is left", "#009e73", RESIDUAL, GGX_NORMAL
+    ),
+)
+FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}
+CLUSTERED, PAIR_HARMONICS = "clusters", "harmonics"
+"""What `coupole reflectance cluster` adds: materials of clusters, and harmonics of both directions."""
+ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS)
+"""Hold from everywhere."""
+RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS)
+"""All that `--fit` of `coupole reflectance relight` takes."""
+
+
+def fitted_together() -> list[Sequence[ViewFit]]:
+    """Those of views in groups that share their functions, each fitted in one pass."""
+    fits = sorted(SLICES.values(), key=lambda fit: not fit.basis.harmonic)
+    return [list(group) for _, group in groupby(fits, key=lambda fit: fit.basis.harmonic)]

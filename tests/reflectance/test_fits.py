@@ -1,0 +1,90 @@
+"""The registry of fits: what is in it is made, completed and shown; what is not is refused, never guessed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from unittest import mock
+
+import cells
+import h5py
+import numpy as np
+import pytest
+from relight_cases import waves
+from residual_cases import write_backscatter
+
+from coupole.commands import completion
+from coupole.reflectance.fits import FITS, GGX, MATERIALS, RELIT, SLICES, MaterialFit, ViewFit, fitted_together
+from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.run_result_files import begin_slices
+from coupole.reflectance.slice_basis import HARMONICS, fewer
+from coupole.reflectance.slice_fit import fit_slices, slice_values
+from coupole.reflectance.triangle_fit import model_values
+from coupole.viewing import ablation_page
+
+LOW = ViewFit("low", "harmonics of few degrees", "#000000", fewer(HARMONICS, 16))
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
+    return write_backscatter(tmp_path_factory.mktemp("fits") / "result", waves(6))
+
+
+def test_a_fit_stands_under_its_own_name_and_no_colour_twice() -> None:
+    assert [name for name, fit in FITS.items() if fit.name != name] == []
+    assert len({fit.colour for fit in FITS.values()}) == len(FITS)
+    assert [fit.name for fit in SLICES.values() if fit.over and fit.over not in MATERIALS.values()] == []
+
+
+def test_each_fit_of_views_is_made_once_with_those_of_its_functions() -> None:
+    groups = fitted_together()
+    assert sorted(fit.name for group in groups for fit in group) == sorted(SLICES)
+    assert [len({fit.basis.harmonic for fit in group}) for group in groups] == [1] * len(groups)
+
+
+def test_a_new_fit_is_made_and_foretells_by_its_place_in_the_registry_alone(result: RunResult) -> None:
+    (view,) = result.views
+    samples, rows = result.view_samples(view, slice(None)), slice(None)
+    used = np.ones(len(view.leds), np.bool_)
+    (found,) = fit_slices(samples, used, (LOW.basis, None))
+    with mock.patch.dict(SLICES, {LOW.name: LOW}), mock.patch.dict(FITS, {LOW.name: LOW}):
+        assert LOW in [fit for group in fitted_together() for fit in group]
+        path = result.slices_path(LOW.name, view)
+        path.parent.mkdir()
+        with h5py.File(path, "w") as file:
+            begin_slices(file, LOW, view, result.channels)[...] = found
+        made = predicted(result, LOW.name, view, rows, samples)
+        mae = {key: [[1.0, dict.fromkeys(FITS, 0.01)]] for key in ("LEDs", "coefficients")}
+        page = "".join(ablation_page._page("x", {"triangles": 1, "mae": mae}))
+    np.testing.assert_array_equal(made, slice_values(samples, found, LOW.basis))
+    assert LOW.title in page
+
+
+def test_a_material_of_another_form_is_asked_for_its_own_values(result: RunResult) -> None:
+    class Twice(MaterialFit):
+        def values(self, samples, materials):  # type: ignore[no-untyped-def]
+            return 2.0 * model_values(samples, materials)
+
+    (view,) = result.views
+    samples = result.view_samples(view, slice(None))
+    plain = predicted(result, "ggx_normal", view, slice(None), samples)
+    with mock.patch.dict(FITS, {"ggx_normal": Twice("ggx_normal", "", "", fits_normals=True)}):
+        twice = predicted(result, "ggx_normal", view, slice(None), samples)
+    np.testing.assert_array_equal(twice, 2.0 * plain)
+
+
+def test_a_name_that_no_fit_has_is_no_ggx_fit(result: RunResult) -> None:
+    (view,) = result.views
+    with pytest.raises(KeyError, match="ggx_new"):
+        predicted(result, "ggx_new", view, slice(None), result.view_samples(view, slice(None)))
+
+
+def test_help_and_shell_know_all_fits(tmp_path: Path) -> None:
+    told = cells.here("reflectance", "relight", "--help").out
+    assert [name for name in RELIT if name not in told] == []
+    assert [name for name, _ in completion.fits("")] == list(RELIT)
+    assert completion.fits("ggx_r") == [("ggx_rbf", FITS["ggx_rbf"].title)]
+    assert [name for name, _ in completion.materials("")] == list(MATERIALS)
+    told = cells.here("export", "--help").out
+    assert [name for name in MATERIALS if name not in told] == []
+    assert GGX.name in MATERIALS

@@ -349,7 +349,7 @@ def _dark_since_s(world: World, for_s: float = 0.3) -> float:
     return looks[0]
 
 
-def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion(
+def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion_that_the_journal_has(
     standing: tuple[CellFolder, World],
 ) -> None:
     cell, world = standing
@@ -358,6 +358,9 @@ def test_the_arm_comes_to_rest_when_the_controller_is_killed_in_a_motion(
     process.kill()
     cells.finish(process)
     cells.wait_until(lambda: cells.safe(world), "the arm at rest")
+    kinds = [event["event"] for event in cells.events(cell.run_folder)]
+    assert kinds[-3:] == ["start", "view", "move"], "what the arm is about to do is on the disk before it moves"
+    assert cells.here("status", cell.run_folder, "--json").document["state"] == "interrupted"
 
 
 @pytest.mark.parametrize("name", ["run.json", "inputs/plan.yaml"])

@@ -105,7 +105,7 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
         "diary = Journal(Path(sys.argv[1])); diary.write(SessionStarted()); diary.commit()\n"
         "diary.write(FaultNoted(kind='Test', message='x' * 50_000))\n"
         "try: diary.commit()\n"
-        "except StorageError as error: print(type(error).__name__)\n"
+        "except StorageError as error: print(type(error).__name__, error)\n"
     )
 
     def limited() -> None:
@@ -120,7 +120,8 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
         preexec_fn=limited,
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
     )
-    assert done.stdout.strip() == "StorageError"
+    assert done.stdout.startswith("StorageError ")
+    assert "Raise the limit (`ulimit -f`)" in done.stdout
     assert [event.event for event in journal.read(path)] == ["journal", "start"]
     assert path.read_bytes().endswith(b"\n")
 

@@ -68,10 +68,14 @@ class OpenedCell:
         ]
 
     def switch_off(self) -> None:
-        """Lights off, and since when they are is noted."""
-        begun_ns = self.clock.now_ns()
+        """Lights off, and since when they are is noted; whatever becomes of the clock, they go off."""
+        times_ns = []
+        with contextlib.suppress(Exception):
+            times_ns.append(self.clock.now_ns())
         self.ledbox.lights_off()
-        self.switched_off_ns.append((begun_ns, self.clock.now_ns()))
+        with contextlib.suppress(Exception):
+            begun_ns, ended_ns = *times_ns, self.clock.now_ns()
+            self.switched_off_ns.append((begun_ns, ended_ns))
 
     def make_safe(self) -> None:
         """Lights off and arm stopped, side by side, then the camera disarmed; each is tried even if another fails

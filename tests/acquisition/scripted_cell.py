@@ -157,6 +157,8 @@ class Cell:
             clock=self,
             robot=SimpleNamespace(measured=self._arm),
             make_safe=lambda: self.done.append("made safe"),
+            switch_off=self.box.lights_off,
+            switched_off_ns=[],
         )
         arm: Any = SimpleNamespace(
             attend=lambda: None,

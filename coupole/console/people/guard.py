@@ -3,7 +3,7 @@ page, or twice; what was asked and would change something is logged, with its an
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -97,8 +97,7 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> Response:
-        told = json.dumps(jsonable_encoder(error.errors()))
-        return JSONResponse({"detail": json.loads(told, parse_constant=str)}, 422)  # JSON has no NaN to tell of
+        return JSONResponse({"detail": _finite(jsonable_encoder(error.errors()))}, 422)
 
     @app.exception_handler(CoupoleError)
     async def failed(_: Request, error: CoupoleError) -> Response:
@@ -107,6 +106,15 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(NotAllowed)
     async def not_allowed(_: Request, refusal: NotAllowed) -> Response:
         return _no(refusal.status, str(refusal))
+
+
+def _finite(found: Any) -> Any:
+    """What JSON can tell, in which there is no NaN."""
+    if isinstance(found, dict):
+        return {key: _finite(value) for key, value in found.items()}
+    if isinstance(found, list):
+        return [_finite(value) for value in found]
+    return str(found) if isinstance(found, float) and not math.isfinite(found) else found
 
 
 class _WebSocketGuard:

@@ -58,13 +58,18 @@ class Call:
     """Time that the work itself may take, if all is well."""
     since_s: float = 0.0
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> Call:
         if threading.get_ident() not in _BY_OTHERS:
             self.since_s = time.monotonic()
             _UNDER_WAY[self] = None
+        return self
 
     def __exit__(self, *_: object) -> None:
         _UNDER_WAY.pop(self, None)
+
+    def goes_on(self) -> None:
+        """Part of it is done, as slowly as it may be: its time begins anew."""
+        self.since_s = time.monotonic()
 
     def end_s(self, stopped_s: float) -> float:
         """When it is given up, monotonic; the session is to end since `stopped_s`."""

@@ -1,27 +1,35 @@
-"""Runs the long proofs one after the other and prints a table of results: `tools/test --full`.
+"""Runs the long proofs one after the other, in parts over several days: `tools/test --full`.
 
-    python tools/full_proofs.py [--only NAME ...] [--list]
+    python tools/full_proofs.py [--only NAME ...] [--again] [--list | --table]
 
-Each proof is a command that can be run by itself. Exits with 1 if one of them failed; its output is in
-`runs/proofs/<name>.log`.
+Each proof is a command that can be run by itself. What has ended well is kept in `runs/proofs/ended.jsonl` and not
+run again without `--again`; Ctrl-C ends after what is kept, and the same command goes on. At the end, and with
+`--table`, all that is kept is printed as docs/reference/proofs.md has it. Exits with 1 if a proof of this run
+failed; its output is in `runs/proofs/<name>.log`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import re
 import shlex
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "runs" / "proofs"
+ENDED = LOGS / "ended.jsonl"
 _PYTEST = "-m pytest --full -q -n 2 --dist loadscope --timeout 3600"
+_APART = {"tests/faults": "tests/faults/test_injection.py", "tests/runs": "tests/runs/test_soak.py"}
+"""What is a proof of its own, by its folder."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +42,23 @@ class Proof:
     """Arguments for Python."""
 
 
+def _rooms() -> list[Proof]:
+    """All tests at full scale, a folder each."""
+    folders = sorted(path.parent.name for path in (ROOT / "tests").glob("*/") if any(path.rglob("test_*.py")))
+    found = []
+    for folder in folders:
+        apart = f" --ignore {_APART[f'tests/{folder}']}" if f"tests/{folder}" in _APART else ""
+        found.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}"))
+    return found
+
+
 PROOFS = (
     Proof("injection", "random faults: labels true, runs completed", f"{_PYTEST} tests/faults/test_injection.py"),
     Proof("soak", "sixty runs in one world: nothing grows", f"{_PYTEST} tests/runs/test_soak.py"),
     Proof("rehearsals", "a million rehearsed shots with faults: labels true, nothing lost", "tools/soak.py"),
+    Proof(
+        "day", "24 h of the rig in one session: labels true, nothing grows", "tools/day.py --hours 24 --speed 20"
+    ),
     Proof(
         "calls",
         "each call of each device fails or stops once in each way: the cell is safe",
@@ -48,7 +69,7 @@ PROOFS = (
         "today's failure at each call, then another one: the cell is safe",
         "tools/fail_every_call.py --pairs 600 --first drawn --keep runs/proofs/pairs.jsonl",
     ),
-    Proof("fuzz", "10,000 mutated files and messages are read or refused", f"{_PYTEST} tests/fuzz"),
+    Proof("freezes", "frozen at 200 random moments: arm at rest, lamps dark", "tools/freeze_at_random.py"),
     Proof("mutants", "95 % of single mistakes in critical code are noticed", "tools/mutants.py"),
     Proof("cells", "intervals of 100 random cells hold", "tools/prove_calibrations.py --cells 100"),
     Proof("cells-absolute", "the same with the arm's absolute errors", "tools/prove_calibrations.py --absolute"),
@@ -68,13 +89,7 @@ PROOFS = (
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
     Proof("layers", "intervals of K and S hold, by matrix exponentials and photons", "tools/prove_layers.py"),
     Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),
-    Proof("conformance", "every driver against its contract", f"{_PYTEST} tests/conformance"),
-    Proof(
-        "tests",
-        "all other tests at full scale",
-        f"{_PYTEST} tests --ignore tests/conformance --ignore tests/faults/test_injection.py "
-        "--ignore tests/runs/test_soak.py --ignore tests/fuzz",
-    ),
+    *_rooms(),
 )
 
 
@@ -82,45 +97,110 @@ PROOFS = (
 class Ended:
     """The result of a proof."""
 
-    proof: Proof
+    name: str
+    date: str
+    commit: str
+    """Begins with `changed: ` if files differed from it."""
+    machine: str
     minutes: float
     code: int
-    last_line: str
+    figure: str
+    """The last line that the proof printed."""
+
+
+# -- running --------------------------------------------------------------------------------------------------
 
 
 def run(proof: Proof) -> Ended:
     """Run one proof with its output in a file."""
-    LOGS.mkdir(parents=True, exist_ok=True)
     log = LOGS / f"{proof.name}.log"
-    started = time.monotonic()
+    commit, started = _commit(), time.monotonic()
     with log.open("w") as file:
         command = [sys.executable, *shlex.split(proof.command)]
         code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False).returncode
     lines = log.read_text(errors="replace").strip().splitlines()
-    return Ended(proof, (time.monotonic() - started) / 60.0, code, lines[-1].strip("= ") if lines else "")
+    return Ended(
+        name=proof.name,
+        date=f"{datetime.now(UTC):%Y-%m-%d}",
+        commit=commit,
+        machine=f"{os.cpu_count()} cores",
+        minutes=round((time.monotonic() - started) / 60.0, 1),
+        code=code,
+        figure=lines[-1].strip("= ") if lines else "",
+    )
+
+
+def _commit() -> str:
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+    changed = "changed: " if git("status", "--porcelain", "--untracked-files=no") else ""
+    return changed + git("rev-parse", "--short=8", "HEAD")
+
+
+# -- what is kept ---------------------------------------------------------------------------------------------
+
+
+def kept() -> dict[str, Ended]:
+    """The last end of each proof."""
+    lines = ENDED.read_text(encoding="utf-8").splitlines() if ENDED.exists() else []
+    found = [Ended(**json.loads(line)) for line in lines]
+    return {one.name: one for one in found}
+
+
+def keep(ended: Ended) -> None:
+    with ENDED.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(ended)) + "\n")
+
+
+def table(found: dict[str, Ended]) -> str:
+    """In Markdown: every proof, those that were not run too."""
+    lines = [
+        "| proof | shows | date, commit | machine | minutes | ended | last line |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for proof in PROOFS:
+        one = found.get(proof.name)
+        if one is None:
+            lines.append(f"| {proof.name} | {proof.shows} | not run | | | | |")
+            continue
+        verdict = "good" if one.code == 0 else f"**exit {one.code}**"
+        figure = re.sub(r"\s+", " ", one.figure).replace("|", "/")
+        lines.append(
+            f"| {proof.name} | {proof.shows} | {one.date}, {one.commit} | {one.machine} | {one.minutes:.1f} "
+            f"| {verdict} | {figure} |"
+        )
+    return "\n".join(lines)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--only", nargs="+", choices=[proof.name for proof in PROOFS], help="only these proofs")
+    parser.add_argument("--again", action="store_true", help="run what has ended well before, too")
     parser.add_argument("--list", action="store_true", help="list the proofs and their commands, run nothing")
+    parser.add_argument("--table", action="store_true", help="print what is kept, run nothing")
     options = parser.parse_args()
     console = Console(soft_wrap=True)
     if options.list:
         for proof in PROOFS:
-            console.print(f"{proof.name:15} {proof.shows}\n{'':15} python {proof.command}", highlight=False)
+            console.print(f"{proof.name:18} {proof.shows}\n{'':18} python {proof.command}", highlight=False)
         return 0
-    chosen = [proof for proof in PROOFS if not options.only or proof.name in options.only]
-    ended = []
-    for proof in chosen:
-        with console.status(f"{proof.name}: {proof.shows}"):
-            ended.append(run(proof))
-    table = Table("proof", "shows", "minutes", "ended", "last line", box=None)
-    for one in ended:
-        verdict = "[green]good[/]" if one.code == 0 else f"[red]exit {one.code}[/]"
-        table.add_row(one.proof.name, one.proof.shows, f"{one.minutes:.1f}", verdict, one.last_line)
-    console.print(table)
-    return int(any(one.code for one in ended))
+    LOGS.mkdir(parents=True, exist_ok=True)
+    failed = False
+    if not options.table:
+        good = set() if options.again else {name for name, one in kept().items() if one.code == 0}
+        for proof in PROOFS:
+            if proof.name in good or (options.only and proof.name not in options.only):
+                continue
+            with console.status(f"{proof.name}: {proof.shows}"):
+                ended = run(proof)
+            keep(ended)
+            failed |= ended.code != 0
+            console.print(
+                f"{proof.name}: {ended.minutes:.1f} min, exit {ended.code}, {ended.figure}", markup=False
+            )
+    print(table(kept()))
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.signals import SignalReceived
-from coupole.bounded import DISK, hangs, left_behind, on_disk
+from coupole.bounded import DISK, bounded, hangs, left_behind, on_disk, under_way
 from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
 from coupole.storage.journal_events import SessionResumed, SessionStopped, TextUnread
@@ -19,7 +19,7 @@ from coupole.viewing.text_outlet import unread
 
 MOST_HASHED_BYTES = 2_000_000_000
 """Views of more bytes together are left to `verify --manifest` and to `archive`, so that a session ends soon."""
-_SLOWEST_BYTES_S, _REPORT_S = 10e6, 20.0
+_SLOWEST_BYTES_S, _REPORT_S = 10e6, 60.0
 
 
 def open_for_session(run: Run) -> None:
@@ -77,7 +77,7 @@ def conclude(run: Run, console: Console) -> None:
                 f"`coupole verify {run.folder} --manifest` enters them"
             )
         elif views:
-            on_disk(str(run.folder), lambda: manifest.enter(run.folder, views), size / _SLOWEST_BYTES_S)
+            bounded(lambda: _enter(run, views, size))
     except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
@@ -96,6 +96,12 @@ def _report(run: Run) -> tuple[list[str], int]:
     listed = manifest.read(run.folder)
     views = [name for name in complete_views(run) if name not in listed]
     return views, sum((run.folder / name).stat().st_size for name in views)
+
+
+def _enter(run: Run, views: list[str], size: int) -> None:
+    """It hashes at the lowest priority: beside others it may take its time, as long as it goes on."""
+    with under_way(DISK, str(run.folder), size / _SLOWEST_BYTES_S) as reading:
+        manifest.enter(run.folder, views, on_read=reading.goes_on)
 
 
 def note_unread(recorder: RunRecorder) -> None:

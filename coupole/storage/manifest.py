@@ -31,7 +31,6 @@ _CHUNK_BYTES = 4 * 2**20
 Progress = Callable[[int, int], None]
 """Files hashed so far, and all."""
 
-
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -84,8 +83,14 @@ def _written_by_sessions(name: str) -> bool:
     return name in _CHANGING or name.startswith(f"{VIEWS}/")
 
 
-def enter(run: Path, names: Iterable[str], progress: Progress = lambda done, total: None) -> None:
-    """Hash these files at low priority and list them; take out those that are `gone`. Raises StorageError."""
+def enter(
+    run: Path,
+    names: Iterable[str],
+    progress: Progress = lambda done, total: None,
+    on_read: Callable[[], None] = lambda: None,
+) -> None:
+    """Hash these files at low priority and list them; `on_read` is called after every 4 MiB. Raises
+    StorageError."""
     wanted = list(names)
     listed = read(run)
     stop = threading.Event()
@@ -93,7 +98,7 @@ def enter(run: Path, names: Iterable[str], progress: Progress = lambda done, tot
         try:
             for done, name in enumerate(wanted):
                 progress(done, len(wanted))
-                listed[name] = hashing.submit(_synced_sha256, run / name, stop).result()
+                listed[name] = hashing.submit(_synced_sha256, run / name, stop, on_read).result()
         finally:
             stop.set()
     _write(run, listed)
@@ -106,7 +111,7 @@ def _yield_to_others() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
 
 
-def _synced_sha256(path: Path, stop: threading.Event) -> str:
+def _synced_sha256(path: Path, stop: threading.Event, on_read: Callable[[], None]) -> str:
     """Of a file that is on the disk first: the manifest must not know of more than the disk."""
     digest = hashlib.sha256()
     try:
@@ -114,6 +119,7 @@ def _synced_sha256(path: Path, stop: threading.Event) -> str:
             os.fsync(file.fileno())
             while (chunk := file.read(_CHUNK_BYTES)) and not stop.is_set():
                 digest.update(chunk)
+                on_read()
     except OSError as error:
         raise disk_error(path, error) from error
     return digest.hexdigest()

@@ -100,6 +100,40 @@ def test_what_takes_its_time_by_the_work_asked_is_waited_for() -> None:
     assert on_disk("views/top.h5", sync, work_s=20.0) == "synced"
 
 
+class WatchersClock:
+    """For `bounded.time`: it goes on when it is told to, and not before the watcher has looked at it."""
+
+    def __init__(self) -> None:
+        self._now_s = time.monotonic()
+
+    def monotonic(self) -> float:
+        return self._now_s
+
+    def advance(self, seconds: float) -> None:
+        self._now_s += seconds
+        cells.wait_until(lambda: bounded._looked_s[-1] >= self._now_s, "a look at the calls under way")
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_what_goes_on_is_waited_for_however_slow_it_is(monkeypatch: pytest.MonkeyPatch, goes_on: bool) -> None:
+    clock = WatchersClock()
+    monkeypatch.setattr(bounded, "time", clock)
+
+    def read() -> str:
+        with under_way(DISK, "views/top.h5") as reading:
+            for _ in range(4):
+                clock.advance(0.15)
+                if goes_on:
+                    reading.goes_on()
+        return "read"
+
+    if goes_on:
+        assert bounded.bounded(read) == "read"
+    else:
+        with pytest.raises(StorageError, match="has not answered"):
+            bounded.bounded(read)
+
+
 def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event) -> None:
     def hang() -> None:
         with under_way("robot", "wait_settled", work_s=1000.0):

@@ -5,12 +5,17 @@ from __future__ import annotations
 import hashlib
 import shutil
 import subprocess
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cells
 import pytest
 from archives import MadeRun, make_run
 
+from coupole import bounded
+from coupole.acquisition import conclusion
 from coupole.acquisition.conclusion import conclude, open_for_session, renew_report
 from coupole.errors import StorageError
 from coupole.storage import manifest
@@ -57,6 +62,26 @@ def test_verify_names_a_file_that_was_changed_or_is_gone(made: MadeRun, name: st
         assert [problem.split(":")[0] for problem in verified.document["bad"]] == [name]
         path.unlink()
         assert "cannot be read" in manifest.problems(made.run.folder)[name]
+
+
+def test_a_slow_disk_that_answers_is_waited_for(made: MadeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hashing a run's views took 194 s beside other work, and was called a disk that does not answer."""
+    monkeypatch.setattr(bounded, "DISK_S", 0.8)
+    monkeypatch.setattr(conclusion, "_SLOWEST_BYTES_S", 1e12)
+    size = max(path.stat().st_size for path in (made.run.folder / manifest.VIEWS).iterdir())
+    monkeypatch.setattr(manifest, "_CHUNK_BYTES", size // 5 + 1)
+    hashed = manifest._synced_sha256
+
+    def slowly(path: Path, stop: threading.Event, on_read: Callable[[], None]) -> str:
+        def read() -> None:
+            time.sleep(0.2)
+            on_read()
+
+        return hashed(path, stop, read)
+
+    monkeypatch.setattr(manifest, "_synced_sha256", slowly)
+    conclude(made.run, make_console(quiet=True))
+    assert {"views/side.h5", "views/top.h5"} <= set(manifest.read(made.run.folder))
 
 
 def test_a_session_takes_out_what_it_writes_and_keeps_complete_views(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from threading import Event
 
 import cells
 import numpy as np
+import pytest
 from browser import needs_chromium
 from relight_cases import GLOSSY, waves, write_result
 from shown_page import SMALL, Page
@@ -66,6 +67,7 @@ def seconds_to_the_first_picture(page: Page, path: Path) -> tuple[float, float]:
     return lasted, float(cpu[1] - cpu[0])
 
 
+@pytest.mark.full
 def test_the_first_picture_of_the_demo_comes_within_three_seconds(page: Page, tmp_path: Path) -> None:
     """On a machine that others use too, a clock tells of them: then what counts is the CPU time that all processes
     of the browser took until the picture stood there. The best of three, each with shaders that the browser has

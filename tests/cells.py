@@ -209,7 +209,7 @@ def here(*arguments: str | Path, typed: str = "") -> Ended:
 
 def start(*arguments: str | Path, anew: bool = False, **popen: Any) -> subprocess.Popen[str]:
     """Run a command as a process; nobody types at it. It and its world are forked where all modules are, unless it
-    is a console, or asked for `anew` or with options of a process beyond its streams."""
+    is asked for `anew` or with options of a process beyond its streams."""
     options: dict[str, Any] = {
         "stdin": subprocess.DEVNULL,
         "stdout": subprocess.PIPE,
@@ -219,7 +219,7 @@ def start(*arguments: str | Path, anew: bool = False, **popen: Any) -> subproces
         **popen,
     }
     words = [*map(str, arguments)]
-    if not anew and popen.keys() <= {"stdin", "stdout", "stderr"} and words[0] != "serve":
+    if not anew and popen.keys() <= {"stdin", "stdout", "stderr"}:
         return NURSERY.command(words, **options)
     return subprocess.Popen([sys.executable, "-m", "coupole.commands.cli", *words], **options)
 

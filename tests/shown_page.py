@@ -36,11 +36,9 @@ class Page:
         self.beginning: dict[str, Any] = {}
 
     def open(self, path: Path, address: str = "") -> None:
-        """Open a page, or have an open one begin anew: shaders take a second to compile."""
+        """Open a page, or have an open one begin anew in its present size: shaders take a second to compile."""
         if path == self.opened and not address:
-            self.driver.execute_script("document.getElementById('stage').style.cssText = ''")
-            cells.wait_until(lambda: self.run("document.getElementById('picture').width") != WIDTH, "the size")
-            self.browser.at("[data-tool=turn]").click()
+            self.driver.execute_script("document.querySelector('[data-tool=turn]').click()")
             self.driver.execute_script("coupole.setSamples(1); coupole.state = arguments[0]", self.beginning)
             return
         self.opened = None if address else path
@@ -51,6 +49,12 @@ class Page:
 
     def run(self, script: str) -> Any:
         return self.browser.run(script)
+
+    def wide(self) -> None:
+        """The picture has the size that the window gives it."""
+        self.driver.execute_script("document.getElementById('stage').style.cssText = ''")
+        cells.wait_until(lambda: self.run("document.getElementById('picture').width") != WIDTH, "the size")
+        self.browser.at("[data-tool=turn]").click()
 
     def small(self) -> None:
         """The picture has a size that is quick to draw."""

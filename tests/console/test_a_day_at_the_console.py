@@ -79,6 +79,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Day]:
             day.visitor.driver.quit()
 
 
+@pytest.mark.full
 @needs_chromium
 def test_a_day_at_the_console(day: Day) -> None:
     _signs_in(day)

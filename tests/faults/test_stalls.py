@@ -48,6 +48,7 @@ def assert_whole(cell: CellFolder) -> None:
     assert mislabelled(cell, cell.run_folder) == []
 
 
+@pytest.mark.full
 @needs_compiler
 def test_a_disk_slower_than_the_camera_slows_the_run_and_loses_nothing(
     cell: CellFolder, slowed: Callable[..., dict[str, str]]

@@ -13,11 +13,13 @@ import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import product
 from pathlib import Path
 
 import cells
 import pytest
 from cells import CellFolder
+from in_part import in_part
 from places import REPO
 
 from sim.world.client import World
@@ -120,7 +122,7 @@ def test_a_run_whose_text_nobody_reads_is_done_and_its_journal_says_so(kind: str
     assert unread["lost_bytes"] + unread["waiting_bytes"] > 0
 
 
-@pytest.mark.parametrize("kind", READERS)
+@pytest.mark.parametrize("kind", in_part(READERS, "full pipe"))
 def test_json_that_nobody_reads_changes_no_exit_code(kind: str, tmp_path: Path) -> None:
     cell = CellFolder(tmp_path)
     with READERS[kind]() as nobody:
@@ -128,8 +130,16 @@ def test_json_that_nobody_reads_changes_no_exit_code(kind: str, tmp_path: Path) 
     cells.assert_each_shot_proven_once(cell.run_folder)
 
 
-@pytest.mark.parametrize("kind", READERS)
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, None])
+@pytest.mark.parametrize(
+    ("ending", "kind"),
+    in_part(
+        product((signal.SIGTERM, signal.SIGINT, signal.SIGHUP, None), READERS),
+        (signal.SIGTERM, "stopped terminal"),
+        (signal.SIGINT, "closed pipe"),
+        (signal.SIGHUP, "full pipe"),
+        (None, "full pipe"),
+    ),
+)
 def test_a_run_whose_text_nobody_reads_is_ended_by_signals_and_by_stop(
     kind: str, ending: signal.Signals | None, standing: tuple[CellFolder, World]
 ) -> None:

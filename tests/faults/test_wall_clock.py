@@ -14,6 +14,7 @@ import pytest
 from cells import CellFolder
 from failing_calls import Failure, acquire, cell_in
 from happenings import AnyTime
+from in_part import in_part
 
 PARIS = "Europe/Paris"
 MOMENTS = {
@@ -52,7 +53,7 @@ def _set_clock(cell: CellFolder, monkeypatch: pytest.MonkeyPatch, moment: dateti
             monkeypatch.setattr(module, "datetime", SetClock)
 
 
-@pytest.mark.parametrize("name", MOMENTS)
+@pytest.mark.parametrize("name", in_part(MOMENTS, next(iter(MOMENTS))))
 def test_a_run_over_a_moment_of_the_calendar_is_whole_and_in_order(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cells
 import h5py
@@ -16,17 +17,21 @@ from coupole.motion.occlusion import REACHED
 STEEP = {**TOP, "name": "steep", "elevation_deg": 88}
 
 
-@pytest.fixture
-def hidden(cell: CellFolder) -> CellFolder:
+def hidden_in(folder: Path, **plan: Any) -> CellFolder:
     """A cell with views in which some LEDs reach nothing: the camera hangs between them and the object. By its
     shading every fifth LED is told from its neighbours only on fine triangles."""
+    cell = CellFolder(folder)
     cell.plan_data["object"]["mesh"] = str(cells.RELIEF)
-    cell.write(views=[STEEP, LOW], lights={"kind": "every", "every": 5})
+    cell.write(views=[STEEP, LOW], lights={"kind": "every", "every": 5}, **plan)
     return cell
 
 
-def test_each_views_file_says_which_leds_reach_which_part_of_the_object(hidden: CellFolder) -> None:
-    assert hidden.acquire().code == 0
+def test_hidden_leds_are_marked_in_journal_and_views_and_taken_where_the_plan_says_nothing(tmp_path: Path) -> None:
+    hidden = hidden_in(tmp_path)
+    ended = hidden.acquire()
+    assert ended.code == 0
+    assert ended.document["shots"] == 2 * 216
+    views = {event["view"]: event["hidden_leds"] for event in cells.events(hidden.run_folder, "view")}
     with h5py.File(hidden.run_folder / "views" / "steep.h5") as file:
         shadow = file["entry/shadow"]
         assert shadow.attrs["NX_class"] == "NXcollection"
@@ -34,21 +39,13 @@ def test_each_views_file_says_which_leds_reach_which_part_of_the_object(hidden: 
         assert codes.shape == (len(shadow["points_mm"]), 1080) == (len(seen), len(leds))
         assert shadow["normals"].shape == shadow["points_mm"].shape
     assert 0.2 < np.mean(codes[seen] == REACHED) < 1.0
+    assert views["steep"] == leds[~(codes[seen] == REACHED).any(axis=0)].tolist()
 
 
-def test_hidden_leds_are_taken_and_marked_where_the_plan_does_not_say_otherwise(hidden: CellFolder) -> None:
-    ended = hidden.acquire()
-    assert ended.code == 0
-    assert ended.document["shots"] == 2 * 216
-    views = {event["view"]: event["hidden_leds"] for event in cells.events(hidden.run_folder, "view")}
-    with h5py.File(hidden.run_folder / "views" / "steep.h5") as file:
-        shadow = file["entry/shadow"]
-        reached = (shadow["codes"][()][shadow["seen"][()]] == REACHED).any(axis=0)
-        assert views["steep"] == shadow["leds"][()][~reached].tolist()
-
-
-def test_hidden_leds_are_left_out_where_the_plan_says_so(hidden: CellFolder) -> None:
-    hidden.write(hidden_lights="skip")
+def test_hidden_leds_are_left_out_as_preflight_says_where_the_plan_says_so(tmp_path: Path) -> None:
+    hidden = hidden_in(tmp_path, hidden_lights="skip")
+    checked = cells.here("check", hidden.plan, "--json").document
+    assert checked["shots"] + checked["hidden_lights"] == 2 * 216
     ended = hidden.acquire()
     assert ended.code == 0, ended.err
     run = hidden.run_folder
@@ -61,20 +58,13 @@ def test_hidden_leds_are_left_out_where_the_plan_says_so(hidden: CellFolder) -> 
     }
     assert skipped & asked
     assert taken == asked - skipped
-    assert ended.document["shots"] == len(taken)
+    assert ended.document["shots"] == len(taken) == checked["shots"]
     assert cells.here("verify", run).code == 0
     assert mislabelled(hidden, run) == []
 
 
-def test_what_preflight_says_will_be_left_out_is_left_out(hidden: CellFolder) -> None:
-    hidden.write(hidden_lights="skip")
-    checked = cells.here("check", hidden.plan, "--json").document
-    assert checked["shots"] + checked["hidden_lights"] == 2 * 216
-    assert hidden.acquire().document["shots"] == checked["shots"]
-
-
-def test_a_run_is_resumed_without_what_it_began_without(hidden: CellFolder) -> None:
-    hidden.write(hidden_lights="skip")
+def test_a_run_is_resumed_without_what_it_began_without(tmp_path: Path) -> None:
+    hidden = hidden_in(tmp_path, hidden_lights="skip")
     hidden.faults({"kind": "unplug_camera", "at_edge": 250})
     assert hidden.acquire().code == 4
     run = hidden.run_folder

@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import cells
 import pytest
 from cells import CellFolder
+from in_part import in_part
 
 from sim.world.client import World
 
@@ -38,8 +40,12 @@ def give_to_another(place: Path) -> None:
     place.symlink_to(other)
 
 
-@pytest.mark.parametrize("then", [leave, give_to_another])
-@pytest.mark.parametrize("ending", [None, signal.SIGTERM], ids=["by itself", "by a signal"])
+@pytest.mark.parametrize(
+    ("ending", "then"),
+    in_part(
+        product((None, signal.SIGTERM), (leave, give_to_another)), (None, give_to_another), (signal.SIGTERM, leave)
+    ),
+)
 def test_a_moved_run_ends_and_says_where_it_is_and_nothing_is_written_where_it_was(
     standing: tuple[CellFolder, World], then: Callable[[Path], None], ending: signal.Signals | None
 ) -> None:

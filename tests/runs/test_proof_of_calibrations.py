@@ -54,6 +54,7 @@ def test_stated_intervals_hold_the_truth(proof: list[dict[str, Any]], scale: Cal
         assert line["rms_over_u"] < scale(4, 2), line
 
 
+@pytest.mark.full
 @pytest.mark.timeout(18000)  # 40 cells with --full
 def test_a_bent_board_is_in_the_intervals(scale: Callable[[int, int], int]) -> None:
     """Two cells of small frames tell an interval that is wrong altogether; forty whether 95 % hold."""
@@ -115,6 +116,7 @@ def test_intervals_that_are_not_true_are_a_failure(tmp_path: Path) -> None:
         assert why in ended.stderr
 
 
+@pytest.mark.full
 def test_cells_of_other_settings_are_not_taken_for_these(tmp_path: Path) -> None:
     ended = judge(tmp_path, [0.1], "--absolute")
     assert ended.returncode == 1

@@ -13,6 +13,8 @@ sys.path.insert(0, str(cells.REPO / "tools"))
 
 from reflectance_cells import Judged, acquire, judge
 
+pytestmark = pytest.mark.full
+
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Judged:

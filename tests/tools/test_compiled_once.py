@@ -7,7 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from places import REPO
+
+pytestmark = pytest.mark.full
 
 PROCESSES = 4
 KERNELS = """

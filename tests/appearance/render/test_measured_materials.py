@@ -8,6 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from in_part import in_part
 from lazily import lazily
 from spectral_scenes import HERE
 from test_coated_materials import ELEVATIONS_DEG, reflected, ways
@@ -98,7 +99,7 @@ def spectral(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("file", [merl, alta, result, spectral])
+@pytest.mark.parametrize("file", in_part([merl, alta, result, spectral], merl, result, spectral))
 def test_a_measured_plane_is_seen_as_its_reader_says(file: Any, tmp_path: Path) -> None:
     path = file(tmp_path)
     # Paths begin at the camera: made-up values, which change when light and eye are exchanged, are seen so.

@@ -20,7 +20,7 @@ from coupole.errors import InputError, StorageError
 
 ROOT = REPO
 SHIPPED = sorted((ROOT / "configs" / "scenes").glob("*.yaml"))
-SLOW = {"layers-and-wear", "makie-box", "nashiji-bowl", "sunset-gilding"}
+SLOW = {"arcature", "layers-and-wear", "makie-box", "nashiji-bowl", "sunset-film", "sunset-gilding"}
 SMALL = """\
 schema_version: 1
 name: small

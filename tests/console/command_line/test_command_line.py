@@ -38,12 +38,13 @@ class Standing:
 
     @contextmanager
     def when_frames_are_proven(self, act: Callable[[], None]) -> Iterator[None]:
-        """Do something in another thread as soon as this session has proven frames."""
-        before = self.state()["proven"]
+        """Do something in another thread as soon as this session has proven more frames than a burst that goes on
+        takes anew, which are its dark ones."""
+        enough = self.state()["proven"] + 10
         done: list[bool] = []
 
         def wait() -> None:
-            cells.wait_until(lambda: self.state()["proven"] > before, "proven frames")
+            cells.wait_until(lambda: self.state()["proven"] >= enough, "proven frames")
             act()
             done.append(True)
 

@@ -21,6 +21,7 @@ pytestmark = needs_chromium
 
 def test_dragging_the_light_moves_it_and_changes_the_picture(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     before, way = page.run("coupole.readPixel(260, 200)"), page.run("coupole.state.lights[0].direction")
     page.browser.at("[data-tool=light]").click()
     canvas = page.browser.at("#picture")
@@ -32,6 +33,7 @@ def test_dragging_the_light_moves_it_and_changes_the_picture(page: Page, folder:
 
 def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     page.focus("picture")
     page.keys(Keys.ARROW_RIGHT)
     assert page.driver.find_elements(By.CSS_SELECTOR, "#marks .aim"), "where the keys point to"
@@ -45,6 +47,7 @@ def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> Non
 
 def test_tab_reaches_every_control(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
     shown = f"[...document.querySelectorAll('{CONTROLS}')].filter(one => one.checkVisibility() && !one.disabled)"
     page.driver.execute_script(f"{shown}.forEach((one, k) => one.dataset.place = k)")
@@ -59,6 +62,7 @@ def test_tab_reaches_every_control(page: Page, folder: Path) -> None:
 
 def test_every_control_has_a_name(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
     controls = page.driver.find_elements(By.CSS_SELECTOR, CONTROLS)
     nameless = [
@@ -109,6 +113,7 @@ BEHIND = """(one) => {
 def test_all_words_and_the_focus_stand_out_from_what_is_behind_them(page: Page, folder: Path, theme: str) -> None:
     """WCAG 2.2: 4.5 at least of words (1.4.3), 3 of controls' edges and of the focus (1.4.11)."""
     page.open(folder / "look.html")
+    page.wide()
     page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
     page.driver.execute_script(
         "document.head.append(Object.assign(document.createElement('style'), "
@@ -139,6 +144,7 @@ def test_all_words_and_the_focus_stand_out_from_what_is_behind_them(page: Page, 
 
 def test_the_page_is_as_light_as_the_system_unless_it_is_told_otherwise(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     for system, chosen, shown in (("light", "system", 0.5), ("dark", "system", 0.0), ("dark", "light", 0.5)):
         media = {"features": [{"name": "prefers-color-scheme", "value": system}]}
         page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
@@ -151,6 +157,7 @@ def test_the_page_is_as_light_as_the_system_unless_it_is_told_otherwise(page: Pa
 
 def test_an_address_brings_back_view_light_and_notes(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     page.look(30.0, 40.0, 170.0, softness=2.0)
     page.run("coupole.setLight(0.3, -0.2, 0.9)")
     page.focus("picture")
@@ -182,6 +189,7 @@ def test_an_address_that_was_damaged_opens_the_page_as_it_begins(page: Page, fol
 
 def test_pixels_outside_of_the_picture_and_lights_without_direction_are_refused(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     for call in ("readPixel(-1, 5)", "readPixel(5, 1e6)", "readPixel(0.5, 5)", "setLight(0, 0, 0)", "setLight(1)"):
         refused = f"try {{ coupole.{call}; }} catch (error) {{ return error.message; }}"
         assert "expected" in page.driver.execute_script(refused), call

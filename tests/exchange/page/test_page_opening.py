@@ -25,6 +25,7 @@ pytestmark = needs_chromium
 
 def test_the_page_opens_from_disk_without_a_network_and_loads_nothing(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     assert page.run("coupole.readPicture().rgba.some(value => value > 0)")
     assert page.run("performance.getEntriesByType('resource').length") == 0
     assert "Simulated object" in page.browser.text("#banner")

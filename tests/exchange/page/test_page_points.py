@@ -25,6 +25,7 @@ pytestmark = needs_chromium
 
 def test_a_point_tells_its_material(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
+    page.wide()
     page.focus("picture")
     page.keys(Keys.ENTER)
     told = page.browser.text("#point")

@@ -147,6 +147,10 @@ class Cell:
     """Frames that had come one round before the arm was last heard of."""
     arrived_last_round: int = 0
     awaited_news: int = 0
+    switched_off_ns: list[tuple[int, int]] = field(default_factory=list)
+    """When the box was told to switch all off, and had answered."""
+    counted: list[dict[str, float]] = field(default_factory=list)
+    """For the light of each burst: how long table and panel are said to have run."""
     _written: threading.Condition = field(default_factory=threading.Condition)
 
     def __post_init__(self) -> None:
@@ -158,7 +162,7 @@ class Cell:
             robot=SimpleNamespace(measured=self._arm),
             make_safe=lambda: self.done.append("made safe"),
             switch_off=self.box.lights_off,
-            switched_off_ns=[],
+            switched_off_ns=self.switched_off_ns,
         )
         arm: Any = SimpleNamespace(
             attend=lambda: None,
@@ -168,7 +172,9 @@ class Cell:
             await_news=self.await_news,
         )
         dose: Any = SimpleNamespace(
-            begin=lambda burst: None, count=lambda burst, log, **figures: (0.0,), end=lambda given_lux_h: None
+            begin=lambda burst: None,
+            count=lambda burst, log, **figures: self.counted.append(figures) or (0.0,),
+            end=lambda given_lux_h: None,
         )
         outcome: Any = SimpleNamespace(over_triggers=0, lost_transfers=0)
         self.runner = BurstRunner(

@@ -159,6 +159,17 @@ def test_an_arm_that_moves_finds_the_lights_off_before_anything_else() -> None:
     assert cell.done[cell.done.index("started") + 1 :] == ["lights off", "camera disarmed", "BurstEnded"]
 
 
+def test_a_burst_gave_light_until_the_box_had_switched_all_off() -> None:
+    """As it does before Ctrl-Z suspends the program, which goes on hours later; an earlier answer says nothing."""
+    for answers_s, ran_s in (((), MIDDLE_S), (((-0.2, -0.1),), MIDDLE_S), (((-0.2, -0.1), (0.03, 0.1)), 0.1)):
+        cell = Cell(BURST, take(BURST), moves_at_s=MIDDLE_S, now_us=1e6)
+        cell.switched_off_ns += [(round(1e9 * (1 + told)), round(1e9 * (1 + off))) for told, off in answers_s]
+        with pytest.raises(ArmMovedError):
+            cell.fire()
+        (figures,) = cell.counted
+        assert figures["table_ran_s"] == pytest.approx(ran_s, abs=0.05)
+
+
 def test_an_upload_that_has_failed_is_heard_of_at_once_and_one_that_runs_is_not() -> None:
     """The arm may be in motion meanwhile, and is stopped then."""
     go_on = threading.Event()

@@ -173,11 +173,9 @@ def test_a_button_moves_the_arm_as_long_as_it_is_held(room: Room) -> None:
     ada.sees("[data-name=enabling-switch]", "no enabling switch")
     room.holds("A1")
     ada.sees("[data-name=hand-said]", "is held")
-    let_go_s = room.world.ask("state")["t_s"]
     ActionChains(ada.driver, duration=20).release().perform()
     rested = room.at_rest()
-    assert rested["t_s"] - let_go_s < 1.0, "the step itself would take seconds more"
-    assert rested["joints_deg"][0] < 25.0
+    assert rested["joints_deg"][0] < 25.0, "the step itself goes farther"
     ada.sees("[data-name=hand-said]", "let go")
     time.sleep(0.3)
     assert np.allclose(room.joints_deg(), rested["joints_deg"], atol=0.01)

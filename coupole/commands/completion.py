@@ -8,11 +8,11 @@ from pathlib import Path
 _PLAN_SAYS, _FIRST_BYTES = "views:", 65536
 
 
-def formats(incomplete: str) -> list[str]:
-    """Formats of `coupole export --to`."""
-    from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
+def formats(incomplete: str) -> list[tuple[str, str]]:
+    """Formats of `coupole export --to`, with what they are."""
+    from coupole.exchange.formats import FORMATS
 
-    return _beginning({*OF_RUNS, *OF_RESULTS_OF_RUNS, *OF_PICTURES}, incomplete)
+    return [(name, one.gives) for name, one in sorted(FORMATS.items()) if name.startswith(incomplete)]
 
 
 def fits(incomplete: str) -> list[tuple[str, str]]:

@@ -10,18 +10,19 @@ import typer
 
 from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats, materials
-from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
-from coupole.exchange.of_results import OF_MATERIALS
+from coupole.exchange.formats import FORMATS, Source, formats_of
 
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
+_OF_MATERIALS = [name for name, one in FORMATS.items() if "triangle" in one.options]
 _SHOWN = "How views are shown (relight, iiif)"
 
 ToOption = Annotated[
     str,
     typer.Option(
         "--to",
-        help=f"Of runs: {', '.join(OF_RUNS)}. Of results of runs: {', '.join(OF_RESULTS_OF_RUNS)}; "
-        f"of results of pictures: {', '.join(OF_PICTURES)}.",
+        help=f"Of runs: {', '.join(formats_of(Source.RUN))}. "
+        f"Of results of runs: {', '.join(formats_of(Source.RESULT))}; "
+        f"of results of pictures: {', '.join(formats_of(Source.PICTURES))}.",
         show_default=False,
         autocompletion=formats,
     ),
@@ -47,7 +48,7 @@ TriangleOption = Annotated[
     list[int] | None,
     typer.Option(
         "--triangle",
-        help=f"Of results, for {', '.join(OF_MATERIALS)}: its number; again for more.",
+        help=f"Of results, for {', '.join(_OF_MATERIALS)}: its number; again for more.",
         min=0,
         rich_help_panel=_PARTS,
     ),

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.commands.common import JsonOption, fail, records_named
-from coupole.commands.export_formats import OF_PICTURES, OF_RESULTS_OF_RUNS, OF_RUNS
 from coupole.commands.export_options import ExportOptions, ToOption
 from coupole.commands.option_groups import flattened
 from coupole.errors import CoupoleError, InputError
-from coupole.exchange import COLMAP, CRATE, FORMATS
-from coupole.exchange.rti import FORMATS as OF_VIEWS
+from coupole.exchange.formats import Writer, format_named, refuse_others_options, source_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,11 +66,6 @@ class Found:
     """Of views: how far the file is from their own pictures, rms, in steps of 8 bits."""
 
 
-_OF_FRAMES, _OF_A_RESULT = ("views", "shots"), ("fit", "triangle")
-_OF_COLOUR = ("sensor-spectra", "led-spectrum", "for-the-eye", "linear")
-_OF_A_CRATE = ("licence", "author", "publisher", "name", "identifier", "in-place")
-
-
 @flattened
 def export(
     source: Annotated[Path, typer.Argument(help="A run's folder, or a result's.", show_default=False)],
@@ -104,64 +97,35 @@ def export(
 
 
 def _written(asked: Asked, console: Console) -> Found:
-    of_run = (asked.source / "object.h5").exists()
-    of_pictures = (asked.source / "normals.npy").exists()
-    _refuse_unknown(asked, of_run=of_run, of_pictures=of_pictures)
-    if of_run:
-        asked.refuse(_OF_FRAMES, "for the frames of a run; this is a result")
-    else:
-        asked.refuse(_OF_A_RESULT, "for results of reflectance of runs")
-    if asked.to != CRATE:
-        asked.refuse(_OF_A_CRATE, f"for --to {CRATE}")
-    if of_run or of_pictures or asked.to not in FORMATS:
-        asked.refuse(_OF_COLOUR, "for frames of a run as dng or tiff")
-    if asked.to != "bsdf":
-        asked.refuse(("adaptive",), f"for --to bsdf; found --to {asked.to}")
-    if asked.to != COLMAP:
-        asked.refuse(("refined",), f"for --to {COLMAP}")
-        if asked.to not in FORMATS:
-            asked.refuse(("calibrations",), f"for {COLMAP}, and for colour of frames")
-    _refuse_misplaced(asked)
-    if asked.to == CRATE:
-        return _export_crate(asked, console)
-    if of_run:
-        return _export_result(asked, console)
-    if of_pictures or asked.to in OF_VIEWS:
-        return _export_views(asked, console)
-    if asked.to == COLMAP:
-        return _export_colmap(asked, console)
-    return _export_frames(asked, console)
+    chosen = format_named(asked.to, source_of(asked.source))
+    _refuse_empty(asked)
+    refuse_others_options(chosen, list(asked.options))
+    writers = {
+        Writer.FRAMES: _export_frames,
+        Writer.VIEWS: _export_views,
+        Writer.POSES: _export_colmap,
+        Writer.RESULT: _export_result,
+        Writer.CRATE: _export_crate,
+    }
+    return writers[chosen.writer](asked, console)
 
 
-def _refuse_unknown(asked: Asked, *, of_run: bool, of_pictures: bool) -> None:
-    """Raise InputError for a format that there is none of for the source, or an option without a value."""
-    if of_run:
-        formats, kind = OF_RESULTS_OF_RUNS, "a result"
-    elif of_pictures:
-        formats, kind = OF_PICTURES, "a result of pictures"
-    else:
-        formats, kind = OF_RUNS, "a run"
-    if asked.to not in formats:
-        why = f"; {CRATE} is for runs and their results" if asked.to == CRATE else ""
-        raise InputError(f"--to: expected one of {', '.join(formats)} for {kind}; found {asked.to}{why}")
+def _refuse_empty(asked: Asked) -> None:
+    """Raise InputError for an option without a value."""
     for name, value in asked.options.items():
         if value == "" or (isinstance(value, list) and "" in value):
             raise InputError(f"--{name}: is empty; give a value, or leave it out")
 
 
-def _refuse_misplaced(asked: Asked) -> None:
-    """Raise InputError for options of another kind of views, or values that they do not have."""
+def _refuse_unknown_planes(asked: Asked) -> None:
+    """Raise InputError for a basis or a number of planes that `relight` does not have."""
     from coupole.exchange.rti.relight_web import BASES, PLANES
 
     basis, planes = asked.text("basis"), asked.options.get("planes")
-    if asked.to != "relight":
-        asked.refuse(("basis", "planes"), f"for --to relight; found --to {asked.to}")
     if basis is not None and basis not in BASES:
         raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {basis}")
     if planes is not None and (planes not in PLANES or basis in ("ptm", "hsh")):
         raise InputError(f"--planes {planes}: expected {' or '.join(map(str, PLANES))}, with bilinear or rbf")
-    if asked.to != "iiif":
-        asked.refuse(("base-url",), f"for --to iiif; found --to {asked.to}")
 
 
 def _export_result(asked: Asked, console: Console) -> Found:
@@ -185,7 +149,7 @@ def _export_views(asked: Asked, console: Console) -> Found:
     from coupole.exchange.rti.export_views import HowShown, export_views
     from coupole.viewing.terminal import step_bars
 
-    asked.refuse(("shots",), "for single frames; of views all LEDs are written")
+    _refuse_unknown_planes(asked)
     given = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
     how = HowShown(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
     views = asked.texts("views")
@@ -197,7 +161,6 @@ def _export_views(asked: Asked, console: Console) -> Found:
 def _export_colmap(asked: Asked, console: Console) -> Found:
     from coupole.exchange.colmap import export_colmap
 
-    asked.refuse(_OF_FRAMES, f"for single frames; {COLMAP} has all views")
     return _sizes(
         _with_bars(
             console,
@@ -216,7 +179,6 @@ def _export_colmap(asked: Asked, console: Console) -> Found:
 def _export_crate(asked: Asked, console: Console) -> Found:
     from coupole.exchange.research_crate import CrateFacts, write_crate
 
-    asked.refuse((*_OF_FRAMES, *_OF_A_RESULT), f"for parts; {CRATE} has all files")
     facts = CrateFacts(
         asked.text("licence"),
         tuple(asked.texts("author")),

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from coupole.errors import InputError
-from coupole.exchange import FORMATS, dng, tiff_for_the_eye
+from coupole.exchange import dng, tiff_for_the_eye
 from coupole.exchange.exported_frame import Picture
+from coupole.exchange.formats import Source, Writer, format_named
 from coupole.exchange.run_colour import ColourWanted, colour_of_run
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.storage.journal_events import FrameProven
@@ -70,8 +71,7 @@ def export_run(
 
 
 def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) -> Callable[[Picture], bytes]:
-    if to not in FORMATS:
-        raise InputError(f"--to: expected one of {', '.join(FORMATS)}; found {to}")
+    format_named(to, Source.RUN, Writer.FRAMES)
     if colour is None:
         encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
         return encode

@@ -11,8 +11,7 @@ import pytest
 from places import REPO
 from pydantic import BaseModel
 
-from coupole.commands.export_formats import OF_RUNS
-from coupole.exchange.of_results import FORMATS as OF_RESULTS
+from coupole.exchange.formats import FORMATS, Writer
 from coupole.heritage.restoration import parts_file, restoration_file
 from coupole.heritage.restoration.restoration_file import Stage
 from coupole.plan import arm_description, plan, rig
@@ -83,5 +82,6 @@ def test_the_reference_has_every_setting_of_a_driver_with_its_default(module: st
 
 def test_exports_of_results_have_a_row_and_figures_each() -> None:
     text = (REFERENCE / "exports.md").read_text(encoding="utf-8")
-    assert [name for name in OF_RESULTS if text.count(f"\n| `{name}` |") != 2] == []
-    assert [name for name in OF_RUNS if f"`{name}`" not in text] == []
+    of_results = [name for name, one in FORMATS.items() if one.writer is Writer.RESULT]
+    assert [name for name in of_results if text.count(f"\n| `{name}` |") != 2] == []
+    assert [name for name in FORMATS if f"`{name}`" not in text] == []

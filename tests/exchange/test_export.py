@@ -20,9 +20,10 @@ from places import SHARED_DATA
 
 from coupole.devices import FrameFormat
 from coupole.errors import ChecksumMismatch, InputError
-from coupole.exchange import FORMATS, dng, tiff
+from coupole.exchange import dng, tiff
 from coupole.exchange.export import export_run
 from coupole.exchange.exported_frame import Picture
+from coupole.exchange.formats import Source, Writer, formats_of
 from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file
 from coupole.storage.archive import archive_run
@@ -30,6 +31,8 @@ from coupole.storage.bitshuffle import CODECS
 
 PATTERNS = ("GBRG", "GRBG", "RGGB", "BGGR")
 REFERENCE = SHARED_DATA / "raw/colorchart.dng"
+
+OF_FRAMES = formats_of(Source.RUN, Writer.FRAMES)
 
 
 def picture(pixels: Frame, *, pattern: str = "GBRG", black_dn: int = 64, white_dn: int = 4095) -> Picture:
@@ -215,7 +218,7 @@ def test_a_tiff_says_what_it_shows() -> None:
 # -- a run ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", FORMATS)
+@pytest.mark.parametrize("to", OF_FRAMES)
 def test_each_frame_becomes_a_file_named_after_its_shot(made: MadeRun, out: Path, to: str) -> None:
     names = export(made, to, out)
     assert names == sorted(f"{shot.replace('/', '_')}.{to}" for shot in made.frames)
@@ -264,7 +267,7 @@ def test_a_choice_without_a_frame_is_refused(made: MadeRun, out: Path) -> None:
 
 
 def test_a_format_that_is_not_known_is_refused_by_name(made: MadeRun, out: Path) -> None:
-    with pytest.raises(InputError, match=f"expected one of {', '.join(FORMATS)}; found jpeg"):
+    with pytest.raises(InputError, match=f"expected one of {', '.join(OF_FRAMES)} for a run; found jpeg"):
         export(made, "jpeg", out)
 
 

@@ -307,8 +307,11 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
             "expected one of ply, gltf, materialx, exr, bsdf, merl, bird, alta, rocrate for a result; found dng",
         ),
         (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
-        (("--to", "ply", "--views", "top"), "--views: is for the frames of a run"),
-        (("--to", "ply", "--linear"), "--linear: is for frames of a run as dng or tiff"),
+        (
+            ("--to", "ply", "--views", "top"),
+            "--views: is for --to dng, tiff, lp, dome, relight",
+        ),
+        (("--to", "ply", "--linear"), "--linear: is for --to tiff; found --to ply"),
         (("--to", "gltf", "--refined", "there"), "--refined: is for --to colmap"),
         (("--to", "ply", "--adaptive", "0.01"), "--adaptive: is for --to bsdf; found --to ply"),
         (("--to", "exr", "--licence", "CC BY 4.0"), "--licence: is for --to rocrate"),
@@ -326,7 +329,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
         (("--to", "bsdf"), "has no clusters; name triangles with --triangle"),
         (("--to", "merl", "--triangle", "99999"), "the mesh has 722, counted from 0"),
         (("--to", "alta"), "--triangle: expected the numbers of triangles"),
-        (("--to", "ply", "--triangle", "3"), "--triangle: is for bsdf, merl, bird, alta; ply has all triangles"),
+        (("--to", "ply", "--triangle", "3"), "--triangle: is for --to bsdf, merl, bird, alta; found --to ply"),
     ],
 )
 def test_what_cannot_be_exported_is_refused(

@@ -354,7 +354,7 @@ def test_pictures_for_rti_are_counted_with_their_linear_ones(
         (("--to", "relight", "--planes", "0"), "--planes 0: expected 27 or 18"),
         (("--to", "relight", "--basis", ""), "--basis: is empty"),
         (("--to", "iiif", "--base-url", ""), "--base-url: is empty"),
-        (("--to", "rocrate", "--licence", "CC0", "--author", "A"), "rocrate is for runs and their results"),
+        (("--to", "rocrate", "--licence", "CC0", "--author", "A"), "rocrate is for a run or a result"),
         (("--to", "rti", "--base-url", "https://a.example"), "is for --to iiif"),
         (("--to", "iiif", "--base-url", "eggs/"), "expected the http address"),
         (("--to", "iiif", "--base-url", "https://[::1"), "expected the http address"),

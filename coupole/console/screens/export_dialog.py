@@ -8,17 +8,8 @@ from pathlib import Path
 from nicegui import ui
 
 from coupole.console.screens.parts import Choice, button, heading
-from coupole.exchange import COLMAP, CRATE, FORMATS
-from coupole.exchange.rti import FORMATS as OF_VIEWS
+from coupole.exchange.formats import FORMATS, Source, formats_of
 from coupole.storage.run import Run
-
-FRAMES = dict(zip(FORMATS, ("RAW frames as DNG, for RAW converters", "frames as TIFF"), strict=True))
-EXPORTS = {
-    **FRAMES,
-    **OF_VIEWS,
-    COLMAP: "views with their poses, for COLMAP",
-    CRATE: "the whole run as a research crate (RO-Crate), with a licence",
-}
 
 
 class ExportDialog:
@@ -29,7 +20,8 @@ class ExportDialog:
         self._run, self._folder = run, folder
         with ui.dialog().props('aria-label="Export"') as self._dialog, ui.column().classes("panel ask"):
             heading(f"Export {run.folder.name}")
-            self._form = Choice("format", EXPORTS, self._tell, name="format")
+            formats = {name: FORMATS[name].gives for name in formats_of(Source.RUN)}
+            self._form = Choice("format", formats, self._tell, name="format")
             views = {"": "all views"} | {view: view for view in run.about["views"]}
             self._view = Choice("views", views, name="views")
             self._licence = ui.input("licence, such as CC-BY-4.0").props("outlined dense").style("width:100%")
@@ -43,8 +35,8 @@ class ExportDialog:
     def _tell(self) -> None:
         form = self._form.value
         self._told.text = f"Into {self._folder(form)} on this machine."
-        self._licence.set_visibility(form == CRATE)
-        self._view.set_visibility(form not in (CRATE, COLMAP))
+        self._licence.set_visibility("licence" in FORMATS[form].options)
+        self._view.set_visibility("views" in FORMATS[form].options)
 
     async def command(self) -> list[str]:
         """The arguments of `coupole` that do it; none if it was cancelled."""
@@ -54,6 +46,7 @@ class ExportDialog:
         if not said:
             return []
         command = ["export", str(self._run.folder), "--to", form, "--out", str(self._folder(form))]
-        command += ["--licence", licence] if form == CRATE and licence else []
-        command += ["--views", view] if form not in (CRATE, COLMAP) and view else []
+        options = FORMATS[form].options
+        command += ["--licence", licence] if "licence" in options and licence else []
+        command += ["--views", view] if "views" in options and view else []
         return command + (["--overwrite"] if self._again.value else [])

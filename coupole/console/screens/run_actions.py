@@ -14,6 +14,7 @@ from coupole.console.runs.run_results import export_folder, look_page, reflectan
 from coupole.console.screens.export_dialog import ExportDialog
 from coupole.console.screens.parts import button, link, sure
 from coupole.console.screens.visit import Visit, enter, in_background, in_thread
+from coupole.exchange.formats import Source, source_of
 from coupole.storage.line_file import utc_now
 from coupole.storage.run import Run
 
@@ -118,7 +119,7 @@ class RunActions:
 
     async def _show(self) -> None:
         result = reflectance_folder(self._cell, self._run)
-        source = result if (result / "object.h5").is_file() else self._run.folder
+        source = result if source_of(result) is Source.RESULT else self._run.folder
         await self._begin("show", ["show", source, "--out", look_page(self._cell, self._run)])
 
     async def _export(self) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from coupole.errors import InputError
-from coupole.exchange.of_results import FORMATS, OF_MATERIALS
+from coupole.exchange.formats import Source, Writer, format_named, refuse_others_options
 from coupole.exchange.of_results.measured_surface import read_surface
 from coupole.exchange.target_folder import writing_into
 
@@ -29,10 +29,7 @@ def export_result(
     Raises InputError for a format that there is none of, a folder that has files (unless `overwrite`), a result
     without the fit; DiskFull or StorageError.
     """
-    if to not in FORMATS:
-        raise InputError(f"--to: expected one of {', '.join(FORMATS)} for a result; found {to}")
-    if triangles and to not in OF_MATERIALS:
-        raise InputError(f"--triangle: is for {', '.join(OF_MATERIALS)}; {to} has all triangles")
+    refuse_others_options(format_named(to, Source.RESULT, Writer.RESULT), ["triangle"] if triangles else [])
     surface = replace(read_surface(result, fit, triangles), most_error=most_error)
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: has files already. Choose another --out, or give --overwrite")

@@ -9,7 +9,8 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from coupole.errors import InputError
-from coupole.exchange.rti import FORMATS, OF_RUNS_ONLY, iiif, relight_web, rti_files, rti_pictures
+from coupole.exchange.formats import Source, Writer, format_named, source_of
+from coupole.exchange.rti import iiif, relight_web, rti_files, rti_pictures
 from coupole.exchange.rti.lit_views import LitView, Said, chosen_views, lit_views
 from coupole.exchange.target_folder import refuse_standing, writing_into
 from coupole.storage.run import Run
@@ -47,10 +48,9 @@ def export_views(
     Raises InputError for a format or options that do not fit the source, no such view, too few lights, files that
     stand there (unless `overwrite`); StorageError for damaged frames or a disk that cannot be written.
     """
-    of_result = (source / "normals.npy").exists()
-    if to not in FORMATS or (of_result and to in OF_RUNS_ONLY):
-        fitting = [name for name in FORMATS if not (of_result and name in OF_RUNS_ONLY)]
-        raise InputError(f"--to: expected one of {', '.join(fitting)} for {source}; found {to}")
+    kind = source_of(source)
+    of_result = kind is Source.PICTURES
+    format_named(to, kind, Writer.VIEWS)
     if of_result and views:
         raise InputError("--views: are for runs; a result of pictures has one view")
     if to == "iiif":

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.exchange.formats import Source, source_of
 from coupole.exchange.srgb import srgb
 from coupole.reflectance.light_files import read_rows
 from coupole.reflectance.picture_result import NORMALS, PictureResult
@@ -98,7 +99,7 @@ def chosen_views(run: Run, patterns: Sequence[str]) -> list[str]:
 def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -> Iterator[LitView]:
     """Views of a run, whose pictures lie in a folder under `scratch` while they are used; or the one of a result
     of pictures. Raises InputError, StorageError for damaged frames."""
-    if (source / "normals.npy").exists():
+    if source_of(source) is Source.PICTURES:
         yield view_of_result(PictureResult(source.resolve()), say)
         return
     run = Run(source)

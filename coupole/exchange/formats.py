@@ -1,0 +1,119 @@
+"""Every format of `coupole export`, in one table: command line, completion, console and exporters read it.
+
+A format of frames is a module of this folder with `encode(picture)`, which gives the file's bytes. A format of
+results is a module of `of_results` with `write(surface, folder)`, which gives the files that it has written.
+Formats of views are in `rti`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from coupole.errors import InputError
+
+
+class Source(Enum):
+    """What can be exported, as messages name it."""
+
+    RUN = "a run"
+    RESULT = "a result"
+    PICTURES = "a result of pictures"
+
+
+class Writer(Enum):
+    """What writes a format, and so what one file of it holds."""
+
+    FRAMES = "a frame in each file"
+    VIEWS = "a view with all its lights"
+    POSES = "all views with their poses"
+    RESULT = "a result"
+    CRATE = "the whole folder"
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format; `options` are those of the command line that not every format has."""
+
+    name: str
+    gives: str
+    """What it is, in words for a list."""
+    writer: Writer
+    sources: tuple[Source, ...]
+    options: tuple[str, ...] = ()
+
+
+_RUN, _PICTURES_TOO = (Source.RUN,), (Source.RUN, Source.PICTURES)
+_OF_FRAMES = ("views", "shots", "sensor-spectra", "led-spectrum", "calibrations")
+_OF_A_CRATE = ("licence", "author", "publisher", "name", "identifier", "in-place")
+
+
+def _views(name: str, gives: str, *options: str, sources: tuple[Source, ...] = _PICTURES_TOO) -> Format:
+    return Format(name, gives, Writer.VIEWS, sources, ("views", *options))
+
+
+def _result(name: str, gives: str, *options: str) -> Format:
+    return Format(name, gives, Writer.RESULT, (Source.RESULT,), ("fit", *options))
+
+
+_TABLE = (
+    Format("dng", "RAW frames as DNG, for RAW converters", Writer.FRAMES, _RUN, _OF_FRAMES),
+    Format("tiff", "frames as TIFF", Writer.FRAMES, _RUN, (*_OF_FRAMES, "for-the-eye", "linear")),
+    _views("lp", "pictures under each LED with directions, for programs that fit them", sources=_RUN),
+    _views("dome", "relight's file of the LEDs' places", sources=_RUN),
+    _views("relight", "relight's planes of coefficients for browsers (OpenLIME)", "basis", "planes"),
+    _views("ptm", "a polynomial texture map, PTM 1.2 LRGB"),
+    _views("rti", "hemispherical harmonics, HSH 1.2"),
+    _views("iiif", "IIIF: a manifest and tiled pictures", "base-url"),
+    Format("colmap", "views with their poses, for COLMAP", Writer.POSES, _RUN, ("refined", "calibrations")),
+    _result("ply", "the mesh, with each triangle's material, normal and uncertainties"),
+    _result("gltf", "a .glb for viewers and browsers: texture of colour, roughness and specular"),
+    _result("materialx", "a MaterialX document of OpenPBR, with textures and mesh"),
+    _result("exr", "a multi-part OpenEXR for each view: material, normal, place and uncertainties of each pixel"),
+    _result("bsdf", "tables of materials in RGL's tensor format, for Mitsuba", "triangle", "adaptive"),
+    _result("merl", "tables of materials as the MERL database has them", "triangle"),
+    _result("bird", "samples of triangles as JSON of the BiRD project, with standard uncertainties", "triangle"),
+    _result("alta", "tables of materials as text for ALTA, with 95 % bounds", "triangle"),
+    Format(
+        "rocrate",
+        "the whole folder as a research crate (RO-Crate), with a licence",
+        Writer.CRATE,
+        (Source.RUN, Source.RESULT),
+        _OF_A_CRATE,
+    ),
+)
+FORMATS = {one.name: one for one in _TABLE}
+"""By name."""
+
+
+def source_of(folder: Path) -> Source:
+    """Which kind of source a folder is, by the files that only one kind has."""
+    if (folder / "object.h5").exists():
+        return Source.RESULT
+    return Source.PICTURES if (folder / "normals.npy").exists() else Source.RUN
+
+
+def formats_of(source: Source, writer: Writer | None = None) -> list[str]:
+    """Names of the formats of a kind of source, of one writer or of all."""
+    return [
+        one.name for one in FORMATS.values() if source in one.sources and (writer is None or writer is one.writer)
+    ]
+
+
+def format_named(name: str, source: Source, writer: Writer | None = None) -> Format:
+    """Raises InputError if there is none of this name for the source (and the writer)."""
+    known = formats_of(source, writer)
+    if name not in known:
+        others = [kind.value for kind in FORMATS[name].sources] if name in FORMATS else []
+        why = f"; {name} is for {' or '.join(others)}" if others and source.value not in others else ""
+        raise InputError(f"--to: expected one of {', '.join(known)} for {source.value}; found {name}{why}")
+    return FORMATS[name]
+
+
+def refuse_others_options(one: Format, given: list[str]) -> None:
+    """Raise InputError for the first of these options (names without dashes) that only other formats have."""
+    for option in given:
+        takers = [other.name for other in FORMATS.values() if option in other.options]
+        if takers and one.name not in takers:
+            raise InputError(f"--{option}: is for --to {', '.join(takers)}; found --to {one.name}")

@@ -49,11 +49,14 @@ def test_a_room_above_its_bound_fails_and_names_each_case(
 ) -> None:
     (tmp_path / "drivers").mkdir()
     (tmp_path / "drivers" / "box.py").write_text('"""A box."""\nfound = 1\n')
-    (tmp_path / "words.toml").write_text("else = {names = 1.0, fragments = 4.0}\n")
+    bounds = '[words]\npronouns = ""\nparticiples = "found"\nno_participles = ""\n[most_percent]\nelse = '
+    (tmp_path / "words.toml").write_text(bounds + "{names = 1.0, fragments = 4.0}\n")
+    check_words.words.cache_clear()
     monkeypatch.setattr(check_words, "ROOT", tmp_path)
-    monkeypatch.setattr(check_words, "BOUNDS", tmp_path / "words.toml")
+    monkeypatch.setattr(check_words, "WORDS", tmp_path / "words.toml")
     monkeypatch.setattr(sys, "argv", ["check_words.py", "--show"])
     assert check_words.main() == 1
     assert "drivers/box.py:2: found" in capsys.readouterr().out
-    (tmp_path / "words.toml").write_text("else = {names = 100.0, fragments = 4.0}\n")
+    (tmp_path / "words.toml").write_text(bounds + "{names = 100.0, fragments = 4.0}\n")
     assert check_words.main() == 0
+    check_words.words.cache_clear()

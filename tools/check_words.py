@@ -9,7 +9,8 @@ Two shares are counted in each room (`coupole/*`, `drivers`, `sim`, `tools`):
 - *fragments*: docstrings that begin with a preposition or a relative word, like "Of a view". Their subject is
   missing.
 
-Bounds and lists of words are in `tools/words.toml`. Exits with 1 if a share is above its bound; `--show` prints every case.
+Bounds and lists of words are in `tools/words.toml`. Exits with 1 if a share is above its bound; `--show` prints
+every case.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ _MOST_S = 120.0
 """A session that is to end, and whose calls all return, is left behind after this time all the same."""
 _LOOK_S, _STOOD_S = 0.1, 1.0
 _BACK_S = 1.0
-"""For a call to come back once the cell was made safe, or once whoever waited for it was interrupted."""
+"""Time for a call to come back once the cell was made safe, or once whoever waited for it was interrupted."""
 _FLUSH_S = 2.0
 DISK = "disk"
 
@@ -72,7 +72,7 @@ class Call:
         self.since_s = time.monotonic()
 
     def end_s(self, stopped_s: float) -> float:
-        """When it is given up, monotonic; the session is to end since `stopped_s`."""
+        """Time when it is given up, monotonic; the session is to end since `stopped_s`."""
         disk = self.of == DISK
         end_s = self.since_s + self.work_s + (DISK_S if disk else DEVICE_S)
         return min(end_s, max(self.since_s, stopped_s) + STOPPED_S + (min(self.work_s, DISK_S) if disk else 0.0))
@@ -126,7 +126,7 @@ def overdue(since_s: float, stopped_s: float = math.inf) -> Call | None:
 
 
 def refuse_overdue(since_s: float) -> None:
-    """For who waits for something else: raise DeviceTimeout or StorageError for a call that is given up."""
+    """Raise DeviceTimeout or StorageError for a call that is given up; for who waits for something else."""
     if call := overdue(since_s):
         leave_behind(call)
         raise call.error()
@@ -230,7 +230,7 @@ def bounded(
 
 
 NOW = threading.Event()
-"""For `stop` of what is done at the end of a session."""
+"""Event for `stop` of what is done at the end of a session."""
 NOW.set()
 
 
@@ -288,7 +288,7 @@ def leave_behind(waited_for: threading.Thread | Call) -> None:
 
 
 def left_behind() -> bool:
-    """Whether something that was given up still hangs."""
+    """Tell whether something that was given up still hangs."""
     return any(one in _UNDER_WAY if isinstance(one, Call) else one.is_alive() for one in _LEFT)
 
 

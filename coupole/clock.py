@@ -17,7 +17,7 @@ class Clock(Protocol):
         clock's source is gone."""
 
     def hurry(self, until_ns: int) -> None:
-        """Until then the caller only waits, so a simulated clock may run fast; a real clock ignores this."""
+        """Run fast until then, as the caller only waits: a simulated clock may; a real clock ignores this."""
 
 
 class SystemClock:

@@ -33,11 +33,11 @@ class Step:
     on_us: int
     """On-time of the LED; for a dark step the nominal time."""
     trigger_delay_us: int
-    """From LED on to the trigger edge."""
+    """Time from LED on to the trigger edge."""
     period_us: int
-    """From this step's LED on to the next one's."""
+    """Time from this step's LED on to the next one's."""
     sends_edge: bool = True
-    """Whether the camera is triggered in this step."""
+    """True if the camera is triggered in this step."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class StepRecord:
     step: int
     """Index in the table, from 0; 0 for a flash."""
     led: int
-    """As in `Step`."""
+    """LED, as in `Step`."""
     edge_sent: bool
     """A trigger edge was sent."""
     led_open: bool
@@ -60,13 +60,13 @@ class StepRecord:
     on_us: float
     """Upper bound of the time that the LED was lit; 0 without light."""
     t_on_ns: int
-    """When the LED was switched on, on the box's clock; UNKNOWN_NS if the box has none."""
+    """Time when the LED was switched on, on the box's clock; UNKNOWN_NS if the box has none."""
     t_trigger_ns: int
-    """When the edge was sent, on the box's clock; UNKNOWN_NS if none was, or if the box has no clock."""
+    """Time when the edge was sent, on the box's clock; UNKNOWN_NS if none was, or if the box has no clock."""
     board_temperature_c: float
-    """Of the LED's board, C; NaN if the box does not measure it."""
+    """Temperature of the LED's board, C; NaN if the box does not measure it."""
     led_current_ma: float
-    """Through the LED, mA; NaN if the box does not measure it."""
+    """Current through the LED, mA; NaN if the box does not measure it."""
 
     @property
     def invalid_exposure(self) -> bool:
@@ -138,17 +138,17 @@ class LedBox(Protocol):
         """
 
     def acknowledge(self) -> None:
-        """After a person's word: clear a latched fault (the watchdog's, say), as opening does. All is dark after
+        """Clear a latched fault (such as the watchdog's) after a person's word, as opening does. All is dark after
         it, and tables must be loaded anew."""
 
     def panel(self, panel: int, on: bool) -> None:
         """Switch a flat white panel (1 to `panel_count`); raises DeviceRefused for any other number."""
 
     def board_temperature_c(self, board: int) -> float | None:
-        """Of an LED board, C; None if the box does not measure it."""
+        """Temperature of an LED board, C; None if the box does not measure it."""
 
     def presence(self) -> bool | None:
-        """Whether a person at the cell holds the enabling switch; None if the box has no input for one."""
+        """Tell whether a person at the cell holds the enabling switch; None if the box has no input for one."""
 
     def close(self) -> None:
         """Lights off if the box still accepts commands; never raises because of a lost link."""
@@ -212,7 +212,7 @@ class FrameFormat:
 
 @dataclass(frozen=True)
 class Exposure:
-    """How a burst is exposed."""
+    """Exposure of a burst."""
 
     exposure_us: int
     gain_db: float = 0.0
@@ -289,7 +289,7 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class ArmCondition:
-    """What the arm's controller tells of its safety. None, or an empty mode: it does not tell."""
+    """State of safety that the arm's controller tells. None, or an empty mode: it does not tell."""
 
     mode: str = ""
     """Operating mode in the controller's own word: `T1`, `automatic`, `running`."""
@@ -308,7 +308,8 @@ class ArmState:
     joints_deg: tuple[float, float, float, float, float, float]
     base_from_flange: Transform
     t_ns: int
-    """When this state was received, on the rig's clock: each new report of the controller has a later time."""
+    """Time when this state was received, on the rig's clock: each new report of the controller has a later
+    time."""
     moving: bool
     fault: str = ""
     """Name and reason of a latched fault; empty when there is none."""

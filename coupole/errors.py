@@ -35,7 +35,7 @@ class CoupoleError(Exception):
 
     exit_code = 1
     heading = ""
-    """What an operator reads above the message, where that does not say by itself what is the matter."""
+    """Line that an operator reads above the message, where that does not say by itself what is the matter."""
 
 
 @dataclass(frozen=True)
@@ -184,5 +184,5 @@ class Interrupted(CoupoleError):
 
 
 def reason(error: BaseException) -> str:
-    """Why something failed, in words: of the system's errors without their numbers."""
+    """Say why something failed: of the system's errors without their numbers."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

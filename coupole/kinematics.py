@@ -127,7 +127,7 @@ def within_limits(arm: Arm, joints_deg: ArrayLike) -> bool:
 
 
 def limit_violations(arm: Arm, joints_deg: ArrayLike) -> str:
-    """Which axes of [6] are out of their limits, as a phrase for messages; empty if none is."""
+    """Say which axes of [6] are out of their limits, as a phrase for messages; empty if none is."""
     phrases = [
         f"A{axis} would be {angle:.3f} deg, its limits are {low:g} to {high:g} deg"
         for axis, (angle, (low, high)) in enumerate(
@@ -139,7 +139,7 @@ def limit_violations(arm: Arm, joints_deg: ArrayLike) -> str:
 
 
 def unreachable_reason(arm: Arm, base_from_flange: Transform) -> str:
-    """Why `inverse` finds nothing, as a phrase for messages; empty if it finds something.
+    """Say why `inverse` finds nothing, as a phrase for messages; empty if it finds something.
 
     Among solutions with axes out of their limits, the one with the least excess is reported.
     """

@@ -1,4 +1,4 @@
-"""How long the arm may move, and lamps may shine, without news of whoever supervises them.
+"""Times for which the arm may move, and lamps may shine, without news of whoever supervises them.
 
 An arm or a lamp is never left alone by something that merely *stops*: a frozen process, a hung call, a cable. So
 whoever moves or shines hears a beat of whoever watches, and makes itself safe when the beats end. A beat comes
@@ -38,14 +38,14 @@ LOOK_S = 0.02
 ASKS_FROM_S = 1.0
 """A process that did not run for so long was frozen, or its machine slept: a person decides whether to go on."""
 HEARD_WITHIN_S = 0.5
-"""Whether it was frozen is heard (SIGCONT) within this time after it runs again."""
+"""A freeze is heard of (SIGCONT) within this time after it runs again."""
 ASKS_AFTER_LAPSE_S = 5.0
 """The same for a lapse of attention that nothing explains: a busy machine, or a call that took its time."""
 _LISTENED_NS = 100_000_000
 
 
 class Silence:
-    """For how long a process that beats has been silent, counted only while its listener itself runs."""
+    """Time for which a process that beats has been silent, counted only while its listener itself runs."""
 
     def __init__(self) -> None:
         self._beat = 0

@@ -33,7 +33,7 @@ RepeatabilityDeg = Annotated[float, typer.Option("--repeatability-deg", min=1e-5
 
 @dataclass(frozen=True)
 class RobotRepeatability:
-    """From pose to pose, as stated."""
+    """Repeatability from pose to pose, as the maker states it."""
 
     repeatability_mm: RepeatabilityMm = 0.03
     repeatability_deg: RepeatabilityDeg = 0.003

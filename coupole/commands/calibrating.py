@@ -1,4 +1,4 @@
-"""What all `coupole calibrate` commands share: options; writing, printing and refusing a record."""
+"""Common parts of all `coupole calibrate` commands: options; writing, printing and refusing a record."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ else:
     Work = Callable
 
 _SUFFIXES = (".yaml", ".html", ".png", ".csv", ".h5", ".icc")
-"""Of a record and of the files beside it."""
+"""Suffixes of a record and of the files beside it."""
 _MOST_FAULTS = 5
-"""In a refusal; the record has all."""
+"""Most faults that a refusal names; the record has all."""
 Paths = Annotated[
     list[Path],
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),

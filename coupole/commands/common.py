@@ -1,4 +1,4 @@
-"""What the commands share: common arguments and options, and errors in JSON."""
+"""Common parts of the commands: arguments and options, and errors in JSON."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def queue(
 
 
 def _named(plans: list[Path], resumed: list[Path], hold: str) -> list[dict[str, str]]:
-    """What is to be entered, in order."""
+    """List what is to be entered, in order."""
     found = [{"plan": str(one.resolve())} for one in plans] + [{"resume": str(one.resolve())} for one in resumed]
     return [*found, *([{"hold": hold}] if hold else [])]
 
@@ -177,7 +177,7 @@ def _show_queue(console: RichConsole, state: dict[str, Any]) -> None:
 
 
 def _outlook(entry: dict[str, Any]) -> str:
-    """When it is expected, and what it needs; empty if it has ended."""
+    """Say when it is expected and what it needs; empty if it has ended."""
     from coupole.viewing.terminal import bytes_text, duration_text
 
     begin, end = (

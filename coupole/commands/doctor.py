@@ -73,7 +73,7 @@ def words_of(jitter: Any) -> str:
 
 
 def advice_of(found: list[Any], rig: Path) -> str:
-    """What to do; `found` is the rig's cycle, and the longer one where that was not held."""
+    """Say what to do; `found` is the rig's cycle, and the longer one where that was not held."""
     asked, last = found[0], found[-1]
     if asked.holds:
         return f"{rig}: this machine holds a cycle of {asked.cycle_ms} ms, as far as was measured"

@@ -67,8 +67,8 @@ def dose(
 
 
 def _sent(cell: Cell | None, object_id: str, what: str, asked: dict[str, Any]) -> bool:
-    """Whether the cell's console has entered it, and so knows who did; False if none is served. Raises InputError:
-    it refuses."""
+    """Tell whether the cell's console has entered it, and so knows who did; False if none is served. Raises
+    InputError: it refuses."""
     from coupole.console.command_line.client import NotServed, call
 
     try:

@@ -182,7 +182,7 @@ class ExportOptions:
     base_url: BaseUrlOption = None
 
     def given(self) -> dict[str, object]:
-        """Those that were given, by their names on the command line without dashes before them."""
+        """Options that were given, by their names on the command line without dashes before them."""
         return {
             name.replace("_", "-"): value
             for name, value in vars(self).items()

@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Asked:
-    """What the options say; those that were not given are empty."""
+    """Options of an export; those that were not given are empty."""
 
     source: Path
     to: str
     out: Path
     overwrite: bool
     options: dict[str, object]
-    """By name, only those that were given."""
+    """Options that were given, by name."""
 
     def refuse(self, names: tuple[str, ...], why: str) -> None:
         """Raise InputError if one of these options was given; `why` is what they are for."""
@@ -58,12 +58,12 @@ class Asked:
 
 @dataclass(frozen=True)
 class Found:
-    """What was written."""
+    """Files that were written."""
 
     files: int
     bytes: int
     misses_dn: dict[str, float] = field(default_factory=dict)
-    """Of views: how far the file is from their own pictures, rms, in steps of 8 bits."""
+    """Difference of each view's file from its own pictures, rms, in steps of 8 bits."""
 
 
 @flattened

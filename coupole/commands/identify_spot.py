@@ -19,7 +19,7 @@ _CHANNELS = 3
 
 @dataclass(frozen=True)
 class Spot:
-    """Where on a result, and what its camera saw under which light."""
+    """Place on a result, and what its camera saw under which light."""
 
     result: Path
     at: str
@@ -45,7 +45,7 @@ def asked_spot(result: Path | None, at: str | None, sensor: Path | None, leds: P
 
 
 def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
-    """What `--json` tells of a spot: the keys of a spectrum's, and the classes that cannot be told apart.
+    """Return what `--json` tells of a spot: the keys of a spectrum's, and the classes that cannot be told apart.
 
     Three channels vouch for no class: the verdict is "ambiguous", or "unknown" if no class has the colour.
     """

@@ -35,12 +35,12 @@ class FilmSpectra:
     u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Its standard uncertainty.")] = 0.0
 
     def are_named(self) -> bool:
-        """Whether any was given."""
+        """Tell whether any was given."""
         named = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
         return any(one is not None for one in named)
 
     def listed(self) -> list[dict[str, Any]]:
-        """As `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
+        """List them as `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
         films: list[dict[str, Any]] = []
         for film, ground, kind in ((self.over_black, self.black, "black"), (self.over_white, self.white, "white")):
             if (film is None) != (ground is None):
@@ -63,7 +63,7 @@ class FilmSpectra:
 
 @dataclass(frozen=True)
 class Instrument:
-    """What a spectrometer sees of a paint."""
+    """Spectrometer, and what it sees of a paint."""
 
     binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5
     geometry: Annotated[str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")] = (

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Said = Callable[[str, int, int], None]
 Made = tuple[dict[str, Any], list[str], Path]
-"""What `result.json` says, remarks, the report."""
+"""Content of `result.json`, remarks, path of the report."""
 JOB = "from"
 """Name of the main job among the steps; nobody types it."""
 

@@ -101,7 +101,7 @@ LeaveOutOption = Annotated[
 
 @dataclass(frozen=True)
 class SamplesOfRuns:
-    """By what samples of reflectance are taken from frames of runs."""
+    """Options by which samples of reflectance are taken from frames of runs."""
 
     mesh: MeshOption = None
     calibrations: RecordsOption = None
@@ -112,7 +112,7 @@ class SamplesOfRuns:
     poses: PosesOption = None
 
     def request(self, runs: Sequence[Path], left_out: Sequence[int]) -> RunRequest:
-        """What these runs are asked for; LEDs that are left out are kept for the check."""
+        """Request to these runs; LEDs that are left out are kept for the check."""
         from coupole.reflectance.run_job import RunRequest
 
         return RunRequest(
@@ -137,7 +137,7 @@ class PicturesWithoutRecords:
 
 @dataclass(frozen=True)
 class Workers:
-    """What fits may use of this machine, or the cluster that does them."""
+    """Share of this machine that fits may use, or the cluster that does them."""
 
     memory: MemoryOption = "2GB"
     scheduler: SchedulerOption = None

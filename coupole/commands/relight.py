@@ -139,7 +139,7 @@ class Lighting:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """From where a result is seen, and by which fit."""
+    """Place from which a result is seen, and the fit."""
 
     view: ViewOption = None
     from_: FromOption = None
@@ -151,7 +151,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class MoreOutput:
-    """What else is written, and what is white."""
+    """Other files that are written, and the white of pictures."""
 
     uncertainty: UncertaintyOption = None
     turn: TurnOption = None

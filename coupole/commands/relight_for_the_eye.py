@@ -53,7 +53,7 @@ class EyeColours:
     colour_record: RecordOption = None
 
     def read(self) -> CameraColour | None:
-        """By a record, or by tables of spectra; None if no picture for the eye is wanted.
+        """Read it from a record, or from tables of spectra; None if no picture for the eye is wanted.
 
         Raises InputError for what does not go together, and as `camera_colour` and `colour_of_record`."""
         from coupole.exchange.camera_colour import camera_colour, colour_of_record

@@ -26,7 +26,7 @@ class Relit:
     picture: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]
     """[h, w, 3] of lights."""
     about: dict[str, Any]
-    """What `--json` and a video's comment say of it."""
+    """Description for `--json` and for a video's comment."""
     uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
     """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
     has_colours: bool = True

@@ -85,7 +85,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
 
 
 def _unsafe(run: Run) -> list[str]:
-    """Why it is not sure that the cell is safe after the last session, by the run's journal."""
+    """Say why it is not sure that the cell is safe after the last session, by the run's journal."""
     from coupole.storage import journal
     from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 
@@ -151,7 +151,7 @@ def _sent(run: Path | None, command: Command, *, until: str = "") -> State:
     from coupole.acquisition.run_control import ask
 
     def alarm(message: str) -> None:
-        """Of a run that does not answer."""
+        """Alarm: a run does not answer."""
         from coupole.viewing import terminal
 
         terminal.alarm(message)

@@ -98,7 +98,7 @@ def _look(
     planes: int | None,
     say: Callable[[str, int, int], None],
 ) -> Look:
-    """By what the source is. Raises InputError if it is neither a scene, a run nor a whole result."""
+    """Build it by the kind of the source. Raises InputError if it is neither a scene, a run nor a whole result."""
     from coupole.exchange.look.look_environment import with_environment
     from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
@@ -129,7 +129,8 @@ def _look(
 
 
 def _look_of_scene(path: Path) -> Look:
-    """Of a scene file. Raises InputError for one that a page cannot show, or without the materials' data."""
+    """Build it from a scene file. Raises InputError for one that a page cannot show, or without the materials'
+    data."""
     from coupole.commands.render_scene import read_scene
     from coupole.exchange.look.look_of_scenes import look_of_scene
 

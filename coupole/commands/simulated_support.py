@@ -1,4 +1,5 @@
-"""What a simulated cell has on its support for a calibration: a copy of its rig, and descriptions of things."""
+"""Things that a simulated cell has on its support for a calibration: a copy of its rig, and descriptions of
+things."""
 
 from __future__ import annotations
 

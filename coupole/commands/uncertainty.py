@@ -35,7 +35,7 @@ CoverageOption = Annotated[
 
 @dataclass(frozen=True)
 class SpotOfObject:
-    """What is measured: a triangle of the mesh, and the light on it."""
+    """Measured spot: a triangle of the mesh, and the light on it."""
 
     incidence_deg: Annotated[float, typer.Option("--incidence", min=0.0, max=75.0, help="Of the light.")] = 42.0
     vertex_um: Annotated[float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error.")] = 30.0
@@ -118,13 +118,13 @@ def _say(result: _Result, console: Console, *, as_json: bool) -> None:
 class _Result:
     budget: Budget
     spread: Spread
-    """Of the first case."""
+    """Spread of the first case."""
     cases: list[Case]
     """Our records, then those of `--beside`."""
     table: tuple[Accuracy, ...]
     doubts: tuple[str, ...]
     document: dict[str, Any]
-    """As `--json` prints it."""
+    """Document as `--json` prints it."""
 
 
 def _propagated(

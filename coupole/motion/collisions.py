@@ -129,7 +129,7 @@ class CellBodies:
         return reach
 
     def margins(self, joints_deg: ArrayLike, far_mm: float = np.inf) -> dict[tuple[str, str], Floats]:
-        """For each pair of bodies distance minus clearance [n] at joint angles [n, 6]; mm, never more than the
+        """Distance minus clearance of each pair of bodies [n] at joint angles [n, 6]; mm, never more than the
         true value, and at most `far_mm` (to save time)."""
         margins = self._margins(np.atleast_2d(np.asarray(joints_deg, dtype=np.float64)), far_mm)
         return {(pair.body.name, pair.other_name): margins[:, n] for n, pair in enumerate(self._pairs)}

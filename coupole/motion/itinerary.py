@@ -1,4 +1,4 @@
-"""From views to motions: a posture of the arm for each view, and collision-free paths between them."""
+"""Motions for views: a posture of the arm for each view, and collision-free paths between them."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Occlusion:
-    """Which LEDs light which patches in one view: plain arrays, LEDs in the order of the dome's table."""
+    """LEDs that light each patch in one view: plain arrays, LEDs in the order of the dome's table."""
 
     codes: NDArray[np.uint8]
     """[patches, leds] REACHED, AWAY, BY_OBJECT, BY_ARM or BY_TOOL."""
@@ -231,8 +231,8 @@ def hidden_by(
     radii_mm: NDArray[np.float64],
     asked: NDArray[np.bool_],
 ) -> NDArray[np.int16]:
-    """For each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k]) that it
-    meets, [n, m]; -1 where it meets none, or where `asked` [n, m] is False."""
+    """Find for each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k])
+    that it meets, [n, m]; -1 where it meets none, or where `asked` [n, m] is False."""
     found = np.full(asked.shape, -1, np.int16)
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)

@@ -39,7 +39,7 @@ class PacketMesh:
     compact: bool = True
     """A smaller tree, in which rays take 1.2 to 1.7 times as long."""
     scene: np.uint64 = field(init=False)
-    """For `blocked16` in compiled code."""
+    """Scene as `blocked16` takes it in compiled code."""
 
     def __post_init__(self) -> None:
         """Raises CoupoleError if Embree has too little memory."""

@@ -32,7 +32,7 @@ class Leg:
     waypoints: tuple[Joints, ...]
     duration_s: float
     contact: Contact | None = None
-    """If there is no path: the contact that blocks it."""
+    """Contact that blocks the path, if there is no path."""
 
 
 class PathPlanner:
@@ -209,7 +209,7 @@ def _sorted(a: Joints, b: Joints) -> tuple[Joints, Joints]:
 
 
 def _branch(tree: list[Joints], parents: list[int], node: int) -> list[Joints]:
-    """From the root to a node."""
+    """Return the branch from the root to a node."""
     places = []
     while node >= 0:
         places.append(tree[node])

@@ -49,11 +49,11 @@ class ArchivedView:
     view: str
     frames: int
     pixel_bytes: int
-    """Of its frames, uncompressed."""
+    """Bytes of its frames, uncompressed."""
     stored_bytes: int
-    """Of its frames in the archive."""
+    """Bytes of its frames in the archive."""
     freed_bytes: int
-    """On the disk; negative if the original is kept."""
+    """Bytes that are free on the disk again; negative if the original is kept."""
     compress_s: float
     read_back_s: float
 

@@ -101,7 +101,7 @@ class ArmFaults:
         self._append(ArmFault(message=message, run=run, id=uuid.uuid4().hex))
 
     def confirm(self, name: str, note: str = "") -> None:
-        """Of all faults that stand."""
+        """Confirm all faults that stand."""
         known = tuple(fault.id for fault in self.standing() if fault.id)
         self._append(Confirmation(name=name, note=note, faults=known))
 
@@ -118,19 +118,19 @@ class ArmFaults:
         return f"{last} (confirmed by {words.name}, {words.t})"
 
     def _append(self, line: _Line) -> None:
-        """To all places, also if one of them does not take it."""
+        """Append it in all places, also if one of them does not take it."""
         failures = [error for path in self._paths if (error := _append_to(path, line)) is not None]
         if failures:
             raise failures[0]
 
 
 def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
-    """Of a cell's arm; `identity` where it is opened."""
+    """Faults of a cell's arm; `identity` where it is opened."""
     return ArmFaults(*places_of_arm(cell, identity))
 
 
 def _unconfirmed(lines: list[Line]) -> list[ArmFault]:
-    """Those after the last confirmation in the same file."""
+    """Faults after the last confirmation in the same file."""
     found: list[ArmFault] = []
     for line in lines:
         if isinstance(line, ArmFault):

@@ -1,5 +1,5 @@
-"""Whether frames are what the run's own plan asked for: light, exposure and pose, by the plan and the rig that the
-run keeps in `inputs/`.
+"""Comparison of frames with what the run's own plan asked for: light, exposure and pose, by the plan and the rig
+that the run keeps in `inputs/`.
 
 A frame's LED is as the box logged it, its exposure as it was commanded, its pose by the arm's joints as they were
 measured. The object's mesh is not needed for it.
@@ -31,9 +31,10 @@ from coupole.storage.run import Run
 from coupole.storage.step_fields import STORED_NO_LED
 
 _SETTLED_DEG = 0.1
-"""Of each axis from where it was sent, beside what an arm may move in a burst (the rig's `still_deg`)."""
+"""Angle of each axis from where it was sent, deg, beside what an arm may move in a burst (the rig's
+`still_deg`)."""
 _REACH_MM = 2000.0
-"""Of an arm: an axis that is off by an angle moves the camera by this radius at most."""
+"""Reach of an arm: an axis that is off by an angle moves the camera by this radius at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,8 @@ class AsPlanned:
                 yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
 
     def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
-        """How a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do not."""
+        """Say how a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do
+        not."""
         asked = self._asked(shot.view).get(shot.label)
         if asked is None:
             return f"{shot}: the run's plan has no such shot" if shot.is_shot else ""
@@ -86,7 +88,7 @@ class AsPlanned:
 
     @lru_cache(maxsize=16)  # noqa: B019
     def _off(self, view: str, joints: bytes) -> str:
-        """How far the arm was from a view; empty if it was there."""
+        """Say how far the arm was from a view; empty if it was there."""
         joints_deg = np.frombuffer(joints)
         planned = next(pose for pose in self.schedule.views if pose.name == view)
         allowed_deg = _SETTLED_DEG + self.rig.motion.still_deg

@@ -1,4 +1,4 @@
-"""What an operating system's error on a run's disk means to the operator."""
+"""Errors of the operating system on a run's disk, in the operator's words."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ PAGE = mmap.PAGESIZE
 MAX_POSES = 256
 PATTERNS = ("MONO", "RGGB", "BGGR", "GRBG", "GBRG")
 _WRONG = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
-"""What h5py and NumPy raise for a file that is damaged, or another one."""
+"""Errors that h5py and NumPy raise for a file that is damaged, or another one."""
 DATA, FRAMES, POSES = (
     "entry/instrument/detector/data",
     "entry/instrument/detector/frames",
@@ -90,7 +90,7 @@ class Layout:
     packed: bool
     """True if two pixels are packed in three bytes (`coupole.storage.packing`, `lsb`)."""
     inode: int
-    """Of the file; it changes when the file is archived."""
+    """Inode of the file; it changes when the file is archived."""
 
     @property
     def frame_bytes(self) -> int:
@@ -183,14 +183,15 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
 
 
 def read_frame_into(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> None:
-    """As `read_frame`, into `pixels` [H, W], C order, of the caller: past the page cache where the file system,
-    the size of the frames and the memory's alignment (512 bytes) allow it. Raises StorageError."""
+    """Read a frame as `read_frame` does, into `pixels` [H, W], C order, of the caller: past the page cache
+    where the file system, the size of the frames and the memory's alignment (512 bytes) allow it. Raises
+    StorageError."""
     if layout.archived or layout.packed or not _read_direct(path, layout, slot, pixels):
         pixels[:] = read_frame(path, layout, slot)
 
 
 def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint16]) -> bool:
-    """Whether the frame was read; not if the file is another one by now, ends early, or cannot be read so."""
+    """Tell whether the frame was read; not if the file is another one by now, ends early, or cannot be read so."""
     if layout.frame_bytes % PAGE or layout.data_offset % PAGE:
         return False
     try:

@@ -19,7 +19,7 @@ from coupole.storage.journal_events import JOURNAL_VERSION, Event, JournalBegun
 from coupole.storage.line_file import LineFile
 
 FRAME_LINE = '{"event":"frame"'
-"""How the line of a proven frame begins."""
+"""Beginning of the line of a proven frame."""
 _EVENT: TypeAdapter[Event] = TypeAdapter(Annotated[Event, Field(discriminator="event")])
 
 
@@ -58,7 +58,7 @@ class Journal:
 
     @property
     def place(self) -> Path | None:
-        """Where it is now; None if it was removed, or that is not told."""
+        """Path where the file is now; None if it was removed, or that is not told."""
         return self._file.place
 
     def close(self) -> None:

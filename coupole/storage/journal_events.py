@@ -59,9 +59,10 @@ class SessionStarted(JournalEvent):
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
-    """What the object may receive in its life, by its ledger and the plan, as the session begins."""
+    """Light that the object may receive in its life, by its ledger and the plan, as the session begins."""
     trusted: tuple[str, ...] = ()
-    """What a person allows by name in the rig (`any_controller_by`, `without_realtime_by`), in words."""
+    """Permissions that a person gives by name in the rig (`any_controller_by`, `without_realtime_by`), in
+    words."""
 
 
 class SessionResumed(JournalEvent):
@@ -113,7 +114,7 @@ class FrameProven(JournalEvent):
     """Its slot in that file."""
     frame_id: int
     xxh3: str
-    """Of the frame's bytes, 16 hexadecimal digits."""
+    """Checksum of the frame's bytes, 16 hexadecimal digits."""
 
 
 class BurstBegun(JournalEvent):
@@ -122,7 +123,7 @@ class BurstBegun(JournalEvent):
     event: Literal["begin"] = "begin"
     view: str
     planned_lux_h: tuple[float, ...]
-    """At each of the object's dose points, at most."""
+    """Largest light at each of the object's dose points."""
 
 
 class BurstEnded(JournalEvent):
@@ -144,7 +145,7 @@ class BurstEnded(JournalEvent):
     """The camera's counters."""
     hottest_board_c: float | None = None
     given_lux_h: tuple[float, ...] | None = None
-    """At each of the object's dose points, in place of what was planned; None in version 0.1."""
+    """Light at each of the object's dose points, in place of what was planned; None in version 0.1."""
 
 
 class GapFound(JournalEvent):
@@ -209,7 +210,7 @@ class TextUnread(JournalEvent):
     waiting_bytes: int
     """Kept for the reader when this was written."""
     stalled_s: float
-    """For how long nothing had been taken."""
+    """Time for which nothing had been taken, s."""
 
 
 class ViewSealed(JournalEvent):

@@ -103,7 +103,7 @@ class Ledger:
             asked.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
 
     def correct(self, plan_id: str, dose_lux_h: float, damage_wh_m2: float | None) -> None:
-        """What was given of that plan, in place of it."""
+        """Enter the light that was given of that plan, in place of the planned light."""
         self._append(LightGiven(id=plan_id, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2))
 
     def enter(self, dose_lux_h: float, note: str) -> None:

@@ -15,7 +15,7 @@ from coupole.errors import DoseBudgetReached, StorageError
 from coupole.storage.line_file import utc_now
 
 BY_HAND = "by hand"
-"""In place of a run's name, for light that was entered with `coupole dose --add`."""
+"""Name in place of a run's, for light that was entered with `coupole dose --add`."""
 _ROUNDING = 1e-9
 _TAIL_BYTES = 256
 NO_FILE = "a pipe or a device, expected a file"
@@ -53,21 +53,21 @@ class LightPlanned(_Light):
 
 
 class LightGiven(_Light):
-    """What was given of the plan with this id."""
+    """Light that was given of the plan with this id."""
 
     event: Literal["given"] = "given"
     id: str
 
 
 class WarningSet(_Line):
-    """From now on a total above this is warned of; None: no total is."""
+    """Total above which a warning is given from now on; None: no warning."""
 
     event: Literal["warn_above"] = "warn_above"
     dose_lux_h: Amount | None
 
 
 class BudgetSet(_Line):
-    """From now on the object may receive so much in its life, by this person's word."""
+    """Light that the object may receive in its life from now on, by this person's word."""
 
     event: Literal["budget"] = "budget"
     dose_lux_h: Amount
@@ -98,10 +98,10 @@ class History:
 
     entries: list[Entry] = field(default_factory=list)
     of_plan: dict[str, Entry] = field(default_factory=dict)
-    """Those that were planned, by their id."""
+    """Entries of planned light, by their id."""
     warn_above_lux_h: float | None = None
     budgets: list[BudgetSet] = field(default_factory=list)
-    """As they were set; the last one holds."""
+    """Budgets in the order in which they were set; the last one holds."""
     unreadable: int = 0
     """Lines that are no entries: torn by a crash before their light was given, or damaged later."""
 
@@ -115,13 +115,14 @@ class History:
         return self.budgets[-1].dose_lux_h if self.budgets else None
 
     def allowed_lux_h(self, plans_lux_h: float | None) -> float | None:
-        """What the object may receive in its life: the smaller of its budget and a plan's; None without both."""
+        """Return the light that the object may receive in its life: the smaller of its budget and a plan's; None
+        without both."""
         known = [one for one in (self.budget_lux_h, plans_lux_h) if one is not None]
         return min(known, default=None)
 
     @property
     def damage_wh_m2(self) -> float:
-        """Of the light whose spectrum is known."""
+        """Damage by the light whose spectrum is known."""
         return sum(entry.damage_wh_m2 or 0.0 for entry in self.entries)
 
     @property
@@ -134,7 +135,7 @@ class History:
         return sum(entry.dose_lux_h for entry in self.entries if not entry.settled)
 
     def planned_lux_h(self, plan_id: str) -> float:
-        """What counts of the plan with this id; 0 if it is not known."""
+        """Return the light that counts of the plan with this id; 0 if it is not known."""
         return self.of_plan[plan_id].dose_lux_h if plan_id in self.of_plan else 0.0
 
     def of_run(self, run: str) -> History:
@@ -142,7 +143,7 @@ class History:
 
     @property
     def runs(self) -> list[str]:
-        """In the order of their first light."""
+        """Runs in the order of their first light."""
         return list(dict.fromkeys(entry.run for entry in self.entries))
 
 
@@ -155,7 +156,7 @@ class Asked:
     """The plan's own, which can only be stricter than the object's."""
     plan: str = ""
     name: str = ""
-    """Who runs it."""
+    """Person who runs it."""
 
     def refuse_beyond(self, object_id: str, history: History, more_lux_h: float = 0.0) -> None:
         """Raise DoseBudgetReached if this light, after what the ledger has and `more_lux_h`, is too much."""
@@ -199,7 +200,7 @@ def _opened(path: Path) -> BinaryIO:
 
 
 def history_of(texts: list[bytes]) -> History:
-    """What these lines say."""
+    """Build the history that these lines tell."""
     reading = Reading()
     for text in texts:
         reading.take(text)
@@ -207,7 +208,7 @@ def history_of(texts: list[bytes]) -> History:
 
 
 class Reading:
-    """What has been read of a ledger that others go on writing."""
+    """Part of a ledger that has been read; others go on writing it."""
 
     def __init__(self, *, only_grows: bool = False) -> None:
         """`only_grows`: once lines were read, the file must keep them, and must be text; `renewed` raises
@@ -217,7 +218,7 @@ class Reading:
         self._inode, self._read_bytes, self._tail = 0, 0, b""
 
     def renewed(self, path: Path) -> Reading:
-        """With the complete lines that came since; all of them anew if the file is another one now. Raises
+        """Add the complete lines that came since; read all of them anew if the file is another one now. Raises
         StorageError."""
         try:
             with _opened(path) as file:

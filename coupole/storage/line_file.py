@@ -37,7 +37,7 @@ class LineFile:
             raise disk_error(path, error) from error
 
     def _end_torn_line(self) -> None:
-        """After a crash the last line may be truncated: end it, so that the next one is separate."""
+        """End the last line, which may be truncated after a crash, so that the next one is separate."""
         size = os.fstat(self._fd).st_size
         if size and os.pread(self._fd, 1, size - 1) != b"\n":
             os.write(self._fd, b"\n")
@@ -68,7 +68,8 @@ class LineFile:
 
     @property
     def place(self) -> Path | None:
-        """Where the file is now, as the kernel has it (proc(5)); None if it was removed, or that is not told."""
+        """Path where the file is now, as the kernel has it (proc(5)); None if it was removed, or that is not
+        told."""
         try:
             found = Path(f"/proc/self/fd/{self._fd}").readlink()
             return found if os.path.samestat(os.fstat(self._fd), found.stat()) else None

@@ -67,7 +67,8 @@ def begin(run: Path) -> None:
 
 
 def open_for_session(run: Path, complete_views: Iterable[str]) -> None:
-    """Before a session: take out what it may write. `complete_views` are files of views that it will not open."""
+    """Take out what a session may write, before it begins. `complete_views` are files of views that it will not
+    open."""
     kept = set(complete_views)
     forget(run, [name for name in read(run) if _written_by_sessions(name) and name not in kept])
 
@@ -112,7 +113,7 @@ def _yield_to_others() -> None:
 
 
 def _synced_sha256(path: Path, stop: threading.Event, on_read: Callable[[], None]) -> str:
-    """Of a file that is on the disk first: the manifest must not know of more than the disk."""
+    """Hash a file that is on the disk first: the manifest must not know of more than the disk."""
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -128,7 +129,7 @@ def _synced_sha256(path: Path, stop: threading.Event, on_read: Callable[[], None
 def problems(
     run: Path, progress: Progress = lambda done, total: None, *, only: AbstractSet[str] | None = None
 ) -> dict[str, str]:
-    """What is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
+    """Say what is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
     listed, found = read(run), {}
     listed = {name: digest for name, digest in listed.items() if only is None or name in only}
     for done, (name, digest) in enumerate(listed.items()):

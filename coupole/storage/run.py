@@ -52,7 +52,7 @@ class Run:
         """Open an existing run. Raises InputError if there is none, or its run.json is wrong."""
         self.folder = folder.resolve()
         self.is_lost = False
-        """In a session its folder or journal was removed or replaced: nothing more is written at its path."""
+        """Whether its folder or journal was removed or replaced: nothing more is written at its path."""
         self.about = read_description(folder)
 
     @staticmethod
@@ -118,7 +118,7 @@ class Run:
 
     @property
     def proof(self) -> str:
-        """What the identity of the run's frames rests on, in the words of run.json."""
+        """Basis of the identity of the run's frames, in the words of run.json."""
         found: str = self.about.get("proof", "not recorded")
         return found
 

@@ -24,7 +24,7 @@ def lux_h_of_points(events: Iterable[Event]) -> tuple[float, ...]:
 
 
 def highest_lux_h(events: Iterable[Event]) -> float:
-    """At the point with the highest dose, which is the run's."""
+    """Light at the point with the highest dose, which is the run's."""
     return max(lux_h_of_points(events), default=0.0)
 
 

@@ -1,4 +1,4 @@
-"""What a run depends on: plan, rig and the files that they name, kept in the run's folder `inputs/`.
+"""Inputs of a run: plan, rig and the files that they name, kept in the run's folder `inputs/`.
 
 ::
 
@@ -88,7 +88,7 @@ def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
 
 
 def _arm_sha256(arm: ArmDescription) -> str:
-    """Of all that the description says; the meshes of its links are compared as files."""
+    """Hash of all that the description says; the meshes of its links are compared as files."""
     return hashlib.sha256(arm.model_dump_json(exclude={"link_meshes"}).encode()).hexdigest()
 
 
@@ -230,7 +230,7 @@ def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
 
 
 def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]:
-    """How plan, rig and the files that they name differ in meaning from those that a run began with.
+    """List how plan, rig and the files that they name differ in meaning from those that a run began with.
 
     Comments, the order of keys, and the place of a file are no change; any other byte of a mesh or a record is.
     """

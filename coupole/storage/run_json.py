@@ -1,4 +1,4 @@
-"""What run.json must hold for the program to go on with it; more may stand there."""
+"""Model of run.json: what the program needs to go on with the run; more may stand there."""
 
 from __future__ import annotations
 

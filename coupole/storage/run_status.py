@@ -48,7 +48,7 @@ class Session:
     outcome: str = ""
     """`done`, `interrupted` or `failed`; empty while it runs, and for one that was killed."""
     reason: str = ""
-    """Why it ended, if not because all was done."""
+    """Reason why it ended, if not because all was done."""
     pauses: int = 0
     paused_s: float = 0.0
     light_s: float = 0.0
@@ -56,7 +56,7 @@ class Session:
 
     @property
     def duration_s(self) -> float:
-        """From its begin to its last event, pauses included, by this machine's clock."""
+        """Time from its begin to its last event, s, pauses included, by this machine's clock."""
         return _seconds(self.begun, self.ended)
 
 
@@ -67,15 +67,15 @@ class Status:
     state: str = CREATED
     """`created`, `running`, `paused`, `done`, `interrupted` (by a person, a signal, a crash) or `failed`."""
     reason: str = ""
-    """Why it is interrupted or failed."""
+    """Reason why it is interrupted or failed."""
     proof: str = ""
-    """What the identity of its frames rests on."""
+    """Basis of the identity of its frames."""
     shots: int = 0
     proven: int = 0
     darks_proven: int = 0
     reshot: int = 0
     faults: list[str] = field(default_factory=list)
-    """What failed. That somebody stopped the run is none."""
+    """Failures of the run. That somebody stopped the run is none."""
     sessions: list[Session] = field(default_factory=list)
     views: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Proven and expected frames of each view."""
@@ -83,7 +83,8 @@ class Status:
     dose_lux_h: float = 0.0
     """Light on the object in all sessions."""
     dose_budget_lux_h: float | None = None
-    """What the object may receive in its life, as the last session began; None: no budget, or not known."""
+    """Light that the object may receive in its life, as it was when the last session began; None: no budget, or
+    not known."""
     stopped_pid: int | None = None
     """The process that has the run, where that is stopped (Ctrl-Z, SIGSTOP)."""
     go_on: str = ""

@@ -1,4 +1,4 @@
-"""What a frame table keeps of a step's record: the columns of a view's file, in the file's own terms."""
+"""Fields of a step's record that a frame table keeps: the columns of a view's file, in the file's own terms."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def step_fields(record: StepRecord, t_trigger_ns: int) -> dict[str, int]:
 
 
 def board_temperature_c(record: np.void) -> float | None:
-    """Of the LED's board, as a frame's record (FRAME_DTYPE) has it, C; None if the box could not tell."""
+    """Temperature of the LED's board, as a frame's record (FRAME_DTYPE) has it, C; None if the box could not
+    tell."""
     decicelsius = int(record["board_temperature_dc"])
     return None if decicelsius == _UNKNOWN else decicelsius / 10
 

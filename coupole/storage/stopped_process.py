@@ -8,7 +8,7 @@ _LOCKS = Path("/proc/locks")
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether it is stopped by Ctrl-Z or SIGSTOP; false too if there is no such process."""
+    """Tell whether a process is stopped by Ctrl-Z or SIGSTOP; false too if there is no such process."""
     try:
         state = (
             Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[0]

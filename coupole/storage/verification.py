@@ -28,7 +28,7 @@ class Verification:
     unlisted: list[str] = field(default_factory=list)
     """Files that the manifest does not cover yet."""
     not_compared: str = ""
-    """Why frames were not compared with the run's plan; empty if they were."""
+    """Reason why frames were not compared with the run's plan; empty if they were."""
 
     @property
     def ok(self) -> bool:

@@ -28,7 +28,7 @@ class View:
     poses: NDArray[np.void]
     """POSE_DTYPE; a record's `pose` is a row of it."""
     attributes: dict[str, Any]
-    """Of the file: object, lens, camera, gain."""
+    """Attributes of the file: object, lens, camera, gain."""
     pattern: str
     black_dn: int
     white_dn: int

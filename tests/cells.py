@@ -6,6 +6,7 @@ Frames have 128 x 96 pixels of the demo's field of view (24576 bytes, six pages)
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import json
 import signal
@@ -204,6 +205,7 @@ def here(*arguments: str | Path, typed: str = "") -> Ended:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+            gc.freeze()  # a session has unfrozen what `conftest` froze: half a million objects for each collection
     return Ended(code, out.getvalue(), err.getvalue())
 
 

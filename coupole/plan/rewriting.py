@@ -99,6 +99,8 @@ def _edited(document: Document, text: str, changes: Mapping[KeyPath, str]) -> st
         if at in document.value_places:
             node = _node(root, at)
             spans.append((node.start_mark.index, node.end_mark.index, json.dumps(value, ensure_ascii=False)))
+        elif isinstance(root, MappingNode) and root.flow_style:
+            raise LookupError(f"a file in braces lacks {at[-1]}")
         else:
             added += f"{at[-1]}: {json.dumps(value, ensure_ascii=False)}\n"
     for begin, end, value in sorted(spans, reverse=True):

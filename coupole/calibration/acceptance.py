@@ -22,7 +22,7 @@ class Allowed:
     """One limit: the largest value that a figure may have."""
 
     name: str
-    """For `--limit`, with its unit."""
+    """Name of the figure for `--limit`, with its unit."""
     what: str
     usual: float
     unit: str = ""

@@ -37,9 +37,10 @@ _SINGULAR = 1e-6
 """Least diagonal element of the Cholesky factor of the scaled normal matrix; its square is the share of a
 parameter's information that is left when the parameters before it are unknown too."""
 _LEAST_REDUNDANCY = 3.0
-"""With less redundancy the residuals do not determine the noise."""
+"""Least redundancy: with less, the residuals do not determine the noise."""
 _LEAST_FACTOR = 1e-4
-"""Of the stated noise: a lower bound, as residuals of nearly zero would give a group unlimited weight."""
+"""Lower bound of a noise factor (estimated over stated noise), as residuals of nearly zero would give a group
+unlimited weight."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,9 @@ class Adjusted(Generic[S]):
     degrees: Floats
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]
-    """Of each block, over the stated noise."""
+    """Residuals of each block, over the stated noise."""
     kept: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
-    """Of each block, which residuals were not rejected."""
+    """Masks of each block: True for residuals that were not rejected."""
     steps: int
 
     def factor(self, name: str) -> float:
@@ -287,7 +288,8 @@ def _reject(
     kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     factors: Floats,
 ) -> list[np.ndarray[tuple[int], np.dtype[np.bool_]]] | None:
-    """Which residuals are within `REJECT_SIGMA`; None if no further one was rejected."""
+    """Return masks of the residuals of each block that are within `REJECT_SIGMA`; None if no further one was
+    rejected."""
     result = []
     for block, before in zip(blocks, kept, strict=True):
         size = groups[block.group].rejects

@@ -1,4 +1,4 @@
-"""How errors of an arm's axes move its flange: the bundle's `axis_sensitivity`."""
+"""Motion of an arm's flange by errors of its axes: the bundle's `axis_sensitivity`."""
 
 from __future__ import annotations
 

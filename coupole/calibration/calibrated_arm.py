@@ -35,7 +35,7 @@ class CalibratedArm:
 
 
 def has_axis_zeros(hand_eye: Path) -> bool:
-    """Whether a hand-eye record was made with the arm's model."""
+    """Tell whether a hand-eye record was made with the arm's model."""
     return any(parameter.name in ZEROS for parameter in read_record(hand_eye).parameters)
 
 

@@ -21,9 +21,9 @@ class Step:
     """One acquisition and the records made from it."""
 
     name: str
-    """Of the plan, and of its template."""
+    """Name of the plan, and of its template."""
     stands: str
-    """What must be on the support, for the operator."""
+    """Text that tells the operator what must be on the support."""
     things: tuple[Mapping[str, Any], ...]
     """The same for a simulated cell, which places it itself (`world.settings.things`)."""
     records: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""How well a fit predicts views that it did not have: each left out in turn, without fitting anew.
+"""Quality of a fit's predictions for views that it did not have: each is left out in turn, without fitting anew.
 
 With H the part of the hat matrix that belongs to a view, the residuals that it would have if it had been left out
 are (I - H)^-1 r, and their covariance is (I - H)^-1 (Allen's PRESS, Technometrics 16, 1974, for blocks). What only
@@ -30,7 +30,7 @@ class LeftOut:
 
     @property
     def ratio(self) -> float:
-        """Over all views."""
+        """Root mean square of the ratios of all views."""
         return float(np.sqrt(np.mean(self.ratios**2)))
 
 

@@ -1,5 +1,5 @@
-"""Whether a plan may be acquired with the calibrations that it names: pure functions that give all reasons
-against."""
+"""Check whether a plan may be acquired with the calibrations that it names: pure functions that give all reasons
+against it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Situation:
     """The cell that is to take the pictures. What is None is not known and not checked."""
 
     now: datetime
-    """With a time zone."""
+    """Time now, with a time zone."""
     simulated: bool
     size_px: tuple[int, int]
     """Width and height of the camera's frames."""
@@ -34,7 +34,7 @@ class Situation:
     camera: str | None = None
     """Model and serial number, once the camera is open."""
     temperature_c: float | None = None
-    """Of the coolest LED board, which is nearest to the room's temperature."""
+    """Temperature of the coolest LED board, which is nearest to the room's temperature."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tup
 
 
 def refusals(named: Sequence[InForce], here: Situation, needed: Sequence[str] = NEEDED) -> list[str]:
-    """Why a plan that names these records must not be acquired here; empty if it may."""
+    """Return the reasons why a plan that names these records must not be acquired here; empty if it may."""
     counts = Counter[str](item.record.kind for item in named)
     reasons = [f"calibrations: no record of the kind `{kind}` is named" for kind in needed if not counts[kind]]
     reasons += [f"calibrations: {n} records of the kind `{kind}` are named" for kind, n in counts.items() if n > 1]

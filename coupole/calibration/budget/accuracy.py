@@ -51,7 +51,7 @@ class Accuracy:
     paper: str
     """The paper's figure in its own words."""
     ours: tuple[tuple[float, ...] | None, ...]
-    """By case: one figure, or the two ends of an interval; None without a record."""
+    """Our figure for each case: one number, or the two ends of an interval; None without a record."""
 
     def cell(self, case: int) -> str:
         """Our figure as text."""
@@ -86,8 +86,9 @@ def _camera_on_flange(item: InForce) -> float:
 
 
 def _camera_in_base(item: InForce) -> float:
-    """At any pose: hand-eye and the robot's noise. A common rotation of the base does not count, as LEDs and mesh
-    are calibrated in the same base."""
+    """Return the standard uncertainty of the camera's position in the base frame, at any pose: hand-eye and the
+    robot's noise. A common rotation of the base does not count, as LEDs and mesh are calibrated in the same
+    base."""
     noise = {line.name: line.found for line in item.record.noise}
     turned_mm = np.radians(noise["robot orientation"]) * camera_reach_mm(item.record)
     pose_mm2 = 3.0 * noise["robot position"] ** 2 + 2.0 * turned_mm**2

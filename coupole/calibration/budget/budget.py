@@ -69,17 +69,17 @@ class Known:
     degrees."""
     edge_mm: float = 0.2
     led_mm: float = 0.7
-    """Of an LED's centre, all directions together."""
+    """Uncertainty of an LED's centre, all directions together."""
     led_deg: float = 0.21
     mesh_mm: float = 0.1
-    """Of mesh to robot, all directions together."""
+    """Uncertainty of the pose of mesh to robot, all directions together."""
     mesh_deg: float = 0.02
     robot_mm: float = 0.03
-    """Of the robot's common error, which shifts LEDs and mesh alike and so correlates them."""
+    """Uncertainty of the robot's common error, which shifts LEDs and mesh alike and so correlates them."""
     camera_mm: float = 0.3
-    """Of the camera's ray where it meets the object, both directions across it together."""
+    """Uncertainty of the camera's ray where it meets the object, both directions across it together."""
     lens_px: float = 0.3
-    """Of the image of a direction by the lens's calibration, both coordinates together."""
+    """Uncertainty of the image of a direction by the lens's calibration, both coordinates together."""
     pixel_mm: float = 0.047
     """Side of a pixel on the object."""
     contrast_per_mm: float = 0.02
@@ -120,12 +120,12 @@ class Known:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where a sample is taken: base frame, mm."""
+    """Geometry at which a sample is taken: base frame, mm."""
 
     incidence_deg: float
-    """Between the surface's normal and the LED."""
+    """Angle between the surface's normal and the direction to the LED."""
     emission_deg: float = 10.0
-    """Between the LED's normal and the sample."""
+    """Angle between the LED's normal and the direction to the sample."""
     distance_mm: float = 1000.0
     exposure_share: float = 0.6
     """Share of full scale at which a white target facing the LED would be exposed."""
@@ -151,7 +151,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Budget:
-    """Of one sample."""
+    """Uncertainty budget of one sample."""
 
     geometry: Geometry
     inputs: Inputs
@@ -160,7 +160,7 @@ class Budget:
     numeric: Propagated
     linear: Linear
     validations: tuple[Validation, ...]
-    """For one and two significant digits of u, at each coverage."""
+    """Tests of the linear formula for one and two significant digits of u, at each coverage."""
     shares: tuple[Share, ...]
 
     def relative(self, coverage: float, kind: str = "symmetric") -> tuple[float, float]:

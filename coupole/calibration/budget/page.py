@@ -38,7 +38,7 @@ def page(
 
 
 def verdict(validation: Validation) -> str:
-    """Whether the linear formula is sufficient, as text."""
+    """Say in words whether the linear formula is sufficient."""
     if not validation.sure:
         return "may do or not: more trials would tell"
     return "will do" if validation.passed else "will not do"

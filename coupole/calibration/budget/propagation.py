@@ -21,9 +21,10 @@ Shape = Literal["normal", "student", "rectangular", "triangular", "arcsine"]
 Model = Callable[[Mapping[str, Floats]], Floats]
 _LEAST_BATCH = 10_000
 _ADVISED = 0.2
-"""Of the tolerance: numerical accuracy of Monte Carlo's ends for a validation (JCGM 101, 8.2)."""
+"""Share of the tolerance that is advised as numerical accuracy of Monte Carlo's ends, for a validation (JCGM 101,
+8.2)."""
 _STEP = 1e-3
-"""Of a standard uncertainty: for central differences."""
+"""Step of central differences, as a share of a standard uncertainty."""
 COVERAGES = (0.68, 0.95)
 
 
@@ -32,7 +33,7 @@ class Quantity:
     """One input of a measurement."""
 
     name: str
-    """With its unit."""
+    """Name with its unit."""
     value: float
     u: float
     """Standard uncertainty, in the name's unit."""
@@ -42,7 +43,7 @@ class Quantity:
     group: str = ""
     """Inputs of one group count as one source of uncertainty; if empty, the input is a group by itself."""
     degrees_of_freedom: float = np.inf
-    """Of Student's distribution."""
+    """Degrees of freedom of Student's distribution."""
 
     @property
     def source_group(self) -> str:
@@ -126,7 +127,7 @@ class Linear:
 
 @dataclass(frozen=True)
 class Validation:
-    """Whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of significant
+    """Result of the test whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of significant
     digits."""
 
     coverage: float

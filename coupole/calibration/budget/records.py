@@ -18,14 +18,14 @@ from coupole.calibration.rotations import Floats, skew
 from coupole.errors import InputError
 
 WORKING_MM = 334.0
-"""From camera to object, for a record that has no focus distance (by seed 003's field and pixels)."""
+"""Distance from camera to object, for a record that has no focus distance (by seed 003's field and pixels)."""
 _FIELD = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
 _SEEN_FROM_HAND_EYE = "flange_from_camera"
 
 
 @dataclass(frozen=True)
 class Said:
-    """What one record contributes: figures of `Known` by name, and the sources of uncertainty that they
+    """Contribution of one record: figures of `Known` by name, and the sources of uncertainty that they
     describe."""
 
     figures: dict[str, float]
@@ -56,7 +56,7 @@ def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
 
 
 def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
-    """Those of the kinds that a budget uses."""
+    """Return the records of the kinds that a budget uses."""
     return tuple(item for item in items if reader_of(item.record.kind))
 
 
@@ -182,7 +182,8 @@ def _of_hand_eye(record: Record, path: Path) -> Said:
 
 
 def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
-    """What reads a record of this kind for a budget; None if it says nothing to one."""
+    """Return the function that reads a record of this kind for a budget; None if a budget does not use this
+    kind."""
     match kind:
         case "camera":
             return _of_camera
@@ -207,11 +208,11 @@ def reader_of(kind: Kind) -> Callable[[Record, Path], Said] | None:
 
 
 _KINDS = ", ".join(kind for kind in get_args(Kind) if reader_of(kind))
-"""Those that a budget uses, for messages."""
+"""Kinds of records that a budget uses, for messages."""
 
 
 def camera_reach_mm(record: Record) -> float:
-    """From the flange's middle to the camera's."""
+    """Return the distance from the middle of the flange to that of the camera."""
     return float(np.linalg.norm(record.transforms[_SEEN_FROM_HAND_EYE].translation_mm))
 
 

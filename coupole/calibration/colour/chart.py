@@ -23,7 +23,7 @@ from coupole.plan.plan import FilePath, Model, Pose
 
 _Length = Annotated[float, Field(gt=0)]
 _NEUTRAL_CHROMA = 5.0
-"""Of patches that count as grey, C*."""
+"""Largest chroma C* of patches that count as grey."""
 _LEAST_PATCHES = 8
 _LEAST_GREY_LIGHTNESS = 20.0
 """L* of the greys that balance the channels: noise and stray light dominate darker ones."""
@@ -45,23 +45,23 @@ class Chart(Model):
     rows: Annotated[int, Field(ge=1, le=100)]
     columns: Annotated[int, Field(ge=1, le=100)]
     pitch_mm: tuple[_Length, _Length]
-    """From the middle of a patch to that of the next, along rows and along columns."""
+    """Distance from the middle of a patch to that of the next, along rows and along columns."""
     patch_mm: tuple[_Length, _Length]
     """Width and height of a patch."""
     used: Annotated[float, Field(gt=0, le=0.95)] = 0.7
     """Share of a patch's width and height that is read, about its middle."""
     names: tuple[tuple[str, ...], ...] | None = None
-    """Of the patches in the file of values, row by row from the top; without it A1, A2, ..., B1, ..."""
+    """Names of the patches in the file of values, row by row from the top; without it A1, A2, ..., B1, ..."""
     values: FilePath
     """Spectra, L*a*b* or XYZ of the patches (CGATS or CSV), beside this file."""
     unit: Unit = "auto"
-    """Of spectra: percent or fraction; auto tells by their size."""
+    """Unit of spectra: percent or fraction; auto tells by their size."""
     u_lab: Annotated[float, Field(ge=0)] = 0.3
     """Standard uncertainty of each of L*, a*, b* of a patch: instrument, and the patch's own unevenness."""
     neutral: tuple[str, ...] | None = None
     """Names of the grey patches; without it those of chroma below 5."""
     support_from_chart: Pose | None = None
-    """Where the chart lies on the support; without it name its corners in the picture (`--corners`)."""
+    """Pose of the chart on the support; without it name its corners in the picture (`--corners`)."""
     without: tuple[str, ...] = ()
     """Names of patches that are not used."""
     edges: tuple[Edge, ...] = ()
@@ -80,7 +80,7 @@ class Chart(Model):
 
     @property
     def patch_names(self) -> tuple[str, ...]:
-        """Of those that are used, row by row from the top."""
+        """Names of the patches that are used, row by row from the top."""
         return tuple(name for name in self._all_names if name not in self.without)
 
     @property

@@ -18,11 +18,11 @@ from coupole.errors import InputError
 
 COLOUR, MONO = "COLOUR", "MONO"
 _LEAST_PIXELS = 12
-"""Of each colour on a patch."""
+"""Least number of pixels of each colour on a patch."""
 _ODD, _ODD_SIGMA = 0.03, 6.0
 """Relative departure of a patch under one light, beyond noise, that counts as shadow or gloss."""
 _LEAST_LIGHTS = 3
-"""To tell shadows."""
+"""Least number of lights that is needed to tell shadows."""
 _ROUNDS = 5
 
 
@@ -75,7 +75,7 @@ class Signals:
 def samples_of(
     picture: ChartPicture, channel: str, inside: tuple[NDArray[np.intp], NDArray[np.intp]]
 ) -> NDArray[np.intp]:
-    """Which of some pixels (rows, columns) have a channel, as numbers [k]."""
+    """Return the numbers [k] of those pixels, among some (rows, columns), that have a channel."""
     if picture.pattern == COLOUR:
         return np.arange(len(inside[0]))
     letters = np.array(list(picture.pattern)).reshape(2, 2)

@@ -19,9 +19,11 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 _LEAST_COSINE = 0.3
-"""Of incidence on the chart: light nearer to its plane than 17 degrees shows its surface, not its colour."""
+"""Least cosine of incidence on the chart: light nearer to its plane than 17 degrees shows its surface, not its
+colour."""
 _GLOSS_DEG = 25.0
-"""About the mirrored direction to the camera: light from there is not used (45/0 geometry keeps away from it)."""
+"""Angle about the mirrored direction to the camera: light from within it is not used (45/0 geometry keeps away
+from it)."""
 
 
 @dataclass(frozen=True)

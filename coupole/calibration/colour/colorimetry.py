@@ -15,7 +15,7 @@ from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
 D50_WHITE = np.array([0.9642, 1.0, 0.8249])
-"""Of the profile connection space (ICC.1:2022, 7.2.16)."""
+"""White of the profile connection space (ICC.1:2022, 7.2.16)."""
 _D65_WHITE = np.array([0.95047, 1.0, 1.08883])
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _FIRST_NM, _LAST_NM = 380.0, 780.0

@@ -31,7 +31,7 @@ _LARGEST_CONDITION = 1e6
 
 @dataclass(frozen=True)
 class Balanced:
-    """What the camera saw of the patches, of one scale with their colours."""
+    """Signals of the patches as the camera saw them, of one scale with the patches' colours."""
 
     signal: Floats
     """[patches, 3] red, green, blue above dark under uniform light, in any unit."""
@@ -40,7 +40,7 @@ class Balanced:
     xyz: Floats
     """[patches, 3] under D50."""
     u_lab: float
-    """Of each of the patches' L*, a*, b*."""
+    """Standard uncertainty of each of the patches' L*, a*, b*."""
     neutral: tuple[int, ...]
     """Numbers of the grey patches."""
     white: Floats | None = None
@@ -61,7 +61,7 @@ class Balanced:
 
 @dataclass(frozen=True)
 class Profile:
-    """From signals to XYZ under D50."""
+    """Conversion of signals to XYZ under D50."""
 
     form: Form
     coefficients: Floats

@@ -1,4 +1,4 @@
-"""From a chart's signals to the record of a colour profile."""
+"""Make the record of a colour profile from a chart's signals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _MOST_EDGE_PICTURES = 8
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen of the chart."""
+    """Signals and edges seen on the chart, and a picture of the white sheet if there is one."""
 
     signals: Signals
     edges: Mapping[str, Sequence[SlantedEdge]] = field(default_factory=dict)

@@ -22,7 +22,7 @@ _GRID, _POWER = 49, 2.5
 and 0.13 at a twentieth of their light."""
 _HEAD_BYTES, _TAG_BYTES = 128, 12
 _LARGEST_XYZ = 1.0 + 32767.0 / 32768.0
-"""What the largest code of X, Y, Z stands for (ICC.1:2022, 6.3.4.2)."""
+"""Value that the largest code of X, Y, Z stands for (ICC.1:2022, 6.3.4.2)."""
 
 
 def icc_profile(chosen: Profile, matrix: Profile, name: str, created: datetime) -> bytes:

@@ -45,7 +45,7 @@ class Tolerance:
     at_least: bool = False
 
     def level(self, value: float) -> str:
-        """In words, such as `ISO 19264-1 A, FADGI 4 stars`."""
+        """Return the level in words, such as `ISO 19264-1 A, FADGI 4 stars`."""
         said = []
         if self.iso:
             met = [letter for letter, most in zip("ABC", self.iso, strict=True) if self._within(value, most, True)]
@@ -72,7 +72,7 @@ TOLERANCES: Mapping[str, Tolerance] = {
     "noise": Tolerance((1.6, 2.0, 2.2), (1.0, 2.0, 3.0, 4.0)),
     "sampling_efficiency": Tolerance((0.85, 0.80, 0.70), (0.90, 0.80, 0.70, 0.60), at_least=True),
 }
-"""By the name of a figure; the others have none that could be verified."""
+"""Tolerances by the name of a figure; the other figures have none that could be verified."""
 
 
 def said(figure: Figure) -> str:
@@ -84,7 +84,7 @@ def said(figure: Figure) -> str:
 
 
 def colour_figures(de: Floats) -> list[Figure]:
-    """Of CIEDE2000 of patches left out."""
+    """Return figures of the CIEDE2000 of patches that were left out."""
     return [
         Figure("colour_mean", float(de.mean()), "dE00", "colour of patches left out, mean"),
         Figure("colour_90", float(np.quantile(de, 0.9)), "dE00", "colour of patches left out, 90 %"),
@@ -93,7 +93,7 @@ def colour_figures(de: Floats) -> list[Figure]:
 
 
 def tone_figures(found: Floats, known: Floats, neutral: Sequence[int]) -> list[Figure]:
-    """Of L*a*b* [patches, 3] as found and as known: the greys' lightness and hue."""
+    """Return figures of the greys' lightness and hue, from L*a*b* [patches, 3] as found and as known."""
     off = (found - known)[list(neutral)]
     return [
         Figure("tone", float(np.abs(off[:, 0]).max()), "L*", "tone (OECF), largest departure of a grey's L*"),
@@ -154,7 +154,7 @@ def edge_figures(edges: Mapping[str, Sequence[SlantedEdge]]) -> list[Figure]:
 
 
 def _shift(edge: SlantedEdge, green: SlantedEdge) -> float:
-    """How far an edge is from green's along the normal, at the middle of green's pixels, px."""
+    """Return how far an edge is from green's along the normal, at the middle of green's pixels, px."""
     return edge.offset_px - float(edge.normal @ (green.middle_px - edge.middle_px)) - green.offset_px
 
 

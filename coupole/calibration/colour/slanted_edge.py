@@ -19,9 +19,9 @@ _LEAST_PIXELS = 60
 _REACH_PX = 3.0
 """The least width of either side of the edge."""
 _LEAST_CONTRAST = 0.2
-"""Of an edge, (light - dark) / (light + dark)."""
+"""Least contrast of an edge, (light - dark) / (light + dark)."""
 _LEAST_SLANT_DEG = 1.0
-"""From the pixels' rows and columns: below it bins would stay empty or be biased."""
+"""Least slant of an edge against the pixels' rows and columns: below it bins would stay empty or be biased."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SlantedEdge:
     normal: Floats
     """[2] unit, from dark to light, x right, y down."""
     offset_px: float
-    """Of the edge at the middle of the pixels, along the normal, from `middle_px`."""
+    """Offset of the edge at the middle of the pixels, along the normal, from `middle_px`."""
     middle_px: Floats
     """[2]."""
     frequencies: Floats

@@ -25,14 +25,14 @@ class Stated:
     """Stated noise: standard deviations of each coordinate."""
 
     tolerance_mm: float = 0.05
-    """Of LEDs on their boards."""
+    """Tolerance of the places of LEDs on their boards."""
     robot_mm: float = 0.03
     robot_deg: float = 0.003
     table_mm: float = 10.0
-    """Of boards against their table: so wide that it matters only for a board that was not seen."""
+    """Deviation of boards from their table: so wide that it matters only for a board that was not seen."""
     table_deg: float = 2.0
     side_mm: float = 7.0
-    """Of an LED."""
+    """Side of an LED."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LedState:
 
 @dataclass(frozen=True)
 class Problem:
-    """What does not change between iterations."""
+    """Quantities that do not change between iterations."""
 
     boards: Boards
     place: Indices

@@ -32,7 +32,7 @@ _ROUNDS = 6
 _WRIST_DEG, _TURN_DEG = 120.0, 90.0
 """Axes 4 and 6 are not turned farther, because of cables."""
 _MARGIN = 0.025
-"""Of the frame's width: a spot nearer to the edge may be cut off."""
+"""Margin as a share of the frame's width: a spot nearer to the edge may be cut off."""
 
 _HEAD = """\
 # Views of the dome's LEDs themselves, for `coupole calibrate leds` (docs/how-to/calibrate-leds.md): {views} views,

@@ -1,4 +1,4 @@
-"""From runs to spots: frames under a single LED, with the pose and dark frames of their view."""
+"""Collect spots from runs: frames under a single LED, with the pose and dark frames of their view."""
 
 from __future__ import annotations
 

@@ -23,12 +23,12 @@ from coupole.calibration import optics
 from coupole.calibration.rotations import Floats
 
 LOW, HIGH = 0.25, 0.75
-"""Of white: a pixel below has weight 0, one above weight 1."""
+"""Levels as shares of white: a pixel below the first has weight 0, one above the second weight 1."""
 LEAST_AREA_PX = 9.0
 """Smaller regions are hot pixels or sparks."""
 LEAST_FILL, MOST_FILL, MOST_STRETCH = 0.935, 1.04, 4.0
-"""Of a disk the fill is 1, of a square 3/pi = 0.955; two spots that touch have less. An LED seen at 75 degrees is
-four times as wide as high."""
+"""Limits of a spot's fill and of the ratio of its axes. The fill of a disk is 1, that of a square 3/pi = 0.955;
+two spots that touch have less. An LED seen at 75 degrees is four times as wide as high."""
 MOST_SPOTS = 12
 """A frame with more has another source of light."""
 _COARSE = 0.4
@@ -54,12 +54,12 @@ class Spot:
 
 @dataclass(frozen=True)
 class Spots:
-    """What a frame shows."""
+    """Bright spots that a frame shows."""
 
     good: tuple[Spot, ...]
     """Largest first."""
     rejected: tuple[str, ...]
-    """Why other bright regions are not spots."""
+    """Reasons why other bright regions are not spots."""
     brightest: float
     """Largest green signal over white."""
 

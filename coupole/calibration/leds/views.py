@@ -21,12 +21,13 @@ from coupole.calibration.rotations import Floats, inverses
 ENOUGH = 6
 """Sightings of each LED (seed 003)."""
 MOST_ANGLE_DEG = 65.0
-"""Between an LED's normal and the direction to the camera; at larger angles edges of boards hide it."""
+"""Largest angle between an LED's normal and the direction to the camera; at larger angles edges of boards hide
+it."""
 NEAREST_MM, FARTHEST_MM = 400.0, 2600.0
 _START_MM = 50.0
 """Standard uncertainty of a board's position by the table."""
 _ANGLE_SIGMA = np.radians(0.004)
-"""Of one sighting, mostly by the arm."""
+"""Angular noise of one sighting, mostly by the arm."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class LedView:
 
     candidate: int
     boards: tuple[int, ...]
-    """As the table numbers them."""
+    """Numbers of the boards in the table."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""From the spots of a run to the record of all LEDs, the dome's new table and what the report shows."""
+"""Make the record of all LEDs, the dome's new table and the report's data from the spots of a run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LedsFound:
     record: Record
     files: dict[str, bytes]
     table: LedTable
-    """Before the calibration."""
+    """Table before the calibration."""
     new_table: LedTable
     geometry: LedGeometry
     matching: Matching

@@ -1,4 +1,4 @@
-"""What a model lacks, found in the structure of its residuals, and what that adds to values and uncertainties.
+"""Errors of a model, found in the structure of its residuals, and what they add to values and uncertainties.
 
 A least-squares fit takes residuals for independent noise. A cause that the model has no term for leaves a pattern
 in them: over the field, over the board, from view to view. Each suspected cause is a set of modes with one unknown
@@ -60,7 +60,7 @@ class ModelError:
     covariance: Floats
     """[p, p]."""
     noise: float
-    """Of the group, over the stated noise: without the patterns."""
+    """Noise of the group without the patterns, over the stated noise."""
     suspects: tuple[Suspected, ...]
 
     def of(self, name: str) -> Suspected:
@@ -146,7 +146,8 @@ class _Fit:
         )
 
     def minus_twice_log_likelihood(self, logs: Floats, redundancy: float) -> float:
-        """By the logarithms of the noise's variance and of the suspects' amplitudes squared."""
+        """Return minus twice the log-likelihood, by the logarithms of the noise's variance and of the suspects'
+        amplitudes squared."""
         factor = cho_factor(self._variance(logs), lower=True)
         told = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(self.seen @ cho_solve(factor, self.seen))
         rest = max(redundancy - len(self.seen), 1.0)

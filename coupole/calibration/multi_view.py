@@ -119,7 +119,8 @@ def _nearest(
     vector: Floats,
     depth_mm: tuple[float, float],
 ) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.intp]], Floats]:
-    """For each point and view the detection nearest to the point's projection [n, views], and its distance, px."""
+    """Find for each point and view the detection nearest to the point's projection [n, views], and its distance,
+    px."""
     nearest = np.zeros((len(points), len(views)), np.intp)
     off_px = np.full((len(points), len(views)), np.inf)
     for number, view in enumerate(views):

@@ -37,7 +37,7 @@ class Convention(Model):
     angle_unit: Literal["deg", "rad"] = "deg"
     rotation: Rotation = "abc"
     order: tuple[int, int, int] = (0, 1, 2)
-    """Which of the three numbers of a rotation stands where; (2, 1, 0): written backwards."""
+    """Order in which the three numbers of a rotation stand; (2, 1, 0): written backwards."""
     gives: Literal["base_from_flange", "flange_from_base"] = "base_from_flange"
 
 

@@ -61,7 +61,7 @@ class Parameter(Model):
     """One estimated figure."""
 
     name: Annotated[str, Field(min_length=1)]
-    """With its unit: `fx_px`, `flange_from_camera.x_mm`."""
+    """Name with its unit: `fx_px`, `flange_from_camera.x_mm`."""
     value: float | None
     """None for the rotations of a small step: the transform itself has the angles."""
     u: NotNegative
@@ -100,7 +100,7 @@ class LedFault:
     leds: tuple[int, ...]
     """Ids; none for a board."""
     text: str
-    """What was seen and what to do."""
+    """Text that says what was seen and what to do."""
 
     @property
     def is_wrong(self) -> bool:
@@ -147,7 +147,7 @@ class Validity(Model):
     focus_tolerance_mm: Positive = 2.0
     f_number: Positive | None = None
     temperature_c: tuple[float, float] | None = None
-    """Of the room, from and to."""
+    """Temperature of the room, from and to."""
 
 
 class Record(Model):
@@ -175,9 +175,9 @@ class Record(Model):
     limits: tuple[Limit, ...]
     """Acceptance limits; all must be met."""
     remarks: tuple[str, ...]
-    """For the operator: methods that disagree, corners that were left out."""
+    """Remarks for the operator: methods that disagree, corners that were left out."""
     faults: tuple[LedFault, ...] = Field(default=(), exclude_if=_none_found)
-    """Of LEDs; their texts are among the remarks."""
+    """Faults of LEDs; their texts are among the remarks."""
     inputs: Annotated[tuple[Input, ...], Field(min_length=1)]
     sha256: Sha256
 
@@ -203,7 +203,7 @@ def sealed(**content: Any) -> Record:
 
 
 def content_sha256(plain: dict[str, Any]) -> str:
-    """Of a record's content as JSON (keys sorted, no spaces), without its own hash."""
+    """Return the hash of a record's content as JSON (keys sorted, no spaces), without its own hash."""
     rest = {key: value for key, value in plain.items() if key != "sha256"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 

@@ -41,7 +41,7 @@ class Outcome:
     draw: Callable[[Figure], None]
     """Fills an empty figure of 1600 x 1200 pixels."""
     files: Mapping[str, bytes] = field(default_factory=dict)
-    """By name, as `record.files` lists them: tables and maps that are too large for YAML."""
+    """Files by name, as `record.files` lists them: tables and maps that are too large for YAML."""
 
 
 def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:

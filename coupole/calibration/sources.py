@@ -31,7 +31,7 @@ from coupole.storage.view_reader import View, read_view
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm")
 POSES_NAME, BOARD_NAME = "poses.yaml", "board.yaml"
 _MOST_FRAMES = 64
-"""Of one view: more do not improve corners."""
+"""Largest number of frames of one view: more do not improve corners."""
 _CLIPPED = 0.02
 
 
@@ -47,7 +47,7 @@ class About:
     temperature_c: tuple[float, float] | None = None
     """Lowest and highest temperature of the LED boards, the only ones that a run has."""
     begun: datetime | None = None
-    """When the latest of the runs began."""
+    """Time when the latest of the runs began."""
 
 
 @dataclass(frozen=True)
@@ -192,13 +192,13 @@ def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
 
 
 def _spread(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
-    """At most `_MOST_FRAMES`, evenly over the list."""
+    """Return at most `_MOST_FRAMES` of the frames, evenly over the list."""
     step = max(1, -(-len(frames) // _MOST_FRAMES))
     return iter(frames[::step])
 
 
 def frames_sha256(frames: Sequence[FrameProven]) -> str:
-    """Of the frames' proven checksums, which packing and archiving do not change."""
+    """Return the hash of the frames' proven checksums, which packing and archiving do not change."""
     lines = sorted(f"{frame.shot} {frame.xxh3}" for frame in frames)
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 

@@ -81,9 +81,9 @@ class Sighting:
     """The corners seen in one image."""
 
     name: str
-    """Of the view or file."""
+    """Name of the view or file."""
     ids: NDArray[np.intp]
-    """Which corners [n], numbers into `Board.points_mm`."""
+    """Numbers of the corners [n], into `Board.points_mm`."""
     board_mm: Floats
     """[n, 3]."""
     pixels: Floats

@@ -49,7 +49,7 @@ class RobotNoise:
     absolute_mm: float = 0.3
     """Absolute error beside repeatability. Not used where axes are known: their zeros are estimated instead."""
     absolute_deg: float = 0.02
-    """Of orientation; of each axis zero where axes are known."""
+    """Absolute error of orientation; that of each axis zero where axes are known."""
 
     def pose_sigmas(self, *, axes_known: bool) -> tuple[float, float]:
         """Stated noise of one pose: mm, radians."""
@@ -92,7 +92,7 @@ class HandEyeCalibration:
     sightings: tuple[Sighting, ...]
     steps: int
     doubts: Doubts | None = None
-    """What the model may lack, already in values and covariance; None: not asked."""
+    """Possible errors of the model, already in values and covariance; None if they were not asked for."""
 
     def u(self, name: str) -> float:
         """Standard uncertainty of a parameter."""

@@ -55,7 +55,7 @@ class CameraCalibration:
     size_px: tuple[int, int]
     """Width and height."""
     doubts: Doubts | None = None
-    """What the model may lack, already in values and covariance; None: not asked."""
+    """Possible errors of the model, already in values and covariance; None if they were not asked for."""
 
 
 def calibrate_camera(

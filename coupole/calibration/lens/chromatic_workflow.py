@@ -1,4 +1,4 @@
-"""From a board's images in three colours to the record of lateral chromatic aberration and its picture."""
+"""Make the record of lateral chromatic aberration and its picture from a board's images in three colours."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ChromaticFound:
     field_px: Floats
     """[k, 2] places in the field at which shifts are given."""
     shifts: dict[str, tuple[Floats, Floats]]
-    """By channel: shift against green, px [k, 2], and its covariance, px^2 [k, 2, 2]."""
+    """Shifts by channel: against green, px [k, 2], and their covariance, px^2 [k, 2, 2]."""
 
 
 def chromatic_from(found: Found, sources: Sources, board: Board, model: str, request: Request) -> ChromaticFound:

@@ -33,7 +33,7 @@ _X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_
 _MOST_STEPS = 40
 _CLOSE_PX = 1e-5
 _WORST = 0.2
-"""Of the contrast: with a larger rms residual the image is not that of a corner."""
+"""Largest rms residual, as a share of the contrast: with a larger one the image is not that of a corner."""
 _LEAST_SIGMA_PX = 0.05
 _THIN = 0.01
 """Least width of a box: an edge along the pixels' rows."""
@@ -55,7 +55,7 @@ class Corners:
 
 
 def enough_pixels(known: NDArray[np.bool_], radius_px: float) -> bool:
-    """Whether a window of that radius has enough pixels for a fit."""
+    """Tell whether a window of that radius has enough pixels for a fit."""
     return bool(np.pi * radius_px**2 * known.mean() >= _LEAST_PIXELS)
 
 

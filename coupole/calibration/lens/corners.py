@@ -23,7 +23,7 @@ class Corners:
     view: np.ndarray[tuple[int], np.dtype[np.intp]]
     """[n], the number of the image."""
     parts: tuple[slice, ...]
-    """Where each image's corners lie."""
+    """Slice of each image's corners."""
 
     @staticmethod
     def of(sightings: Sequence[Sighting]) -> Corners:

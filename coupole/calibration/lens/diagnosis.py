@@ -1,4 +1,4 @@
-"""Why robot and camera contradict each other: the most likely cause.
+"""Diagnosis of robot and camera that contradict each other: the most likely cause.
 
 If the board's position scatters from pose to pose by more than noise explains, the data are wrong. Each hypothesis
 (another unit, other angles, the inverse pose, a board that was moved, a wrong pair) is another interpretation of
@@ -51,7 +51,7 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found."""
+    """Findings: the scatter, its likely causes, and methods that disagree."""
 
     scatter_mm: float
     scatter_deg: float
@@ -109,7 +109,7 @@ class Diagnosis:
 def expected_scatter(
     camera_from_board: Floats, *, pixel_px: float, focal_px: float, robot_mm: float, robot_deg: float
 ) -> Expected:
-    """By the corners' noise and the robot's stated noise, at the board's distance."""
+    """Return the scatter to expect by the corners' noise and the robot's stated noise, at the board's distance."""
     distance_mm = float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
     seen_rad = _DEPTH_WORSE * pixel_px / focal_px
     turned_rad = np.radians(robot_deg)

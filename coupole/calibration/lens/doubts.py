@@ -40,7 +40,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Doubts:
-    """What may be wrong with the model, and how well it predicts."""
+    """Possible errors of the model, and the quality of its predictions."""
 
     error: ModelError
     field: Field
@@ -60,7 +60,7 @@ class Doubts:
         return float(PIXEL_SIGMA_PX * np.sqrt(np.mean(self.predicted.off**2)))
 
     def sentences(self) -> Iterator[str]:
-        """What was found, for the record's remarks."""
+        """Yield the findings as sentences, for the record's remarks."""
         for one in self.error.suspects:
             if one.evidence >= CLEAR:
                 pattern_px = PIXEL_SIGMA_PX * one.pattern

@@ -63,7 +63,7 @@ def _draw_field(ax: Axes, shown: Shown) -> None:
 
 
 def _draw_coverage(ax: Axes, shown: Shown) -> None:
-    """How many corners were seen in each part of the field."""
+    """Draw how many corners were seen in each part of the field."""
     pixels = np.concatenate(shown.pixels)
     width, height = shown.size_px
     cells = np.floor(pixels * FIELD_CELLS / shown.size_px).astype(int)

@@ -1,4 +1,4 @@
-"""Where the camera sits on the flange: A X = X B in closed form, by three methods.
+"""Place of the camera on the flange: A X = X B in closed form, by three methods.
 
 X is `flange_from_camera`. The board and the base stand still, so base_from_flange_i X camera_from_board_i is the
 same for all poses i, and each pair of poses gives one equation A X = X B with the motions A of the flange and B of
@@ -59,8 +59,8 @@ class Solution:
 
 
 def motions(base_from_flange: Floats, camera_from_board: Floats) -> Motions:
-    """Of all pairs of poses [n, 4, 4], without those with a rotation of nearly 180 degrees, whose axes have no
-    sign.
+    """Return the motions of all pairs of poses [n, 4, 4], without those with a rotation of nearly 180 degrees,
+    whose axes have no sign.
 
     Raises InputError if all motions have the same rotation axis: then X is not determined.
     """

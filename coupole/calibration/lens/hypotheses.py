@@ -1,4 +1,4 @@
-"""What may be wrong with the poses of a robot or the images of a board, and the scatter that remains if it is.
+"""Possible errors in the poses of a robot or the images of a board, and the scatter that remains if they are real.
 
 Each hypothesis is another interpretation of the data (other units or angles, the inverse pose, another pairing, a
 board in two places) with the scatter of the board's position under it. `coupole.calibration.lens.diagnosis` ranks
@@ -50,7 +50,7 @@ class Expected:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may be wrong, and the scatter if it is."""
+    """A possible error, and the scatter that remains if it is real."""
 
     causes: tuple[str, ...]
     """Names, as in this module's constants."""

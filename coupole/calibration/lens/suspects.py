@@ -1,4 +1,4 @@
-"""What may be wrong with the model of a board's images: the lens's form, the board's shape, a focus that changes.
+"""Suspected errors in the model of a board's images: the lens's form, the board's shape, a focus that changes.
 
 Modes of the lens are polynomials over the field less the best lens of the record's own form, so that what a record
 says of its lens is the best of that form over the whole field, and its modes are the rest (orthogonal in the sense

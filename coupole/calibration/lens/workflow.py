@@ -1,4 +1,4 @@
-"""From images and poses to a record and the report's data: the functions that the commands call.
+"""Make a record and the report's data from images and poses: the functions that the commands call.
 
 Each function makes a sealed record. A contradiction with a known cause raises an error with that cause, as the
 result would be meaningless; one without a simple cause becomes a remark of the record, which exceeds its limits.
@@ -46,12 +46,12 @@ FIELD_CELLS = (8, 6)
 
 @dataclass(frozen=True)
 class Shown:
-    """What the report draws."""
+    """Data that the report draws."""
 
     record: Record
     size_px: tuple[int, int]
     names: tuple[str, ...]
-    """Of the images."""
+    """Names of the images."""
     pixels: tuple[Floats, ...]
     """[k, 2] of each image."""
     residuals_px: tuple[Floats, ...]
@@ -162,7 +162,7 @@ def hand_eye_from(
 def _refused_if_contradicting(
     fit: CameraCalibration, reported: ReportedPoses, robot: RobotNoise, names: Sequence[str]
 ) -> Diagnosis:
-    """How well robot and camera agree. Raises InputError if they do not and the cause is known."""
+    """Diagnose how well robot and camera agree. Raises InputError if they do not and the cause is known."""
     robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
     expected = expected_scatter(
         fit.camera_from_board,

@@ -47,15 +47,15 @@ class Dark:
 
     offset_dn: Maps
     current_dn_per_s: Maps
-    """At `reference_c`."""
+    """Dark current at `reference_c`."""
     noise_dn: Maps
     """Standard deviation of each pixel about its own line."""
     cofactor: NDArray[np.float64]
     """[2, 2] of offset and current: times a pixel's noise squared it is their covariance (DN, s)."""
     degrees_of_freedom: int
-    """Behind `noise_dn`."""
+    """Degrees of freedom of `noise_dn`."""
     read_noise_dn: float
-    """Of one pixel, without row noise and rounding."""
+    """Read noise of one pixel, without row noise and rounding."""
     read_noise_u_dn: float
     row_noise_dn: float
     row_noise_u_dn: float

@@ -42,7 +42,7 @@ class Reading:
     ratio: float
     """Measured signal over that expected from the LED's calibrated power."""
     u_ratio: float
-    """From noise, and from the LED's own calibration."""
+    """Standard uncertainty of the ratio, from noise and from the LED's own calibration."""
     by_shared: tuple[float, ...] = ()
     """Relative change of the ratio by one unit of each figure that all readings share."""
 
@@ -56,11 +56,11 @@ class Drift:
     covariance: Floats
     """[3, 3]."""
     start_s: float
-    """Of the first reading, on the frames' clock."""
+    """Time of the first reading, on the frames' clock."""
     noise: float
     """Relative noise of one reading: the estimated one, but not less than the stated one."""
     used: tuple[Reading, ...]
-    """In their order."""
+    """Readings that were used, in their order."""
     residuals: Floats
     """[used] relative."""
     odd: tuple[Reading, ...]
@@ -69,7 +69,7 @@ class Drift:
 
     @property
     def hours(self) -> float:
-        """From the first to the last reading; beyond them the factor is an extrapolation."""
+        """Time from the first to the last reading; beyond them the factor is an extrapolation."""
         return (self.used[-1].t_s - self.used[0].t_s) / 3600.0
 
     def factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
@@ -182,7 +182,7 @@ def _excess(left: Floats, noise: Floats) -> float:
 
 
 def _odd(left: Floats, noise: Floats) -> NDArray[np.bool_]:
-    """Which single readings [n] are far from their neighbours' median; a lasting step does not count."""
+    """Mark single readings [n] that are far from their neighbours' median; a lasting step does not count."""
     from scipy.ndimage import median_filter
 
     if len(left) < _NEIGHBOURS:

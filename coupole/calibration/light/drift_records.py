@@ -1,4 +1,4 @@
-"""From the frames of a run that show the reference tile to the record of its drift."""
+"""Make the record of a run's drift from its frames that show the reference tile."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from coupole.errors import InputError
 CHANNEL = "G"
 """One channel is sufficient: the power of an LED drifts, its colour hardly."""
 _DARK = 0.1
-"""Of the expected signal: less is a shadow, or a dead LED."""
+"""Share of the expected signal: less is a shadow, or a dead LED."""
 _FLASH = 5e-4
 """Relative scatter of an LED's flashes (as in `calibrate_led_power`)."""
 
@@ -202,7 +202,8 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
 
 
 def _shared_covariance(setting: Setting, powers: Powers) -> Floats:
-    """Of the tile's tilt and height in this run, then of the figures that the powers' calibration shared."""
+    """Return the covariance of the tile's tilt and height in this run, then of the figures that the powers'
+    calibration shared."""
     from scipy.linalg import block_diag
 
     place = np.diag(prior_of(setting.tile)[:OF_PLACE] ** 2)

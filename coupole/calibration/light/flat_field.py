@@ -67,7 +67,7 @@ class FlatField:
     residual: float
     """Relative, robust standard deviation of a block."""
     residuals: tuple[Floats, ...]
-    """Of each view, relative; NaN where a block was not used."""
+    """Relative residuals of each view; NaN where a block was not used."""
     rejected: float
     """Share of the blocks with weight 0."""
     views: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""From views of a luminous panel to the record of the flat field."""
+"""Make the record of the flat field from views of a luminous panel."""
 
 from __future__ import annotations
 

@@ -34,9 +34,9 @@ class LightFrame:
     shot: ShotId
     exposure_us: float
     t_s: float
-    """Of its trigger, on the box's clock."""
+    """Time of the frame's trigger, on the box's clock."""
     temperature_c: float
-    """Of the LED's board; NaN where the box gave none."""
+    """Temperature of the LED's board; NaN where the box gave none."""
     base_from_flange: Floats
     """[4, 4] measured, mm."""
     base_from_camera: Floats

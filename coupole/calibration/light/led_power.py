@@ -60,7 +60,7 @@ class LedPower:
     noise: float
     """Relative, of one LED in one view, as found."""
     residuals: tuple[Floats, ...]
-    """Of each view [n], relative; NaN where not used."""
+    """Relative residuals of each view [n]; NaN where not used."""
     remarks: tuple[str, ...]
     """Faults by name: dead LEDs, shadows, saturation."""
     degrees_of_freedom: float

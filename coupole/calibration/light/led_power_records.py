@@ -1,4 +1,4 @@
-"""From frames of a white tile to the record of the LEDs' power."""
+"""Make the record of the LEDs' power from frames of a white tile."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
 
 
 def covariance_of(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
-    """Of `_parameters`, [channels (1 + c)] squared.
+    """Return the covariance of `_parameters`, [channels (1 + c)] squared.
 
     All channels see the same tile. With the prior S and posteriors C_a, C_b the errors of channels a and b have
     the covariance C_a S^-1 C_b, the remaining part of the prior's error; their noise is independent.

@@ -107,7 +107,7 @@ class TileReader:
         }
 
     def sees(self, base_from_camera: Floats) -> bool:
-        """Whether a view shows all of the tile."""
+        """Tell whether a view shows all of the tile."""
         return min(map(len, self.patches(base_from_camera)[1])) > 0
 
     def patches(self, base_from_camera: Floats) -> tuple[Floats, list[NDArray[np.intp]]]:
@@ -136,7 +136,8 @@ class TileReader:
     def means(
         self, frame: LightFrame, patches: Sequence[NDArray[np.intp]]
     ) -> dict[str, tuple[Floats, Floats, bool]]:
-        """By channel: mean signal of each patch over flat field, DN/s; its uncertainty; whether saturated."""
+        """Return for each channel: mean signal of each patch over flat field, DN/s; its uncertainty; whether
+        saturated."""
         raw = frame.read()
         signal = raw - self._dark(frame)
         found = {}

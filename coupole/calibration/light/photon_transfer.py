@@ -20,7 +20,7 @@ from coupole.errors import InputError
 ROUNDING_VARIANCE = 1.0 / 12.0
 _LEVELS = 24
 _LEAST_PIXELS = 400
-"""Of one level: fewer do not determine its variance."""
+"""Least number of pixels of one level: fewer do not determine its variance."""
 _COLLAPSED = 0.7
 """Variance over that of the line, below which a level counts as saturated."""
 _GROSS = 6.0
@@ -28,11 +28,11 @@ _GROSS = 6.0
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """Of one channel."""
+    """Photon transfer of one channel."""
 
     gain_dn_per_e: Estimate
     read_noise_dn: Estimate
-    """Of one frame, without rounding; row noise included."""
+    """Read noise of one frame, without rounding; row noise included."""
     read_noise_e: Estimate
     saturation_dn: float
     """Signal above dark at which variance has its maximum (EMVA 1288, 6.6)."""

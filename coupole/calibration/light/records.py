@@ -1,4 +1,4 @@
-"""From frames of runs to the records of dark frames and response; functions that all radiometric records share.
+"""Make the records of dark frames and response from frames of runs; functions that all radiometric records share.
 
 Each calibration returns an `Outcome`: a sealed record, its maps or tables, its picture.
 """
@@ -50,7 +50,7 @@ from coupole.plan.shot_id import Light
 
 Progress = Callable[[int, int], None]
 _MOST_PIXELS = 200_000
-"""Of a channel, used for the response."""
+"""Number of pixels of a channel that are used for the response, at most."""
 
 
 def sealed_outcome(

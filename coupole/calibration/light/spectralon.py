@@ -36,9 +36,10 @@ class Tile(Model):
     """Width of the rim that is not used."""
     support_from_tile: Pose = Pose(translation_mm=(0.0, 0.0, 10.0))
     u_tilt_deg: Annotated[float, Field(gt=0)] = 0.1
-    """Of its normal, about each of two axes: standard uncertainty of the pose above."""
+    """Standard uncertainty of the tilt of the tile's normal in the pose above, about each of two axes."""
     u_height_mm: Annotated[float, Field(gt=0)] = 0.5
-    """Of its white face along its normal; shifts within the face do not change the image."""
+    """Standard uncertainty of the white face's place along its normal; shifts within the face do not change the
+    image."""
 
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
         """f in 1/sr, for cosines of incidence and observation above 0."""

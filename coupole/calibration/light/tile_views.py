@@ -14,12 +14,13 @@ from coupole.calibration.rotations import Floats
 
 _DEAD_SIGMA = 5.0
 _DEAD_SHARE = 0.01
-"""Of the median LED's power."""
+"""Share of the median LED's power: a signal below it counts as dark."""
 _SHADED = 0.03
 """Relative departure of a part of the tile, beyond noise, that counts as shadow."""
 _SHADED_SIGMA = 6.0
 _LOWEST_COSINE = 0.05
-"""Of incidence on the tile: the signal of LEDs within 3 degrees of its horizon depends mostly on its tilt."""
+"""Least cosine of incidence on the tile: the signal of LEDs within 3 degrees of its horizon depends mostly on its
+tilt."""
 _STEP, _STEP_MM = 1e-4, 0.05
 OF_PLACE = 3
 """Figures of each place of the tile: two tilts, its height."""
@@ -71,7 +72,7 @@ class Row:
     value: float
     """S / h, before the logarithm: the power if the tile's pose is as described."""
     u: float
-    """Of the value, from noise."""
+    """Standard uncertainty of the value, from noise."""
     design: Floats
     """Relative change of h by the figures that LEDs share: two tilts and the height of all places, then ln
     reflectance and Minnaert's k."""

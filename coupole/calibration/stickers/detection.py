@@ -24,7 +24,7 @@ LEAST_RADIUS_PX = 4.0
 LEAST_AXES_RATIO = 0.25
 """Seen at more than 75 degrees from its normal, a disk's printed rim is not distinguished from its edge."""
 LEAST_CONTRAST = 0.25
-"""Between disk and border, over the disk's signal: a border is black."""
+"""Least contrast between disk and border, over the disk's signal: a border is black."""
 _RAYS = 96
 _INSIDE, _OUTSIDE = 0.65, 1.35
 """Radii at which disk and border are sampled, over the disk's radius; the border ends at 1.67."""
@@ -48,9 +48,9 @@ class Sticker:
     covariance: Floats
     """[2, 2] of the middle, px^2."""
     radius_px: float
-    """Of the ellipse, the longer."""
+    """Longer radius of the ellipse."""
     distance_mm: float
-    """By its size."""
+    """Distance of the disk, by its size."""
 
 
 @dataclass(frozen=True)

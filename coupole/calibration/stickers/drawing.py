@@ -61,7 +61,7 @@ def _draw_uncertainty(ax: Axes, found: MeshFound) -> None:
 
 
 def _draw_views(ax: Axes, found: MeshFound) -> None:
-    """How many views saw each sticker."""
+    """Draw how many views saw each sticker."""
     counts = [found.pose.views_of.get(name, 0) for name in found.scan.names]
     colours = [BLUE if count else RED for count in counts]
     ax.bar(np.arange(len(counts)), counts, color=colours)

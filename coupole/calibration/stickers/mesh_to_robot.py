@@ -62,7 +62,8 @@ class MeshPose:
     views_of: dict[str, int]
     residual_px: float
     residuals_of: tuple[tuple[int, int, float], ...]
-    """By view: stickers used, left out as gross errors, and the rms distance of those used, px."""
+    """Residuals by view: stickers used, stickers left out as gross errors, and the rms distance of those used,
+    px."""
     point_rms_mm: float
     """Root mean square distance of the points found in space from the table's, before the adjustment."""
     noise: dict[str, float]

@@ -45,7 +45,7 @@ def corrected(
 
 
 def _agreed(normals: Floats) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Which of two normals [views, 2, 3] each view sees, so that they agree best."""
+    """Choose which of two normals [views, 2, 3] each view sees, so that they agree best."""
     candidates = normals.reshape(-1, 3)
     cosines = np.einsum("ci,vki->cvk", candidates, normals)
     best = int(np.argmax(cosines.max(axis=2).sum(axis=1)))

@@ -1,4 +1,4 @@
-"""From the stickers of a run and of a scan to the record of the mesh's pose and the report's data."""
+"""Make the record of the mesh's pose and the report's data from the stickers of a run and of a scan."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from coupole.scan.simplify import simplified
 
 _LEAST_SIGMA_PX = 0.02
 _MOST_FACES = 1_000_000
-"""Of the mesh that is drawn onto a frame."""
+"""Largest number of faces of the mesh that is drawn onto a frame."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class AltaSamples:
     low: Array
     """[n, outputs] bounds; NaN where the file has none."""
     high: Array
-    """As `low`; inf where it is open."""
+    """[n, outputs] upper bounds, as `low`; inf where a bound is open."""
 
     def directions(self) -> tuple[Array, Array]:
         """Unit vectors [n, 3] to light and eye. Raises InputError for angles that do not say both."""

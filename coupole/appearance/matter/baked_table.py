@@ -58,7 +58,7 @@ class BakedTable:
         )
 
     def read(self) -> RglTable:
-        """As a reader of the file has it; of all channels."""
+        """Return the table as a reader of the file has it; of all channels."""
         phi_i, theta_i, ndf, sigma, vndf = (
             np.asarray(self.fields[name], np.float64) for name in ("phi_i", "theta_i", "ndf", "sigma", "vndf")
         )
@@ -68,7 +68,7 @@ class BakedTable:
 
 
 def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, side: int = SIDE) -> BakedTable:
-    """Of an isotropic BRDF of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
+    """Bake an isotropic BRDF of 81 bands, or of channels that `to_bands` [channels, 81] makes bands of."""
     steps = np.linspace(0.0, 1.0, thetas)
     theta_i = np.asarray(0.5 * np.pi * (1.0 - (1.0 - steps) ** _CROWDING), np.float32)
     ndf = _back(source)

@@ -1,4 +1,5 @@
-"""What an instrument sees of a paint, and what holds inside its binder: two types, and Saunderson between them.
+"""Reflectance of a paint as an instrument sees it, and as it holds inside the binder: two types, and Saunderson
+between them.
 
 A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
 leave. Of a paint that reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5.
@@ -18,21 +19,23 @@ from coupole.appearance.spectra.grid import Array, within
 from coupole.errors import InputError
 
 Geometry = Literal["gloss excluded", "gloss included", "45:0"]
-"""Of an instrument. Gloss excluded: diffuse light seen along the normal, or the reverse, with a gloss trap (d:8,
-SCE). Gloss included: without it (d:8, SCI). 45:0: light at 45 degrees seen along the normal."""
+"""Geometry of an instrument. Gloss excluded: diffuse light seen along the normal, or the reverse, with a gloss
+trap (d:8, SCE). Gloss included: without the trap (d:8, SCI). 45:0: light at 45 degrees seen along the normal."""
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredReflectance:
-    """In air, as an instrument sees it: fractions [..., bands]; noise may go below 0, gloss above 1."""
+    """Reflectance in air, as an instrument sees it: fractions [..., bands]; noise may go below 0, gloss above
+    1."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
 class InternalReflectance:
-    """Of a layer inside its binder, for diffuse light: 0 to 1, [..., bands]. Raises InputError beyond."""
+    """Reflectance of a layer inside its binder, for diffuse light: 0 to 1, [..., bands]. Raises InputError
+    beyond."""
 
     values: Array
 
@@ -48,19 +51,20 @@ class Face:
     """
 
     passing: Array
-    """What of the incident light enters, times what of the emerging light is seen."""
+    """Share of the incident light that enters, times the share of the emerging light that is seen."""
     inner: Array
     """Reflectance for diffuse light from within (k2)."""
     gloss: Array
     """Light that the face itself sends to the instrument."""
 
     def seen(self, internal: InternalReflectance) -> MeasuredReflectance:
-        """In air, of a layer under this face."""
+        """Return the reflectance in air of a layer under this face."""
         r = internal.values
         return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
 
     def inside(self, measured: MeasuredReflectance) -> InternalReflectance:
-        """Of the layer under this face. Raises InputError where no layer can be the reason of what is seen."""
+        """Return the reflectance of the layer under this face. Raises InputError where no layer can be the reason
+        of what is seen."""
         r = np.asarray(measured.values, dtype=float) - self.gloss
         found = np.asarray(r / (self.passing + self.inner * r))
         found = np.where((found > 1.0) & (found < 1.0 + _ROUNDING), 1.0, found)
@@ -76,7 +80,7 @@ class Face:
 
     @property
     def brightest(self) -> Array:
-        """What is seen of a layer that reflects everything."""
+        """Reflectance in air of a layer that reflects everything."""
         return np.asarray(self.passing / (1.0 - self.inner) + self.gloss)
 
 

@@ -135,7 +135,7 @@ class Stack:
     mean_body: Array
     """[bands], of `body` for light from everywhere."""
     mirror_roughness: float
-    """As seen from air."""
+    """Roughness of the mirror image, as seen from air."""
 
 
 def stack(binder: Binder, ground: Ground, roughness: float, films: Sequence[Film] = ()) -> Stack:
@@ -170,7 +170,7 @@ def stack_brdf(wi: Array, wo: Array, *, stack: Stack) -> Array:
 
 
 def _seen_roughness(mirror: float, face: float, index: float) -> float:
-    """Of facets under a rough face, seen from air near the normal.
+    """Return the roughness of facets under a rough face, as seen from air near the normal.
 
     Refraction makes their slopes `index` times as steep, and each of two passages through the face adds its slopes
     times (index - 1)/2; independent slopes add by squares.

@@ -31,9 +31,9 @@ class Sheet:
     """A smooth sheet's reflectance and transmittance. Arrays [angles, bands] are for light from air."""
 
     reflectance: Array
-    """At `COSINES`."""
+    """Reflectance at `COSINES`."""
     transmittance: Array
-    """Into the body's medium."""
+    """Transmittance into the body's medium."""
     normal_reflectance: Array
     """[bands]."""
     internal_reflectance: Array

@@ -24,7 +24,8 @@ from coupole.errors import InputError
 
 _SINGULAR = 1e-9
 _SUM_IS_ONE = 1e-3
-"""If the metal's weights m' sum to 1 within this, the sum does not determine p."""
+"""Largest departure of a sum from 1: if the metal's weights m' sum to 1 within this, the sum does not determine
+p."""
 
 
 @dataclass(frozen=True)

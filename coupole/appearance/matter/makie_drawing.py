@@ -19,7 +19,7 @@ Motif = Literal["waves", "flowers"]
 _RINGS = 4
 _PETALS = 5
 _HALF_LINE = 0.014
-"""In periods."""
+"""Half the width of a line, in periods."""
 
 
 def motif(name: Motif, period_mm: float, edge_mm: float) -> Drawing:

@@ -18,7 +18,7 @@ from coupole.errors import InputError
 _STEPS = (90, 90, 180)
 _BYTES = 12 + 3 * 8 * 90 * 90 * 180
 _SCALES = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
-"""Of the database: a value is what is stored, times that of its colour."""
+"""Scales of the database: a value is what is stored, times the scale of its colour."""
 
 
 def read_merl(path: Path) -> Brdf:

@@ -37,7 +37,7 @@ class Slab:
     """e1 and e2: 1 is an ellipsoid, towards 0 a box."""
     seed: int = 1
     flattens: bool = False
-    """Whether a flake too steep for the lacquer is tilted only as far as it fits; else it is refused."""
+    """True if a flake too steep for the lacquer is tilted only as far as it fits; else it is refused."""
 
 
 @dataclass(frozen=True)

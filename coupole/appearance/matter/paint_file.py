@@ -57,7 +57,7 @@ class PaintFile:
     """Further columns [n], such as those of four fluxes."""
 
     def on_grid(self) -> Pigment:
-        """As a pigment on 380 to 780 nm, straight between its wavelengths, its ends held."""
+        """Return the paint as a pigment on 380 to 780 nm, linear between its wavelengths, its ends held."""
         return Pigment(
             self.name,
             *(np.interp(WAVELENGTHS_NM, self.wavelengths_nm, v) for v in (self.absorption, self.scattering)),

@@ -17,7 +17,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _LOBES = 12
-"""Into which the roughnesses of triangles are sorted."""
+"""Number of groups into which the roughnesses of triangles are sorted."""
 
 
 def read_result(

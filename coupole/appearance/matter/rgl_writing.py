@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from coupole.appearance.matter.brdf import Brdf
 
 _LEAST_DRAWN = 1e-3
-"""Of the mean density: nothing that reflects is never drawn."""
+"""Share of the mean density that is added everywhere: nothing that reflects is never drawn."""
 _NDF = 4.0
-"""Over 4 sigma it is 1."""
+"""Value of `ndf`: over 4 sigma it is 1."""
 _TYPES = {"uint8": 1, "float32": 10}
 
 
@@ -84,7 +84,8 @@ def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArr
 def fields_of(
     theta_i: NDArray[np.float32], rgb: NDArray[np.float32], luminance: NDArray[np.float32], text: str
 ) -> dict[str, NDArray[np.float32] | NDArray[np.uint8]]:
-    """Of an isotropic file whose half vectors are not warped, and whose values are not divided by anything."""
+    """Return the fields of an isotropic file whose half vectors are not warped, and whose values are not divided
+    by anything."""
     return {
         "theta_i": theta_i,
         "phi_i": np.zeros(1, np.float32),

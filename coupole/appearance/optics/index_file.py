@@ -23,7 +23,7 @@ _YAML = {".yml", ".yaml"}
 _MICROMETRES_BELOW = 30.0
 _HIGHEST = 20.0
 _WIDEST_GAP_NM = 80.0
-"""Of tables: Johnson and Christy's lines are up to 65 nm apart."""
+"""Widest gap of tables: Johnson and Christy's lines are up to 65 nm apart."""
 _SELLMEIER, _SELLMEIER_2, _CAUCHY = "formula 1", "formula 2", "formula 5"
 
 

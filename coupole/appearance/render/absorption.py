@@ -1,4 +1,4 @@
-"""What a clear medium takes from light on its way through it, per mm (Beer and Lambert)."""
+"""Absorption of light on its way through a clear medium, per mm (Beer and Lambert)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PerMm = NotNegative | NumbersFile
 
 
 class Urushi(Model):
-    """Of transparent urushi, an assumed shape (`lacquer.urushi_absorption`)."""
+    """Absorption of transparent urushi, an assumed shape (`lacquer.urushi_absorption`)."""
 
     kind: Literal["urushi"]
     at_450_nm_per_mm: NotNegative = 6.0
@@ -38,7 +38,7 @@ class Urushi(Model):
 
 
 class TypicalVarnish(Model):
-    """Of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
+    """Absorption of a natural resin's varnish as it yellows: an assumed shape, no measured varnish.
 
     age k exp(-fall (w - 450 nm)): strong in the violet, next to nothing in the red.
     """
@@ -47,7 +47,7 @@ class TypicalVarnish(Model):
     age: NotNegative
     """0 is fresh and clear, 1 yellowed for long."""
     at_450_nm_per_mm: NotNegative = 15.0
-    """At age 1."""
+    """Coefficient at 450 nm and age 1."""
     fall_per_nm: Positive = 0.018
 
 
@@ -59,9 +59,9 @@ class Absorbance(Model):
     path: Path
     column: int | None = None
     film_mm: Positive
-    """Of the film that was measured."""
+    """Thickness of the film that was measured."""
     age: NotNegative = 1.0
-    """In parts of the one that was measured."""
+    """Age in parts of the measured film's age."""
 
 
 class AbsorptionPerMm(Model):
@@ -71,7 +71,7 @@ class AbsorptionPerMm(Model):
 
 
 class Transmittance(Model):
-    """Of a free film of known thickness, measured with its two faces."""
+    """Transmittance of a free film of known thickness, measured with its two faces."""
 
     kind: Literal["file"]
     path: Path

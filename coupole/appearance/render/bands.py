@@ -36,13 +36,13 @@ _RAMP_NM = 0.01
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Of the film, to one band of a group."""
+    """Sensitivity of the film to one band of a group."""
 
     quarter: int
 
 
 def chosen(step_nm: StepNm) -> list[int]:
-    """Which of the 81 bands are rendered."""
+    """Return the numbers of those of the 81 bands that are rendered."""
     return list(range(0, BANDS, step_nm // int(STEP_NM)))
 
 

@@ -26,7 +26,7 @@ from coupole.errors import InputError
 
 Progress = Callable[[int, int], None]
 _RAYS = 2
-"""Of a pixel, along each side."""
+"""Number of rays along each side of a pixel."""
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 
 

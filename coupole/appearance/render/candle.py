@@ -20,7 +20,7 @@ from coupole.appearance.spectra.grid import Array
 
 _AROUND, _ALONG = 16, 10
 _GAP_MM = 3.0
-"""From the wax to the flame."""
+"""Gap from the wax to the flame."""
 _MM2 = 1e-6
 _WAX = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.75))
 
@@ -30,7 +30,7 @@ class Candle(Model):
 
     kind: Literal["candle"]
     position_mm: Vector
-    """Of its foot."""
+    """Position of the candle's foot."""
     intensity_cd: Positive = 1.0
     """Seen from the side."""
     flame_height_mm: Positive = 28.0
@@ -41,7 +41,7 @@ class Candle(Model):
     spectrum: Power = BlackBody(kind="black_body", kelvin=1900.0)
 
     def luminance_cd_m2(self) -> float:
-        """Of the flame."""
+        """Return the luminance of the flame."""
         return self.intensity_cd / (seen_area_mm2(flame(self)) * _MM2)
 
 
@@ -65,7 +65,7 @@ def stem(candle: Candle) -> Array:
 
 
 def seen_area_mm2(corners_mm: Array) -> float:
-    """Of a convex body from the side, the mean over azimuths (Cauchy)."""
+    """Return the area of a convex body as seen from the side, the mean over azimuths (Cauchy)."""
     doubled = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     return float(np.hypot(doubled[:, 0], doubled[:, 1]).sum() / (2.0 * np.pi))
 

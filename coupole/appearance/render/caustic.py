@@ -32,7 +32,7 @@ class Niche:
     gilded_mm: Array
     stone_mm: Array
     reflectance: Reflectance
-    """Of the gold."""
+    """Reflectance of the gold."""
     roughness: float
     """0 is a mirror."""
 

@@ -17,9 +17,9 @@ from coupole.appearance.spectra.grid import Array
 _ARC = 12
 """Segments of each half of a pointed arch."""
 _RIB_WIDTH, _RIB_DEPTH = 0.05, 0.035
-"""In widths of the nave."""
+"""Width and depth of a rib, in widths of the nave."""
 _TILES = 12
-"""Across the floor."""
+"""Number of tiles across the floor."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class Size:
     width_mm: float
     length_mm: float
     spring_mm: float
-    """From the floor to where the vault begins."""
+    """Height from the floor to where the vault begins."""
     bays: int
     wall_mm: float
     """Thickness of the walls, seen in the windows' reveals."""
     window_width_mm: float
     window_sill_mm: float
     window_spring_mm: float
-    """From the floor to where a window's arch begins."""
+    """Height from the floor to where a window's arch begins."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def _wall(width_mm: float, height_mm: float, size: Size) -> tuple[Array, Array]:
 
 
 def _gable(outline: Array) -> Array:
-    """What closes the vault at an end, in y = 0."""
+    """Return the surface that closes the vault at an end, in y = 0."""
     level = np.stack([outline[:, 0], np.full(len(outline), outline[0, 1])], axis=1)
     return _between(_at(level), _at(outline))
 

@@ -1,4 +1,4 @@
-"""From spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
+"""Convert spectra to a picture on a screen: observer, chromatic adaptation, sRGB."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Eye:
 
 
 def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: StepNm) -> Eye:
-    """Of an observer in the light `power` [81] who is used to `white_power` [81]."""
+    """Return the eye of an observer in the light `power` [81] who is used to `white_power` [81]."""
     luminosity = light.observer("2 deg")[1]
     functions = light.observer(observer)
     white = functions @ white_power

@@ -28,7 +28,7 @@ _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0
 _BALL_PARTS = 64
 """A weathered ball has 20 times their square of triangles."""
 _FILTER_MM = 1.0
-"""From the projection centre to the polariser."""
+"""Distance from the projection centre to the polariser."""
 
 
 def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Sequence[Piece] = ()) -> Description:
@@ -64,7 +64,7 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
 
 
 def _reach_mm(piece: Piece | Ball) -> float:
-    """From the origin to its farthest point."""
+    """Return the distance from the origin to the farthest point of a piece."""
     if isinstance(piece, Ball):
         return float(np.linalg.norm(piece.centre_mm)) + piece.radius_mm
     return float(np.linalg.norm(piece.corners_mm, axis=2).max())
@@ -130,8 +130,8 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
 
 
 def _integrator(parts: Description, *, polarised: bool) -> str:
-    """For media, that which weighs a way by all bands of a group: their absorption may differ by far. Behind a
-    pane light is found by what looks for it through panes.
+    """Choose the integrator. The one for media weighs a way by all bands of a group, as their absorption may
+    differ by far. The one for panes looks for light through panes.
 
     Raises InputError for media and polarisation together.
     """

@@ -23,14 +23,14 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 from coupole.errors import InputError
 
 MOST_COLUMNS = 2048
-"""Of a map in the renderer; larger ones are reduced by means over pixels."""
+"""Largest width of a map in the renderer; larger ones are reduced by means over pixels."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear sRGB (IEC 61966-2-1)."""
+"""Luminance of the primaries of linear sRGB (IEC 61966-2-1)."""
 _D65_AT_560_NM = 100.0 / 98.8900106203
 """Mitsuba's D65, whose luminance is that of 1 W/(m^2 sr nm) at all wavelengths."""
 _MOST_NEGATIVE = 0.01
 _PARTS = 40
-"""Of a band, in which D65 is averaged over it as the renderer does."""
+"""Number of parts of a band, in which D65 is averaged over it as the renderer does."""
 
 
 class EnvironmentMap(Model):
@@ -40,13 +40,13 @@ class EnvironmentMap(Model):
     path: Path
     """Equirectangular, .hdr or .exr: twice as wide as high, up is the first row."""
     centre_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Where the picture's middle is: degrees from +y by +x (from north by east, where +y is north)."""
+    """Azimuth of the picture's middle: degrees from +y by +x (from north by east, where +y is north)."""
     white_cd_m2: Positive | None = None
     """Luminance of a pixel 1, 1, 1: 1 if pixels are cd/m^2, 179 after Radiance."""
     illuminance_lux: Positive | None = None
-    """On a level plane that sees nothing else."""
+    """Illuminance of a level plane that sees nothing else."""
     spectrum: Power = Illuminant(kind="illuminant", name="D65")
-    """Of a white pixel."""
+    """Spectrum of a white pixel."""
 
     @model_validator(mode="after")
     def _one_amount(self) -> EnvironmentMap:
@@ -55,7 +55,8 @@ class EnvironmentMap(Model):
         return self
 
     def white_luminance_cd_m2(self, pixels: Array) -> float:
-        """Of a pixel 1, 1, 1. Raises InputError for an amount of light that a dark map cannot give."""
+        """Return the luminance of a pixel 1, 1, 1. Raises InputError for an amount of light that a dark map cannot
+        give."""
         if self.white_cd_m2 is not None:
             return self.white_cd_m2
         assert self.illuminance_lux is not None
@@ -105,7 +106,7 @@ def _reduced(pixels: Array) -> Array:
 
 
 def level_irradiance(radiance: Array) -> float:
-    """On a plane that faces up, by radiance [h, w] of an equirectangular map."""
+    """Return the irradiance of a plane that faces up, by radiance [h, w] of an equirectangular map."""
     height, width = radiance.shape
     above = np.minimum(np.linspace(0.0, np.pi, height + 1), 0.5 * np.pi)
     return float(radiance.sum(axis=1) @ np.diff(np.sin(above) ** 2) * (np.pi / width))

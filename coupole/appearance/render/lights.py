@@ -42,9 +42,9 @@ class Distant(Model):
 
     kind: Literal["distant"]
     direction: Vector
-    """In which light travels."""
+    """Direction in which light travels."""
     illuminance_lux: Positive
-    """On a surface that faces it."""
+    """Illuminance of a surface that faces the light."""
     width_deg: Annotated[float, Field(ge=0, le=60)] = 0.0
     spectrum: Power
 
@@ -94,7 +94,7 @@ class Daylight(Model):
     """East."""
     altitude_m: Annotated[float, Field(ge=-430, le=9000)] = 0.0
     y_azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Where the scene's +y points: degrees from north by east."""
+    """Azimuth of the scene's +y: degrees from north by east."""
     sky: bool = True
     """The light of the sky, evenly from all directions; without it only the sun shines."""
     aerosol_depth_500nm: Annotated[float, Field(ge=0, le=2)] = 0.1
@@ -154,15 +154,15 @@ def radiance_unit(lights: Iterable[PlainLight], folder: Path, step_nm: StepNm) -
 
 @dataclass(frozen=True)
 class Setting:
-    """What lights depend on."""
+    """Quantities that lights depend on."""
 
     folder: Path
-    """Of relative paths."""
+    """Folder that relative paths start from."""
     step_nm: StepNm
     radiance_unit: Array
     """[81] W/(m^2 sr nm)."""
     reach_mm: float
-    """Of the scene's objects from the origin."""
+    """Distance from the origin to the farthest point of the scene's objects."""
 
 
 def emitters(light: PlainLight, setting: Setting, mi: Any) -> list[Description]:

@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 Roughness = Annotated[float, Field(ge=0.01, le=1)]
 """GGX alpha. Perfect mirrors are excluded, because point lights would be invisible in them."""
 Index = Annotated[float, Field(gt=1, le=3)]
-"""Of refraction, of something transparent."""
+"""Index of refraction of something transparent."""
 
 
 class Model(BaseModel):

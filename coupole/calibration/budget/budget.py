@@ -72,7 +72,7 @@ class Known:
     """Uncertainty of an LED's centre, all directions together."""
     led_deg: float = 0.21
     mesh_mm: float = 0.1
-    """Uncertainty of the pose of mesh to robot, all directions together."""
+    """Uncertainty of the mesh's position against the robot, all directions together."""
     mesh_deg: float = 0.02
     robot_mm: float = 0.03
     """Uncertainty of the robot's common error, which shifts LEDs and mesh alike and so correlates them."""

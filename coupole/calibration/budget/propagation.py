@@ -127,8 +127,8 @@ class Linear:
 
 @dataclass(frozen=True)
 class Validation:
-    """Result of the test whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of significant
-    digits."""
+    """Result of the test whether the linear formula is sufficient (JCGM 101, section 8), for u with a number of
+    significant digits."""
 
     coverage: float
     digits: int

@@ -39,7 +39,8 @@ _BLACK = Constant(kind="constant", value=0.0)
 
 
 class Coefficients(Model):
-    """Of four fluxes, per mm: K and S of diffuse light; k, s_i (forwards), s_j (backwards) of directed light."""
+    """Coefficients of four fluxes, per mm: K and S of diffuse light; k, s_i (forwards), s_j (backwards) of
+    directed light."""
 
     kind: Literal["values"]
     absorption: PerMm
@@ -62,7 +63,7 @@ class FourFlux(Model):
     ground: Reflectance = _BLACK
     """Inside the binder; measured under a face of the same index."""
     ground_mirror: Share = 0.0
-    """Of a glossy ground, for directed light: in addition to `ground`."""
+    """Reflectance of a glossy ground for directed light: in addition to `ground`."""
     ground_roughness: Roughness = 0.1
     index: Annotated[float, Field(ge=1.01, le=3)] = indices.BINDER
     roughness: Roughness = 0.05
@@ -73,7 +74,7 @@ class PaintLayer(Model):
     pigment: Colouring
     thickness_mm: Positive
     scattering_per_mm: Positive = 30.0
-    """Of a pigment whose reflectance is given; a paint file has its own."""
+    """Scattering of a pigment whose reflectance is given; a paint file has its own."""
 
 
 class GlazeLayer(Model):
@@ -106,7 +107,7 @@ Layer = Annotated[PaintLayer | GlazeLayer | ClearLayer | Leaf, Field(discriminat
 
 
 class Layers(Model):
-    """From the top to the bottom, in one binder; a leaf on top lies bare in the air."""
+    """Layers from the top to the bottom, in one binder; a leaf on top lies bare in the air."""
 
     kind: Literal["layers"]
     layers: Annotated[tuple[Layer, ...], Field(min_length=1, max_length=20)]
@@ -114,7 +115,7 @@ class Layers(Model):
     """Inside the binder; measured under a face of the same index."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.05
-    """Of the face; a leaf on top has its own."""
+    """Roughness of the face; a leaf on top has its own."""
 
     @model_validator(mode="after")
     def _covered(self) -> Layers:

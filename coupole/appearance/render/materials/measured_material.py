@@ -26,7 +26,7 @@ from coupole.errors import InputError
 
 _THETAS, _SIDE = 48, 96
 _TURNS = 16
-"""Of an anisotropic surface."""
+"""Number of turns over which an anisotropic surface is averaged."""
 
 
 class MeasuredMaterial(Model):
@@ -36,11 +36,11 @@ class MeasuredMaterial(Model):
     kind: Literal["measured"]
     path: Path
     fit: Literal["ggx", "ggx_normal"] = "ggx"
-    """Of a result."""
+    """Fit that is taken of a result."""
     cluster: Annotated[int, Field(ge=0)] | None = None
-    """Of a result; if not given, the mean of its triangles."""
+    """Cluster of a result; if not given, the mean of its triangles."""
     triangles: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] | None = None
-    """Of a result's mesh, whose mean is taken."""
+    """Triangles of a result's mesh, whose mean is taken."""
 
     @model_validator(mode="after")
     def _one_region(self) -> MeasuredMaterial:
@@ -55,7 +55,7 @@ def measured_bsdf(material: MeasuredMaterial, folder: Path) -> Description:
 
 
 def measured_table(material: MeasuredMaterial, folder: Path) -> BakedTable:
-    """For Mitsuba; paths are relative to `folder`. Raises InputError."""
+    """Return the table for Mitsuba; paths are relative to `folder`. Raises InputError."""
     path = folder / material.path
     if path.suffix.lower() == ".bsdf":
         table = read_bsdf(path)
@@ -72,7 +72,7 @@ def measured_table(material: MeasuredMaterial, folder: Path) -> BakedTable:
 
 
 def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
-    """By the file's own channels [..., channels], as its reader has it. Raises InputError."""
+    """Return the BRDF by the file's own channels [..., channels], as its reader has it. Raises InputError."""
     path = folder / material.path
     if path.is_dir():
         return read_result(path, material.fit, cluster=material.cluster, triangles=material.triangles)

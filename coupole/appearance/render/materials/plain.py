@@ -58,12 +58,14 @@ class Paint(Model):
 
     kind: Literal["paint"]
     pigment: Colouring
-    """Of an opaque layer: measured as it is seen under its face, otherwise inside the binder. Or K and S."""
+    """Reflectance of an opaque layer: measured as it is seen under its face, otherwise inside the binder. Or K and
+    S."""
     thickness_mm: Positive | None = None
     ground: Reflectance = Constant(kind="constant", value=0.0)
-    """As `pigment`: measured under a face of the same index, otherwise inside the binder."""
+    """Reflectance of the ground, as `pigment`: measured under a face of the same index, otherwise inside the
+    binder."""
     scattering_per_mm: Positive = 30.0
-    """Of a pigment whose reflectance is given; a paint file has its own."""
+    """Scattering of a pigment whose reflectance is given; a paint file has its own."""
     index: Refraction = indices.BINDER
     roughness: Roughness = 0.25
 
@@ -85,14 +87,14 @@ class Metal(Model):
     gold: Share = 1.0
     """Share of gold by atoms; the rest is silver."""
     index: IndexFile | None = None
-    """Of another metal, in place of gold and silver."""
+    """Index of another metal, in place of gold and silver."""
     roughness: Roughness = 0.1
     """Alpha, of GGX's or of Beckmann's slopes."""
     distribution: Facets = "ggx"
     depth_mm: Annotated[float, Field(ge=0)] | None = None
-    """Under the lacquer's face. None: in air."""
+    """Depth under the lacquer's face. None: in air."""
     face: bool = True
-    """Whether light that the face reflects is lost here; not where the scene has the face as a body of glass."""
+    """True if light that the face reflects is lost here; False where the scene has the face as a body of glass."""
 
 
 class Gilt(Model):
@@ -102,7 +104,7 @@ class Gilt(Model):
     thickness_nm: Annotated[float, Field(ge=0)] = 100.0
     gold: Share = 1.0
     index: IndexFile | None = None
-    """Of another metal's leaf."""
+    """Index of another metal's leaf."""
     holes: Annotated[float, Field(ge=0, le=0.3)] = 0.0
     """Nanoscopic, by volume (Maxwell Garnett)."""
     uncovered: Share = 0.0

@@ -30,9 +30,9 @@ class Cracks(Model):
 
     kind: Literal["cracks"]
     cell_mm: Positive
-    """Of a cell, in the mean of all."""
+    """Size of a cell, in the mean of all."""
     width_mm: Positive | None = None
-    """Of a crack; if not given, the `share` says it."""
+    """Width of a crack; if not given, the `share` says it."""
     seed: int = 1
 
 
@@ -41,7 +41,7 @@ class Edges(Model):
 
     kind: Literal["edges"]
     reach_mm: Positive
-    """Over which an edge is one."""
+    """Distance within which the surface about a point decides whether it is on an edge."""
     seed: int = 1
 
 
@@ -55,7 +55,7 @@ class Worn(Model):
     over: Solid
     under: Solid
     share: Share | None = None
-    """Of the area where `under` shows."""
+    """Share of the area where `under` shows."""
     pattern: Annotated[Uniform | Cracks | Edges, Field(discriminator="kind")] = Uniform(kind="uniform")
 
     @model_validator(mode="after")
@@ -72,14 +72,14 @@ class Dusty(Model):
     kind: Literal["dusty"]
     over: Annotated[Plain | Coating | MeasuredMaterial | Worn, Field(discriminator="kind")]
     grams_per_m2: Annotated[float, Field(ge=0)]
-    """On what faces up."""
+    """Mass of dust per area on what faces up."""
     settles: Literal["up", "everywhere"] = "up"
     """`up`: per area of ground plan, z up; nothing on what faces down."""
     grain_um: Positive = 20.0
     """Diameter of a grain."""
     density_g_cm3: Positive = 2.0
     reflectance: Reflectance = Constant(kind="constant", value=0.35)
-    """Of thick dust."""
+    """Reflectance of thick dust."""
 
     def covered(self, upward: Array) -> Array:
         """Share of the surface under grains, by the normals' upward parts [n].
@@ -94,7 +94,7 @@ Weathered = Worn | Dusty
 
 
 def needs_mesh(material: Weathered) -> bool:
-    """Whether shares differ from place to place."""
+    """Tell whether shares differ from place to place."""
     if isinstance(material, Dusty):
         return material.settles == "up" or (isinstance(material.over, Worn) and needs_mesh(material.over))
     return not isinstance(material.pattern, Uniform)

@@ -191,7 +191,7 @@ def _read_ascii_ply(source: MeshFile, elements: list[_Element], at: int, line: i
 
 
 def _after_lines(path: Path, data: NDArray[np.uint8], at: int, element: _Element) -> int:
-    """Where the lines of an element end that is skipped."""
+    """Return the place where the lines of a skipped element end."""
     if element.count == 0:
         return at
     begins = np.concatenate([[at], at + 1 + np.flatnonzero(data[at:] == ord("\n"))])

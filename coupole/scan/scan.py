@@ -110,7 +110,7 @@ def edges_mm(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def target_distances_mm(targets_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From each target to the nearest other one [n], and between all pairs [n (n - 1) / 2]."""
+    """Return distances from each target to the nearest other one [n], and between all pairs [n (n - 1) / 2]."""
     from scipy.spatial.distance import pdist, squareform
 
     pairs_mm: NDArray[np.float64] = pdist(targets_mm)

@@ -112,7 +112,7 @@ class NashijiSlab(Pose):
     kind: Literal["nashiji_slab"]
     size_mm: tuple[Positive, Positive] = (20.0, 20.0)
     depth_mm: Positive = 0.4
-    """Of the lacquer."""
+    """Depth of the lacquer."""
     flakes_per_mm2: Positive = 6.0
     flake_radius_mm: Positive = 0.12
     tilt_deg: Annotated[float, Field(ge=0, lt=45)] = 8.0
@@ -126,7 +126,7 @@ class Arcature(Pose):
     kind: Literal["arcature"]
     radius_mm: Positive = 400.0
     height_mm: Positive = 600.0
-    """From the sill to where the arch begins."""
+    """Height from the sill to where the arch begins."""
     depth_mm: Positive = 300.0
     gilt: Gilt = Gilt(kind="gilt")
     stone: Material = Diffuse(kind="diffuse", reflectance=Shape(kind="shape", name="dull_yellow_shape"))
@@ -148,7 +148,7 @@ class Church(Pose):
     width_mm: Positive = 6000.0
     length_mm: Positive = 12000.0
     spring_mm: Positive = 5000.0
-    """From the floor to where the vault begins."""
+    """Height from the floor to where the vault begins."""
     bays: Annotated[int, Field(ge=1, le=20)] = 3
     wall_mm: Positive = 600.0
     window_width_mm: Positive = 1000.0
@@ -158,7 +158,7 @@ class Church(Pose):
     light_tiles: Material = _STONE
     dark_tiles: Material = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.12))
     glazing: Glazing | None = None
-    """Of all windows; without it they are open."""
+    """Glazing of all windows; without it they are open."""
     lead: Material = _LEAD
 
     @model_validator(mode="after")
@@ -201,7 +201,7 @@ def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
 
 
 def _local(thing: LocalObject, folder: Path) -> list[Piece]:
-    """In the object's own frame."""
+    """Return the pieces in the object's own frame."""
     match thing:
         case Mesh():
             corners = mesh_corners(folder / thing.path, thing.unit)
@@ -270,7 +270,7 @@ def _panel(panel: samples.SteppedPanel, materials: Sequence[Material]) -> list[P
 
 
 def _paint_fields(thing: PaintWedge) -> list[Material]:
-    """In the generator's order: row by row, black ground first, with the steps' thicknesses."""
+    """Return the paints in the generator's order: row by row, black ground first, with the steps' thicknesses."""
     return [
         Paint(
             kind="paint",

@@ -43,7 +43,8 @@ class Transmitted(Model):
 
 
 class Absorbed(Model):
-    """By the coefficient of absorption of a glass in 1/mm (natural logarithm), and the sheet's thickness."""
+    """Sheet of glass, by the glass's coefficient of absorption in 1/mm (natural logarithm) and the sheet's
+    thickness."""
 
     kind: Literal["absorption"]
     path: Path

@@ -30,7 +30,7 @@ class Mirror:
     corners_mm: Array
     """[triangles, 3, 3]."""
     reflectance: Reflectance
-    """Of cosines [n]: [n, 81]."""
+    """Function that gives the reflectance [n, 81] of cosines [n]."""
     roughness: float
 
 
@@ -44,7 +44,7 @@ class Matt:
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end; those that miss everything have surface -1."""
+    """Ends of rays; those that miss everything have surface -1."""
 
     surface: NDArray[np.int64]
     """[n], the number of the surface."""
@@ -217,8 +217,8 @@ def seen_by_gold(
     seed: int,
     progress: Progress,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """For rays of an eye (starts [n, 3], ways [n, 3]): radiance [n, bands] of matt surfaces by light that came
-    over gold, in W/(m^2 sr nm), and which rays meet gold first [n]."""
+    """Return for rays of an eye (starts [n, 3], ways [n, 3]): radiance [n, bands] of matt surfaces by light that
+    came over gold, in W/(m^2 sr nm), and which rays meet gold first [n]."""
     hits = room.hits(*rays)
     albedo = np.stack([one.reflectance if isinstance(one, Matt) else np.zeros(81) for one in room.surfaces])[
         :, list(bands)

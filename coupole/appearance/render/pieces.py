@@ -1,4 +1,4 @@
-"""What objects consist of: triangles and balls, each of one material."""
+"""Pieces that objects consist of: triangles and balls, each of one material."""
 
 from __future__ import annotations
 

@@ -83,16 +83,16 @@ class Display(Model):
     """Luminance that is shown as white; none: the level exceeded by the share `clipped`."""
     clipped: Annotated[float, Field(ge=0, lt=0.5)] = 0.005
     adaptation: Literal["CAT16", "Bradford", "none"] = "CAT16"
-    """From the white of the first light to D65; none shows the light's own colour."""
+    """Adaptation from the white of the first light to D65; none shows the light's own colour."""
     denoised: bool = False
-    """By Open Image Denoise, for the PNG alone."""
+    """True if the PNG, and it alone, is denoised by Open Image Denoise."""
 
 
 class Outputs(Model):
     spectra: Literal["half", "float"] = "float"
     """Number format of the EXR."""
     xyz: bool = True
-    """Whether it has X, Y, Z in addition to the bands."""
+    """True if the EXR has X, Y, Z in addition to the bands."""
 
 
 class Caustic(Model):
@@ -106,9 +106,9 @@ class Gathered(Model):
     """Sunlight that gold sends onto matt surfaces, by photons gathered by the eye, in place of paths."""
 
     photons: Annotated[int, Field(ge=1000, le=100_000_000)] = 2_000_000
-    """Of each sun."""
+    """Number of photons of each sun."""
     radius_mm: Positive = 4.0
-    """About what the eye sees: less is sharper, and needs more photons."""
+    """Radius about what the eye sees: less is sharper, and needs more photons."""
 
 
 class Film(Model):
@@ -118,7 +118,7 @@ class Film(Model):
     ends: AwareDatetime
     every_s: Annotated[float, Field(gt=0)] = 30.0
     frames_per_s: Annotated[int, Field(ge=1, le=60)] = 12
-    """When it is shown."""
+    """Pictures per second when the film is shown."""
 
     @model_validator(mode="after")
     def _rises(self) -> Film:
@@ -136,7 +136,7 @@ class Turntable(Model):
 
     frames: Annotated[int, Field(ge=2, le=1000)] = 48
     degrees: Annotated[float, Field(ge=-3600, le=3600)] = 360.0
-    """From the first picture to the one that would follow the last."""
+    """Angle from the first picture to the one that would follow the last."""
     frames_per_s: Annotated[int, Field(ge=1, le=60)] = 12
 
     def angles_deg(self) -> list[float]:
@@ -238,7 +238,7 @@ def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str
 
 
 def remarks(scene: Scene) -> list[str]:
-    """What its maker must know, one sentence each."""
+    """Return remarks that the scene's maker must know, one sentence each."""
     found = [shape.remark() for shape in _shapes(scene)]
     return list(dict.fromkeys(remark for remark in found if remark))
 

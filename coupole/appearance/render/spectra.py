@@ -42,7 +42,7 @@ class Shape(Model):
     name: str
 
     def remark(self) -> str:
-        """What its maker must know of a former name; empty if there is none."""
+        """Return what the scene's maker must know of a former name; empty if there is none."""
         now = typical.FORMER_NAMES.get(self.name)
         if now is None:
             return ""
@@ -62,7 +62,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """How its face was seen; bare: it had none (matt powder), so that it holds inside a binder as it was seen."""
+    """Condition of the sample's face as it was seen; bare: it had none (matt powder), so that the reflectance
+    holds inside a binder as it was seen."""
 
 
 class MeasuredPaint(Model):
@@ -82,7 +83,7 @@ class MeasuredPower(Model):
 
 Reflectance = Annotated[Constant | Shape | Bole | Measured, Field(discriminator="kind")]
 Colouring = Annotated[Constant | Shape | Bole | Measured | MeasuredPaint, Field(discriminator="kind")]
-"""Of a paint."""
+"""Colour of a paint: a reflectance, or K and S."""
 
 
 class Illuminant(Model):
@@ -115,7 +116,7 @@ class Values(Model):
 
     kind: Literal["values"]
     name: str = "given"
-    """As pictures and pages name it."""
+    """Name as pictures and pages show it."""
     values: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=BANDS, max_length=BANDS)]
 
 

@@ -14,7 +14,7 @@ from coupole.appearance.shapes.triangles import grid_faces
 from coupole.appearance.spectra.grid import Array
 
 OPEN = "."
-"""In a layout: no glass."""
+"""Sign in a layout: no glass."""
 
 
 class Glazing(Model):

@@ -87,7 +87,7 @@ def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
 
 @dataclass(frozen=True)
 class _Moves:
-    """What changes from picture to picture of a film."""
+    """Changes from picture to picture of a film."""
 
     steps: Sequence[Callable[[Scene], Scene]]
     frames_per_s: int

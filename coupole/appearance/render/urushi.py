@@ -23,7 +23,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 _CLEAR_MM = 0.01
-"""Between flakes and both faces of the lacquer, whose triangles lie as much below the curved surface."""
+"""Gap between flakes and both faces of the lacquer, whose triangles lie as much below the curved surface."""
 _MOST_GRAINS = 6_000_000
 _MOST_FLAKES = 400_000
 
@@ -61,7 +61,7 @@ class MotifDrawing(Model):
     name: makie_drawing.Motif
     period_mm: Positive = 24.0
     edge_mm: Positive = 0.5
-    """Over which the powder thins out."""
+    """Distance over which the powder thins out."""
 
 
 class PictureDrawing(Model):
@@ -70,7 +70,7 @@ class PictureDrawing(Model):
     kind: Literal["picture"]
     path: Path
     width_mm: Positive
-    """Under `uv` the picture covers the texture's square, whatever is here."""
+    """Width of the picture. Under `uv` the picture covers the texture's square, whatever is here."""
 
 
 class Makie(Pose):
@@ -96,7 +96,7 @@ class Nashiji(Pose):
     kind: Literal["nashiji"]
     body: Body
     depth_mm: Positive = 0.4
-    """Of the lacquer over the body."""
+    """Depth of the lacquer over the body."""
     flakes_per_mm2: Positive = 3.0
     flake_radius_mm: Positive = 0.16
     tilt_deg: Annotated[float, Field(ge=0, lt=45)] = 8.0
@@ -104,7 +104,7 @@ class Nashiji(Pose):
     metal: Metal = Metal(kind="metal", gold=0.8, roughness=0.08)
     absorption: Absorption = Urushi(kind="urushi")
     ground: Material = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.006))
-    """Of the body, inside the lacquer."""
+    """Material of the body, inside the lacquer."""
     seed: int = 1
 
 

@@ -79,13 +79,13 @@ def _lit(
 
 
 def gold_reflectance(gilt: Gilt, folder: Path) -> caustic.Reflectance:
-    """Of the covered share, by cosine; the bole's light is neglected."""
+    """Return the reflectance of the covered share, by cosine; the bole's light is neglected."""
     leaf = _leaf(gilt, folder)
     return lambda cosines: layered.at_cosine(leaf, cosines)
 
 
 def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caustic.Sun:
-    """In the niche's frame."""
+    """Return the sun in the niche's frame."""
     direction = thing.scene_from_thing()[:3, :3].T @ np.array(unit(light.direction))
     if direction[1] <= 0.0:
         raise InputError(

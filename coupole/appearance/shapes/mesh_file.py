@@ -21,7 +21,8 @@ def mesh_corners(path: Path, unit: str) -> Array:
 
 
 def mesh_and_uv(path: Path, unit: str) -> tuple[Array, Array]:
-    """As `mesh_corners`, and the corners' texture coordinates [triangles, 3, 2]. Raises InputError."""
+    """Return corners as `mesh_corners` does, and their texture coordinates [triangles, 3, 2]. Raises
+    InputError."""
     mesh = _read(path)
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or len(uv) != len(mesh.vertices):

@@ -34,7 +34,8 @@ class Skin:
 
 
 def skin_of(corners_mm: Array) -> Skin:
-    """Of corners [m, 3, 3]; a point's normal is the mean of its triangles' by their angles (Thuermer 1998)."""
+    """Return the skin of corners [m, 3, 3]; a point's normal is the mean of its triangles' by their angles
+    (Thuermer 1998)."""
     points, faces = welded(corners_mm)
     sides = corners_mm[:, [1, 2, 0]] - corners_mm
     length = np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-300)

@@ -1,4 +1,4 @@
-"""Where on a surface a layer is worn off: by fields in space, without texture coordinates.
+"""Masks that say where on a surface a layer is worn off: by fields in space, without texture coordinates.
 
 A field is a number at each point of a surface with its normal; where it is below a level, the layer is off.
 Triangles are divided where the level may cross them, until they are as small as the pattern needs.
@@ -16,7 +16,8 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 Field = Callable[[Array, Array], Array]
-"""Of points [n, 3] in mm and normals [n, 3]: [n] in mm, which change by no more than the way between points."""
+"""Function of points [n, 3] in mm and normals [n, 3]. It gives [n] in mm, which change by no more than the way
+between points."""
 SAMPLES = 40_000
 """Points by which the level of a share is found."""
 MOST_TRIANGLES = 2_000_000
@@ -35,7 +36,7 @@ class Divided:
 
     @property
     def share(self) -> float:
-        """Of the area that is off."""
+        """Share of the area that is off."""
         areas = _areas(self.corners_mm)
         return float(areas[self.off].sum() / areas.sum())
 

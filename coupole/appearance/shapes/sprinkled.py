@@ -13,8 +13,9 @@ from coupole.appearance.shapes.skin import skin_of
 from coupole.appearance.shapes.triangles import Array
 
 Wrapping = Literal["sides", "above", "around", "uv"]
-"""How a flat drawing lies on the body. `sides`: projected onto each of six sides, by the normal; `above`: along z;
-`around`: rolled around z; `uv`: by the mesh's texture coordinates, less their middle (0.5, 0.5)."""
+"""Ways in which a flat drawing lies on the body. `sides`: projected onto each of six sides, by the normal;
+`above`: along z; `around`: rolled around z; `uv`: by the mesh's texture coordinates, less their middle (0.5,
+0.5)."""
 
 
 @dataclass(frozen=True)

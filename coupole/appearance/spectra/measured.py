@@ -67,7 +67,8 @@ def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None)
 def parse_spectrum(
     text: str, file: str, *, name: str = "", unit: Unit = "auto", column: int | None = None
 ) -> Measured:
-    """As `read_spectrum`, from text; `file` is the name in errors. Raises InputError for ambiguous input."""
+    """Read a spectrum as `read_spectrum`, from text; `file` is the name in errors. Raises InputError for ambiguous
+    input."""
     table = _table(text, file)
     rows = table.rows
     _check_columns(table, file)

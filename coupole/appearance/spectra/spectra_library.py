@@ -184,7 +184,7 @@ def _numbers(path: Path, nm: Array, line: int, name: str, fields: list[str]) -> 
 
 
 def _scale(path: Path, nm: Array, numbers: list[Array], rows: list[Row], unit: Unit) -> float:
-    """What turns the file's reflectances into fractions; checks them."""
+    """Return the factor that turns the file's reflectances into fractions, and check them."""
     spectra = [(values, row) for values, row in zip(numbers, rows, strict=True) if len(values) == len(nm)]
     if not spectra:
         return 1.0

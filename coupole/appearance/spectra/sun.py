@@ -22,14 +22,14 @@ WIDTH_DEG = 0.533
 
 @dataclass(frozen=True)
 class SunPlace:
-    """Where the sun stands for an observer. Azimuths count from north by east."""
+    """Place of the sun for an observer. Azimuths count from north by east."""
 
     refracted_elevation_deg: float
-    """Of the disk's centre, as seen through the air: light comes from there."""
+    """Elevation of the disk's centre, as seen through the air: light comes from there."""
     azimuth_deg: float
     day_of_year: int
     pressure_pa: float
-    """Of the standard atmosphere at the observer's altitude."""
+    """Pressure of the standard atmosphere at the observer's altitude."""
 
     def direction(self, y_azimuth_deg: float) -> Array:
         """[3], unit: in which light travels, in a frame whose z is up and whose y points to `y_azimuth_deg`."""
@@ -41,7 +41,7 @@ class SunPlace:
 
 @dataclass(frozen=True)
 class Air:
-    """What is in a clear atmosphere; defaults are those of ASTM G173's, but for its cleaner aerosol."""
+    """Contents of a clear atmosphere; defaults are those of ASTM G173, except for a cleaner aerosol."""
 
     aerosol_depth_500nm: float = 0.1
     """Optical depth of the aerosol at 500 nm (rural; exponent 1.14): 0.05 very clear, 0.4 hazy."""
@@ -61,7 +61,7 @@ class ClearSky:
 
 
 def place(when: datetime, latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> SunPlace:
-    """Where the sun stands. Raises InputError if `when` has no offset from UTC, or if the sun is down."""
+    """Return the sun's place. Raises InputError if `when` has no offset from UTC, or if the sun is down."""
     if when.tzinfo is None:
         raise InputError(
             f"{when.isoformat()}: expected a time with its offset from UTC, such as {when.isoformat()}+02:00"

@@ -62,11 +62,11 @@ class Sightings:
 
     @property
     def anchored(self) -> bool:
-        """Whether control points determine where the scans are."""
+        """True if control points determine where the scans are."""
         return self.control is not None
 
     def of_scans(self, scans: Sequence[int]) -> Sightings:
-        """Those of some scans, which are numbered anew in this order."""
+        """Return the sightings of some scans, which are numbered anew in this order."""
         place = {scan: k for k, scan in enumerate(scans)}
         kept = tuple(replace(one, scan=place[one.scan]) for one in self.seen if one.scan in place)
         known = {one.name for one in kept} & set(self.control or {})
@@ -89,7 +89,8 @@ class Sightings:
         )
 
     def normal_equations(self, poses: Sequence[Floats], pivots: Floats) -> tuple[Floats, Floats]:
-        """What the targets add: [6 n, 6 n] and [6 n] of steps about pivots; their own places are eliminated."""
+        """Return the targets' part of the equations: [6 n, 6 n] and [6 n] of steps about pivots; the targets' own
+        places are eliminated."""
         normal, gradient = np.zeros((6 * len(poses),) * 2), np.zeros(6 * len(poses))
         for name, several in self.by_name().items():
             known = (self.control or {}).get(name)

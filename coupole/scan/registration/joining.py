@@ -28,7 +28,7 @@ class Groups:
     """Groups of scans with known places in each other, and which motions they rest on."""
 
     group_from_scan: list[Floats]
-    """Of each scan, 4x4 mm, into the frame of its group's first scan."""
+    """Transform of each scan, 4x4 mm, into the frame of its group's first scan."""
     members: dict[int, list[int]]
     group_of: list[int]
     accepted: list[PairMotion] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Groups:
         return np.asarray(inverse_of(self.group_from_scan[first]) @ self.group_from_scan[second])
 
     def agrees(self, scans: Sequence[PreparedScan], motion: PairMotion) -> bool:
-        """Whether a motion between two scans of one group says where they lie already."""
+        """Tell whether a motion between two scans of one group agrees with the places that they have already."""
         predicted = self.predicted(motion.first, motion.second)
         return predicted is not None and _agree(scans, motion, predicted)
 
@@ -137,7 +137,7 @@ def _contradict(
 
 
 def spheres_meet(one: PreparedScan, other: PreparedScan, one_from_other: Floats) -> bool:
-    """Whether two scans' bounding spheres meet: only then they may overlap."""
+    """Tell whether two scans' bounding spheres meet: only then they may overlap."""
     (middle_one, radius_one), (middle_other, radius_other) = one.coarse.sphere, other.coarse.sphere
     apart = np.linalg.norm(applied(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)

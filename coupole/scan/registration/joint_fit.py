@@ -66,11 +66,11 @@ class JointFit:
     pivots_mm: Floats
     """[n, 3] middle of each scan in the common frame."""
     noise_mm: float
-    """Of one distance between two surfaces: robust standard deviation."""
+    """Noise of one distance between two surfaces: robust standard deviation."""
     rms_mm: float
-    """Of the distances along normals, over all overlaps."""
+    """Root mean square of the distances along normals, over all overlaps."""
     median_nearest_mm: float
-    """From points to the nearest ones of other scans, over all overlaps."""
+    """Median distance from points to the nearest ones of other scans, over all overlaps."""
     inflation: float
     """Standard uncertainties over those that independent errors of all points would give."""
     sightings: tuple[Sighting, ...]
@@ -120,7 +120,7 @@ class _State:
     noise_mm: float
     targets_normal: Floats
     normal: Floats
-    """With targets, and with what is known before: no scan is farther off than its own size."""
+    """Normal matrix with targets, and with what is known before: no scan is farther off than its own size."""
     gradient: Floats
     prior: Floats
     """[6 n]"""
@@ -284,8 +284,8 @@ def _overlaps(
 def distances(
     first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, *, signless: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Of points of the second scan near the first one: normals [n, 3] there, distances along these [n], points
-    [n, 3] in the first scan's frame, and distances to its points [n]."""
+    """Return for points of the second scan near the first one: normals [n, 3] there, distances along these [n],
+    points [n, 3] in the first scan's frame, and distances to its points [n]."""
     moved = applied(first_from_second, second.points_mm)
     away_mm, nearest = first.tree.query(moved, distance_upper_bound=reach_mm)
     hit = np.flatnonzero(np.isfinite(away_mm))

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from coupole.scan.registration.viewpoint import Floats
 
 NO_COLOUR = (0, 0, 0)
-"""Of vertices near which no point has a colour, as PTX has it."""
+"""Colour of vertices near which no point has a colour, as PTX has it."""
 _NEIGHBOURS = 8
 
 

@@ -47,15 +47,15 @@ _CHUNK = 2_000_000
 
 @dataclass
 class Merged:
-    """What was written."""
+    """Counts and sizes of what was written."""
 
     vertices: int = 0
     triangles: int = 0
     points: int = 0
-    """Read, of all scans."""
+    """Points that were read, of all scans."""
     cell_mm: float = 0.0
     coloured: bool = False
-    """Whether a scan had colours, and mesh and clouds have them."""
+    """True if a scan had colours, and mesh and clouds have them."""
     levels: dict[str, int] = field(default_factory=dict)
     """Points of each thinner cloud, by the name of its file."""
 

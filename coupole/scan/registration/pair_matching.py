@@ -1,4 +1,4 @@
-"""How one scan lies to another: found by features without a first guess, refined, and verified.
+"""Motion of one scan to another: found by features without a first guess, refined, and verified.
 
 Motions come from KISS-Matcher (Lim, Kim, Shin, Sattler, Myung, ICRA 2025: Faster-PFH features, pruning by a
 graph of consistent pairs, a solver by graduated non-convexity) and are refined by generalized ICP (Koide,
@@ -25,7 +25,7 @@ pose."""
 _LEAST_AGREED = 5
 """Pairs of features that agree on a motion, below which it is not even refined."""
 _ROUGH_OVERLAP, _ROUGH_CONTRADICTED = 0.06, 0.15
-"""What a motion must reach before it is refined on the fine clouds."""
+"""Least overlap and largest contradicted share of a motion before it is refined on the fine clouds."""
 _SAME_SIDE = 0.7
 """Cosine between normals of points that lie on each other."""
 _COARSE_ITERATIONS, _FINE_ITERATIONS = 40, 12
@@ -33,7 +33,7 @@ _COARSE_ITERATIONS, _FINE_ITERATIONS = 40, 12
 
 @dataclass(frozen=True)
 class Fit:
-    """How well two scans lie on each other."""
+    """Measures of how well two scans lie on each other."""
 
     overlap: float
     """Share of the smaller scan's places that lie on the other scan."""
@@ -41,9 +41,9 @@ class Fit:
     """Share of points, seen by the other scanner, that lie where it saw nothing; 0 where neither viewpoint is
     known."""
     rms_mm: float
-    """Along the normals, over the overlap."""
+    """Root mean square distance along the normals, over the overlap."""
     places: int
-    """Of the overlap, on the coarse grid."""
+    """Number of places of the overlap, on the coarse grid."""
 
     @property
     def holds(self) -> bool:
@@ -108,7 +108,7 @@ def _tree(cloud: Cloud) -> Any:
 
 
 def fit_of(first: PreparedScan, second: PreparedScan, first_from_second: Floats, near_mm: float) -> Fit:
-    """How well two scans lie on each other: points within `near_mm` along the normals count."""
+    """Measure how well two scans lie on each other: points within `near_mm` along the normals count."""
     moved = second.coarse.points_mm @ first_from_second[:3, :3].T + first_from_second[:3, 3]
     turned = second.coarse.normals @ first_from_second[:3, :3].T
     reach_mm = 1.5 * first.coarse.pitch_mm

@@ -20,7 +20,7 @@ _WORTH_PROCESSES = 30
 _TOGETHER = 8
 
 _scans_there: list[PreparedScan] = []
-"""Of a process that matches."""
+"""Scans of a process that matches."""
 
 
 class Search:

@@ -19,11 +19,11 @@ from coupole.scan.registration.scan_files import read_scan
 from coupole.scan.registration.viewpoint import DepthPicture, Floats, Stand, Viewpoint, folds
 
 NEIGHBOURS = 12
-"""Of a point, by which its normal is found."""
+"""Number of a point's neighbours by which its normal is found."""
 PLACE_SPACINGS = 2.0
 _SAMPLE, _MOST_PICTURED = 100_000, 120_000
 _COARSEST_STEP = 0.05
-"""Of 32-bit coordinates, over the points' spacing."""
+"""Largest step of 32-bit coordinates, over the points' spacing."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Cloud:
     incidence: Floats
     """[n] cosine between normal and the way to the scanner; 1 where that is not known."""
     pitch_mm: float
-    """Of the grid."""
+    """Pitch of the grid."""
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -48,13 +48,13 @@ class Cloud:
         return middle, float(np.linalg.norm(self.points_mm - middle, axis=1).max())
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without trees and the libraries' own clouds, which every process makes for itself."""
+        """Return the state without trees and the libraries' own clouds, which every process makes for itself."""
         return {name: self.__dict__[name] for name in ("points_mm", "normals", "incidence", "pitch_mm")}
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What is known of a scan before pitches and viewpoints are chosen for all."""
+    """Facts about a scan before pitches and viewpoints are chosen for all scans."""
 
     count: int
     spacing_mm: float
@@ -64,12 +64,12 @@ class Survey:
     places: int
     """Cells of a grid of `PLACE_SPACINGS` spacings that hold points."""
     folded: dict[Stand, float]
-    """Of each viewpoint that it could have: share of rays along which two surfaces lie."""
+    """Share of rays along which two surfaces lie, for each viewpoint that the scan could have."""
 
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """What is kept of a scan in memory; the whole is read again when scans are merged."""
+    """Parts of a scan that are kept in memory; the whole is read again when scans are merged."""
 
     source: ScanSource
     stated_pose: Floats | None

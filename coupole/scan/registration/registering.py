@@ -29,7 +29,7 @@ ALL_PAIRS = 20
 _FINE_PLACES, _COARSE_PLACES = (20_000, 2_500), (8_000, 1_600)
 """Points of a scan's fine and coarse cloud: of few scans, and of many."""
 _PARTNERS = 6
-"""Of each scan in a round, of more scans than `ALL_PAIRS`."""
+"""Largest number of pairs of each scan in a round, of more scans than `ALL_PAIRS`."""
 _ODD_SIZE = 200.0
 """A scan larger or smaller than most by this factor has another unit."""
 _LEAST_JOINT_OVERLAP = 0.04
@@ -50,15 +50,15 @@ class Registered:
     """[6, 6] of each pose: a step (mm, rad) about the scan's middle, in the common frame; in the control points'
     frame if there are any."""
     site_from_first: Floats | None
-    """Into the control points' frame."""
+    """Transform of the first placed scan's frame into the control points' frame."""
     unplaced: tuple[int, ...]
     motions: tuple[PairMotion, ...]
     rejected: tuple[PairMotion, ...]
     pairs: int
-    """That overlap."""
+    """Number of pairs that overlap."""
     loops: tuple[Loop, ...]
     loop_factor: float
-    """By which the loops enlarged all uncertainties."""
+    """Factor by which the loops enlarged all uncertainties."""
     fit: JointFit
 
 

@@ -13,16 +13,16 @@ from coupole.scan.mesh import Mesh
 
 @dataclass(frozen=True)
 class ScanSource:
-    """Where a scan is stored."""
+    """Place where a scan is stored."""
 
     path: Path
     name: str
-    """That of the file, with `#2` and so on for the second scan of a file and the next ones."""
+    """Name of the file, with `#2` and so on for the second scan of a file and the next ones."""
     number: int = 0
-    """In its file."""
+    """Number of the scan in its file."""
     at_byte: int = 0
     at_line: int = 1
-    """Where its own header begins, in files of text."""
+    """Line where the scan's own header begins, in files of text."""
 
     def __str__(self) -> str:
         return str(self.path) if self.number == 0 else f"{self.path}, scan {self.number + 1}"
@@ -33,7 +33,7 @@ class ScanContent:
     """Points or a mesh of one scan, in the frame of its scanner."""
 
     mesh: Mesh
-    """Without triangles if it is a cloud."""
+    """Mesh of the scan; without triangles if it is a cloud."""
     srgba: NDArray[np.uint8] | None = None
     """[n, 4] sRGB colours, 8 bit, and 255 where a point has one, else 0; None where no point has."""
     stated_pose: NDArray[np.float64] | None = None

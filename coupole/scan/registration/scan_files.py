@@ -29,7 +29,7 @@ from coupole.scan.scanner_export import MM_PER_UNIT
 
 SUFFIXES = (".ply", ".stl", ".obj", ".e57", *HEADED_SUFFIXES, *TEXT_SUFFIXES)
 LEAST_POINTS = 200
-"""Of a scan: with fewer no shape can be recognized."""
+"""Least number of points of a scan: with fewer no shape can be recognized."""
 _HEADER_BYTES = 65536
 PLAUSIBLE_SIZE_MM = (2.0, 1e6)
 """Diagonal of a scan's bounding box: from a coin to a cathedral."""

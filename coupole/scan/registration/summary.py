@@ -1,4 +1,4 @@
-"""What a registration found, as JSON and in sentences."""
+"""Results of a registration, as JSON and in sentences."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def worst_loop_mm(found: Registered) -> float:
 
 
 def remarks(found: Registered) -> Iterator[str]:
-    """What its reader must know, one sentence each."""
+    """Yield remarks that the reader must know, one sentence each."""
     names = found.names
     yield (
         f"{len(found.placed)} of {len(names)} scans placed by {found.pairs} overlapping pairs; surfaces lie on "

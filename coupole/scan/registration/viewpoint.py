@@ -1,4 +1,4 @@
-"""Where a scanner stood, and the space that it saw through.
+"""Viewpoint of a scanner, and the space that it saw through.
 
 A scan is what one scanner saw from one side: each of its rays ends at the first surface. So no point of another
 scan may lie between the scanner and its surface; where one does, the two scans are placed wrongly (free-space
@@ -58,7 +58,7 @@ def _axis(stand: Stand) -> Floats:
 
 
 class DepthPicture:
-    """What a scanner saw, in cells of its picture: the nearest and farthest depth in and around each."""
+    """Picture of what a scanner saw, in cells: the nearest and farthest depth in and around each."""
 
     def __init__(self, viewpoint: Viewpoint, points_mm: Floats, spacing_mm: float) -> None:
         self._viewpoint = viewpoint
@@ -89,8 +89,8 @@ class DepthPicture:
         return float(np.mean(far[filled] - near[filled] > step_mm))
 
     def in_front(self, points_mm: Floats, least_mm: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of points [n, 3] in this scan's frame: which lie in rays that ended at a surface, and which of these by
-        `least_mm` or more before it, in space that the scanner saw through."""
+        """Tell which points [n, 3] in this scan's frame lie in rays that ended at a surface, and which of these
+        lie by `least_mm` or more before it, in space that the scanner saw through."""
         places, depths = self._viewpoint.seen(points_mm @ self._level)
         flat, inside = self._cells(self._turned(places))
         nearest = np.where(inside, self._nearest[flat], -np.inf)
@@ -127,7 +127,7 @@ def _gap(azimuths: Floats) -> float:
 
 
 def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[Stand, float]:
-    """Of each viewpoint that a scan [n, 3] could have: share of the rays along which two surfaces lie.
+    """Return for each viewpoint that a scan [n, 3] could have: share of the rays along which two surfaces lie.
 
     Where normals [n, 3] say which side is out, they choose between the two ends of an axis, else it is the
     positive end, as range images have it.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from coupole.appearance.matter.brdf import Brdf
 
 _LEAST_DRAWN = 1e-3
-"""Share of the mean density that is added everywhere: nothing that reflects is never drawn."""
+"""Share of the mean density that is added everywhere, so that all that reflects is drawn at times."""
 _NDF = 4.0
 """Value of `ndf`: over 4 sigma it is 1."""
 _TYPES = {"uint8": 1, "float32": 10}

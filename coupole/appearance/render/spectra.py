@@ -62,8 +62,8 @@ class Measured(Model):
     path: Path
     column: int | None = None
     sample: Literal["gloss excluded", "gloss included", "bare"] = "gloss excluded"
-    """Condition of the sample's face as it was seen; bare: it had none (matt powder), so that the reflectance
-    holds inside a binder as it was seen."""
+    """Way in which the sample's face was seen; bare: it had none (matt powder), so that the reflectance holds
+    inside a binder as it was seen."""
 
 
 class MeasuredPaint(Model):

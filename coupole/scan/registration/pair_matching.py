@@ -25,7 +25,7 @@ pose."""
 _LEAST_AGREED = 5
 """Pairs of features that agree on a motion, below which it is not even refined."""
 _ROUGH_OVERLAP, _ROUGH_CONTRADICTED = 0.06, 0.15
-"""Least overlap and largest contradicted share of a motion before it is refined on the fine clouds."""
+"""Least overlap and largest contradicted share of a motion that is worth refining on the fine clouds."""
 _SAME_SIDE = 0.7
 """Cosine between normals of points that lie on each other."""
 _COARSE_ITERATIONS, _FINE_ITERATIONS = 40, 12

@@ -44,7 +44,7 @@ class JointDescription(Model):
     """One joint, in the frame of the link before it; with all angles 0 that frame is parallel to the base's."""
 
     origin_mm: Vector
-    """Of the joint, in the frame of the link before it."""
+    """Origin of the joint, in the frame of the link before it."""
     axis: Axis
     """Axis of rotation, right-handed."""
     limits_deg: Range
@@ -52,11 +52,11 @@ class JointDescription(Model):
     posture_limits_deg: Range | None = None
     """Limits for planned postures: narrower where links come near each other, or cables would twist."""
     speed_deg_s: Positive
-    """At most, by the data sheet."""
+    """Greatest speed, by the data sheet."""
     acceleration_deg_s2: Positive
-    """At most."""
+    """Greatest acceleration."""
     jerk_deg_s3: Positive = 3000.0
-    """At most."""
+    """Greatest jerk."""
 
 
 class CapsuleDescription(Model):
@@ -67,14 +67,14 @@ class CapsuleDescription(Model):
     to_mm: Vector
     """Its other end."""
     radius_mm: Length
-    """About the segment."""
+    """Radius about the segment."""
 
 
 class LinkDescription(Model):
     """The body of a link: capsules that enclose it."""
 
     name: BodyName
-    """In messages and pictures."""
+    """Name of the body in messages and pictures."""
     link: Annotated[int, Field(ge=0, le=6)]
     """0 is the base, which is fixed; link k turns with joint k."""
     capsules: Annotated[tuple[CapsuleDescription, ...], Field(min_length=1, max_length=100)]
@@ -108,13 +108,13 @@ class ArmDescription(Model):
     0."""
 
     schema_version: Literal[1]
-    """Of the format of arms."""
+    """Version of the format of arms."""
     name: Annotated[str, Field(min_length=1, max_length=64)]
-    """Model."""
+    """Model of the arm."""
     joints: Annotated[tuple[JointDescription, ...], Field(min_length=6, max_length=6)]
-    """From the base on."""
+    """Joints from the base on."""
     link_6_from_flange: Pose
-    """Where the flange's frame lies in that of the last link."""
+    """Pose of the flange's frame in the frame of the last link."""
     links: Annotated[tuple[LinkDescription, ...], Field(min_length=1, max_length=100)]
     """Bodies of the links."""
     kept_apart: Annotated[tuple[KeptApart, ...], Field(max_length=1000)] = ()

@@ -31,7 +31,7 @@ class Cell:
     known."""
     panel_damage_w_per_lm: float | None = None
     files: InputFiles = field(default_factory=InputFiles, repr=False, compare=False)
-    """What was read; whoever needs one of these files again gets the same bytes."""
+    """Files that were read; whoever needs one of them again gets the same bytes."""
 
     @property
     def leds_path(self) -> Path:
@@ -51,34 +51,35 @@ class Cell:
 
     @property
     def state_folder(self) -> Path:
-        """What is true of the cell whatever is acquired."""
+        """Folder for what is true of the cell whatever is acquired."""
         given = self.rig.storage.state
         return self.document.resolve(given) if given is not None else self.storage_folder / "state"
 
     @property
     def ledger_folder(self) -> Path:
-        """Where the objects' dose ledgers are."""
+        """Folder of the objects' dose ledgers."""
         return self.document.resolve(self.rig.ledger) if self.rig.ledger is not None else users_ledger_folder()
 
     @property
     def controllers_folder(self) -> Path:
-        """Where it is kept what is true of arms' controllers (`coupole.plan.controller_places`)."""
+        """Folder for what is true of arms' controllers (`coupole.plan.controller_places`)."""
         given = self.rig.controllers
         return self.document.resolve(given) if given is not None else users_data_folder() / "controllers"
 
     @property
     def former_ledger_folder(self) -> Path:
-        """Where version 0.1 kept them."""
+        """Folder in which version 0.1 kept the dose ledgers."""
         return self.storage_folder / "ledger"
 
 
 def users_ledger_folder() -> Path:
-    """Of rigs that name none."""
+    """Return the ledger folder of rigs that name none."""
     return users_data_folder() / "ledger"
 
 
 def users_data_folder() -> Path:
-    """Coupole's in the user's data folder (XDG Base Directory Specification; a relative path is ignored there)."""
+    """Return Coupole's folder in the user's data folder (XDG Base Directory Specification; a relative path is
+    ignored there)."""
     given = Path(os.environ.get("XDG_DATA_HOME", ""))
     return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole"
 
@@ -121,7 +122,8 @@ def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
 def _damage_w_per_lm(
     document: Document, key: str, given: Path | None, files: InputFiles, problems: list[Problem]
 ) -> float | None:
-    """Of the lamps whose spectrum is in this file; None if none is given, or it adds to `problems`."""
+    """Return the damaging power per lumen of the lamps whose spectrum is in this file; None if no file is given,
+    or if a problem was added to `problems`."""
     if given is None:
         return None
     from coupole.appearance.spectra.damage import damage_w_per_lm

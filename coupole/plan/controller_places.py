@@ -64,7 +64,8 @@ def _by_address(cell: Cell) -> Path:
 
 
 def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, str]:
-    """Where a driver with these settings finds its controller, and the setting that says so, if one does."""
+    """Return where a driver with these settings finds its controller, and the setting that says so, if one
+    does."""
     for name in _ADDRESSES:
         field = model.model_fields.get(name)
         given = settings.get(name, field.default if field is not None else "")
@@ -75,7 +76,8 @@ def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, 
 
 
 def _by_serial(identity: Identity | None) -> list[str]:
-    """None for a stand-in, nor for a driver that cannot know it."""
+    """Return the file name for the serial number; empty for a stand-in, and for a driver that cannot know the
+    number."""
     if identity is None or identity.simulated or not identity.serial.strip(" 0"):
         return []
     return [_file_name("serial", identity.vendor, identity.serial)]

@@ -1,4 +1,4 @@
-"""What the keys of a plan or a rig mean: the docstrings under the fields of their models, read for a JSON schema.
+"""Descriptions of the keys of a plan or a rig: the docstrings under their models' fields, read for a JSON schema.
 
 `use_attribute_docstrings` of pydantic reads them when a model is made, in every process. That took a third of the
 time of importing the models of plans and rigs.
@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 
 def key_descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """Of each field that has a docstring, its own or inherited."""
+    """Return the docstring of each field that has one, its own or inherited."""
     described: dict[str, str] = {}
     for parent in reversed(model.__mro__):
         if issubclass(parent, BaseModel) and parent is not BaseModel:
@@ -27,7 +27,7 @@ def key_descriptions(model: type[BaseModel]) -> dict[str, str]:
 
 @lru_cache
 def _by_class(path: str) -> dict[str, dict[str, str]]:
-    """Of the classes of a file, their fields' docstrings."""
+    """Return the fields' docstrings of the classes of a file, by class."""
     tree = ast.parse(Path(path).read_text(encoding="utf-8"))
     return {node.name: dict(_docstrings(node)) for node in tree.body if isinstance(node, ast.ClassDef)}
 

@@ -58,8 +58,8 @@ def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) ->
 
 
 def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) -> list[Sequence[Led] | Panel]:
-    """What each burst of one exposure lights: one burst for all LEDs, neighbours in time on different boards, or
-    one for each panel. Raises KeyError as `select_leds`."""
+    """Return what each burst of one exposure lights: one burst for all LEDs, in which neighbours in time are on
+    different boards, or one for each panel. Raises KeyError as `select_leds`."""
     match lights:
         case AllLights() | LightIds() | LightBoards() | EveryLight() | LightCone() | NoLights():
             rows = select_leds(lights, leds, base_from_support)

@@ -1,4 +1,4 @@
-"""Where a folder of link meshes keeps the mesh of each link."""
+"""Names of the files in a folder of link meshes, for each link."""
 
 from __future__ import annotations
 

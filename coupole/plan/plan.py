@@ -61,7 +61,7 @@ class Model(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """With the fields' docstrings as descriptions."""
+        """Return the schema with the fields' docstrings as descriptions."""
         from coupole.plan.key_descriptions import key_descriptions
 
         schema = handler(core_schema)
@@ -129,11 +129,11 @@ class LightCone(Model):
     kind: Literal["cone"]
     """LEDs within an angle of a direction."""
     azimuth_deg: Degrees
-    """Of the direction, from the support frame's x towards y."""
+    """Azimuth of the direction, from the support frame's x towards y."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)]
-    """Of the direction, above the support's plane."""
+    """Elevation of the direction above the support's plane."""
     half_angle_deg: Annotated[float, Field(gt=0, le=180)]
-    """Between the direction and the outermost LED."""
+    """Angle between the direction and the outermost LED."""
 
 
 class Panels(Model):
@@ -163,19 +163,19 @@ class LookAt(Model):
     kind: Literal["look_at"]
     """One view, from a direction."""
     name: Name
-    """Of the view, in shot ids and file names."""
+    """Name of the view, in shot ids and file names."""
     target_mm: Vector
     """The point in the picture's middle, in the support frame."""
     distance_mm: Annotated[float, Field(gt=0, le=3000)]
-    """To the camera's projection centre."""
+    """Distance from the target to the camera's projection centre."""
     azimuth_deg: Degrees
-    """Where the camera stands, from the support frame's x towards y."""
+    """Azimuth of the camera seen from the target, from the support frame's x towards y."""
     elevation_deg: Annotated[float, Field(ge=-90, le=90)]
-    """Where the camera stands, above the support's plane."""
+    """Elevation of the camera seen from the target, above the support's plane."""
     roll_deg: Degrees = 0.0
-    """Of the camera about its line of sight."""
+    """Roll of the camera about its line of sight."""
     lights: Lights | None = None
-    """Of this view; the plan's if not given."""
+    """Lights of this view; the plan's if not given."""
 
 
 class Grid(Model):
@@ -188,15 +188,15 @@ class Grid(Model):
     target_mm: Vector
     """The point in the pictures' middle, in the support frame."""
     distance_mm: Annotated[float, Field(gt=0, le=3000)]
-    """To the camera's projection centre."""
+    """Distance from the target to the camera's projection centre."""
     azimuths_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
-    """Where the camera stands, from the support frame's x towards y."""
+    """Azimuths of the camera seen from the target, from the support frame's x towards y."""
     elevations_deg: Annotated[tuple[Annotated[float, Field(ge=-90, le=90)], ...], Field(min_length=1)]
-    """Where the camera stands, above the support's plane."""
+    """Elevations of the camera seen from the target, above the support's plane."""
     roll_deg: Degrees = 0.0
-    """Of the camera about its line of sight."""
+    """Roll of the camera about its line of sight."""
     lights: Lights | None = None
-    """Of this view; the plan's if not given."""
+    """Lights of these views; the plan's if not given."""
 
 
 class Joints(Model):
@@ -205,11 +205,11 @@ class Joints(Model):
     kind: Literal["joints"]
     """One view, from angles of the arm."""
     name: Name
-    """Of the view, in shot ids and file names."""
+    """Name of the view, in shot ids and file names."""
     joints_deg: tuple[Degrees, Degrees, Degrees, Degrees, Degrees, Degrees]
-    """Of the six axes, from the base on."""
+    """Angles of the six axes, from the base on."""
     lights: Lights | None = None
-    """Of this view; the plan's if not given."""
+    """Lights of this view; the plan's if not given."""
 
 
 View = Annotated[LookAt | Grid | Joints, Field(discriminator="kind")]
@@ -249,13 +249,13 @@ class MeasuredObject(Model):
     """The object on the support: its id, mesh, pose and dose budget."""
 
     id: Name
-    """Of the object whose dose is kept in the ledger: an accession number."""
+    """Id of the object whose dose is kept in the ledger: an accession number."""
     mesh: FilePath | None = None
     """PLY, STL or OBJ; for collisions, occlusion, dose and pictures."""
     mesh_unit: Literal["mm", "m", "um"] = "mm"
-    """Of the coordinates in the mesh."""
+    """Unit of the coordinates in the mesh."""
     support_from_object: Pose = Pose()
-    """Where the mesh's frame lies on the support."""
+    """Pose of the mesh's frame on the support."""
     dose_budget_lux_h: Annotated[float, Field(gt=0, le=1e9)] | None = None
     """Light that the object may receive in its life; not limited if not given."""
 
@@ -264,28 +264,28 @@ class Optics(Model):
     """The intended lens settings; preflight compares them with the rig."""
 
     focus_distance_mm: Length | None = None
-    """To which the lens is to be focused, from the projection centre."""
+    """Distance from the projection centre to which the lens is to be focused."""
     f_number: Annotated[float, Field(gt=0, le=1000)] | None = None
-    """To which the aperture is to be set."""
+    """F-number to which the aperture is to be set."""
 
 
 class Plan(Model):
     """One acquisition."""
 
     schema_version: Literal[1]
-    """Of the format of plans."""
+    """Version of the format of plans."""
     name: Name
     """Ends the name of the run's folder."""
     rig: FilePath
     """The rig's file, relative to the plan."""
     object: MeasuredObject | None = None
-    """What lies on the support."""
+    """Object that lies on the support."""
     optics: Optics = Optics()
     """The lens settings that are meant."""
     calibrations: Literal["none"] | tuple[FilePath, ...] | None = None
     """Records that must be in force; None: those that the rig names."""
     views: Annotated[tuple[View, ...], Field(min_length=1)]
-    """Where the camera takes its pictures from."""
+    """Views from which the camera takes its pictures."""
     order: Literal["fastest", "as_written"] = "fastest"
     """Order of the views: on the shortest path, or as written."""
     lights: Lights
@@ -297,13 +297,13 @@ class Plan(Model):
     exposure: Exposures
     """One exposure time, or several."""
     gain_db: Annotated[float, Field(ge=0, le=42)] = 0.0
-    """Of the camera's amplifier."""
+    """Gain of the camera's amplifier."""
     darks_per_view: Annotated[int, Field(ge=0, le=1000)] = 2
     """Frames without light in each view."""
     trigger: Literal["hardware", "software"] = "hardware"
     """The camera is triggered by the LED box, or by the host, light by light."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
-    """How often frames that are not proven are taken again."""
+    """Number of times that frames which are not proven are taken again, at most."""
     licence: Words | None = None
     """Terms under which the run's data may be used; None: the rig's. For the run's README.txt."""
     contact: Words | None = None

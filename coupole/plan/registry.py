@@ -33,7 +33,7 @@ class StandIn:
     """The stand-in for a driver in a world."""
 
     kind: str
-    """In `world.settings.robot` or `world.settings.ledbox`."""
+    """Kind of the stand-in, in `world.settings.robot` or `world.settings.ledbox`."""
     alike: tuple[str, ...] = ()
     """Settings of the driver that the stand-in shares, unless the rig's world gives its own."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -61,7 +61,7 @@ ROBOT_STAND_INS = {
     ),
     "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
-"""For the included robot drivers; all choose a free address."""
+"""Stand-ins for the included robot drivers; all choose a free address."""
 ANSWER_JITTER = {"drivers.kuka.rsi:KukaRsi": "drivers.kuka.rsi.jitter:measured"}
 """Measures how soon the driver answers its controller; of drivers that must in every cycle."""
 ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
@@ -72,9 +72,10 @@ LEDBOX_STAND_INS = {
     "drivers.ledbox:LedBox": StandIn("scpi"),
     "drivers.ledbox.text_lines:TextLineBox": StandIn("text", ("baud", "led_count", "first_led")),
 }
-"""For the included LED box drivers: `world.settings.ledbox.kind`."""
+"""Stand-ins for the included LED box drivers: `world.settings.ledbox.kind`."""
 CAMERA_STAND_INS = {"drivers.camera.aravis:AravisCamera": "gige"}
-"""For camera drivers whose stand-in is not the camera in shared memory: `world.settings.camera.kind`."""
+"""Kinds of stand-in for camera drivers whose stand-in is not the camera in shared memory:
+`world.settings.camera.kind`."""
 
 RENAMED = {
     "drivers.kuka_rsi:KukaRsi": "drivers.kuka.rsi:KukaRsi",

@@ -27,7 +27,7 @@ class Twin(Model):
     driver: DriverName
     """Its class."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """What its driver asks for."""
+    """Settings that its driver asks for."""
 
 
 class Device(Model):
@@ -36,20 +36,20 @@ class Device(Model):
     driver: DriverName
     """Its class."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """What its driver asks for: address, limits."""
+    """Settings that its driver asks for: address, limits."""
     twin: Twin | None = None
-    """What `--dry-run` opens in its place; a stand-in of its kind if not given."""
+    """Driver that `--dry-run` opens in its place; a stand-in of its kind if not given."""
 
 
 class Sensor(Model):
     """Format of the camera's frames; compared with the camera's report when it is opened."""
 
     width_px: Annotated[int, Field(ge=8, le=65536)]
-    """Of a frame."""
+    """Width of a frame."""
     height_px: Annotated[int, Field(ge=8, le=65536)]
-    """Of a frame."""
+    """Height of a frame."""
     pixel_pitch_um: Annotated[float, Field(gt=0, le=1000)]
-    """From pixel to pixel on the sensor."""
+    """Distance from pixel to pixel on the sensor."""
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 12
     """Bits of a pixel."""
     bayer_pattern: Literal["GBRG", "GRBG", "RGGB", "BGGR", "MONO"] = "GBRG"
@@ -57,7 +57,7 @@ class Sensor(Model):
     black_dn: Annotated[int, Field(ge=0, le=65535)] = 64
     """Value of a pixel without light."""
     max_frames_per_s: Annotated[float, Field(ge=0.001, le=100_000)] = 100.0
-    """That camera and its link can keep up."""
+    """Frame rate that camera and its link can keep up."""
     exposure_gap_us: Annotated[int, Field(ge=0, le=10_000_000)] = 100
     """Least time between the end of one exposure and the start of the next."""
 
@@ -74,11 +74,11 @@ class Sensor(Model):
 
 class Lens(Model):
     focal_length_mm: Annotated[float, Field(gt=0, le=5000)]
-    """By its maker."""
+    """Focal length as stated by its maker."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
-    """To which its aperture is set."""
+    """F-number to which its aperture is set."""
     focus_distance_mm: Length
-    """From the projection centre to the plane of best focus."""
+    """Distance from the projection centre to the plane of best focus."""
 
     @model_validator(mode="after")
     def _makes_an_image(self) -> Lens:
@@ -88,12 +88,12 @@ class Lens(Model):
 
 
 class WhiteResponse(Model):
-    """What a white diffuser that faces the light gives in the camera's pictures, measured with a lux meter."""
+    """Response of the camera's pictures to a white diffuser that faces the light, measured with a lux meter."""
 
     dn_per_lux_s: Annotated[float, Field(gt=0, le=1e9)]
-    """Above black, per lux and second of exposure, in the most sensitive channel, at gain 0 dB."""
+    """Value above black, per lux and second of exposure, in the most sensitive channel, at gain 0 dB."""
     f_number: Annotated[float, Field(gt=0, le=1000)]
-    """With which it was measured; at another one it does not hold."""
+    """F-number with which the response was measured; at another one it does not hold."""
 
 
 class Dome(Model):
@@ -117,13 +117,13 @@ class BoardThermal(Model):
     led_power_w: Annotated[float, Field(gt=0, le=10_000)] = 15.0
     """Heat of an LED that is lit."""
     rise_c_per_j: Annotated[float, Field(gt=0, le=1000)] = 0.02
-    """Of the board."""
+    """Temperature rise of the board."""
     time_constant_s: Annotated[float, Field(ge=0.001, le=1e6)] = 240.0
-    """Of its cooling."""
+    """Time constant of the board's cooling."""
     ambient_c: Annotated[float, Field(ge=-50, le=100)] = 22.0
     """Temperature of a board that was long dark."""
     limit_c: Annotated[float, Field(ge=-50, le=1000)] = 70.0
-    """Which preflight lets no board exceed."""
+    """Temperature that preflight lets no board exceed."""
 
 
 class LedLimits(Model):
@@ -132,11 +132,11 @@ class LedLimits(Model):
     on_us: tuple[OnTimeUs, OnTimeUs] = (1_000, 2_000_000)
     """Shortest and longest time for which an LED may be lit."""
     rise_us: Annotated[int, Field(ge=0, le=10_000_000)] = 1_000
-    """From switching on to full current: the trigger waits for it."""
+    """Time from switching on to full current: the trigger waits for it."""
     cooldown_ratio: Annotated[float, Field(ge=0, le=100_000)] = 2.0
     """An LED that was lit for t stays dark for at least `cooldown_ratio` * t."""
     board: BoardThermal = BoardThermal()
-    """How boards warm up."""
+    """Thermal model of how boards warm up."""
 
     @model_validator(mode="after")
     def _shortest_first(self) -> LedLimits:
@@ -149,13 +149,13 @@ class Motion(Model):
     """Motion between views: share of the joint speeds, acceleration, jerk, and settling."""
 
     speed_fraction: Annotated[float, Field(ge=0.001, le=1)] = 0.3
-    """Of the joints' greatest speeds."""
+    """Share of the joints' greatest speeds."""
     acceleration_deg_s2: Annotated[float, Field(ge=0.01, le=100_000)] = 300.0
-    """Of each joint, at most."""
+    """Greatest acceleration of each joint."""
     jerk_deg_s3: Annotated[float, Field(ge=0.01, le=10_000_000)] = 3000.0
-    """Of each joint, at most."""
+    """Greatest jerk of each joint."""
     settle_dwell_s: Annotated[float, Field(ge=0, le=3600)] = 0.3
-    """Waited after the arm has come to rest."""
+    """Time waited after the arm has come to rest."""
     still_deg: Annotated[float, Field(gt=0, le=10)] = 0.01
     """Largest change of an axis during a burst. Beyond it, shots that were not proven before are taken again."""
     home_joints_deg: Posture = (
@@ -168,16 +168,16 @@ class Motion(Model):
     )
     """Assumed start posture when a plan is checked without the arm."""
     park_joints_deg: Posture | None = None
-    """Where the arm is left when nobody works with it. Without it the arm cannot be sent to park."""
+    """Posture in which the arm is left when nobody works with it. Without it the arm cannot be sent to park."""
 
 
 class Support(Model):
     """The disk that carries the object, and the origin of the support frame."""
 
     base_from_support: Pose
-    """Where the support frame (the disk's centre, z up) lies in the robot's base frame."""
+    """Pose of the support frame (the disk's centre, z up) in the robot's base frame."""
     diameter_mm: Length = 1480.0
-    """Of the disk."""
+    """Diameter of the disk."""
 
 
 class KeepOutSphere(Model):
@@ -186,18 +186,18 @@ class KeepOutSphere(Model):
     kind: Literal["sphere"]
     """A ball."""
     name: Name
-    """In messages."""
+    """Name of the volume in messages."""
     center_mm: Vector
-    """In the support frame."""
+    """Centre of the ball in the support frame."""
     radius_mm: Length
-    """Of the ball."""
+    """Radius of the ball."""
 
 
 class KeepOutBox(Model):
     kind: Literal["box"]
     """A box along the support frame's axes."""
     name: Name
-    """In messages."""
+    """Name of the volume in messages."""
     min_mm: Vector
     """Lowest corner, in the support frame."""
     max_mm: Vector
@@ -217,33 +217,33 @@ class ToolBody(Model):
     """A body on the flange: a capsule in the flange's frame."""
 
     name: Name
-    """In messages and pictures."""
+    """Name of the body in messages and pictures."""
     from_mm: Vector
     """One end of the capsule's axis."""
     to_mm: Vector
     """Its other end."""
     radius_mm: Length
-    """Of the capsule."""
+    """Radius of the capsule."""
 
 
 class Clearances(Model):
     """Clearances of the arm, mm."""
 
     object_mm: Annotated[float, Field(ge=0, le=5000)] = 50.0
-    """To the object."""
+    """Clearance to the object."""
     support_mm: Annotated[float, Field(ge=0, le=5000)] = 10.0
-    """To the disk."""
+    """Clearance to the disk."""
     dome_mm: Annotated[float, Field(ge=0, le=5000)] = 20.0
-    """To the dome."""
+    """Clearance to the dome."""
     self_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
-    """Between parts of the arm."""
+    """Clearance between parts of the arm."""
     keep_out_mm: Annotated[float, Field(ge=0, le=5000)] = 0.0
-    """To the volumes to keep out of."""
+    """Clearance to the volumes to keep out of."""
 
 
 class Storage(Model):
     folder: FilePath
-    """Where runs are made, relative to the rig."""
+    """Folder in which runs are made, relative to the rig."""
     reserve_bytes: Annotated[int, Field(ge=0, le=2**60)] = 256 * 1024**2
     """Free space that a run leaves on the disk."""
     pixels: Literal["uint16", "packed12"] = "uint16"
@@ -273,16 +273,16 @@ class WorldSection(Model):
     driver: DriverName = WORLD
     """Class of the stand-ins."""
     settings: dict[str, Any] = Field(default_factory=dict)
-    """What the stand-ins simulate, and how."""
+    """Settings that say what the stand-ins simulate, and how."""
 
 
 class Rig(Model):
     """One cell: devices, geometry, limits, storage."""
 
     schema_version: Literal[1]
-    """Of the format of rigs."""
+    """Version of the format of rigs."""
     name: Name
-    """In runs and reports."""
+    """Name of the rig in runs and reports."""
     ledbox: Device
     """The box that switches the LEDs."""
     camera: Device
@@ -296,9 +296,10 @@ class Rig(Model):
     lens: Lens
     """The lens as it is set."""
     white_response: WhiteResponse | None = None
-    """Without it, and without a record of the LEDs' power, exposures cannot be judged without the camera."""
+    """Response to white. Without it, and without a record of the LEDs' power, exposures cannot be judged without
+    the camera."""
     flange_from_camera: Pose
-    """Where the camera's frame lies in the flange's, by drawing; a hand-eye record replaces it."""
+    """Pose of the camera's frame in the flange's, by drawing; a hand-eye record replaces it."""
     dome: Dome
     """The LEDs and panels."""
     support: Support
@@ -313,11 +314,11 @@ class Rig(Model):
     keep_out: Annotated[tuple[KeepOut, ...], Field(max_length=1000)] = ()
     """Volumes that the arm must not enter."""
     led_limits: LedLimits = LedLimits()
-    """For how long LEDs may be lit."""
+    """Limits of LEDs and boards: for how long LEDs may be lit."""
     motion: Motion = Motion()
-    """How the arm moves between views."""
+    """Motion of the arm between views."""
     storage: Storage
-    """Where runs go."""
+    """Storage of the runs."""
     ledger: FilePath | None = None
     """Folder of the objects' dose ledgers, the same for all rigs under which they lie. `coupole/ledger` in the
     user's data folder (XDG) if not given."""
@@ -327,7 +328,7 @@ class Rig(Model):
     calibrations: Literal["none"] | tuple[FilePath, ...] = "none"
     """Records that must be in force for plans without a list of their own."""
     console: Consoles = Consoles()
-    """Which consoles stand at the cell."""
+    """Consoles that stand at the cell."""
     world: WorldSection | None = None
     """The stand-ins of a simulated rig; none on a real one."""
     licence: Words | None = None

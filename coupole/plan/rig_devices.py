@@ -156,8 +156,8 @@ def camera_kind(rig: Rig, *, dry_run: bool) -> str:
 
 
 def trusted_by_name(rig: Rig) -> tuple[str, ...]:
-    """What a person has allowed in the settings of the rig's real devices, in words with the name; nothing of a
-    cell of stand-ins, whose devices nobody else can reach."""
+    """Return what a person has allowed in the settings of the rig's real devices, in words with the name. Return
+    nothing for a cell of stand-ins, whose devices nobody else can reach."""
     if in_world(rig, dry_run=False):
         return ()
     said = ((kind, key, getattr(rig, kind).settings.get(key)) for kind in DEVICES for key in _WORDS)

@@ -1,4 +1,4 @@
-"""From plan to ordered views and their bursts. Pure: no device, no file."""
+"""Expansion of a plan into ordered views and their bursts. Pure: no device, no file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
-"""Of one plan, as many as fit into memory."""
+"""Largest numbers of views and frames of one plan, as many as fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,8 @@ class Schedule:
         )
 
     def left(self, proven: Collection[ShotId]) -> Schedule:
-        """What is still to be taken: views with unproven frames, with their bursts reduced to these."""
+        """Return the schedule of what is still to be taken: views with unproven frames, with their bursts reduced
+        to these."""
         left = [bursts_left(bursts, proven) for bursts in self.bursts]
         numbers = [n for n, bursts in enumerate(left) if bursts]
         return Schedule(

@@ -227,7 +227,7 @@ class _Explainer:
         return dict(items[0] if self._variable() else items[index])
 
     def words(self) -> str:
-        """What this node accepts, as `a number from 0 to 42`."""
+        """Describe what this node accepts, as `a number from 0 to 42`."""
         if self.kind in ("literal", "enum"):
             return " or ".join(f"`{item}`" for item in self._literals())
         if self.kind == "union":

@@ -23,13 +23,13 @@ _resolver = YAML(typ="safe", pure=True).resolver
 
 @functools.lru_cache(maxsize=4)
 def graph(text: str) -> Node | None:
-    """None when the text has no content. A text is composed once to be read and once to be rewritten; nobody
-    changes the nodes. Raises ruamel.yaml's YAMLError, and RecursionError."""
+    """Compose a text into its nodes; None when it has no content. A text is composed once to be read and once to
+    be rewritten; nobody changes the nodes. Raises ruamel.yaml's YAMLError, and RecursionError."""
     return _composed_quickly(text) or composed_by_ruamel(text)
 
 
 def composed_by_ruamel(text: str) -> Node | None:
-    """The same, of any text."""
+    """Compose any text by ruamel.yaml; None when it has no content."""
     reader = YAML(typ="safe", pure=True)
     reader.composer.warn_double_anchors = False  # YAML 1.2 (3.2.2.2): a later anchor may replace an earlier one
     root: Node | None = reader.compose(text)
@@ -37,7 +37,8 @@ def composed_by_ruamel(text: str) -> Node | None:
 
 
 def _composed_quickly(text: str) -> Node | None:
-    """By libyaml; None if that is not here, refuses the text, or might mean something else by it."""
+    """Compose a text by libyaml; None if libyaml is not there, refuses the text, or might understand it
+    differently."""
     if not yaml.__with_libyaml__ or _NOT_PLAIN.search(_COMMENT_LINES.sub("", text)):
         return None
     ends = text.endswith("\n")

@@ -64,7 +64,7 @@ class Document:
     value_places: dict[KeyPath, Place] = field(repr=False)
     key_places: dict[KeyPath, Place] = field(repr=False)
     text: str = field(repr=False)
-    """What was parsed: without byte order mark, with LF line ends."""
+    """Text that was parsed: without byte order mark, with LF line ends."""
     _resolved: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def resolve(self, path: Path) -> Path:

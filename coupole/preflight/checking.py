@@ -138,8 +138,8 @@ def check_job(
 
 
 def allowed_lux_h(job: Job, history: History) -> float | None:
-    """What the job's object may receive in its life, by its ledger's `history` or by the plan if that is stricter;
-    None without a budget."""
+    """Return the light that the job's object may receive in its life, by its ledger's `history` or by the plan if
+    that is stricter; None without a budget."""
     return history.allowed_lux_h(job.plan.object.dose_budget_lux_h) if job.plan.object else None
 
 
@@ -154,7 +154,8 @@ def light_refusals(job: Job, history: History) -> list[str]:
 
 
 def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
-    """What the operator should know of the object's ledger before it receives so much more light."""
+    """Return what the operator should know of the object's ledger before the object receives so much more
+    light."""
     if job.plan.object is None:
         return []
     name, warnings = job.plan.object.id, []

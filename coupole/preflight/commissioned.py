@@ -45,7 +45,7 @@ _HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit
 
 
 class Answer(Model):
-    """What the person was asked, and whether the answer was yes."""
+    """Question that the person was asked, and whether the answer was yes."""
 
     question: str
     yes: bool
@@ -67,7 +67,7 @@ class StepResult(Model):
     answers: tuple[Answer, ...]
     remarks: tuple[str, ...]
     failure: str = ""
-    """What was wrong and what to do; empty if nothing was."""
+    """Failure and what to do about it; empty if nothing was wrong."""
 
     @property
     def passed(self) -> bool:
@@ -100,7 +100,7 @@ class CommissioningRecord(Model):
 
 
 def record_path(cell: Cell) -> Path:
-    """In the rig's state folder; copies are in the other places of the arm."""
+    """Return the record's path in the rig's state folder; copies are in the other places of the arm."""
     return cell.state_folder / _FILE
 
 
@@ -140,7 +140,7 @@ def _read(path: Path) -> CommissioningRecord:
 
 
 def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
-    """In all places of the arm. Raises StorageError."""
+    """Write the record in all places of the arm. Raises StorageError."""
     for place in places_of_arm(cell):
         write_sealed(place / _FILE, json.loads(record.model_dump_json()), _HEAD)
 
@@ -163,7 +163,8 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
 
 
 def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
-    """Why a step's result does not fit the rig (and the opened devices) any more; empty if it does."""
+    """Return why a step's result does not fit the rig (and the opened devices) any more; empty if it still
+    does."""
     before, now = result.settings, settings_of(cell, result.step)
     lacking = []
     if result.covers is None:
@@ -178,8 +179,8 @@ def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] 
 
 
 def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None = None) -> list[str]:
-    """Why a cell that is not simulated must not be used: a step of its commissioning is missing, failed or does
-    not fit the rig any more, or the opened devices are others. Empty for a simulated cell."""
+    """Return why a cell that is not simulated must not be used: a step of its commissioning is missing, failed or
+    does not fit the rig any more, or the opened devices are others. Empty for a simulated cell."""
     if in_world(cell.rig, dry_run=False):
         return []
     command = f"coupole commission {cell.document.path} --name NAME"

@@ -1,4 +1,4 @@
-"""What of a rig each step of a commissioning covers: everything, but for what is named as harmless here.
+"""Parts of a rig that each step of a commissioning covers: everything, except what is named as harmless here.
 
 A key of the rig, of its arm's description or of a driver's settings is covered as soon as it exists. `_STEPS` says
 which steps a change of it asks for; one that it does not name asks for all of them. Files count by their content.
@@ -19,7 +19,7 @@ Step = Literal[
     "cycle", "axes", "stopping", "geometry", "lamps", "trigger", "watchdog", "presence", "emergency-stop"
 ]
 STEPS: tuple[Step, ...] = get_args(Step)
-"""In the order in which they are done."""
+"""Steps in the order in which they are done."""
 ARM: tuple[Step, ...] = ("cycle", "axes", "stopping", "emergency-stop")
 GEOMETRY: tuple[Step, ...] = ("geometry",)
 LAMPS: tuple[Step, ...] = ("lamps", "trigger", "watchdog")
@@ -108,7 +108,8 @@ def everything(cell: Cell) -> dict[str, Any]:
 
 
 def _complete_settings(cell: Cell, kind: str) -> dict[str, Any]:
-    """Of the driver that a run opens, with its defaults; without the arm, which has keys of its own."""
+    """Return the settings of the driver that a run opens, with its defaults; without the arm, which has keys of
+    its own."""
     driver, given = device_for(cell.rig, kind, dry_run=False)
     model = settings_class(driver)
     places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
@@ -137,7 +138,7 @@ def _leaves(at: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _value(cell: Cell, value: Any) -> Any:
-    """As JSON has it; a file by the SHA-256 of its content."""
+    """Return a value as JSON has it; a file as the SHA-256 of its content."""
     if isinstance(value, Path):
         path = cell.document.resolve(value)
         return cell.files.sha256(path) if cell.files.there(path) else str(value)

@@ -1,4 +1,4 @@
-"""What a white surface gives in this cell's pictures, by what is known of its lamps, lens and sensor.
+"""Values that a white surface gives in this cell's pictures, by what is known of its lamps, lens and sensor.
 
 The simulated world scales its light to the plan (but with `world.settings.white_at_us`), so its frames say nothing
 about a cell's exposure. The scale is known from a record of the LEDs' power that is in force, or from the rig's
@@ -31,23 +31,23 @@ UNDER_EXPOSED = 0.05
 
 @dataclass(frozen=True)
 class ExposureScale:
-    """A horizontal, perfectly white diffuser at the support's centre, in the most sensitive channel."""
+    """Signal of a horizontal, perfectly white diffuser at the support's centre, in the most sensitive channel."""
 
     dn_per_s: NDArray[np.float64]
     """[leds] above black, at gain 0 dB, under each LED of the dome's table; 0 for a dead one."""
     source: str
-    """From which it is known."""
+    """Record or rig setting from which the scale is known."""
 
 
 @dataclass(frozen=True)
 class ExposedWhite:
-    """How one exposure of a plan renders white."""
+    """Brightness of white in one exposure of a plan."""
 
     exposure_us: int
     brightest: float
     """Share of full scale above black under the LED of the plan that gives most; above 1 it saturates."""
     median: float
-    """Under the median LED of the plan."""
+    """Share of full scale above black under the median LED of the plan."""
 
     def verdict(self) -> str:
         """`over-exposed`, `under-exposed` or `well exposed`."""
@@ -79,7 +79,7 @@ def exposure_scale(job: Job) -> ExposureScale | None:
 
 
 def exposed_white(job: Job, scale: ExposureScale) -> list[ExposedWhite]:
-    """For each exposure of the plan; empty if it lights no LED."""
+    """Return the brightness of white in each exposure of the plan; empty if the plan lights no LED."""
     cell = job.cell
     rows = leds_of_plan(job.plan, cell.leds, cell.rig.support.base_from_support.matrix())
     lit = scale.dn_per_s[rows] * 10.0 ** (job.plan.gain_db / 20.0)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Files:
-    """What is to be checked."""
+    """Files that are to be checked."""
 
     plan: Path
     rig: Path | None = None

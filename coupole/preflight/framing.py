@@ -24,8 +24,8 @@ from coupole.plan.schedule import Schedule, ViewPose
 SHARP_PX = 2.0
 """One cell of the Bayer pattern."""
 RESTS_MM = 2.0
-"""Within this height of the disk an object rests on it: meshes and poses are known no better before they are
-calibrated."""
+"""Distance from the disk, above or below, within which an object counts as resting on it: meshes and poses are
+known no better before they are calibrated."""
 _COLUMNS = 64
 """Rays through the picture, per row."""
 _SAMPLES = 2000
@@ -47,7 +47,7 @@ class Placement:
     reach_mm: float
     """Greatest distance from the disk's centre, seen from above."""
     lowest_over_disk_mm: float | None
-    """Of what is above or below the disk; None if all of it is beside the disk."""
+    """Lowest height of the part that is above or below the disk; None if all of the object is beside the disk."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,12 @@ class Framing:
     """Share of the picture that shows the object."""
     nearest_mm: float
     farthest_mm: float
-    """Along the optical axis, of what the picture shows; NaN if it shows nothing of the object."""
+    """Nearest and farthest depth along the optical axis of what the picture shows; NaN if it shows nothing of the
+    object."""
     in_focus: float
     """Share of what the picture shows of the object that is within the depth of field."""
     px_per_mm: tuple[float, float]
-    """At the farthest and the nearest point shown; NaN if nothing is."""
+    """Scale of the picture at the farthest and at the nearest point shown; NaN if nothing is shown."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def check_object(
 
 
 def placement_of(corners_mm: NDArray[np.float64], disk_radius_mm: float) -> Placement:
-    """Where an object [triangles, 3, 3] is on the support."""
+    """Return where an object [triangles, 3, 3] is on the support."""
     points = corners_mm.reshape(-1, 3)
     away_mm = np.hypot(points[:, 0], points[:, 1])
     over = points[away_mm <= disk_radius_mm, 2]
@@ -144,7 +145,7 @@ def surface_samples(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def framing_of(
     view: str, sight: Sight, sharp_mm: tuple[float, float], mesh: Any, points_mm: NDArray[np.float64]
 ) -> Framing:
-    """What a camera sees of an object: a `ray_mesh`, and points [n, 3] on its surface."""
+    """Return what a camera sees of an object, given as a `ray_mesh` and points [n, 3] on its surface."""
     depth_mm = seen_depths_mm(sight, mesh)
     visible, inside, depth_of_points_mm = points_shown(sight, mesh, points_mm)
     near_mm, far_mm = sharp_mm
@@ -182,8 +183,8 @@ def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
 def points_shown(
     sight: Sight, mesh: Any, points_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]:
-    """Of points [n, 3] on the surface of a `ray_mesh`: which nothing of it hides from the camera's place, which of
-    these are inside the picture, and all their depths along the axis; [n] each."""
+    """Tell which points [n, 3] on the surface of a `ray_mesh` are not hidden by it from the camera's place, and
+    which of these are inside the picture. Also return the depths of all points along the axis; [n] each."""
     eye_mm = sight.support_from_camera[:3, 3]
     away_mm = np.linalg.norm(eye_mm - points_mm, axis=1)
     starts_mm = points_mm + (eye_mm - points_mm) * (RAY_START_MM / np.maximum(away_mm, RAY_START_MM))[:, None]

@@ -100,8 +100,9 @@ def at_pace(job: Job, pace: Pace) -> Job:
 
 
 def without_hidden(job: Job, known: Mapping[str, Sequence[int]] | None = None) -> Job:
-    """With `hidden_lights: skip`: the same job without the LEDs that light nothing that a view sees. These are the
-    `known` ones, if a run began without them, otherwise those for the postures of the paths from home."""
+    """Return the same job without the LEDs that light nothing that a view sees, if the plan has `hidden_lights:
+    skip`. These LEDs are the `known` ones, if a run began without them, otherwise those for the postures of the
+    paths from home."""
     if job.plan.hidden_lights != "skip":
         return job
     hidden = dict(known) if known is not None else _hidden_from_home(job)

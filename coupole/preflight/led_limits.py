@@ -41,7 +41,7 @@ def refuse_on_times(bursts_of_views: Sequence[Sequence[Burst]], limits: LedLimit
 
 @dataclass(frozen=True)
 class Heat:
-    """Of the boards over a whole schedule."""
+    """Heating of the boards over a whole schedule."""
 
     peak_c: float
     too_hot: bool

@@ -22,12 +22,12 @@ _SMALLEST_MM = 1.0
 _DOUBTFUL_MM = 10.0
 """Objects below it are measured, but wrong units are likelier."""
 _LARGEST_AREA_MM2 = 1e8
-"""Of all triangles together: beyond it they are no surface of an object."""
+"""Area of all triangles together beyond which they are not the surface of an object."""
 
 
 @dataclass(frozen=True)
 class ObjectShape:
-    """In the support frame, mm."""
+    """Shape of the object in the support frame, mm."""
 
     mesh_path: Path | None
     corners_mm: NDArray[np.float64]
@@ -73,7 +73,7 @@ def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -
 
 
 def _impossible_size(corners: NDArray[np.float64], size_mm: float, unit: str, diameter_mm: float) -> str:
-    """Why a mesh cannot be an object on a support of this diameter; empty if it can."""
+    """Return why a mesh cannot be an object on a support of this diameter; empty if it can."""
     if not _SMALLEST_MM <= size_mm <= _LARGEST * diameter_mm:
         return (
             f"read in {unit} the object is {size_mm:.3g} mm large; expected {_SMALLEST_MM:g} to "

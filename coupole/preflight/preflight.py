@@ -28,7 +28,7 @@ from coupole.preflight.led_limits import heat_of, refuse_on_times
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
 SETTLE_CHECK_S = 0.1
-"""From the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
+"""Time from the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
 DISK_SHARE = 0.9
 """Share of the disk's measured speed that the frame rate may use."""
 PAGE_BYTES = 4096
@@ -42,11 +42,11 @@ class StorageFacts:
     write_bytes_s: float = 0.0
     """Measured; 0: not measured."""
     folder: Path | None = None
-    """In which the run would be, or is; None: the rig's."""
+    """Folder in which the run would be, or is; None: the rig's."""
     allocated_bytes: int = 0
-    """What a resumed run already occupies: its views' files are allocated as a whole."""
+    """Space that a resumed run already occupies: its views' files are allocated as a whole."""
     trouble: str = ""
-    """Why nothing can be written there."""
+    """Reason why nothing can be written there."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Whole:
     frames: int
     bytes: int
     duration_s: float
-    """Without regard to collisions."""
+    """Duration without regard to collisions."""
     dose_lux_h: float
 
 
@@ -78,9 +78,9 @@ class Report:
     """The expected course of a plan, or of what is left of a run, and the refusals."""
 
     whole: Whole | None = None
-    """Of a resumed run; None otherwise."""
+    """Figures of the whole run, if it is resumed; None otherwise."""
     views: list[ViewReport] = field(default_factory=list)
-    """In the order of the visits; unreachable ones last."""
+    """Views in the order of the visits; unreachable ones last."""
     shots: int = 0
     frames: int = 0
     bytes: int = 0
@@ -98,9 +98,9 @@ class Report:
     asked_bytes_s: float = 0.0
     disk_bytes_s: float = 0.0
     exposure_scale: str | None = None
-    """From which it is known how bright white will be; None: it is not known."""
+    """Record or rig setting from which it is known how bright white will be; None: it is not known."""
     white: tuple[ExposedWhite, ...] = ()
-    """Of each exposure, if that is known."""
+    """Brightness of white in each exposure, if that is known."""
     object_check: ObjectCheck | None = None
     """None without a mesh."""
     refusals: list[str] = field(default_factory=list)

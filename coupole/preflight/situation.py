@@ -1,4 +1,4 @@
-"""What a rig's calibration records must hold for."""
+"""Conditions that a rig's calibration records must hold for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coupole.plan.rig_devices import in_world
 
 
 def situation_of(rig: Rig, *, camera: str | None = None, temperature_c: float | None = None) -> Situation:
-    """What this rig's records must hold for, now."""
+    """Return the present conditions that this rig's records must hold for."""
     return Situation(
         now=datetime.now(UTC),
         simulated=in_world(rig, dry_run=False),

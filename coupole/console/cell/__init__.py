@@ -1,1 +1,1 @@
-"""What happens at the cell: runs that the queue begins, its loan, the bench, calibrations, its state now."""
+"""Work at the cell: runs that the queue begins, the cell's loan, the bench, calibrations, the present state."""

@@ -44,7 +44,7 @@ class Acquisitions:
         self._ended = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self.state: State | None = None
-        """Of the run at work, as its process tells it; None if there is none."""
+        """State of the run at work, as its process tells it; None if no run is at work."""
         self.lending = Lending()
         self.give_way: Callable[[str], object] = lambda _: None
         """Called, again and again, when something is to begin and something else has the cell, with its name."""
@@ -58,7 +58,7 @@ class Acquisitions:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """What runs goes on without us."""
+        """End the thread; a run at work goes on without it."""
         self._ended.set()
         self._thread.join()
 
@@ -104,13 +104,13 @@ class Acquisitions:
             self.lending.lend(pid, who, what)
 
     def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
-        """What an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`, once they
-        are there."""
+        """Return what an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`,
+        once they are there."""
         said, figures = self._files(entry)
         return end_of_file(said, _MOST_SAID_BYTES), _last_document(figures)
 
     def _had_by(self) -> str:
-        """Who has the cell; empty if nobody."""
+        """Return who has the cell; empty if nobody has it."""
         if self._queue.running is not None:
             return f"{self._queue.running.words} is being acquired"
         if self.state is not None:
@@ -120,8 +120,8 @@ class Acquisitions:
         return "another process of this user has its devices open" if is_in_use(self._cell) else ""
 
     def _is_ours(self, state: State) -> bool:
-        """Whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names its
-        own copy of the rig)."""
+        """Tell whether a run is one of this cell: it names its rig, or the queue has begun it (a resumed run names
+        its own copy of the rig)."""
         entry = self._queue.running
         return state["rig"] == self._rig or (entry is not None and bool(entry.pid) and state["pid"] == entry.pid)
 

@@ -23,7 +23,7 @@ from coupole.plan.reading import read_plan
 from coupole.plan.schedule import expand_view
 
 IDLE_S = 600.0
-"""It is closed when nobody has used it for so long."""
+"""Time without use after which the bench is closed."""
 _LOOK_EVERY_S, _FOREIGN_EVERY_S, _LOOKED_AT_S = 0.1, 1.0, 2.0
 _CLOSES_WITHIN_S = 20.0
 Phase = Literal["closed", "opening", "open", "closing"]
@@ -50,9 +50,9 @@ class Bench:
         self.plan = ""
         """The plan whose object lies on the support; empty: nothing does, or this console has not begun it."""
         self.state: dict[str, Any] | None = None
-        """As the bench told it last; None if there is none."""
+        """State that the bench told last; None if there is no bench."""
         self.closed_because = ""
-        """Why the last one has ended; empty if somebody closed it."""
+        """Reason why the last bench has ended; empty if somebody closed it."""
         self._thread = threading.Thread(target=self._watch, name="bench", daemon=True)
         acquisitions.give_way = self.give_way
 
@@ -61,7 +61,7 @@ class Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """With the console nobody can see what is open: it ends."""
+        """Close this console's bench: without the console nobody can see what is open."""
         self._ended.set()
         self._thread.join()
         if self._running is not None:
@@ -77,7 +77,7 @@ class Bench:
 
     @property
     def is_own(self) -> bool:
-        """Whether this console has begun it."""
+        """Tell whether this console has begun the bench."""
         return self._running is not None
 
     @property
@@ -87,7 +87,7 @@ class Bench:
 
     @property
     def identities(self) -> dict[str, Any]:
-        """Of the devices that it holds, by kind."""
+        """Identities of the devices that the bench holds, by kind."""
         devices = (self.state or {}).get("devices", {})
         return {kind: device["identity"] for kind, device in devices.items()}
 
@@ -118,7 +118,7 @@ class Bench:
             self._task, self.plan, self.closed_because = task, plan, ""
 
     def close(self, why: str = "") -> list[str]:
-        """End it, with the cell safe; what is not sure then. Raises InputError: there is none."""
+        """End the bench, with the cell safe; return what is not sure then. Raises InputError: there is none."""
         if self.phase not in ("open", "opening"):
             raise InputError(f"the devices are {self.phase}")
         return self._close(why)
@@ -130,8 +130,8 @@ class Bench:
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
     def stop(self) -> list[str]:
-        """Stop what it does; what is not sure then. One that does not obey (it is being opened or closed) is
-        ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
+        """Stop what the bench does; return what is not sure then. A bench that does not obey (it is being opened
+        or closed) is ended, as by Ctrl-C. Raises InputError: it is not this console's, and does not obey."""
         try:
             return list(self.ask("stop")["trouble"])
         except InputError:
@@ -141,7 +141,8 @@ class Bench:
             return ["not sure: the devices do not answer; their process was told to make the cell safe and end"]
 
     def ask(self, command: str, **fields: Any) -> dict[str, Any]:
-        """What it answers. Raises InputError with its words where it did not obey."""
+        """Send a command to the bench and return its answer. Raises InputError with its words where it did not
+        obey."""
         self._acted_s = self._now_s()
         return obeyed(ask_bench(self._cell, command, **fields))
 

@@ -41,13 +41,14 @@ class RecordRow:
     """UTC, ISO 8601."""
     age_days: float = 0.0
     left_days: float = 0.0
-    """Until it expires; below 0 when it has."""
+    """Days until the record expires; below 0 when it has expired."""
     tightest: str = ""
     """The limit that is nearest to be missed."""
     margin: float | None = None
-    """How far below that limit, as a share of it; below 0 when it is missed; None without limits."""
+    """Distance below the tightest limit, as a share of that limit; below 0 when it is missed; None without
+    limits."""
     against: tuple[str, ...] = ()
-    """Why plans must not use it here."""
+    """Reasons why plans must not use the record here."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class PlanRow:
     wants: bool
     """It wants calibrations at all."""
     against: tuple[str, ...]
-    """Why its records refuse it; empty if they do not."""
+    """Reasons why its records refuse the plan; empty if they do not."""
 
 
 @dataclass(frozen=True)
@@ -142,11 +143,11 @@ class CalibrationStatus:
         return folder
 
     def steps(self, folder: Path) -> list[StepNow]:
-        """How far a campaign is."""
+        """Return how far each step of a campaign is."""
         return [_step(step, folder) for step in OF_A_CELL]
 
     def lines_for_the_rig(self, folder: Path) -> str:
-        """What puts a campaign's records in force for all plans of the rig."""
+        """Return the lines of a rig that put a campaign's records in force for all its plans."""
         paths = [folder / f"{kind}.yaml" for kind in USUAL]
         there = [os.path.relpath(path, self.rig_path.resolve().parent) for path in paths if path.is_file()]
         return "\n".join(["calibrations:", *(f"  - {path}" for path in there)])

@@ -1,4 +1,4 @@
-"""To whom the cell is lent: one process of the service's user at a time, for what needs no run."""
+"""Loan of the cell to one process of the service's user at a time, for what needs no run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.errors import InputError
 
 
 def begun_here(pid: int) -> bool:
-    """Whether this process has begun that one."""
+    """Tell whether this process has begun the process `pid`."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -39,14 +39,14 @@ class Lending:
 
     @property
     def lent_to(self) -> str:
-        """Who has the cell and what for; empty if it is not lent."""
+        """Name of who has the cell, and what for; empty if it is not lent."""
         with self._lock:
             if self._loan is not None and select.select([self._loan.process], [], [], 0)[0]:
                 self._end()
             return self._loan.words if self._loan else ""
 
     def has(self, pid: int) -> bool:
-        """Whether the cell is lent to this process."""
+        """Tell whether the cell is lent to the process `pid`."""
         with self._lock:
             return bool(self.lent_to) and self._loan is not None and self._loan.pid == pid
 

@@ -104,7 +104,7 @@ def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
 
 
 def _rounded(time: datetime) -> datetime:
-    """To 10 s: what is expected does not change with every look."""
+    """Round a time to 10 s, so that an expected time does not change with every look."""
     return datetime.fromtimestamp(round(time.timestamp(), -1), UTC)
 
 
@@ -126,8 +126,8 @@ _NO_OBJECT = {"object": "", "dose_before": 0.0, "dose_budget": None}
 
 
 def _object_of(cell: Cell, run: str) -> dict[str, Any]:
-    """Of a run that is being acquired: its object, the light on it that is not this run's, and its budget, both
-    as the ledger has them now; nothing if it cannot be read."""
+    """Return the object of a run that is being acquired, the light on it that is not this run's, and its budget,
+    both as the ledger has them now; no object if this cannot be read."""
     try:
         ledger, named, plans_budget = _ledger_when(cell.ledger_folder, cell.former_ledger_folder, run)
         history = ledger.newest() if ledger else History()

@@ -69,8 +69,8 @@ def call(
     patience_s: float = _PATIENCE_S,
     given_up: Callable[[], bool] = _never,
 ) -> Any:
-    """What the service answers; a person is told on standard error if it does not within 2 s. Raises NotServed;
-    GivenUp; NoAnswer; InputError: it refuses, with its words."""
+    """Send a request and return the service's answer; a person is told on standard error if none comes within 2 s.
+    Raises NotServed; GivenUp; NoAnswer; InputError: the service refuses, with its words."""
     rig, end_s = cell.document.path, time.monotonic() + patience_s
     place = _place(cell)
     connection = _Local(place, patience_s)
@@ -151,7 +151,7 @@ def _await(sock: socket.socket, place: str, rig: Path, end_s: float, given_up: C
 
 
 def _answers(place: str) -> bool:
-    """Whether a console answers at all: one that makes a preflight answers others meanwhile."""
+    """Tell whether a console answers at all: one that makes a preflight answers others meanwhile."""
     probe = _Local(place, _LOOK_EVERY_S * 4)
     try:
         probe.request("GET", "/api/v1/token")
@@ -183,7 +183,7 @@ def _told_if_given_up(rig: Path, counts_anyway: bool) -> Iterator[None]:
 
 
 def is_served(cell: Cell) -> bool:
-    """Whether a console of this user on this machine owns the cell. Raises InputError: it does not answer."""
+    """Tell whether a console of this user on this machine owns the cell. Raises InputError: it does not answer."""
     try:
         call(cell, "GET", "/api/v1/state")
     except NotServed:

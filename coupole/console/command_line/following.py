@@ -121,7 +121,7 @@ class _Followed:
 
     @property
     def _run(self) -> Path | None:
-        """That of the entry, once it has one."""
+        """Folder of the entry's run, once it has one."""
         return Path(self._entry["run"]) if self._entry.get("run") else None
 
     @property
@@ -142,8 +142,8 @@ class _Followed:
         self._conclude(figures, found)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:
-        """Until the entry has ended. Raises Interrupted: it was taken out before it began; DeviceLost: the console
-        has ended, and after it what it had begun."""
+        """Yield the output until the entry has ended. Raises Interrupted: the entry was taken out before it began;
+        DeviceLost: the console has ended, and after it what it had begun."""
         told = False
         while not self._ended:
             try:
@@ -186,7 +186,7 @@ class _Followed:
                 ask(self._run, "go-on" if paused else "pause")
 
     def _say(self, said: str) -> None:
-        """What is new of it, in whole lines."""
+        """Print what is new in the process's output, in whole lines."""
         whole = said[: said.rfind("\n") + 1]
         new = whole[len(self._printed) :] if whole.startswith(self._printed) else whole
         self._printed = whole

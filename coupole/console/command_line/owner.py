@@ -1,4 +1,4 @@
-"""Which process has a cell's console, whether or not it listens.
+"""Search for the process that has a cell's console, whether or not it listens.
 
 Whoever asks takes no lock itself, so that a console which begins is never in its way.
 """

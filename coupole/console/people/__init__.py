@@ -1,1 +1,1 @@
-"""Who may do what at a console: accounts, sessions, control, the guard before all requests, the log."""
+"""Rights of people at a console: accounts, sessions, control, the guard before all requests, the log."""

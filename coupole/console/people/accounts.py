@@ -1,4 +1,4 @@
-"""Who may sign in to a cell's console, and as what: names, roles and hashed passwords in one file."""
+"""Accounts of the people who may sign in to a cell's console: names, roles and hashed passwords in one file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST_FAILURES, _MOST_FROM_ELSEWHERE, _MOST_KEPT, _FORGOTTEN_AFTER_S = 5, 30, 10
 
 
 class Role(IntEnum):
-    """What somebody may do; each may all that those below may."""
+    """Rights of a person; each role may also do all that the lower ones may."""
 
     OBSERVER = 1
     """Looks."""
@@ -56,7 +56,7 @@ class Account:
     name: str
     role: Role
     key: str = field(default="", compare=False, repr=False)
-    """By which it is told from another one of that name, made later."""
+    """Key that tells this account from a later one of the same name."""
 
 
 FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
@@ -79,15 +79,15 @@ class Accounts:
         except (OSError, InputError) as error:
             raise StorageError(f"{path}: the console's accounts cannot be read: {error}") from error
         self.first_token = "" if _has_engineer(self._stored) else secrets.token_urlsafe(24)
-        """With which an engineer signs in while no engineer has an account; empty if it does not hold."""
+        """Token with which an engineer signs in while no engineer has an account; empty if it does not hold."""
 
     def listed(self) -> list[Account]:
-        """All, by name."""
+        """Return all accounts, by name."""
         return [Account(name, Role.of(kept["role"])) for name, kept in sorted(self._stored.items())]
 
     def holds(self, account: Account) -> bool:
-        """Whether somebody still is who signed in: the account is there, with this role; and of the first engineer
-        that no engineer has an account yet."""
+        """Tell whether an account that has signed in still holds: it is there, with this role. The first
+        engineer's holds while no engineer has an account."""
         if account == FIRST_ENGINEER:
             return not _has_engineer(self._stored)
         kept = self._stored.get(account.name)
@@ -179,7 +179,8 @@ def _key(kept: dict[str, Any]) -> str:
 
 
 def _seen(name: str) -> str:
-    """As a reader sees it: two that differ by capitals, width or spaces alone are one person in a log."""
+    """Return a name as a reader sees it: two that differ only by capitals, width or spaces are one person in a
+    log."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 

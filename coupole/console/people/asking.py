@@ -1,4 +1,4 @@
-"""What routes ask of a request: who sends it."""
+"""Account of whoever sends a request, as routes ask for it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coupole.console.people.sessions import Session
 
 
 def _account(request: Request) -> Account:
-    """Whose session it is."""
+    """Return the account of the request's session."""
     session: Session = request.state.session
     return account_here(session.account, of_this_machine=is_of_this_machine(request))
 

@@ -1,5 +1,5 @@
-"""Who asked for what at the console: `audit.jsonl`, a line for each request that would change something, with its
-answer; also if it was refused."""
+"""Log of who asked for what at the console: `audit.jsonl`, a line for each request that would change something,
+with its answer; also if it was refused."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Who asks: nothing but the sign-in page is served to who is not signed in; nothing is changed for another site's
-page, or twice; what was asked and would change something is logged, with its answer."""
+"""Guard before all requests. Nothing but the sign-in page is served to somebody who is not signed in. Nothing is
+changed for another site's page, or twice. What was asked and would change something is logged, with its answer."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def guard(app: FastAPI, service: Service) -> None:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    """In words, with their status."""
+    """Answer errors in words, with their status."""
 
     @app.exception_handler(InputError)
     async def wrong(_: Request, error: InputError) -> Response:
@@ -109,7 +109,8 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _finite(found: Any) -> Any:
-    """What JSON can tell, in which there is no NaN."""
+    """Return a value that JSON can express: numbers that are not finite become text, as there is no NaN in
+    JSON."""
     if isinstance(found, dict):
         return {key: _finite(value) for key, value in found.items()}
     if isinstance(found, list):
@@ -160,14 +161,16 @@ def _no(code: int, why: str) -> Response:
 
 
 def why_unwanted(request: Request, service: Service) -> str:
-    """Why nothing is begun for a request: whoever asked has gone, or it may have lain here long; else empty."""
+    """Return why nothing is begun for a request: whoever asked has gone, or it may have lain here long; else
+    empty."""
     if hung_up(request.state.connection):
         return "whoever asked has gone: not begun"
     return service.loop_watch.refusal()
 
 
 def is_command_line(request: Request | WebSocket) -> bool:
-    """By the service's Unix socket, at which only processes of its own user are heard."""
+    """Tell whether a request came by the service's Unix socket, at which only processes of its own user are
+    heard."""
     server = request.scope.get("server")
     return server is not None and server[1] is None
 
@@ -178,12 +181,12 @@ def bearer_of(request: Request | WebSocket) -> str:
 
 
 def address_of(request: Request | WebSocket) -> str:
-    """Where somebody is who asks."""
+    """Return the address of whoever asks."""
     return request.client.host if request.client else "command line"
 
 
 def session_of(request: Request | WebSocket, service: Service, *, used: bool = True) -> Session | None:
-    """Of who asks; None without one. Looking on does not count as using it."""
+    """Return the session of whoever asks; None without one. Looking on does not count as using it."""
     if is_command_line(request):
         return service.command_line
     if bearer := bearer_of(request):
@@ -199,5 +202,5 @@ def is_of_this_machine(request: Request | WebSocket) -> bool:
 
 
 def account_here(account: Account, *, of_this_machine: bool) -> Account:
-    """Who somebody is where they sit: from another machine everybody is an observer."""
+    """Return an account with its role at this place: from another machine everybody is an observer."""
     return account if of_this_machine else replace(account, role=min(account.role, Role.OBSERVER))

@@ -1,4 +1,4 @@
-"""Whether somebody may do something: by role, and by who is in control."""
+"""Permission for what somebody wants to do: by role, and by who is in control."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from coupole.console.service_parts import Service
 
 
 class NotAllowed(Exception):
-    """With the HTTP status and the words for whoever asked."""
+    """Refusal of an action, with the HTTP status and the words for whoever asked."""
 
     def __init__(self, status: int, words: str) -> None:
         super().__init__(words)

@@ -1,4 +1,4 @@
-"""Who is signed in, and who of them is in control."""
+"""Sessions of the people who are signed in, and which of them is in control."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from coupole.console.people.accounts import Account, Role
 from coupole.errors import InputError
 
 IDLE_S = 12 * 3600.0
-"""After which a session that was not used is over."""
+"""Time after which a session that was not used is over."""
 ABSENT_S = 300.0
-"""After which somebody in control who did nothing may be relieved by any operator."""
+"""Time after which any operator may relieve somebody in control who did nothing."""
 _MOST_TOKENS = 64
 
 
@@ -28,7 +28,7 @@ class Session:
     script: bool
     """Its secret comes as a bearer, which no browser adds by itself."""
     tokens: set[str] = field(default_factory=set)
-    """For one request that changes something each."""
+    """Tokens, each for one request that changes something."""
 
 
 class Sessions:
@@ -70,7 +70,7 @@ class Sessions:
             self._by_hash.pop(_hash(secret), None)
 
     def token(self, session: Session) -> str:
-        """For one request of this session."""
+        """Return a new token for one request of this session."""
         token = secrets.token_urlsafe(16)
         with self._lock:
             while len(session.tokens) >= _MOST_TOKENS:
@@ -92,7 +92,7 @@ def _hash(secret: str) -> str:
 
 @dataclass(frozen=True)
 class InControl:
-    """Who is in control, and who asks to be."""
+    """Name of the person in control, and of the one who asks for control."""
 
     name: str = ""
     asked_by: str = ""
@@ -131,8 +131,8 @@ class Control:
             return self._now
 
     def act(self, account: Account, *, keep: bool = True) -> bool:
-        """Whether somebody may act now: who is in control, or an operator where nobody is, who then has it, unless
-        he does not `keep` it."""
+        """Tell whether somebody may act now: the person in control, or any operator if nobody is. That operator
+        then takes control, unless `keep` is false."""
         with self._lock:
             if self._now.name not in ("", account.name):
                 return False

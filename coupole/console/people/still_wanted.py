@@ -1,9 +1,9 @@
-"""Whether what was asked of a console is still wanted when it gets to it.
+"""Check whether what was asked of a console is still wanted when the console gets to it.
 
-A console that is stopped (Ctrl-Z, SIGSTOP), or whose machine sleeps, finds requests when it runs again whose
-people have long given up. So nothing begins for a caller whose connection is gone, nor, where that cannot be seen
-(a page that is open still), of what may have come while the console stood still. What ends or pauses something
-always counts.
+A console stands still if it is stopped (Ctrl-Z, SIGSTOP), or if its machine sleeps. When it runs again it finds
+requests whose senders have long given up. So nothing begins for a caller whose connection is gone. Where that
+cannot be seen (a page that is still open), nothing begins of what may have come while the console stood still.
+What ends or pauses something always counts.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _ENDINGS = ("/stop", "/pause", "/sign-out", "/control/give")
 
 
 def begins_nothing(method: str, path: str) -> bool:
-    """Whether a request of the HTTP interface only reads, ends or pauses: it counts, whoever is gone."""
+    """Tell whether a request of the HTTP interface only reads, ends or pauses: it counts, whoever is gone."""
     return method in ("GET", "HEAD", "DELETE") or path.endswith(_ENDINGS)
 
 
 def hung_up(connection: socket.socket) -> bool:
-    """Whether the other end of a connection is closed, whatever it has sent before."""
+    """Tell whether the other end of a connection is closed, whatever it has sent before."""
     if connection.fileno() < 0:
         return True
     poll = select.poll()
@@ -55,7 +55,8 @@ class LoopWatch:
         self._beat_s = now_s
 
     def refusal(self, longest_s: float = STOOD_STILL_S) -> str:
-        """Why nothing may begin at this moment: what came while it stood still comes to it now; else empty."""
+        """Return why nothing may begin at this moment: what came while the console stood still reaches it now;
+        else empty."""
         now_s = self._now_s()
         stood_s = now_s - self._beat_s
         if now_s - self._awake_s < _BACKLOG_S:

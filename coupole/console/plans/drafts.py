@@ -24,12 +24,12 @@ class Draft:
 
 @dataclass(frozen=True)
 class Checked:
-    """What is to be said of a draft."""
+    """Result of the check of a draft."""
 
     problems: tuple[Problem, ...] = ()
     """Mistakes in the files; with any there is nothing else."""
     report: dict[str, Any] = field(default_factory=dict)
-    """As `coupole check --json`."""
+    """Report, as of `coupole check --json`."""
     views: tuple[dict[str, Any], ...] = ()
     """Name, duration in s and dose in lux h of each, in the order of the visits."""
     budget_lux_h: float | None = None

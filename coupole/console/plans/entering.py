@@ -30,14 +30,14 @@ from coupole.storage.run import Run
 
 
 class Entering:
-    """What may enter one cell's queue."""
+    """Entrance to one cell's queue, which decides what may enter."""
 
     def __init__(self, cell: Cell, plans: Path, queue: PlanQueue, acquisitions: Acquisitions) -> None:
         self._cell, self._plans, self._queue, self._acquisitions = cell, plans, queue, acquisitions
         self._rig = cell.document.path.resolve()
         self.preflight = EntryPreflight()
         self.one_at_a_time = CapacityLimiter(1)
-        """For threads that call `enter` and `move`: each counts what the ones before have entered."""
+        """Limit for threads that call `enter` and `move`: each counts what the ones before have entered."""
 
     def close(self) -> None:
         """End what is being checked."""

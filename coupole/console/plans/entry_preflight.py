@@ -21,12 +21,12 @@ that is busy; a burst does not wait for it, as the box fires by itself."""
 
 @dataclass(frozen=True)
 class Found:
-    """What preflight says."""
+    """Result of a preflight."""
 
     problems: tuple[Problem, ...] = ()
     """Mistakes in the files, or refusals; with any nothing can be run."""
     document: dict[str, Any] = field(default_factory=dict)
-    """As of `coupole check --json`."""
+    """Figures, as of `coupole check --json`."""
 
 
 def check_entry(files: Files, *, measure: bool) -> Found:
@@ -52,13 +52,14 @@ class EntryPreflight:
 
     @property
     def words(self) -> str:
-        """What is being checked, for whom, since when, and how far it is; empty if nothing is."""
+        """Words on what is being checked, for whom, since when, and how far it is; empty if nothing is."""
         if not (known := self._for):
             return ""
         return f"{known}: {self._process.step or 'it begins'}"
 
     def of(self, files: Files, by: str, *, beside_a_run: bool) -> Found:
-        """What preflight says of files. Raises InputError: it takes too long, is given up, or its process died."""
+        """Return what preflight says of files. Raises InputError: it takes too long, is given up, or its process
+        died."""
         with self._told(f"{(files.resume or files.plan).name}, entered by {by} at {utc_now()[11:19]} UTC"):
             niceness = BESIDE_A_RUN if beside_a_run else 0
             return self._process.run(check_entry, AT_MOST_S, niceness, files, measure=not beside_a_run)

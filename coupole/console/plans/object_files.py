@@ -1,4 +1,4 @@
-"""What a console knows of objects: their ledgers, their photographs, and the plans and runs that name them."""
+"""Objects that a console knows: their ledgers, their photographs, and the plans and runs that name them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ObjectFiles:
         self._cell, self._plans, self._runs, self._folder = cell, plans, runs, folder
 
     def ids(self) -> list[str]:
-        """Of all objects that a plan, a run or a ledger names."""
+        """Return the ids of all objects that a plan, a run or a ledger names."""
         ledgers = [*self._cell.ledger_folder.glob("*.jsonl"), *self._cell.former_ledger_folder.glob("*.jsonl")]
         found = {path.stem for path in ledgers}
         found |= {row.object for row in self._runs.rows() if row.object}

@@ -1,4 +1,4 @@
-"""What a queue will need: when each entry begins and ends, and whether light and disk suffice for all of them."""
+"""Outlook of a queue: when each entry begins and ends, and whether light and disk suffice for all of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.console.plans.plan_queue import Entry
 
 @dataclass(frozen=True)
 class AtWork:
-    """What the run at work still takes."""
+    """Disk space and light that the run at work still takes."""
 
     folder: str = ""
     bytes_left: int = 0
@@ -107,7 +107,7 @@ def too_little_disk(
 
 
 def at_work_of(state: Mapping[str, Any] | None, frame_bytes: int) -> AtWork:
-    """Of a run's state as its process tells it; nothing if there is none."""
+    """Return what a run still takes, by its state as its process tells it; nothing if there is no state."""
     if state is None:
         return AtWork()
     left = max(0, state.get("frames", 0) - state.get("proven", 0))

@@ -108,7 +108,7 @@ def _same_views(one: PlanFields, other: PlanFields) -> bool:
 
 
 def _set(mapping: Any, key: str, value: Any, before: Any) -> None:
-    """Only what has changed; None takes it out."""
+    """Set a key only if its value has changed; None takes the key out."""
     if value == before:
         return
     if value is None:

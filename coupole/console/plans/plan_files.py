@@ -37,7 +37,7 @@ class PlanFiles:
         return self.drawings / secrets.token_hex(8)
 
     def names(self) -> list[str]:
-        """Of all plans, sorted: files with `views`."""
+        """Return the names of all plans, sorted. A plan is a file with `views`."""
         found = []
         for path in self.folder.rglob("*.yaml"):
             inside = path.relative_to(self.folder)

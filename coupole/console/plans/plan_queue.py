@@ -19,28 +19,29 @@ MOST_WAITING, MOST_ENDED = 200, 100
 
 
 class Needs(BaseModel):
-    """What preflight said of an entry when it was entered; of a run that is resumed, of what is left of it."""
+    """Needs of an entry, as preflight found them when it was entered; of a run that is resumed, of what is left of
+    it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     duration_s: float
-    """Of the acquisition."""
+    """Duration of the acquisition."""
     preparation_s: float
     """Time that preflight took; it is made again when the entry begins."""
     dose_lux_h: float
     """Light on the object, in lux hours."""
     bytes: int
-    """On the disk."""
+    """Size on the disk."""
     frames: int
-    """Dark frames included."""
+    """Number of frames, dark frames included."""
     object: str | None = None
     """Its id; None if the plan names none."""
     dose_budget_lux_h: float | None = None
     """All light that the object may receive, in lux hours, with what it has received; None: no limit."""
     folder: str = ""
-    """In which the run will be."""
+    """Folder in which the run will be."""
     warnings: tuple[str, ...] = ()
-    """What the operator should know."""
+    """Warnings that the operator should know."""
 
 
 class Entry(BaseModel):
@@ -49,11 +50,11 @@ class Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     id: str
-    """Of this entry."""
+    """Id of this entry."""
     plan: str = ""
     """File of the plan; empty for a hold, and for a run that goes on with its own copy."""
     hold: str = ""
-    """What is to be done before the queue goes on; empty for a plan."""
+    """Task to be done before the queue goes on; empty for a plan."""
     resume: str = ""
     """Folder of the run to be resumed; empty for a new one."""
     output: str = ""
@@ -63,27 +64,27 @@ class Entry(BaseModel):
     needs: Needs | None = None
     """None for a hold, and for what began at once."""
     by: str
-    """Who entered it."""
+    """Name of whoever entered it."""
     entered: str
     """UTC, ISO 8601."""
     state: EntryState = "waiting"
-    """How far it is."""
+    """State of the entry: how far it is."""
     begun: str = ""
     """UTC; empty while it waits."""
     ended: str = ""
     """UTC; empty until it has ended."""
     pid: int = 0
-    """Of the process that acquires; 0 while it waits."""
+    """Id of the process that acquires; 0 while the entry waits."""
     run: str = ""
     """Folder of the run, once there is one."""
     exit_code: int | None = None
-    """Of the process; None until it has ended, and if it was killed."""
+    """Exit code of the process; None until it has ended, and if it was killed."""
     said: str = ""
-    """Why it failed."""
+    """Reason why it failed."""
 
     @property
     def words(self) -> str:
-        """What it is, for people."""
+        """Name of the entry, for people."""
         return f"hold: {self.hold}" if self.hold else Path(self.plan or self.resume).name
 
 
@@ -112,7 +113,7 @@ class PlanQueue:
 
     @property
     def halted(self) -> str:
-        """Why nothing more begins; empty if something may."""
+        """Reason why nothing more begins; empty if something may."""
         return self._kept.halted
 
     @property
@@ -177,7 +178,8 @@ class PlanQueue:
         return (*entries[:place], entry, *entries[place:])
 
     def _in_the_way(self) -> str:
-        """Why nothing can begin at once; empty if it can. A plan that failed is not in the way of another one."""
+        """Return why nothing can begin at once; empty if it can. A plan that failed is not in the way of another
+        one."""
         if self.running is not None:
             return f"{self.running.words} is being acquired"
         if self.waiting:

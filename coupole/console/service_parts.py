@@ -1,4 +1,4 @@
-"""What a console's interface and its screens stand in front of."""
+"""Parts of a console behind its interface and its screens."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Service:
 
     cell: Cell
     folder: Path
-    """Of the console's own state: accounts, log, queue."""
+    """Folder of the console's own state: accounts, log, queue."""
     plans: Path
     """Folder of the plans that may be entered."""
     accounts: Accounts
@@ -51,19 +51,19 @@ class Service:
     calibrations: CalibrationStatus
     bundles: SupportBundles
     watch: RunWatch
-    """Of the run at work."""
+    """Watch over the run at work."""
     objects: ObjectFiles
     tasks: Tasks
     bench: Bench
     """Holds the devices while no run is at work."""
     state: Callable[[], StateNow]
-    """As it is."""
+    """Function that returns the cell's state as it is."""
     newest: Callable[[], StateNow]
-    """As it was a moment ago; takes no time."""
+    """Function that returns the cell's state as it was a moment ago; takes no time."""
     entering: Entering
     origins: frozenset[str]
-    """Of this service's own pages."""
+    """Origins of this service's own pages."""
     cookie: str
     """Name of the sessions' cookie, which no other console of this machine has."""
     command_line: Session
-    """Of the service's own user, on this machine."""
+    """Session of the service's own user, on this machine."""

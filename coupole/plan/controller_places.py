@@ -64,8 +64,7 @@ def _by_address(cell: Cell) -> Path:
 
 
 def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, str]:
-    """Return where a driver with these settings finds its controller, and the setting that says so, if one
-    does."""
+    """Return where a driver with these settings finds its controller, and the setting that says so, if any."""
     for name in _ADDRESSES:
         field = model.model_fields.get(name)
         given = settings.get(name, field.default if field is not None else "")
@@ -76,8 +75,7 @@ def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, 
 
 
 def _by_serial(identity: Identity | None) -> list[str]:
-    """Return the file name for the serial number; empty for a stand-in, and for a driver that cannot know the
-    number."""
+    """Return the serial number's file name; empty for a stand-in, and for a driver that cannot know the number."""
     if identity is None or identity.simulated or not identity.serial.strip(" 0"):
         return []
     return [_file_name("serial", identity.vendor, identity.serial)]

@@ -37,8 +37,8 @@ def composed_by_ruamel(text: str) -> Node | None:
 
 
 def _composed_quickly(text: str) -> Node | None:
-    """Compose a text by libyaml; None if libyaml is not there, refuses the text, or might understand it
-    differently."""
+    """Compose a text by libyaml; None if libyaml is missing, refuses the text, or might understand it
+    otherwise."""
     if not yaml.__with_libyaml__ or _NOT_PLAIN.search(_COMMENT_LINES.sub("", text)):
         return None
     ends = text.endswith("\n")

@@ -45,8 +45,7 @@ class RecordRow:
     tightest: str = ""
     """The limit that is nearest to be missed."""
     margin: float | None = None
-    """Distance below the tightest limit, as a share of that limit; below 0 when it is missed; None without
-    limits."""
+    """Distance below the tightest limit, as a share of it; below 0 when it is missed; None without limits."""
     against: tuple[str, ...] = ()
     """Reasons why plans must not use the record here."""
 

@@ -109,8 +109,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _finite(found: Any) -> Any:
-    """Return a value that JSON can express: numbers that are not finite become text, as there is no NaN in
-    JSON."""
+    """Return a value that JSON can express: numbers that are not finite (NaN) become text."""
     if isinstance(found, dict):
         return {key: _finite(value) for key, value in found.items()}
     if isinstance(found, list):
@@ -161,7 +160,7 @@ def _no(code: int, why: str) -> Response:
 
 
 def why_unwanted(request: Request, service: Service) -> str:
-    """Return why nothing is begun for a request: whoever asked has gone, or it may have lain here long; else
+    """Return why nothing is begun for a request: its sender has gone, or it may have lain here long; else
     empty."""
     if hung_up(request.state.connection):
         return "whoever asked has gone: not begun"
@@ -169,8 +168,7 @@ def why_unwanted(request: Request, service: Service) -> str:
 
 
 def is_command_line(request: Request | WebSocket) -> bool:
-    """Tell whether a request came by the service's Unix socket, at which only processes of its own user are
-    heard."""
+    """Tell whether a request came by the service's Unix socket, which hears only processes of its own user."""
     server = request.scope.get("server")
     return server is not None and server[1] is None
 

@@ -55,8 +55,7 @@ class LoopWatch:
         self._beat_s = now_s
 
     def refusal(self, longest_s: float = STOOD_STILL_S) -> str:
-        """Return why nothing may begin at this moment: what came while the console stood still reaches it now;
-        else empty."""
+        """Return why nothing may begin now: what came while the console stood still reaches it now; else empty."""
         now_s = self._now_s()
         stood_s = now_s - self._beat_s
         if now_s - self._awake_s < _BACKLOG_S:

@@ -1,4 +1,4 @@
-"""What a process prints into a file, as it grows: only what is new is read."""
+"""File into which a process prints, read as it grows: only what is new is read."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What people begin at the console beside the queue: commands of the command line (`verify`, `archive`, ...), each
-in a process of its own, whose output is kept while the service lives."""
+"""Tasks that people begin at the console beside the queue: commands of the command line (`verify`, `archive`,
+...), each in a process of its own, whose output is kept while the service lives."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Task:
 
     id: str
     words: str
-    """What it does, for people."""
+    """Description of what the task does, for people."""
     command: tuple[str, ...]
     """Arguments of `coupole`."""
     by: str
@@ -88,18 +88,18 @@ class Task:
 
     @property
     def why(self) -> str:
-        """Why it failed, in a line; empty if it did not."""
+        """Reason why the task failed, in a line; empty if it did not."""
         if self.running or self.exit_code == 0:
             return ""
         lines = [line.strip() for line in self.said.splitlines() if line.strip()]
         return str(self.found.get("error") or (lines[-1] if lines else "it was stopped"))
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Until it has ended. Raises subprocess.TimeoutExpired."""
+        """Wait until the task has ended. Raises subprocess.TimeoutExpired."""
         self.process.wait(timeout_s)
 
     def stop(self) -> None:
-        """As Ctrl-C does."""
+        """Interrupt the task, as Ctrl-C does."""
         if self.running:
             os.kill(self.process.pid, signal.SIGINT)
 

@@ -29,7 +29,7 @@ _IMPORTED = [
 ]
 _LONGEST_STEP = 200
 _steps: list[Any] = []
-"""In a worker: where it says what it does."""
+"""Places in which a worker says what it does; empty outside a worker."""
 
 
 def say(step: str) -> None:
@@ -39,7 +39,7 @@ def say(step: str) -> None:
 
 
 def _begin(step: Any, niceness: int) -> None:
-    """In a worker: it ends with the console, to which Ctrl-C is left."""
+    """Prepare a worker: it ends with the console, to which Ctrl-C is left."""
     threading.Thread(target=_end_with_console, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(niceness)
@@ -67,14 +67,14 @@ class WarmProcess:
 
     @property
     def step(self) -> str:
-        """What it does now, as it said last."""
+        """Step at which the process is now, as it said last."""
         return bytes(self._step.value).decode(errors="replace")
 
     def run(
         self, work: Callable[P, T], within_s: float, niceness: int = 0, *args: P.args, **kwargs: P.kwargs
     ) -> T:
-        """What work gives. Raises InputError: it takes too long, or the process died of it or was ended; and what
-        work raises."""
+        """Run work in the process and return its result. Raises InputError: it takes too long, or the process died
+        of it or was ended; and what the work raises."""
         self._step.value = b""
         pool, future = self._submit(niceness, work, *args, **kwargs)
         try:

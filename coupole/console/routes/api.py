@@ -91,7 +91,7 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/token")
     def token(request: Request) -> dict[str, str]:
-        """For the next request that changes something, in its header X-Coupole-Token."""
+        """Return a token for the next request that changes something, to be sent in its header X-Coupole-Token."""
         return {"token": service.sessions.token(request.state.session)}
 
 
@@ -153,8 +153,9 @@ def _add_cell(app: FastAPI, service: Service) -> None:
 
     @app.post("/api/v1/runs/{run}/{command}", responses=REFUSALS)
     def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
-        """To the run that is being acquired. Any operator may pause and stop, whoever is in control: this never
-        harms. `stop` is answered when the lights are off and the arm was told to stop, or with the `trouble`."""
+        """Send a command to the run that is being acquired. Any operator may pause and stop, whoever is in
+        control: this never harms. `stop` is answered when the lights are off and the arm was told to stop, or with
+        the `trouble`."""
         allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 

@@ -43,7 +43,7 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/queue/{entry}/output", responses=REFUSALS)
     def output(entry: Text) -> Output:
-        """What the process of an entry has told."""
+        """Return what the process of an entry has told."""
         found = service.queue.entry(entry)
         said, figures = service.acquisitions.output(found)
         return Output(entry=found, said=said, figures=figures)

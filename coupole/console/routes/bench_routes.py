@@ -49,8 +49,9 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
 
     @app.websocket(HOLD)
     async def hold(socket: WebSocket) -> None:
-        """While a button is held the page sends `{axis, direction, share}`, the next one only when the answer to
-        the last has come; when it is let go, or lost, the connection ends, and so does the motion."""
+        """Move an axis while a button is held. The page sends `{axis, direction, share}`, the next one only when
+        the answer to the last has come. When the button is let go, or the connection is lost, the connection ends,
+        and so does the motion."""
         await socket.accept()
         await _Hold(service, socket).serve()
 
@@ -100,7 +101,7 @@ class _Hold:
         return work
 
     def _let_go(self) -> str:
-        """At once: a renewal the other way ends a hold."""
+        """End the motion at once: a renewal the other way ends a hold."""
         if self._number is None:
             return "the button was let go"
         other = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}

@@ -1,4 +1,4 @@
-"""What is sent to the console and told by it, version 1."""
+"""Messages that are sent to the console, and its answers, version 1."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class SignIn(Asked):
     """A name and a password, or the token of the first start."""
 
     name: Text = ""
-    """Of an account."""
+    """Name of an account."""
     password: Text = ""
-    """Of the account."""
+    """Password of the account."""
     token: Text = ""
     """Printed at a start without an engineer's account; an engineer's, once, on the same machine."""
     script: bool = False
@@ -42,7 +42,7 @@ class NewEntry(Asked):
     resume: Text = ""
     """Folder of the run to be resumed, relative to the cell's storage folder."""
     hold: Text = ""
-    """What is to be done before the queue goes on."""
+    """Task to be done before the queue goes on."""
     before: Text = ""
     """Id of the waiting entry before which it comes; empty: at the end."""
     now: bool = False
@@ -61,37 +61,37 @@ class Move(Asked):
 
 
 class Lease(Asked):
-    """What the cell is wanted for."""
+    """Request for the loan of the cell."""
 
     what: Annotated[str, Field(min_length=1, max_length=200)]
-    """In words."""
+    """Purpose of the loan, in words."""
 
 
 class Light(Asked):
     """Light that an object was given elsewhere."""
 
     dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
-    """In lux hours."""
+    """Light dose in lux hours."""
     note: Annotated[str, Field(min_length=1, max_length=2000)]
-    """What that light was."""
+    """Description of that light."""
 
 
 class Budget(Asked):
-    """What an object may receive in its life."""
+    """Light that an object may receive in its life."""
 
     dose_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)]
-    """In lux hours."""
+    """Light dose in lux hours."""
     name: Annotated[str, Field(max_length=200)] = ""
-    """Whose word it is; empty: of who asks."""
+    """Name of the person whose word it is; empty: whoever asks."""
     reason: Annotated[str, Field(max_length=2000)] = ""
-    """Why it is this."""
+    """Reason for this budget."""
 
 
 class Warn(Asked):
-    """When an object's ledger warns."""
+    """Limit above which an object's ledger warns."""
 
     above_lux_h: Annotated[float, Field(ge=0, le=MOST_LUX_H, allow_inf_nan=False, strict=True)] | None
-    """Of a total above this; null: of none."""
+    """Total light above which the ledger warns, in lux hours; null: it never warns."""
 
 
 class EntryNow(Entry):
@@ -105,27 +105,27 @@ class EntryNow(Entry):
 
 
 class Output(BaseModel):
-    """What an entry's process has told."""
+    """Output of an entry's process."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     entry: Entry
-    """As it is."""
+    """Entry of the queue, as it is."""
     said: str
     """The last 64 KiB of what it printed."""
     figures: dict[str, Any]
-    """As of `coupole acquire --json`; empty until it has ended."""
+    """Figures, as of `coupole acquire --json`; empty until the process has ended."""
 
 
 class NewAccount(Asked):
-    """Of a person."""
+    """New account of a person."""
 
     name: Text
-    """With which they sign in."""
+    """Name with which the person signs in."""
     password: Text
-    """With at least ten characters."""
+    """Password with at least ten characters."""
     role: Literal["observer", "operator", "engineer"]
-    """What they may do."""
+    """Role: what the person may do."""
 
 
 class Hand(Asked):
@@ -147,7 +147,7 @@ class StateNow(BaseModel):
     devices are closed, the report is made; `silent`: the run's process does not answer, all else is what it told
     last."""
     t: str
-    """When this was so, UTC."""
+    """Time when this was so, UTC."""
     rig: str
     """Name of the rig."""
     simulated: bool
@@ -169,23 +169,23 @@ class StateNow(BaseModel):
     dose_budget: float | None
     """Light that the object may receive in its life, by its ledger and the run's plan."""
     left_s: float | None
-    """Expected until the run is complete."""
+    """Expected time until the run is complete."""
     halted: str
-    """Why the queue waits for a person; empty if it does not."""
+    """Reason why the queue waits for a person; empty if it does not."""
     arm_fault: str
     """The fault of the arm that stands until a person confirms; empty if there is none."""
     devices: dict[str, Any]
     """Identities of the devices that a run, or the bench, has open."""
     lent_to: str
-    """To whom the cell is lent, and for what; empty if it is not. Nothing begins meanwhile."""
+    """Name of who has borrowed the cell, and for what; empty if it is not lent. Nothing begins meanwhile."""
     queue: list[EntryNow]
     """All entries that run or wait, after the 20 that ended last, in their order."""
     checking: str
-    """What preflight is being made of, for whom, since when and how far it is; empty if of nothing. What else is
-    entered waits for it."""
+    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. What else
+    is entered waits for it."""
     in_control: str
-    """Who may act; empty: any operator."""
+    """Name of the person who may act; empty: any operator."""
     asked_by: str
-    """Who asks for control."""
+    """Name of the person who asks for control."""
     trouble: str
-    """What the service itself cannot do, such as write its log; empty if nothing."""
+    """Trouble of the service itself, such as that it cannot write its log; empty if there is none."""

@@ -16,7 +16,7 @@ from coupole.errors import InputError
 
 
 def add_object_routes(app: FastAPI, service: Service) -> None:
-    """What the object screen shows and takes."""
+    """Add the routes for what the object screen shows and takes."""
 
     @app.get("/api/v1/objects")
     def objects() -> list[str]:
@@ -25,7 +25,7 @@ def add_object_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/objects/{object_id}/photograph", response_class=Response)
     def photograph(object_id: Text) -> Response:
-        """As JPEG."""
+        """Return the photograph of an object as JPEG."""
         if (path := service.objects.photograph(object_id)) is None:
             raise InputError(f"{object_id}: there is no photograph")
         return FileResponse(path, media_type="image/jpeg")

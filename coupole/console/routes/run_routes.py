@@ -22,13 +22,13 @@ _STILL = (
     "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'"
 )
-"""Of a page that only shows: no script, nothing from elsewhere, nothing of this console's origin."""
+"""Policy of a page that only shows: no script, nothing from elsewhere, nothing of this console's origin."""
 _LIVELY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval'; "
     "style-src 'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'"
 )
-"""Of a page with scripts of its own, which reach nothing but the page itself."""
+"""Policy of a page with scripts of its own, which reach nothing but the page itself."""
 
 
 def add_run_routes(app: FastAPI, service: Service) -> None:
@@ -54,7 +54,7 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
 
     @app.get("/api/v1/runs/{run}/readme", response_class=FileResponse)
     def readme(run: Text) -> FileResponse:
-        """What the run's folder says of itself."""
+        """Return the README.txt of the run's folder: what the folder says of itself."""
         return _file(service.runs.run(run).folder / "README.txt", "text/plain; charset=utf-8", _STILL)
 
     @app.get("/api/v1/support-bundles/{name}", response_class=FileResponse)

@@ -1,4 +1,4 @@
-"""Where a console listens: a port for browsers, by TLS if others can reach it, and a Unix socket for commands."""
+"""Sockets of a console: a port for browsers, by TLS if others can reach it, and a Unix socket for commands."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def in_url(host: str) -> str:
 
 
 def origins_of(url: str, hosts: Sequence[str]) -> frozenset[str]:
-    """Of pages at these hosts; browsers leave out the port that is their scheme's own."""
+    """Return the origins of pages at these hosts; browsers leave out the port that is their scheme's own."""
     scheme, port = url.partition("://")[0], url.rpartition(":")[2]
     places = {f"{scheme}://{in_url(host)}" for host in hosts}
     own = port == {"http": "80", "https": "443"}[scheme]

@@ -28,7 +28,8 @@ from coupole.storage.journal_events import (
 
 
 def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
-    """What happened; empty for what a person does not need to read (each proven frame, and the file's head)."""
+    """Describe what happened; empty for what a person does not need to read (each proven frame, and the file's
+    head)."""
     match event:
         case JournalBegun() | FrameProven() | ArmSettled():
             return ""

@@ -1,4 +1,4 @@
-"""What contact sheets and pictures of the dome show of a run: its frames by view, light and exposure, how bright
+"""Contents of a run's contact sheets and pictures of the dome: its frames by view, light and exposure, how bright
 each is, and where each LED stands."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from coupole.storage.durable import make_folder
 from coupole.storage.view_reader import View
 
 _MOST_PAIRS = 256
-"""Of rows of a frame that its mean is taken of."""
+"""Number of pairs of rows of a frame that its mean is taken of, at most."""
 _KEPT_EVERY = 100
 
 
@@ -31,7 +31,7 @@ class SheetFrame:
 
     shot: str
     light: str
-    """For people: `LED 417`, `dark 3`."""
+    """Name of the light for people: `LED 417`, `dark 3`."""
     led: int | None
     """Its id in the dome's table; None for a panel, and without light."""
     exposure: int
@@ -41,16 +41,16 @@ class SheetFrame:
 
 @dataclass(frozen=True)
 class LedPlace:
-    """Where an LED stands, seen from the support's centre."""
+    """Place of an LED, seen from the support's centre."""
 
     azimuth_deg: float
-    """About the support's z axis, from its x axis."""
+    """Azimuth about the support's z axis, from its x axis."""
     elevation_deg: float
-    """Above the support's plane."""
+    """Elevation above the support's plane."""
 
 
 class FrameSheets:
-    """For all runs of a cell; means are read once and kept."""
+    """Frames and their means for all runs of a cell; means are read once and kept."""
 
     def __init__(self, runs: RunFiles, folder: Path) -> None:
         """`folder`: for the means."""
@@ -77,13 +77,13 @@ class FrameSheets:
         ]
 
     def places(self, name: str) -> dict[int, LedPlace]:
-        """Of all LEDs of the run's own table, by id. Raises InputError."""
+        """Return the places of all LEDs of the run's own table, by id. Raises InputError."""
         if name not in self._places:
             self._places[name] = places_in(read_cell(self._runs.run(name).rig_path))
         return self._places[name]
 
     def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
-        """Those of `means` that were read before. Raises InputError, StorageError."""
+        """Return those of `means` that were read before. Raises InputError, StorageError."""
         kept, proven = self._kept(name), self._runs.proven(name)
         found = {shot: kept.get(proven[one].xxh3) for shot in shots if (one := ShotId.parse(shot)) in proven}
         return {shot: mean for shot, mean in found.items() if mean is not None}
@@ -121,7 +121,7 @@ class FrameSheets:
 
 
 def places_in(cell: Cell) -> dict[int, LedPlace]:
-    """Of all LEDs of a cell, by id."""
+    """Return the places of all LEDs of a cell, by id."""
     support_from_base = np.linalg.inv(cell.rig.support.base_from_support.matrix())
     x, y, z = support_from_base[:3, :3] @ cell.leds.positions_mm.T + support_from_base[:3, 3:]
     azimuths, elevations = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -132,7 +132,7 @@ def places_in(cell: Cell) -> dict[int, LedPlace]:
 
 
 def led_places(sheets: FrameSheets, name: str) -> dict[int, LedPlace]:
-    """As `FrameSheets.places`; empty for a run whose rig cannot be read any more."""
+    """Return places as `FrameSheets.places` does; empty for a run whose rig cannot be read any more."""
     try:
         return sheets.places(name)
     except (InputError, CoupoleError):

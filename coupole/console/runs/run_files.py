@@ -32,7 +32,7 @@ class RunRow:
 
     name: str
     state: str
-    """As `run_status.Status.state`, or `damaged`."""
+    """State of the run, as `run_status.Status.state`, or `damaged`."""
     object: str
     created: str
     operator: str
@@ -43,7 +43,7 @@ class RunRow:
     archived: bool
     """All views are compressed."""
     verified: str
-    """When it was last read back without a fault and has not changed since, UTC; empty if never."""
+    """Time when it was last read back without a fault and has not changed since, UTC; empty if never."""
     thumbnail: str
     """A shot to be shown; empty without one."""
 
@@ -184,8 +184,8 @@ class RunFiles:
         )
 
     def fingerprint(self, name: str) -> str:
-        """Of names, sizes and times of all files in a run's folder: another one once any was written, put in or
-        taken out."""
+        """Return a checksum of names, sizes and times of all files in a run's folder: it changes once any file was
+        written, put in or taken out."""
         folder = self.folder / name
         found = hashlib.sha256()
         for path in sorted(folder.rglob("*")):

@@ -1,4 +1,4 @@
-"""Where the console puts what is made of a run: outside of its folder, below the cell's storage folder."""
+"""Folders for what the console makes of a run: outside of the run's folder, below the cell's storage folder."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def reflectance_folder(cell: Cell, run: Run) -> Path:
 
 
 def look_page(cell: Cell, run: Run) -> Path:
-    """What `coupole show` makes."""
+    """Return the path of the page that `coupole show` makes."""
     return results_folder(cell, run) / "look.html"
 
 
 def stands_alone(page: Path) -> bool:
-    """Whether a page to look at has all its data in itself."""
+    """Tell whether a page to look at has all its data in itself."""
     return page.is_file() and not page.with_suffix(".data").exists()

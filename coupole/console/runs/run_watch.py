@@ -26,7 +26,7 @@ class Watched:
     views: tuple[tuple[str, int, int], ...]
     """Name, proven and expected frames of each, in the plan's order."""
     newest: FrameProven | None
-    """Under an LED."""
+    """Newest proven frame under an LED."""
     reshot: int
     hottest_board_c: float | None
     events: tuple[tuple[str, str], ...]

@@ -56,7 +56,7 @@ class ArmPicture:
         self._words.text = f"The camera is at x {x:.0f}, y {y:.0f}, z {z:.0f} mm above the support's centre."
 
     def show_way(self, camera_mm: Sequence[Any] = (), links_mm: Sequence[Any] = ()) -> None:
-        """Where the camera will go [n, 3], and the arm at its end [8, 3]; nothing: no path is shown."""
+        """Show where the camera will go [n, 3], and the arm at its end [8, 3]; without these no path is shown."""
         self._way_mm = self._in_support(np.array(camera_mm)) if len(camera_mm) else None
         goal_mm = [*links_mm, camera_mm[-1]] if len(camera_mm) else None
         self._goal_mm = self._in_support(np.array(goal_mm)) if goal_mm else None

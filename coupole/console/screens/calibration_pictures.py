@@ -1,4 +1,4 @@
-"""What is to be placed on the support for each step of a calibration, as plain drawings from above."""
+"""Pictures of what is to be placed on the support for each step of a calibration: plain drawings from above."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run is to be exported to, asked in a dialog."""
+"""Dialog that asks which format a run is exported to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After a fault of the arm: the word of a named person who has been to the cell."""
+"""Panel after a fault of the arm, for the word of a named person who has been to the cell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coupole.storage.arm_faults import faults_of
 
 
 class FaultOfArm:
-    """Is there while a fault stands."""
+    """Panel that is shown while a fault of the arm stands."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit = visit

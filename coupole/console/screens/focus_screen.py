@@ -257,7 +257,7 @@ class _Screen:
 
 
 def why_live_ends(*, watched: bool, untouched_s: float, stopped: bool) -> str:
-    """Why no further picture is taken by itself; empty if one is."""
+    """Return why no further picture is taken by itself; empty if one is."""
     if not watched:
         return "the page was closed"
     if untouched_s > LIVE_S:

@@ -1,4 +1,4 @@
-"""What all screens have: the header with the cell's state, its dose, pause and stop, and the way to the others."""
+"""Parts of all screens: the header with the cell's state, its dose, pause and stop, and the way to the others."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def can_be_stopped(now: StateNow) -> bool:
 
 
 def light_words(now: StateNow) -> str:
-    """What the header says of light: that none is given only while nobody can give any."""
+    """Return the header's words on light. They say that none is given only while nobody can give any."""
     if now.run:
         budget = f" of {now.dose_budget:g}" if now.dose_budget else ""
         return f"light on {now.object or 'the object'}: {now.dose_before + now.dose:.3f} lux h{budget}"

@@ -18,7 +18,7 @@ _EMIT = """(e) => {
   emit([at.x, at.y]);
 }"""
 _NEAR = 0.06
-"""Of the dome's radius, within which a click is meant for an LED."""
+"""Greatest distance from an LED at which a click is meant for it, as a share of the dome's radius."""
 
 
 class LedChooser:
@@ -81,6 +81,6 @@ def numbers(text: str, what: str) -> list[int]:
 
 
 def _at(place: LedPlace) -> tuple[float, float]:
-    """On the picture: the zenith in the middle, elevation 0 at a radius of 1."""
+    """Return the LED's place on the picture: the zenith in the middle, elevation 0 at a radius of 1."""
     far, angle = 1 - place.elevation_deg / 90, math.radians(place.azimuth_deg)
     return far * math.cos(angle), -far * math.sin(angle)

@@ -38,7 +38,7 @@ class LookPicture:
         self._draw()
 
     def build_loupe(self) -> None:
-        """Where the loupe is shown."""
+        """Build the place where the loupe is shown."""
         self._loupe = named(ui.html("", sanitize=False), "loupe").classes("loupe")
         self._loupe.set_content('<p class="hint">Click on the picture: each pixel of the sensor is one here.</p>')
 
@@ -58,7 +58,8 @@ class LookPicture:
         self._draw()
 
     async def loupe(self, at_px: Sequence[int] | None = None) -> None:
-        """Into the last picture at a point, or in the middle of the region, or of the picture."""
+        """Show the last picture through the loupe at a point; without one, in the middle of the region, or of the
+        picture."""
         if not self._number:
             return
         x, y, width, height = self._region or (0, 0, *self._size_px)

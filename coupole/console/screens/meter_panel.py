@@ -14,7 +14,7 @@ from coupole.console.screens.visit import Visit
 
 
 class MeterPanel:
-    """What `coupole meter` does, with the devices that are open."""
+    """Panel that does what `coupole meter` does, with the devices that are open."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit, self._bench = visit, visit.service.bench

@@ -23,7 +23,7 @@ def button(
     icon: str | None = None,
     kind: Literal["main", "quiet", "flat", "stop"] = "quiet",
 ) -> ui.button:
-    """Of one of the four looks; `name` is its `data-name` in the page."""
+    """Build a button with one of the four looks; `name` is its `data-name` in the page."""
     made = ui.button(words, icon=icon, on_click=on_click, color=None)
     return named(made.classes(f"b-{kind}").props("unelevated no-caps"), name)
 
@@ -81,7 +81,7 @@ def table_html(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def picture_address(run: str, shot: str, width_px: int, *, saturation: bool = False) -> str:
-    """Where the interface serves a shot's picture."""
+    """Return the address at which the interface serves a shot's picture."""
     marked = "&saturation=true" if saturation else ""
     return f"/api/v1/runs/{quote(run)}/picture?shot={quote(shot, safe='')}&width={width_px}{marked}"
 
@@ -128,7 +128,7 @@ async def sure(title: str, words: str, yes: str) -> bool:
 
 
 def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
-    """To a page of this console."""
+    """Build a link to a page of this console."""
     return named(ui.link(words, target, new_tab=new_tab), name)
 
 

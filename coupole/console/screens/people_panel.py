@@ -1,4 +1,4 @@
-"""Who may sign in, for engineers: add, remove, change what they may do."""
+"""Panel of the people who may sign in, for engineers: add, remove, change what they may do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the bench's next picture is taken: its light, exposure, region, marks and white point."""
+"""Settings of the bench's next picture: its light, exposure, region, marks and white point."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class PictureSettings:
 
     @property
     def light_words(self) -> str:
-        """For the log, and for people."""
+        """Light and exposure in words, for the log and for people."""
         asked = self.request()
         lights = [*(f"LED {led}" for led in asked["lights"]), *(f"panel {one}" for one in asked["panels"])]
         return f"{', '.join(lights) or 'no light'}, {asked['exposure_us'] / 1000:g} ms"

@@ -1,4 +1,4 @@
-"""What preflight says of a plan, in words for a screen."""
+"""Verdict of preflight on a plan, in words for a screen."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from coupole.viewing.terminal import bytes_text, duration_text
 
 
 def figures_of(found: Checked) -> dict[str, str]:
-    """What the plan takes, by its preflight."""
+    """Return what the plan takes, by its preflight."""
     report = found.report
     dose = f"{report['dose_lux_h']:.3f} lux h"
     if report["dose_before_lux_h"]:

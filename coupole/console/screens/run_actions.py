@@ -1,4 +1,4 @@
-"""What can be done with a run: go on with it, or begin a command of the command line on it."""
+"""Actions on a run: go on with it, or begin a command of the command line on it."""
 
 from __future__ import annotations
 

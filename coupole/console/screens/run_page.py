@@ -39,12 +39,12 @@ from coupole.viewing.terminal import bytes_text, duration_text
 
 _EVENTS_SHOWN, _LOOK_EVERY_S = 200, 2.0
 _READ_UNASKED_BYTES = 2_000_000_000
-"""Of frames whose means are read without being asked for."""
+"""Greatest total size of frames whose means are read without being asked for."""
 
 
 @dataclass(frozen=True)
 class _Known:
-    """What is read of a run before it is shown."""
+    """Data that are read of a run before it is shown."""
 
     run: Run
     row: RunRow
@@ -118,7 +118,7 @@ class _Page:
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def _renew(self) -> None:
-        """What commands have changed since."""
+        """Show what commands have changed since."""
         row = await in_thread(self._visit.service.runs.row, self._name)
         if row != self._row:
             self._row = row

@@ -75,7 +75,7 @@ class _Screen:
             self._show_last(last)
 
     def _show_last(self, last: EntryNow | None) -> None:
-        """How the last one ended, and what can be done about it."""
+        """Show how the last entry ended, and what can be done about it."""
         self._after.clear()
         if last is None:
             return

@@ -20,7 +20,7 @@ OF_RUNS = ("verify", "report", "archive", "export", "reflectance", "show")
 """Commands that are begun on runs."""
 STATE_KINDS = {"done": "good", "failed": "bad", "damaged": "bad", "interrupted": "warm", "paused": "warm"}
 EMIT_NAMED = "(e) => { const one = e.target.closest('[data-%s]'); if (one) emit(one.dataset.%s) }"
-"""Of a click on a part of some HTML that has an attribute `data-...`."""
+"""JavaScript handler of a click on a part of some HTML that has an attribute `data-...`."""
 _HEADS = ("", "run", "state", "frames", "size", "verified", "archived", "")
 
 

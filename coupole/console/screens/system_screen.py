@@ -102,7 +102,7 @@ def _rig(visit: Visit) -> None:
 
 
 class _Log:
-    """Who asked for what; the newest first."""
+    """Panel of the log: who asked for what, the newest first."""
 
     def __init__(self, visit: Visit) -> None:
         self._path = visit.service.folder / "audit.jsonl"
@@ -151,7 +151,7 @@ def _notifications(visit: Visit) -> None:
 
 
 class _Bundle:
-    """What is sent to whoever is asked for help."""
+    """Panel of the support bundle, a file for whoever is asked for help."""
 
     def __init__(self, visit: Visit) -> None:
         self._visit = visit

@@ -31,7 +31,7 @@ class Visit:
         self.service = service
         self._secret = request.cookies.get(service.cookie, "")
         self._here, self.address = is_of_this_machine(request), address_of(request)
-        """Where the browser is, as this machine sees it."""
+        """Place of the browser: whether it is on this machine, and its address as this machine sees it."""
         self._client: Client = ui.context.client
         self._followers: list[Callable[[StateNow], object]] = []
 
@@ -147,7 +147,7 @@ class Visit:
 
     @property
     def is_watched(self) -> bool:
-        """Whether the page is open in a browser at this moment."""
+        """Tell whether the page is open in a browser at this moment."""
         return self._client.has_socket_connection
 
     def say(self, words: str, *, bad: bool = False) -> None:
@@ -190,7 +190,7 @@ async def _in(pool: ThreadPoolExecutor, do: Callable[P, T], *args: P.args, **kwa
 _READING, _LONG = ThreadPoolExecutor(8, "reading"), ThreadPoolExecutor(1, "reading for long")
 _ACTING, _URGENT = ThreadPoolExecutor(16, "acting"), ThreadPoolExecutor(8, "stopping")
 _LOGGING = ThreadPoolExecutor(1, "log")
-"""Who looks can keep nobody from acting, and nobody anybody from a stop."""
+"""Thread pools, kept apart: who looks can keep nobody from acting, and nobody can keep anybody from a stop."""
 
 
 def in_background(work: Callable[[], Awaitable[object]]) -> None:

@@ -1,1 +1,1 @@
-"""What keeps a console and its people informed: notifications, facts of the system, support bundles."""
+"""Upkeep of a console, and news for its people: notifications, facts of the system, support bundles."""

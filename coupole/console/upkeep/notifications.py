@@ -50,13 +50,13 @@ class Email(Model):
     server: Word
     """Its name."""
     port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    """Without it 587, 465 or 25, by `security`."""
+    """Port of the server; without it 587, 465 or 25, by `security`."""
     security: Literal["starttls", "tls", "none"] = "starttls"
-    """How the connection is protected; the server's certificate is checked."""
+    """Protection of the connection; the server's certificate is checked."""
     user: str = ""
     """Name at the server; empty: it wants none."""
     password: str = ""
-    """Of the user."""
+    """Password of the user."""
     sender: Word
     """Address from which the mail comes."""
     to: Annotated[tuple[Word, ...], Field(min_length=1)]
@@ -84,15 +84,15 @@ class Settings(Model):
     schema_version: Literal[1]
     """Version of this format."""
     events: tuple[Kind, ...] = get_args(Kind)
-    """What is told."""
+    """Kinds of events that are told."""
     disk_low_gb: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 20.0
     """Free space on the disk of the runs below which is told, in GB."""
     email: Email | None = None
-    """By e-mail."""
+    """Messages by e-mail."""
     webhooks: tuple[Webhook, ...] = ()
-    """By HTTP."""
+    """Messages by HTTP."""
     desktop: bool = False
-    """By the desktop's notifications (`notify-send`) of this machine's user."""
+    """Messages by the desktop's notifications (`notify-send`) of this machine's user."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +111,13 @@ class Message:
 
 
 def console_folder(cell: Cell) -> Path:
-    """Where a cell's console keeps what it must remember."""
+    """Return the folder where a cell's console keeps what it must remember."""
     return cell.state_folder / "console"
 
 
 def read_settings(folder: Path) -> Settings | None:
-    """Of `folder`; None if there is no file. Raises InputError: it is wrong, or others may read it."""
+    """Read the settings of `folder`; None if there is no file. Raises InputError: it is wrong, or others may read
+    it."""
     path = folder / NAME
     if not path.is_file():
         return None
@@ -126,8 +127,8 @@ def read_settings(folder: Path) -> Settings | None:
 
 
 def ways(settings: Settings) -> Mapping[str, Callable[[Message], None]]:
-    """How messages go out, by name; each raises OSError or ValueError if it did not, with what the other side
-    said."""
+    """Return the ways by which messages go out, by name; each raises OSError or ValueError if the message did not
+    go out, with what the other side said."""
     found: dict[str, Callable[[Message], None]] = {}
     if settings.email is not None:
         found[f"e-mail by {settings.email.server}"] = partial(_mail, settings.email)

@@ -20,11 +20,11 @@ from coupole.storage.line_file import LineFile, utc_now
 
 _LOOK_EVERY_S, _TRIALS, _AGAIN_AFTER_S, _MOST_WAITING = 1.0, 3, 5.0, 100
 _RELIEF = 1.1
-"""How many times the limit must be free again before a disk counts as low once more."""
+"""Factor on the limit: so many times the limit must be free again before a disk counts as low once more."""
 
 
 class Occurrences:
-    """What has happened at a cell since it was last asked."""
+    """Search for what has happened at a cell since it was last asked."""
 
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
@@ -100,7 +100,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """What is still to be sent is given up."""
+        """End the threads; what is still to be sent is given up."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)

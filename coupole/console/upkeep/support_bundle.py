@@ -119,7 +119,7 @@ def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
 
 
 def _is_below(line: str, column: int, items: bool) -> bool:
-    """Whether a line goes on with a value whose key stands at this column."""
+    """Tell whether a line goes on with a value whose key stands at this column."""
     lead = _LEAD.match(line)
     at = len(lead[0]) if lead else 0
     rest = line[at:]
@@ -194,7 +194,7 @@ class SupportBundles:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Of Coupole, Python, the system, and the packages that Coupole wants."""
+    """Return the versions of Coupole, Python, the system, and the packages that Coupole wants."""
     found = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}
     for wanted in sorted(importlib.metadata.requires("coupole") or []):
         name = re.split(r"[\s<>=!~;\[]", wanted, maxsplit=1)[0]

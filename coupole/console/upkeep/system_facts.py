@@ -1,4 +1,4 @@
-"""What the console tells of the machine and the rig: room on the disk, what is still to be measured, the log."""
+"""Facts that the console tells of machine and rig: room on the disk, what is still to be measured, the log."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ NOTIFICATIONS = "notifications.yaml"
 
 @dataclass(frozen=True)
 class Disk:
-    """Where the runs are; in bytes."""
+    """Disk where the runs are; in bytes."""
 
     total: int
     free: int
     runs: int
-    """That the cell's runs take."""
+    """Size of the cell's runs."""
     reserve: int
-    """That a run leaves free."""
+    """Space that a run leaves free."""
     frame: int
-    """Of this rig."""
+    """Size of a frame of this rig."""
 
     @property
     def frames_left(self) -> int:
@@ -50,7 +50,7 @@ class ToMeasure:
 
 
 def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
-    """Of the cell's storage folder, with these runs."""
+    """Return the facts of the disk of the cell's storage folder, with these runs."""
     folder = cell.storage_folder
     while not folder.exists():
         folder = folder.parent
@@ -60,7 +60,7 @@ def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
 
 
 def to_measure(rig: Path) -> list[ToMeasure]:
-    """What comments `# Measure: ...` in a rig's file are written above."""
+    """Find the keys of a rig's file that stand below comments `# Measure: ...`."""
     lines = rig.read_text(encoding="utf-8").splitlines()
     found = []
     for number, line in enumerate(lines, 1):
@@ -92,8 +92,8 @@ def log_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def notifications(folder: Path) -> dict[str, str]:
-    """Who is told what, by `notifications.yaml` in the console's folder, without its passwords; empty if there is
-    no such file."""
+    """Return who is told what, by `notifications.yaml` in the console's folder, without its passwords; empty if
+    there is no such file."""
     path = folder / NOTIFICATIONS
     if not path.is_file():
         return {}

@@ -141,7 +141,7 @@ def led_places(sheets: FrameSheets, name: str) -> dict[int, LedPlace]:
 
 def _mean(pixels: NDArray[np.uint16], view: View) -> float:
     pairs = pixels[: pixels.shape[0] // 2 * 2].reshape(-1, 2, pixels.shape[1])
-    some = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
+    some = pairs[:: -(-len(pairs) // _MOST_PAIRS) or 1]
     return float((some.mean() - view.black_dn) / (view.white_dn - view.black_dn))
 
 

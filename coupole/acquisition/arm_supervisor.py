@@ -71,7 +71,7 @@ class ArmSupervisor:
         """Joint angles at which the next leg begins."""
         speeds_deg_s = np.array(self._arm.velocity_deg_s)
         self._stopping_s = float((self._robot.stopping_deg() / speeds_deg_s).max())
-        """Within which the arm comes to rest from its highest speed; from lower ones sooner."""
+        """Time within which the arm comes to rest from its highest speed, s; from lower speeds sooner."""
         self._before: ArmState | None = None
         """An earlier reading during a motion, for the axes' speeds."""
         self._latest_deg_s = np.zeros(6)
@@ -151,8 +151,8 @@ class ArmSupervisor:
             self._stand()
 
     def was_held(self, error: BaseException) -> bool:
-        """Whether this came because the session is to stand (`Control.stands`). Where that is still to be heard,
-        lights go off and the arm stops first."""
+        """Tell whether this error came because the session is to stand (`Control.stands`). While that is not known
+        yet, lights go off and the arm stops first."""
         if not isinstance(error, DeviceError):
             return isinstance(error, Held)
         if self._control.awaits_word:
@@ -160,7 +160,7 @@ class ArmSupervisor:
         return self._control.stands
 
     def await_return(self, moved: ArmMovedError) -> SettledPose:
-        """After a push: wait for the arm to spring back by itself; returns the newly measured pose.
+        """Wait after a push for the arm to spring back by itself; return the newly measured pose.
 
         Raises DeviceFault if it does not: then only a person may say that it can move again.
         """
@@ -263,7 +263,7 @@ class ArmSupervisor:
 
 
 def _may_go_on(lapse_s: float) -> str:
-    """What is said of a lapse after which no person is asked."""
+    """Return the message about a lapse after which no person is asked."""
     return (
         f"robot: nobody looked at its motion for {lapse_s:.2f} s (the program stood still, or waited for "
         "something), so it braked on its path. It may move on by itself at any moment: keep clear of it."

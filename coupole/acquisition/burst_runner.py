@@ -51,11 +51,11 @@ class _RunningBurst:
     proven: set[int] = field(default_factory=set)
     """Frames already passed to the recorder."""
     started_ns: int | None = None
-    """When the box was told to run the table, on the rig's clock; None until then."""
+    """Time when the box was told to run the table, on the rig's clock; None until then."""
     runs_since_ns: int | None = None
-    """When the box had answered that it runs it."""
+    """Time when the box had answered that it runs the table."""
     panel_since_ns: int | None = None
-    """When the panel was switched on; None without one."""
+    """Time when the panel was switched on; None without one."""
 
 
 class BurstRunner:
@@ -84,10 +84,10 @@ class BurstRunner:
         self._buffers = 0
         """Buffers of the previous burst; never reduced, because a new size means newly allocated memory."""
         self.times_s: list[float] = []
-        """From start to last proof of each burst, on the rig's clock."""
+        """Durations of the bursts, from the start to the last proof of each, on the rig's clock."""
 
     def exposure(self, burst: Burst) -> Exposure:
-        """How the camera must be configured for a burst."""
+        """Return the settings that the camera must have for a burst."""
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)
 
     def prepare(self, burst: Burst) -> None:
@@ -278,9 +278,9 @@ class BurstRunner:
         )
 
     def _dark_ns(self, running: _RunningBurst) -> int:
-        """Until when the burst may have given light: until now, or until the box had switched all off before, as
-        it does when somebody suspends the program. An answer to a call that was made before the table ran says
-        nothing of it."""
+        """Return the time until which the burst may have given light. This is now, or the time when the box had
+        switched all off before, as it does when somebody suspends the program. An answer to a call that was made
+        before the table ran says nothing of it."""
         since_ns, now_ns = running.runs_since_ns, self._cell.clock.now_ns()
         offs = self._cell.switched_off_ns if since_ns is not None else ()
         return next((dark_ns for told_ns, dark_ns in offs if told_ns >= (since_ns or 0)), now_ns)

@@ -28,12 +28,12 @@ _KIND = "in-use"
 _LOCK = "hhqqi4x"
 """`struct flock` of 64-bit Linux: type, whence, start, length (0: the whole file), process (0)."""
 _GRACE_S, _NAP_S = 2.0, 0.01
-"""Within which a process that has just ended gives up its mark."""
+"""Time within which a process that has just ended gives up its mark."""
 
 
 @contextmanager
 def in_use(cell: Cell) -> Iterator[None]:
-    """While the context lasts `is_in_use` is true of the cell.
+    """Mark the cell as in use: while the context lasts, `is_in_use` is true of it.
 
     Raises InputError: another session has the devices of a cell that one session can have; StorageError: it cannot
     be marked, so that others would not know. A session that has a world of its own does without.
@@ -56,12 +56,12 @@ def in_use(cell: Cell) -> Iterator[None]:
 
 
 def is_in_use(cell: Cell) -> bool:
-    """Whether a process of this user on this machine has the devices of the cell open."""
+    """Tell whether a process of this user on this machine has the devices of the cell open."""
     return any(map(_is_locked, places_of_arm(cell)))
 
 
 def _alone(cell: Cell) -> bool:
-    """Whether all sessions have the same devices."""
+    """Tell whether all sessions have the same devices."""
     world = cell.rig.world
     return not in_world(cell.rig, dry_run=False) or (world is not None and world.join is not None)
 

@@ -74,13 +74,13 @@ class LightOnObject:
         self._given_lux_h = np.array(before_lux_h) if len(before_lux_h) else np.zeros(points)
         self._planned: _Planned | None = None
         self._unentered_lux_h = 0.0
-        """Of this session, in a simulated cell."""
+        """Dose of this session, in a simulated cell."""
         if self._ledger is not None:
             self._ledger.newest()
 
     @property
     def lux_h(self) -> float:
-        """Of the run so far, or of the live view."""
+        """Dose of the run so far, or of the live view."""
         return float(self._given_lux_h.max())
 
     @property
@@ -95,19 +95,19 @@ class LightOnObject:
 
     @property
     def total_lux_h(self) -> float:
-        """Of the object's life, by its ledger as it is now, without what is being given."""
+        """Dose of the object's life, by its ledger as it is now, without what is being given."""
         planned_lux_h = self._history.planned_lux_h(self._planned.plan_id) if self._planned else 0.0
         return self._history.total_lux_h - planned_lux_h + self._unentered_lux_h
 
     @property
     def left_lux_h(self) -> float:
-        """Until the budget is reached, by the ledger as it is now; infinite without one."""
+        """Dose that is left until the budget is reached, by the ledger as it is now; infinite without a budget."""
         allowed_lux_h = self._history.allowed_lux_h(self._asked.budget_lux_h)
         return math.inf if allowed_lux_h is None else allowed_lux_h - self.total_lux_h
 
     @property
     def warning(self) -> str:
-        """Why the object's light is to be watched; empty if it is not."""
+        """Reason why the object's light is to be watched; empty if it is not."""
         limit = self._history.warn_above_lux_h
         if limit is None or self.total_lux_h <= limit:
             return ""
@@ -165,7 +165,8 @@ class LightOnObject:
         return np.zeros_like(self._given_lux_h) if self._planned is None else self._planned.at_most
 
     def more_lux_h(self, lux_h: LuxHours) -> float:
-        """What these add to the dose, so that a run's entries sum to the dose of its highest point."""
+        """Return what this light adds to the dose, so that a run's entries sum to the dose of its highest
+        point."""
         return float((self._given_lux_h + lux_h).max() - self._given_lux_h.max())
 
     def _entry(self, lux_h: LuxHours, w_per_lm: float | None) -> tuple[float, float | None]:
@@ -196,12 +197,12 @@ class FlashMeter:
 
     @property
     def total_lux_h(self) -> float:
-        """Of the object's life, by its ledger, with what is planned."""
+        """Dose of the object's life, by its ledger, with what is planned."""
         return self._light.total_lux_h + self._light.more_lux_h(self._given_lux_h)
 
     @property
     def left_lux_h(self) -> float:
-        """Until the object's budget is reached; infinite without one."""
+        """Dose that is left until the object's budget is reached; infinite without a budget."""
         return self._light.left_lux_h
 
     def begin(self, lux_h: LuxHours, at_most_lux_h: LuxHours, w_per_lm: float | None = None) -> None:
@@ -247,21 +248,22 @@ class DoseMeter:
 
     @property
     def lux_h(self) -> float:
-        """Of the run so far, all its sessions; without the burst under way."""
+        """Dose of the run so far, all its sessions; without the burst under way."""
         return self._light.lux_h
 
     @property
     def lux_h_in_all(self) -> float:
-        """Of the run, all its sessions, as journal and ledger have it: a burst whose light nobody could count
+        """Dose of the run, all its sessions, as journal and ledger have it: a burst whose light nobody could count
         counts as planned."""
         return self._light.lux_h_at_most
 
     def lux_h_after(self, steps: int) -> float:
-        """Of the run so far, with so many steps of the burst under way, whose panel counts when it has ended."""
+        """Return the dose of the run so far, with so many steps of the burst under way. A panel of it counts when
+        it has ended."""
         return max(self.lux_h, float(self._under_way_lux_h[min(steps, len(self._under_way_lux_h) - 1)]))
 
     def begin(self, burst: Burst) -> None:
-        """To be called before a burst gives light: its plan is on the disk when this returns.
+        """Plan the light of a burst before it is given: the plan is on the disk when this returns.
 
         Raises DoseBudgetReached and StorageError: no light may then be given.
         """
@@ -285,7 +287,8 @@ class DoseMeter:
         self._recorder.commit(now=True)
 
     def ask_again(self, burst: Burst, step: int) -> None:
-        """To be called before the host lights a step of the burst that has begun. Raises DoseBudgetReached."""
+        """Ask the budget again before the host lights a step of the burst that has begun. Raises
+        DoseBudgetReached."""
         so_far = burst.table[: step + 1]
         share = len(so_far) / len(burst.table)
         panel_s = share * (burst.duration_s + BURST_OVERHEAD_S) if burst.panel else 0.0
@@ -294,8 +297,9 @@ class DoseMeter:
     def count(
         self, burst: Burst, log: NDArray[np.void], *, table_ran_s: float, panel_s: float
     ) -> tuple[float, ...]:
-        """What a burst has given [points]: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks and that
-        may have begun while the box ran the table for `table_ran_s`; and a panel that was on for `panel_s`.
+        """Return what a burst has given [points]: by its `log` (STEP_RECORD_DTYPE [n]); steps that the log lacks
+        and that may have begun while the box ran the table for `table_ran_s`; and a panel that was on for
+        `panel_s`.
 
         If it is not sure that the lights are off, all that was planned counts. For the journal, then for `end`.
         """

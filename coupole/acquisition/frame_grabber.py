@@ -34,7 +34,7 @@ def buffers_for(frames: int, frame_bytes: int, period_s: float, memory_bytes: in
 
 
 class FrameGrabber:
-    """From `start()` to `stop()`: stores every frame of the camera and returns its buffer.
+    """Grabber that stores every frame of the camera, from `start()` to `stop()`, and returns its buffer.
 
     `keep(frame)` runs on `writers` threads and returns the slot. Frames are listed in order of arrival.
     """

@@ -1,4 +1,5 @@
-"""Which step fired which frame: proofs from the box's trigger times and the camera's timestamps.
+"""Matching of frames to the steps that fired them: proofs from the box's trigger times and the camera's
+timestamps.
 
 The box logs when each step sent its edge, on its own clock; the camera stamps each frame that reaches the host, on
 another clock. A *hypothesis* is one alignment of the two clocks: frame `a` was fired by step `i`. It assigns a
@@ -75,15 +76,15 @@ class Match:
     lost_in_transfer: NDArray[np.bool_]
     """[steps] missing, and the frame ids show that the camera did expose it."""
     ambiguous: bool
-    """At least one frame could be neither labelled nor declared surplus or pending."""
+    """True if at least one frame could be neither labelled nor declared surplus or pending."""
     reason: str
-    """Why nothing, or not everything, could be proven; empty if everything was."""
+    """Reason why nothing, or not everything, could be proven; empty if everything was."""
     clocks: ClockFit | None
 
 
 @dataclass(frozen=True)
 class _Aligned:
-    """What the candidates say of each frame."""
+    """Steps that the candidates assign to each frame."""
 
     edged: NDArray[np.int64]
     """Rows of the log whose step sent an edge."""
@@ -151,7 +152,7 @@ def match(
 def _obstacle(
     edged: NDArray[np.int64], id_steps: NDArray[np.int64], most_id_step: int, timestamps_ns: NDArray[np.int64]
 ) -> str:
-    """Why frames that have come cannot be aligned with the log; empty if they can."""
+    """Return why frames that have come cannot be aligned with the log; empty if they can."""
     if len(edged) == 0:
         return "frames came before the box sent an edge"
     if np.any(id_steps == 0) or np.any(id_steps > most_id_step):

@@ -88,7 +88,7 @@ class HostBurst:
         self._cell, self._recorder, self._arm = cell, recorder, arm
         self._tell, self._wait_while_paused, self._dose, self._note = tell, wait_while_paused, dose, note
         self._panel_s = 0.0
-        """For which the panel of this burst was on, at most."""
+        """Time for which the panel of this burst was on, at most."""
 
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
         """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on
@@ -199,7 +199,7 @@ def _gives_light(burst: Burst, index: int) -> bool:
 
 
 def _cut_short(led: int, on_us: float) -> StepRecord:
-    """Of a flash whose end the box did not report: it may have shone for all of this time."""
+    """Return the record of a flash whose end the box did not report: it may have shone for all of this time."""
     return StepRecord(
         step=0,
         led=led,
@@ -216,7 +216,7 @@ def _cut_short(led: int, on_us: float) -> StepRecord:
 
 
 def too_bright(frame: Frame, frame_format: FrameFormat) -> str:
-    """Why a mark's frame is not dark; empty if it is dark, or has no picture (in a dry run)."""
+    """Return why a mark's frame is not dark; empty if it is dark, or has no picture (in a dry run)."""
     if not frame.rendered:
         return ""
     black_dn, white_dn = frame_format.black_dn, frame_format.white_dn

@@ -154,7 +154,7 @@ def _show_live(
     longest_us: int,
     halt: Callable[[], object],
 ) -> None:
-    """Until the operator stops it; `halt` is called as soon as he does."""
+    """Show the live view until the operator stops it; `halt` is called as soon as he does."""
     try:
         server = serve(studio, source.leds, longest_us, port)
     except OSError as error:

@@ -65,7 +65,7 @@ class MemoryRecorder:
 
 
 class DryRecorder(MemoryRecorder):
-    """For a dry run: evaluates the exposure of frames with a picture."""
+    """Recorder for a dry run: evaluates the exposure of frames with a picture."""
 
     name = "dry run"
 
@@ -95,7 +95,7 @@ class DryRecorder(MemoryRecorder):
 
 
 class MeterRecorder(MemoryRecorder):
-    """For metering: keeps a sample of each frame's pixels."""
+    """Recorder for metering: keeps a sample of each frame's pixels."""
 
     name = "meter"
 

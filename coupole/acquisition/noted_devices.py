@@ -14,11 +14,11 @@ from coupole.motion.itinerary import arm_of
 from coupole.plan.rig import Rig
 
 NAMES = {"ledbox": "led box", "camera": "camera", "robot": "robot"}
-"""As errors name them."""
+"""Names of the devices in errors."""
 _DEADLINE_SHARE = 10.0
 """`coupole.clock.Deadline` waits this many times as long by the machine's clock, if the rig's clock stands."""
 _STEP_BYTES, _SLOWEST_BYTES_S = 16, 480.0
-"""Of a table; a serial line of 4800 baud."""
+"""Size of a step of a table; speed of a serial line of 4800 baud."""
 
 _WORK_S: Mapping[str, Callable[..., float]] = {
     "next_frame": lambda timeout_s: _DEADLINE_SHARE * timeout_s,
@@ -57,7 +57,8 @@ class NotedDevice:
             self._device.move_to(joints_deg, speed)
 
     def _longest_motion_s(self) -> float:
-        """From one end of the axes' ranges to the other, at the speed of the last motion."""
+        """Return the time of a motion from one end of the axes' ranges to the other, at the speed of the last
+        motion."""
         arm = arm_of(self._rig)
         lowest_deg, highest_deg = zip(*arm.limits_deg, strict=True)
         return _SETTLES * move_duration_s(arm, lowest_deg, highest_deg) / max(self._speed, 1e-3)

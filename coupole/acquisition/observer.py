@@ -45,7 +45,7 @@ class Held(Exception):
 
 
 def frozen(seconds: float) -> str:
-    """Why a session is held whose process did not run."""
+    """Return why a session is held whose process did not run."""
     return f"the program did not run for {seconds:.1f} s: it was stopped, or its machine slept"
 
 
@@ -63,23 +63,23 @@ class Control:
     paused: threading.Event = field(default_factory=threading.Event)
     """Set while the session stands: lights off, the arm at rest."""
     can_stand: bool = False
-    """Whether the session can stand and go on; one that cannot is stopped by a hold."""
+    """True if the session can stand and go on; one that cannot is stopped by a hold."""
     held: threading.Event = field(default_factory=threading.Event)
     """Set from a hold until the session stands."""
     halting: threading.Event = field(default_factory=threading.Event)
     """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
     held_because: str = ""
     unsure: Sequence[str] = ()
-    """What a hold could not confirm to be safe: then the session ends."""
+    """Sentences on what a hold could not confirm to be safe: then the session ends."""
     pulse_s: float = math.inf
-    """When this process last proved that it runs, monotonic s: a thread that does nothing else sets it
-    (`coupole.acquisition.signals`); never, where there is none."""
+    """Time when this process last proved that it runs, monotonic s. A thread that does nothing else sets it
+    (`coupole.acquisition.signals`); infinite where there is none."""
     stood_at_s: float = -math.inf
-    """When that thread last found that it had not run for a while, monotonic s."""
+    """Time when that thread last found that it had not run for a while, monotonic s."""
     signal_number: int = signal.SIGINT
     """The signal that set `stop`, or as whose the session ends."""
     stopped_by: str = ""
-    """What set `stop`, in words; empty: the signal."""
+    """Cause that set `stop`, in words; empty: the signal."""
 
     def stop_by(self, number: int, what: str = "") -> None:
         """Stop for this signal, or for `what` as if by it; the first one counts."""
@@ -139,7 +139,7 @@ class Control:
 
     @property
     def awaits_word(self) -> bool:
-        """Whether `stands` would wait: this process did not run for a while, and it is not known yet why."""
+        """True if `stands` would wait: this process did not run for a while, and it is not known yet why."""
         now_s = time.monotonic()
         late = now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S
         return late and not self.held.is_set()

@@ -56,7 +56,8 @@ class OpenedCell:
     made_safe: bool = False
     """`make_safe` was called: nothing may be lit or moved any more."""
     switched_off_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=16))
-    """On the rig's clock, the newest last: when the box was told to switch the lights off, and had answered."""
+    """Times on the rig's clock, the newest last: when the box was told to switch the lights off, and when it had
+    answered."""
     _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _done: threading.Event = field(default_factory=threading.Event, repr=False)
 

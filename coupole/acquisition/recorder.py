@@ -25,14 +25,14 @@ COMMIT_EVERY_S = 0.5
 SPARE_SLOTS = 32
 """Additional slots for surplus frames, until their burst has been evaluated."""
 _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
-"""Of disks that still answer: an allocation may be written out."""
+"""Speeds of the slowest disks that still answer: an allocation may be written out."""
 
 
 class Recorder(Protocol):
     """The recorder that the sequencer needs. `put` may be called from several threads, all else from one."""
 
     name: str
-    """What the light is for, in the object's dose ledger: the run's name, or `meter`."""
+    """Purpose of the light, in the object's dose ledger: the run's name, or `meter`."""
 
     def light_before_lux_h(self) -> tuple[float, ...]:
         """Light that earlier sessions of the run gave each of the object's dose points; empty if none did."""
@@ -66,7 +66,7 @@ class Recorder(Protocol):
     def free(self, slot: int) -> None: ...
 
     def note(self, event: Event) -> None:
-        """For the journal."""
+        """Note an event for the journal."""
         ...
 
     def commit(self, *, now: bool) -> None:
@@ -77,7 +77,7 @@ class Recorder(Protocol):
 
 
 class RunRecorder:
-    """Into a run folder."""
+    """Recorder into a run folder."""
 
     def __init__(
         self,

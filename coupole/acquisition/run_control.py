@@ -76,7 +76,7 @@ class RunControl:
         self._served.close()
 
     def state(self) -> State:
-        """What is answered to every request."""
+        """Return the answer to every request."""
         control = self._control
         state = "running"
         if control.pause.is_set():

@@ -1,4 +1,4 @@
-"""What every view's file says of the cell, so that it can be used without rig and plan: LEDs and lens."""
+"""Description of the cell in every view's file, so that it can be used without rig and plan: LEDs and lens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes a cell safe, each action by itself; what is not sure to be done is told."""
+"""Actions that make a cell safe, each by itself; what is not sure to be done is told."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Safeguard:
     def __init__(self, what: str, act: Callable[[], None]) -> None:
         self.what, self._act = what, act
         self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
-        """Why it is not sure to be done; empty when it is done."""
+        """Reason why the action is not sure to be done; empty when it is done."""
         self._begun_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, name=what, daemon=True)
         self._thread.start()
@@ -39,7 +39,7 @@ class Safeguard:
 
 
 def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
-    """What is not sure to be done of it after a while."""
+    """Wait for the actions for a while; list what is not sure to be done then."""
     end_s = time.monotonic() + within_s
     for safeguard in done:
         safeguard.wait(max(0.0, end_s - time.monotonic()))

@@ -89,7 +89,7 @@ class Sequencer:
 
     @property
     def burst_times_s(self) -> list[float]:
-        """From start to last proof of each burst, on the rig's clock."""
+        """Durations of the bursts, from the start to the last proof of each, on the rig's clock."""
         return self._burst_runner.times_s
 
     # -- the run ------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What a session's end writes of that which went wrong: each file call on the way out is bounded."""
+"""Notes of a session's end on what went wrong: each file call on the way out is bounded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coupole.viewing.terminal import alarm
 
 
 def statistics(cell: OpenedCell) -> dict[str, float]:
-    """Of the arm's link; empty if its driver has none to give any more."""
+    """Return the statistics of the arm's link; empty if its driver has none to give any more."""
     try:
         return {} if hangs("robot") else dict(bounded(cell.robot.statistics, stop=NOW))
     except Exception:  # noqa: BLE001  the session's end is told without them

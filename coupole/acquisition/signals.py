@@ -29,7 +29,7 @@ from coupole.viewing.text_outlet import say_now
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
-"""When the main thread last heard of one, outside sessions."""
+"""Time when the main thread last heard of a signal, outside sessions."""
 
 _PULSE_S, _TOLD_WITHIN_S = 0.25, 0.1
 _LEAVES_WITHIN_S = 300.0
@@ -106,7 +106,7 @@ def _end_unheard(ours: int) -> None:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """What arrives within is dropped: whoever uses this is ending the session already."""
+    """Drop signals that arrive within the context: whoever uses this is ending the session already."""
     with _handlers(dict.fromkeys(ENDING, _drop)):
         yield
 
@@ -176,7 +176,7 @@ def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
 
 
 def _slept_s() -> float:
-    """For how long this machine has slept since it started."""
+    """Return for how long this machine has slept since it started."""
     return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
@@ -204,7 +204,8 @@ def _suspend(control: Control, act: Callable[[], object]) -> None:
 
 
 def _tell(text: str) -> None:
-    """On the terminal, if it takes it within a moment: the process is about to stop, and its queue of text too."""
+    """Write to the terminal, if it takes the text within a moment: the process is about to stop, and its queue of
+    text too."""
     say_now(text, _TOLD_WITHIN_S)
 
 

@@ -27,7 +27,7 @@ LONGEST_REQUEST_BYTES = 65536
 PATIENCE_S = 10.0
 _SAID_AFTER_S = 1.5
 Gone = Callable[[], bool]
-"""Whether whoever asked has closed the connection."""
+"""Function that tells whether the other end has closed the connection."""
 _LONGEST_ANSWER_BYTES = 16 * 1024**2
 
 
@@ -97,7 +97,7 @@ def _peer(connection: socket.socket) -> tuple[int, int, int]:
 
 
 def _hung_up(connection: socket.socket) -> bool:
-    """Whether the other end is closed; one that only sends nothing more is not."""
+    """Tell whether the other end is closed; one that only sends nothing more is not."""
     poll = select.poll()
     poll.register(connection, 0)
     return any(what & (select.POLLHUP | select.POLLERR) for _, what in poll.poll(0))
@@ -144,7 +144,7 @@ def told_if_given_up(words: str, say: Callable[[str], object]) -> Iterator[None]
 
 
 def _silence(pid: int, patience_s: float) -> str:
-    """Why a process does not answer."""
+    """Return why a process does not answer."""
     if is_stopped(pid):
         return (
             f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "

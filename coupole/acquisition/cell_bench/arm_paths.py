@@ -64,7 +64,7 @@ class ArmPaths:
         return ShownPath(number, name, start_deg, visit, self.motion)
 
     def figures(self, path: ShownPath) -> dict[str, Any]:
-        """What a console shows of a path, JSON's values only."""
+        """Return what a console shows of a path, as JSON's values only."""
         corners = [path.start_deg, *path.visit.leg.waypoints]
         along = shown_postures(corners)
         return {

@@ -21,7 +21,7 @@ _STOP_GIVEN_UP = "given up without an answer: the bench obeys the stop as soon a
 
 
 def bench_socket(cell: Cell) -> Path:
-    """Where the bench of a cell answers, if there is one."""
+    """Return the path of the socket at which the bench of a cell answers, if there is one."""
     return named_after(cell.state_folder, "bench")
 
 

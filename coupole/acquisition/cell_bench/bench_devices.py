@@ -23,7 +23,7 @@ _ASKED_EVERY_S = 2.0
 
 
 class BenchDevices:
-    """What is known of the three devices."""
+    """State of the three devices, as far as it is known."""
 
     def __init__(self, cell: Cell, opened: OpenedCell) -> None:
         self._cell, self._opened = cell, opened
@@ -37,8 +37,8 @@ class BenchDevices:
         """Held by whoever talks to box and camera."""
 
     def state(self, robot_heard_s_ago: float | None) -> dict[str, Any]:
-        """By kind: identity, link, temperature, last error, last self-test. The box is asked for its temperature
-        now and then, unless it is busy."""
+        """Return by kind of device: identity, link, temperature, last error, last self-test. The box is asked for
+        its temperature now and then, unless it is busy."""
         self._ask_the_box()
         now_s = time.monotonic()
         heard = {kind: round(now_s - heard_s, 3) for kind, heard_s in self._heard_s.items()}

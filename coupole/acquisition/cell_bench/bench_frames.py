@@ -94,7 +94,7 @@ class BenchFrames:
         return {"number": number, "region": [*at_px, width_px, height_px], "picture": str(picture)}
 
     def dose(self) -> dict[str, Any]:
-        """Of this bench, and of the object if it is known."""
+        """Return the dose of this bench, and of the object if it is known."""
         meter = self._meter
         left_lux_h = meter.left_lux_h if meter else math.inf
         return {
@@ -105,7 +105,7 @@ class BenchFrames:
         }
 
     def begin_counting(self) -> None:
-        """From what the object's ledger says now. Raises StorageError."""
+        """Begin to count from what the object's ledger says now. Raises StorageError."""
         job = self._job
         self._meter = FlashMeter(job, self._opened, "bench", 1.0) if job and job.plan.object else None
         self._shots = SingleShots(self._cell, self._opened, self._lux, self._meter)
@@ -192,7 +192,8 @@ def _within(region: Sequence[int], width_px: int, height_px: int) -> tuple[int, 
 
 
 def _added_up(shots: Sequence[Shot]) -> Shot:
-    """What one exposure under all lights at once would give, but for its noise; full where one of them is."""
+    """Return what one exposure under all lights at once would give, but for its noise. A pixel is full where one
+    of the shots is."""
     if len(shots) == 1:
         return shots[0]
     coding = shots[0].coding

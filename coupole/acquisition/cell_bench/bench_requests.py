@@ -1,4 +1,4 @@
-"""What a bench can be asked: one line of JSON each, `{"version": 1, "command": ..., ...}`.
+"""Requests to a bench: one line of JSON each, `{"version": 1, "command": ..., ...}`.
 
 Nothing is converted and no other field is allowed. docs/reference/bench.md describes the answers.
 """
@@ -72,11 +72,11 @@ class JogAsked(_Request):
     axis: Axis
     direction: Literal[1, -1]
     share: Annotated[float, Field(gt=0, le=1)] = 0.4
-    """Of reduced speed, 250 mm/s."""
+    """Share of reduced speed, 250 mm/s."""
     hold: int | None = None
     """The number that the first answer gave; without it a button is pressed anew."""
     at: Annotated[str, Field(alias="from")]
-    """Where the request comes from: an address in the rig's `console: at_the_cell:`."""
+    """Origin of the request: an address in the rig's `console: at_the_cell:`."""
 
 
 _Gain = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
@@ -92,17 +92,17 @@ class FrameAsked(_Request):
     panels: Annotated[list[int], Field(max_length=4)] = []
     """Numbers of panels, from 1; in the same way."""
     exposure_us: Annotated[int, Field(ge=10)]
-    """Of each picture."""
+    """Exposure time of each picture."""
     gain_db: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.0
     region: _Region | None = None
-    """With figures of its own."""
+    """Region of the picture that gets figures of its own."""
     width_px: Annotated[int, Field(ge=16, le=8192)] = 960
-    """Of the JPEG, at most."""
+    """Greatest width of the JPEG."""
     marks: list[Literal["saturation", "focus"]] = []
     gains: _Gains = [1.0, 1.0, 1.0]
-    """White point: of R, G, B in the JPEG."""
+    """White point: factors of R, G, B in the JPEG."""
     stops: Annotated[int, Field(ge=0)] | None = None
-    """As a state told it: nothing is lit if a stop came since."""
+    """Number of stops as a state told it: nothing is lit if a stop came since."""
 
 
 class LoupeAsked(_Request):

@@ -58,7 +58,7 @@ from coupole.viewing.terminal import alarm
 _LOOK_EVERY_S = 0.1
 _STOPPED_WITHIN_S = 4.0
 _BEGIN = (SelfTestAsked, DriveAsked, JogAsked, FrameAsked, MeterAsked)
-"""What may move the arm or light the object."""
+"""Requests that may move the arm or light the object."""
 
 
 class BenchService:
@@ -171,7 +171,8 @@ class BenchService:
         return work.figures()
 
     def _stop(self) -> list[str]:
-        """What is not sure then. Pictures that are under way have ended, with their light, when this returns."""
+        """Stop everything; return what is not sure then. Pictures that are under way have ended, with their light,
+        when this returns."""
         self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
         if self.works.last is not None:

@@ -1,4 +1,5 @@
-"""What a bench does by and by, in a thread of its own, one at a time; it can be stopped from any thread."""
+"""Work that takes a bench some time: one piece at a time, in a thread of its own. It can be stopped from any
+thread."""
 
 from __future__ import annotations
 
@@ -62,7 +63,7 @@ class Works:
         self._lock = threading.Lock()
         self.last: Work | None = None
         self.stops = 0
-        """How often a stop was asked."""
+        """Number of stops that were asked for."""
 
     def begin(self, work: Work, stops: int) -> None:
         """`stops` as it was when the work was asked. Raises InputError if a stop came since, or while another is

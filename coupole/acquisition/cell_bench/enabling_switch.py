@@ -49,9 +49,9 @@ class EnablingSwitch:
 
     @contextmanager
     def held(self) -> Iterator[Callable[[], None]]:
-        """While the context lasts, what it gives raises ReleasedError unless the switch is held. It is to be
-        called all the time while the arm moves: another thread asks the box, but nothing for a caller that hangs,
-        or the box's watchdog would hear it in the caller's place."""
+        """Give a function that raises ReleasedError unless the switch is held, while the context lasts. It is to
+        be called all the time while the arm moves. Another thread asks the box, but not for a caller that hangs:
+        or else the box's watchdog would hear that thread in the caller's place."""
         if not self.exists:
             yield lambda: None
             return

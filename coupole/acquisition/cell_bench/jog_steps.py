@@ -25,10 +25,11 @@ from coupole.motion.path_planner import Joints, Leg
 _STEP_DEG, _STEP_MM = 30.0, 100.0
 _LEAST_DEG, _LEAST_MM = 0.05, 1.0
 _OFF_LINE_MM, _MOST_TURN_DEG = 1.0, 20.0
-"""Of the camera from its line within a step; of any axis in a step along a line."""
+"""Greatest distance of the camera from its line within a step; greatest turn of any axis in a step along a
+line."""
 _HALVINGS = 10
 _KEPT_MM = 2.0
-"""At least so much less than could be gone towards a contact, at any point of arm and tool."""
+"""Length by which a step towards a contact stops short of what could be gone, at any point of arm and tool."""
 _SAMPLES, _ROUNDING_MM = 65, 1e-6
 
 

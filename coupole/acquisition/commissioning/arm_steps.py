@@ -18,7 +18,8 @@ CYCLES = {"cycle_ms": "packets", "status_ms": "statuses", "frequency_hz": "sampl
 the reports."""
 _CYCLE_S = 3.0
 _CYCLE_DEVIATION = 0.05
-"""Of the period of the controller's reports, as a share: more is another cycle, not another quartz."""
+"""Greatest deviation of the period of the controller's reports, as a share: more is another cycle, not another
+quartz."""
 _LENS_MM, _LEAST_DEG, _MOST_DEG = 15.0, 3.0, 10.0
 _TURNED_DEG, _OTHERS_DEG = 0.05, 0.05
 _SHARES = (1.0, 0.5, 0.25)

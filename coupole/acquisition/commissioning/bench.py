@@ -1,4 +1,4 @@
-"""What every step of a commissioning works with: the opened cell, the person, and the result that grows."""
+"""Bench that every step of a commissioning works with: the opened cell, the person, and the result that grows."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from coupole.preflight.commissioned import Answer
 
 
 class Person(Protocol):
-    """Who stands at the cell."""
+    """Person who stands at the cell."""
 
     def is_ready(self, announcement: str) -> bool:
-        """The word before something moves or is lit."""
+        """Ask for the person's word before something moves or is lit."""
         ...
 
     def confirms(self, question: str) -> bool:
-        """Whether what was seen is what is described."""
+        """Tell whether the person saw what is described."""
         ...
 
     def measures(self, what: str, question: str) -> float | None:
@@ -58,13 +58,13 @@ class StepFailedError(Exception):
 
 @dataclass
 class Findings:
-    """What a step has found so far."""
+    """Findings of a step so far."""
 
     limits: list[Limit] = field(default_factory=list)
     answers: list[Answer] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     remedy: str = ""
-    """What to do if a limit is missed or an answer is no."""
+    """Remedy if a limit is missed or an answer is no."""
 
     def at_most(self, what: str, found: float, limit: float, unit: str) -> bool:
         """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""
@@ -74,7 +74,7 @@ class Findings:
 
     @property
     def passed(self) -> bool:
-        """Whether all is well so far."""
+        """True if all is well so far."""
         return all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
 
 
@@ -83,10 +83,10 @@ class Bench:
     """One session of commissioning."""
 
     cell: Cell
-    """With the rig at reduced speed."""
+    """Cell with the rig at reduced speed."""
     opened: OpenedCell
     bodies: CellBodies
-    """Of an empty cell: no object lies on the support."""
+    """Bodies of an empty cell: no object lies on the support."""
     velocity_deg_s: NDArray[np.float64]
     """[6] greatest speeds of the axes in this session."""
     person: Person

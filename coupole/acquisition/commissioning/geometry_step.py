@@ -29,11 +29,13 @@ from coupole.motion.itinerary import arm_of
 from coupole.plan.rig import KeepOut, KeepOutBox, Rig
 
 MOST_HEIGHT_MM, MOST_SIDEWAYS_MM, MOST_TILT_DEG, MOST_DISAGREEMENT_MM = 15.0, 20.0, 2.0, 3.0
-"""Of the board as it is seen: a lens is known within 2 % here, 7 mm at 335 mm; a board is laid down by hand."""
+"""Greatest deviations of the board as it is seen: a lens is known within 2 % here, 7 mm at 335 mm; a board is laid
+down by hand."""
 MOST_TOO_NEAR_MM, MOST_BEYOND_MM, MOST_ROUGH_MM = 5.0, 2.0, 10.0
-"""By ruler: room that only the rig has; parts that stick out of the rig's bodies; large lengths."""
+"""Greatest deviations by ruler: room that only the rig has; parts that stick out of the rig's bodies; large
+lengths."""
 _TILTS_DEG = (12.0, 9.0, 6.0)
-"""Of the camera about the board, the first at which the arm has room for all sights."""
+"""Tilts of the camera about the board. The first at which the arm has room for all sights is taken."""
 _MOST_TURN_DEG = 30.0
 _METERED = 5
 Floats = NDArray[np.float64]
@@ -106,7 +108,7 @@ def _measure_bodies(bench: Bench) -> None:
 
 
 def _ask_for_volumes(bench: Bench) -> None:
-    """Only a person can see what stands in the cell."""
+    """Ask the person about the volumes: only a person can see what stands in the cell."""
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
@@ -134,7 +136,7 @@ def _described(volume: KeepOut) -> str:
 
 
 def _lowest_mm(rig: Rig, base_from_flange: Transform) -> float:
-    """Of the flange and what it carries by the rig, over the disk."""
+    """Return the least height over the disk of the flange and what it carries, by the rig."""
     support_from_flange = inverse(rig.support.base_from_support.matrix()) @ base_from_flange
     ends = [(0.0, 0.0, 0.0, 0.0)]
     ends += [(*end, body.radius_mm) for body in rig.tool for end in (body.from_mm, body.to_mm)]
@@ -144,7 +146,7 @@ def _lowest_mm(rig: Rig, base_from_flange: Transform) -> float:
 
 
 def _extent_mm(rig: Rig) -> tuple[float, float]:
-    """Of the rig's bodies on the flange: along its axis from its face, and from its axis."""
+    """Return the extent of the rig's bodies on the flange: along its axis from its face, and from its axis."""
     ends = [(*end, body.radius_mm) for body in rig.tool for end in (body.from_mm, body.to_mm)]
     points = np.array(ends).reshape(-1, 4)
     along, aside = points[:, 2] + points[:, 3], np.hypot(points[:, 0], points[:, 1]) + points[:, 3]
@@ -254,7 +256,8 @@ def _first_pose(sight: Sight, intrinsics: Intrinsics) -> Transform:
 
 
 def nominal_intrinsics(rig: Rig) -> Intrinsics:
-    """Of the lens by its maker's figures, focused as the rig says: the image distance is 1 / (1/f - 1/focus)."""
+    """Return the lens's intrinsics by its maker's figures, focused as the rig says. The image distance is 1 / (1/f
+    - 1/focus)."""
     lens, sensor = rig.lens, rig.sensor
     image_mm = 1.0 / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
     focal_px = image_mm * 1e3 / sensor.pixel_pitch_um

@@ -16,8 +16,8 @@ from coupole.plan.led_table import LedTable
 _LEAST_SPREAD = 0.05
 """Smallest singular value of the normals in view, as a share of the largest: below it the object is too flat."""
 _LEAST_SIGNAL_SIGMA, _LEAST_SIGNAL_SHARE = 8.0, 0.01
-"""Of a picture's mean over its dark frame: in standard deviations of that mean, and as a share of the median
-LED's."""
+"""Least signal of a picture, its mean over its dark frame: in standard deviations of that mean, and as a share of
+the median LED's."""
 _LEAST_CURRENT_SHARE = 0.5
 _MOST_PIXELS = 4000
 _LIT_SHARE = 0.1
@@ -28,7 +28,7 @@ _SHOWN_US = 2_000_000
 
 @dataclass(frozen=True)
 class Pictures:
-    """What was seen under each LED."""
+    """Pictures and currents under each LED."""
 
     ids: NDArray[np.int64]
     pictures: NDArray[np.float64]

@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_DEVIATION_DEG = 25.0
-"""Between the direction in a picture and the table's. Shadows, gloss and the nearness of the LEDs bend it; LEDs
-that are swapped within this angle are found by `coupole calibrate leds`."""
+"""Greatest angle between the direction in a picture and the table's. Shadows, gloss and the nearness of the LEDs
+bend it; LEDs that are swapped within this angle are found by `coupole calibrate leds`."""
 FEWEST_LEDS = 8
 _LIT_SHARE = 0.1
 _RIDGE = 1e-6
 _FEWEST_LIGHTS = 4
 """A pixel that fewer lights reach tells no normal."""
 _LEAST_REST = 1e-4
-"""Where less than this share of a direction is left when a light is taken out, the pixel is solved anew: the
-update would lose more than four digits."""
+"""Least share of a direction that may be left when a light is taken out. If less is left, the pixel is solved
+anew: the update would lose more than four digits."""
 _ROUNDS = 4
 Floats = NDArray[np.float64]
 Each = Callable[[str, Iterable[int]], Iterable[int]]
@@ -73,11 +73,11 @@ class Normals:
         self._solved = np.einsum("pij,pj->ip", self._inverses, sides)
 
     def all(self) -> Floats:
-        """From all good lights."""
+        """Return the normals from all good lights."""
         return np.where(self._counts < _FEWEST_LIGHTS, 0.0, self._solved)
 
     def without(self, led: int) -> Floats:
-        """From all good lights but one.
+        """Return the normals from all good lights but one.
 
         With b the solution of all, N their inverse normal matrix, y the pixel's value under the light l, u = N l
         and h = l . u, that without l is b - u (y - l . b) / (1 - h) (Sherman and Morrison, Ann. Math. Stat. 21,

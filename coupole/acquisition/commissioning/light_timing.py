@@ -33,7 +33,7 @@ _LEAST_EXPOSURE_US = 2000
 _SEGMENT_US = 200_000
 _WATCH_BEYOND_S = 4.0
 _DARK_LATE_S = 0.5
-"""After the watchdog's time and this, no frame may show light: the box's own tolerance."""
+"""Tolerance of the box itself: after the watchdog's time and this, no frame may show light."""
 _LEAST_SIGNAL_SIGMA = 8.0
 
 
@@ -199,7 +199,7 @@ def _by_software(bench: Bench, exposure_us: int) -> NDArray[np.float64]:
 
 
 def _watchdog_s(bench: Bench) -> float:
-    """Of the rig's box, as its driver sets it; 0 if the driver knows none."""
+    """Return the watchdog's time of the rig's box, as its driver sets it; 0 if the driver knows none."""
     driver, settings = device_for(bench.cell.rig, "ledbox", dry_run=False)
     model = settings_class(driver)
     places = {name: value for name, value in NOWHERE["ledbox"].items() if name in model.model_fields}

@@ -1,4 +1,4 @@
-"""Who answers in a commissioning: a person at the terminal; for a simulated cell, the simulation itself."""
+"""Persons who answer in a commissioning: one at the terminal; for a simulated cell, the simulation itself."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class SimulatedPerson:
         return True
 
     def measures(self, what: str, question: str) -> float | None:
-        """With a ruler that the simulated cell has: it knows nothing of the rig."""
+        """Measure with a ruler that the simulated cell has: it knows nothing of the rig."""
         found = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
         self._console.print(f"{question}: {found} mm (measured in the simulation)", markup=False)
         return found if found is None else float(found)

@@ -130,7 +130,7 @@ def commission(
 
 
 def shortcomings(result: StepResult) -> list[str]:
-    """What of a step did not pass, in words."""
+    """List in words what did not pass in a step."""
     missed = [
         f"{one.what}: {one.found:.4g} {one.unit}, at most {one.limit:.4g}".replace(" ,", ",")
         for one in result.limits

@@ -1,4 +1,4 @@
-"""What sights of one board from several postures say about the geometry of a rig: pure geometry, no devices."""
+"""Deviations of a rig's geometry, from sights of one board in several postures: pure geometry, no devices."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Sight:
     """The board, seen once."""
 
     support_from_camera: Transform
-    """By the rig, from the measured axes."""
+    """Pose of the camera by the rig, from the measured axes."""
     board_mm: Floats
     """[n, 3] the corners that are seen, in the board's frame."""
     pixels: Floats
@@ -28,16 +28,17 @@ class Sight:
 
 @dataclass(frozen=True)
 class Deviations:
-    """Where all sights together have the board, less where it lies; support frame."""
+    """Pose of the board by all sights together, less the pose in which it lies; support frame."""
 
     height_mm: float
-    """Of the board's middle; above 0, it is seen higher."""
+    """Height of the board's middle; above 0, it is seen higher."""
     sideways_mm: float
     tilt_deg: float
-    """Of the board against the disk."""
+    """Tilt of the board against the disk."""
     disagreement_mm: float
-    """Of the worst sight: root mean square distance on the board between where its corners are seen and where they
-    would be, if all sights were right. Errors of the camera's place on the flange, of its lens and of the arm."""
+    """Disagreement of the worst sight: root mean square distance on the board between where its corners are seen
+    and where they would be, if all sights were right. It shows errors of the camera's place on the flange, of its
+    lens and of the arm."""
     cause: str
     """The one error that explains the sights best, in words."""
 

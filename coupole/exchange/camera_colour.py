@@ -23,35 +23,37 @@ Neutral = Callable[[int | None], Floats]
 """[3] of white under an LED, by its id: what the channels give, the greatest 1."""
 
 _NOISE = 0.02
-"""Of a table's greatest value, that it may fall below 0."""
+"""Share of a table's greatest value by which it may fall below 0."""
 D65_CODE = 21
 """EXIF's LightSource."""
 _LARGEST_CONDITION = 1e5
-"""Of the covariance of what the channels give of reflectances; that of real sensors is below 1e4."""
+"""Largest condition number of the covariance of what the channels give of reflectances; that of real sensors is
+below 1e4."""
 _CORRELATED_NM = 50.0
-"""Of reflectances: the standard deviation of their covariance over wavelength."""
+"""Correlation of reflectances: the standard deviation of their covariance over wavelength."""
 
 
 @dataclass(frozen=True)
 class CameraColour:
-    """What is known of the colours of a camera under the LEDs."""
+    """Colours of a camera under the LEDs, as far as they are known."""
 
     xyz_from_balanced: Floats | None
     """[3, 3] XYZ under D65, Y = 1 for white, of red, green, blue of which white has 1, 1, 1; None: not known."""
     neutral: Neutral
     told: str
-    """From what it is known."""
+    """Origin of this knowledge, in words."""
 
 
 def unknown_colour() -> CameraColour:
-    """Of a camera of which nothing is known."""
+    """Return the colours of a camera of which nothing is known."""
     told = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
     return CameraColour(None, lambda led: np.ones(3), told)
 
 
 def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None) -> CameraColour:
-    """From tables of the sensor's sensitivities (nm, red, green, blue; relative to each other) and of the LEDs'
-    spectral power (nm, power). `white_of_leds` is what the channels measured of white, if a record has it.
+    """Compute the colours from tables of the sensor's sensitivities (nm, red, green, blue; relative to each other)
+    and of the LEDs' spectral power (nm, power). `white_of_leds` is what the channels measured of white, if a
+    record has it.
 
     Raises InputError for other tables, channels that do not tell colours apart, or without colour-science, which
     has the CIE's observer.
@@ -112,7 +114,7 @@ def _spectrum(path: Path, column: int) -> Floats:
 
 
 def colour_of_record(path: Path) -> CameraColour:
-    """By the matrix of a record of `coupole calibrate colour`, adapted from D50 to D65.
+    """Take the colours from the matrix of a record of `coupole calibrate colour`, adapted from D50 to D65.
 
     Raises InputError for another record, or one that missed its limits.
     """

@@ -31,10 +31,11 @@ from coupole.storage.durable import write_synced
 MODEL, PICTURES = "sparse/0", "images"
 MOST_POINTS = 50_000
 _MOST_FRAMES = 48
-"""Of a view, spread over its LEDs, whose mean is its picture: light from all sides, almost without shadows."""
+"""Greatest number of frames of a view, spread over its LEDs, whose mean is its picture: light from all sides,
+almost without shadows."""
 _WHITE_QUANTILE = 0.999
 _TO_CENTRE_PX = 0.5
-"""From our pixels to COLMAP's, in which the first one ends at 1."""
+"""Offset from our pixels to COLMAP's, in which the first one ends at 1."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class PosedPicture:
     """A view and the triangles' centres that it sees."""
 
     name: str
-    """Of its file."""
+    """Name of its file."""
     support_from_camera: Transform
     triangles: NDArray[np.int64]
     """[n] rising numbers."""

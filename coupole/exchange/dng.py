@@ -123,7 +123,8 @@ def _times(picture: Picture, number: int) -> list[Tag]:
 
 
 def _colour_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
-    """With colours: ColorMatrix1 gives of XYZ under D65 what the channels give under the LED."""
+    """Return the tags of colour. If colours are known, ColorMatrix1 gives from XYZ under D65 what the channels
+    give under the LED."""
     neutral = colour.neutral(picture.about.get("led"))
     matrix = np.eye(3)
     if colour.xyz_from_balanced is not None:

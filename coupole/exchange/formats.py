@@ -15,7 +15,7 @@ from coupole.errors import InputError
 
 
 class Source(Enum):
-    """What can be exported, as messages name it."""
+    """Kinds of sources that can be exported, as messages name them."""
 
     RUN = "a run"
     RESULT = "a result"
@@ -23,7 +23,7 @@ class Source(Enum):
 
 
 class Writer(Enum):
-    """What writes a format, and so what one file of it holds."""
+    """Kinds of writers of a format, named by what one file of it holds."""
 
     FRAMES = "a frame in each file"
     VIEWS = "a view with all its lights"
@@ -38,7 +38,7 @@ class Format:
 
     name: str
     gives: str
-    """What it is, in words for a list."""
+    """Description of the format, in words for a list."""
     writer: Writer
     sources: tuple[Source, ...]
     options: tuple[str, ...] = ()
@@ -84,11 +84,11 @@ _TABLE = (
     ),
 )
 FORMATS = {one.name: one for one in _TABLE}
-"""By name."""
+"""Formats by name."""
 
 
 def source_of(folder: Path) -> Source:
-    """Which kind of source a folder is, by the files that only one kind has."""
+    """Tell which kind of source a folder is, by the files that only one kind has."""
     if (folder / "object.h5").exists():
         return Source.RESULT
     return Source.PICTURES if (folder / "normals.npy").exists() else Source.RUN

@@ -1,4 +1,4 @@
-"""What pages and exports take of a result's materials."""
+"""Values that pages and exports take of a result's materials."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ Entity = dict[str, Any]
 
 @dataclass(frozen=True)
 class CrateFacts:
-    """What only its authors can say."""
+    """Facts that only the authors of a crate can say."""
 
     licence: str | None = None
     """A URL, or words; None: what the run's plan says."""
@@ -247,7 +247,7 @@ def _organisation(name: str) -> Entity:
 
 
 def _part_of_id(name: str) -> str:
-    """Of a URI; other names give other ids."""
+    """Encode a name as a part of a URI; other names give other ids."""
     return quote(name, safe="")
 
 

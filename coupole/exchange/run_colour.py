@@ -20,14 +20,14 @@ _HOW = "give a table of nm, power with --led-spectrum, or name it in the rig (do
 
 @dataclass(frozen=True)
 class ColourWanted:
-    """How frames are to be coloured."""
+    """Tables and records by which frames are to be coloured."""
 
     sensor: Path
     """Table of nm, red, green, blue."""
     leds: Path | None
     """Table of nm, power; None: the rig's."""
     records: tuple[Path, ...] = ()
-    """In place of those that the run names."""
+    """Records in place of those that the run names."""
 
 
 def colour_of_run(run: Run, wanted: ColourWanted) -> CameraColour:
@@ -43,7 +43,7 @@ def colour_of_run(run: Run, wanted: ColourWanted) -> CameraColour:
 
 
 def _measured_white(records: Sequence[Path]) -> Neutral | None:
-    """By the record of the LEDs' power, if one is named."""
+    """Return white by the record of the LEDs' power, if one is named."""
     named = [path for path in records if read_record(path).kind == "led-power"]
     if not named:
         return None

@@ -1,1 +1,1 @@
-"""What comes from outside: files, each read once, and others' JSON and YAML as plain data."""
+"""Input from outside: files, each read once, and others' JSON and YAML as plain data."""

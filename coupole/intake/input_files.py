@@ -52,7 +52,7 @@ class InputFiles:
         return self._read[key]
 
     def changes(self) -> list[str]:
-        """What happened on the disk to files since they were read, one sentence each; told once."""
+        """List what happened on the disk to files since they were read, one sentence each; each is told once."""
         found = [f"{path} {how}" for path, read in self._read.items() if (how := _change(path, read))]
         new = [sentence for sentence in found if sentence not in self._told]
         self._told |= set(new)
@@ -74,7 +74,7 @@ def _stamp(about: os.stat_result) -> tuple[int, ...]:
 
 
 def _change(path: Path, read: _Read) -> str:
-    """What is different now; empty if nothing is, or only the file's times are."""
+    """Return what is different now; empty if nothing is, or only the file's times are."""
     try:
         about = path.stat()
         if _stamp(about) == read.stamp:

@@ -19,9 +19,9 @@ from coupole.errors import InputError, Problem
 MOST_BYTES = 256 * 1024**2
 MAX_DEPTH = 100
 MAX_DIGITS = 40
-"""Of a whole number; 2^64 has 20."""
+"""Most digits of a whole number; 2^64 has 20."""
 MAX_VALUES = 1_000_000
-"""Of a YAML text, each alias counted as what it stands for."""
+"""Most values of a YAML text, each alias counted as what it stands for."""
 
 _STRING = re.compile(rb'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _OTHER_THAN_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))

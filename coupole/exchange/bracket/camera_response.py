@@ -26,7 +26,7 @@ _SMOOTH = 0.3
 _WIDE = 2.6
 """Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""
 _ROUNDS, _OUTLIER = 8, 4.0
-"""Of the fit; standard deviations from which on a sample counts for less in the next round."""
+"""Rounds of the fit; standard deviations from which on a sample counts for less in the next round."""
 _MIDDLE = NODES // 2
 
 
@@ -64,7 +64,7 @@ class Response:
 
 
 def linear_response(noise: Array) -> Response:
-    """Of a sensor whose values are proportional to exposure."""
+    """Return the response of a sensor whose values are proportional to exposure."""
     z = np.maximum(np.linspace(0.0, 1.0, NODES), 0.5 / NODES)
     curve = np.repeat((np.log(z) - np.log(z[_MIDDLE]))[:, None], 3, axis=1)
     return Response(curve, np.zeros((NODES, 3)), noise)
@@ -83,7 +83,7 @@ def found_response(photographs: Photographs) -> Response:
 
 
 def left_open(exposure_s: Array) -> str:
-    """What photographs of these times cannot tell of a response, in words; empty if they can.
+    """Return, in words, what photographs of these times cannot tell of a response; empty if they can tell all.
 
     With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts.
     """
@@ -153,7 +153,7 @@ def _left_over(samples: Array, weights: Array, g: Array, log_t: Array) -> tuple[
 
 
 def _normal_equations(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:
-    """Of g alone: each pixel's ln E is its weighted mean."""
+    """Return the normal equations of g alone: each pixel's ln E is its weighted mean."""
     place = np.clip(samples, 0.0, 1.0) * (NODES - 1)
     low = np.minimum(place.astype(int), NODES - 2)
     share = place - low

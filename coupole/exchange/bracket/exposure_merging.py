@@ -104,7 +104,7 @@ def _contradicting(
 
 
 def _median(logs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Over photographs, of what is no NaN."""
+    """Return the median over photographs, without NaN."""
     ordered = np.sort(logs, axis=0)  # NaN last
     last = np.maximum(np.isfinite(logs).sum(axis=0) - 1, 0)
     low, high = (np.take_along_axis(ordered, index[None], axis=0)[0] for index in (last // 2, (last + 1) // 2))

@@ -1,4 +1,4 @@
-"""What a merged bracket is written to: OpenEXR of linear values, and a picture of the camera's response."""
+"""Files of a merged bracket: OpenEXR of linear values, and a picture of the camera's response."""
 
 from __future__ import annotations
 

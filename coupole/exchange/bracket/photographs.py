@@ -19,7 +19,7 @@ _LEAST_RATIO = 1.2
 
 @dataclass(frozen=True)
 class Photographs:
-    """Of one scene, by rising exposure time."""
+    """Photographs of one scene, by rising exposure time."""
 
     paths: tuple[Path, ...]
     values: NDArray[np.float32]
@@ -27,9 +27,9 @@ class Photographs:
     exposure_s: NDArray[np.float64]
     """[photographs]."""
     levels: int
-    """That a value can have."""
+    """Number of levels that a value can have."""
     raw: bool
-    """Whether they are a sensor's values, without a transfer curve: a pixel for each 2 x 2 cells."""
+    """True if they are a sensor's values, without a transfer curve: a pixel for each 2 x 2 cells."""
 
 
 def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None = None) -> Photographs:
@@ -123,7 +123,7 @@ def _exif(path: Path) -> dict[int, float]:
 
 
 def _exif_of_raw(path: Path) -> dict[int, float]:
-    """Of raw files that are built as TIFF."""
+    """Read time, aperture and ISO of raw files that are built as TIFF."""
     import tifffile
 
     try:

@@ -72,7 +72,8 @@ class Samples:
 
 
 def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) -> Samples:
-    """Of linear pictures [h, w, 3], NaN where nothing is known; those near both horizons are left out.
+    """Take samples from linear pictures [h, w, 3], NaN where nothing is known. Samples near the horizon of the
+    light or of the camera are left out.
 
     Raises InputError where the sphere is not in the picture, or too few pixels say anything.
     """
@@ -104,7 +105,7 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
 
 
 def table_of(samples: Samples) -> SpecularTable:
-    """By least squares of log f, each sample as it is and with its directions exchanged."""
+    """Fit a table by least squares of log f, each sample as it is and with its directions exchanged."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 

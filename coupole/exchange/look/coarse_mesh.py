@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 MOST_TRIANGLES = 20_000
 _FINER = 1.25
-"""By how much more cells are there on a side at each further trial."""
+"""Factor by which there are more cells on a side at each further trial."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class CoarseMesh:
 def coarse_mesh(
     places: NDArray[np.uint16], triangles: NDArray[np.uint32], most: int = MOST_TRIANGLES
 ) -> CoarseMesh:
-    """Of places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most `most` triangles."""
+    """Make a coarse mesh from places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most
+    `most` triangles."""
     cells = 4.0
     found = _clustered(places, triangles, cells)
     while len(found.triangles) <= most and cells < 1 << 16:

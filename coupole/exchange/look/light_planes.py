@@ -66,8 +66,9 @@ def light_planes(
     say: Callable[[str, int, int], None],
     planes: int = PLANES,
 ) -> LightPlanes:
-    """Of frames [h, w, 3], shares of the camera's range, that `frame` reads by number, under LEDs towards `ways`
-    [n, 3]. Each frame is read twice, and seen once by `see`. Memory is for `planes` pictures of one channel.
+    """Find the planes of frames [h, w, 3], shares of the camera's range, that `frame` reads by number, under LEDs
+    towards `ways` [n, 3]. Each frame is read twice, and seen once by `see`. Memory is for `planes` pictures of one
+    channel.
     """
     count = len(ways)
     places = None

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 TYPES = ("uint8", "uint16", "uint32", "float16", "float32")
 LOG_LEAST, LOG_STEPS = 1e-4, 254
-"""Of `log_coded`: what 1 stands for, and steps from there to its `LOG_RATIO`-fold."""
+"""Codes of `log_coded`: the value of code 1, and steps from there to its `LOG_RATIO`-fold."""
 LOG_RATIO = 1e5
 _LARGEST_HALF = 65504.0
 _SAME_SIZE = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
 SCRIPT_BEGINS = "coupoleBlock("
-"""Of each block's script."""
+"""Beginning of each block's script."""
 
 
 def in_script(value: object) -> str:
@@ -42,25 +42,25 @@ class Block:
 
     @property
     def script(self) -> str:
-        """What a script tag has to say for the page to have it."""
+        """Text of a script tag by which the page has the block."""
         about = in_script({"name": self.name, "dtype": self.dtype, "shape": self.shape})
         return f'{SCRIPT_BEGINS}{about},"{self.text}");\n'
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a page shows."""
+    """Contents of a page."""
 
     about: dict[str, Any]
-    """What its scripts know of it; docs/reference/page.md."""
+    """Facts that its scripts know of it; docs/reference/page.md."""
     blocks: tuple[Block, ...]
-    """What its picture needs."""
+    """Blocks that its picture needs."""
     later: tuple[Block, ...] = ()
     """Blocks that a page reads when they are asked for."""
     first: tuple[Block, ...] = ()
     """Blocks of `first-` and a name of `blocks` that stand for them, and are few: for a first picture."""
     errors: dict[str, str] = field(default_factory=dict)
-    """What is lost by writing numbers short, by the name of a quantity."""
+    """Loss by writing numbers short, by the name of a quantity."""
 
 
 def block_of(name: str, values: NDArray[Any]) -> Block:

@@ -12,7 +12,7 @@ from coupole.exchange.look.look_blocks import Look
 from coupole.reflectance.new_light.environment import read_environment
 
 SAMPLES = 64
-"""As many as a page averages."""
+"""Number of directions that a page averages."""
 
 
 def with_environment(look: Look, path: Path | None, axes: NDArray[np.float64]) -> Look:

@@ -22,7 +22,7 @@ from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
 Floats = NDArray[np.float64]
 
 MOST_PX = 640
-"""Of a frame's longer side."""
+"""Greatest length of a frame's longer side."""
 DEGREE = 5
 _MOST_PLACES = 20_000
 _WHITE_QUANTILE = 0.999
@@ -31,7 +31,7 @@ _WHITE_QUANTILE = 0.999
 def frames_of_view(
     result: RunResult, view: ViewSamples, support_from_base: Floats
 ) -> tuple[dict[str, Any], list[Block]] | None:
-    """What the page knows of a view and its frames, and their pictures; None if the view has none."""
+    """Return what the page knows of a view and its frames, and their pictures; None if the view has none."""
     path = result.folder / FRAMES / view.path.name
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""What a page shows of a run that nothing was fitted to: its frames, and each view between its LEDs."""
+"""Contents of a page on a run that nothing was fitted to: its frames, and each view between its LEDs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ class Frames:
 
 
 def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
-    """Of the views of a run that match one of the patterns, or of all. Nominal places; no calibration is used.
+    """Return the page's contents for the views of a run that match one of the patterns, or for all. Places are
+    nominal; no calibration is used.
 
     Raises InputError: no run, no such view, too few LEDs; StorageError, ChecksumMismatch for damaged frames.
     """
@@ -159,7 +160,7 @@ def _ways(frames: Frames, leds: LedTable, target_mm: Floats) -> Floats:
 def _view(
     frames: Frames, name: str, ways: Floats, say: Said
 ) -> tuple[dict[str, Any], Block, list[Block], list[Block]]:
-    """What the page knows of a view; its block of lights; tiles; pictures of frames."""
+    """Return what the page knows of a view; its block of lights; tiles; pictures of frames."""
     leds = sorted(frames.chosen)
     shown: list[dict[str, Any]] = []
     pictures: list[Block] = []
@@ -242,8 +243,8 @@ def _missed_as_written(
 
 
 def _apart_deg(ways: Floats) -> float:
-    """How far a light may be from the nearest LED and still be between them: twice what nearly all have to their
-    nearest neighbour."""
+    """Return the greatest angle of a light to the nearest LED at which it is still between the LEDs: twice what
+    nearly all LEDs have to their nearest neighbour."""
     cosines = ways @ ways.T
     np.fill_diagonal(cosines, -1.0)
     nearest = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))

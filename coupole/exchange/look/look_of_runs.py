@@ -1,4 +1,5 @@
-"""What a page shows of a result of runs: the mesh, and for each triangle its material and how well it is known."""
+"""Contents of a page on a result of runs: the mesh, and for each triangle its material and how well it is
+known."""
 
 from __future__ import annotations
 
@@ -37,8 +38,9 @@ def look_of_result(
     coarse_over: int = MOST_TRIANGLES,
     planes: int = PLANES,
 ) -> Look:
-    """Of a whole result; a mesh of more than `coarse_over` triangles has a coarse one for the first picture. With
-    `planes` of the residual, if there is one, the material is the one that it is added to.
+    """Return the page's contents for a whole result. A mesh of more than `coarse_over` triangles has a coarse one
+    for the first picture. With `planes` of the residual, if there is one, the material is the one that the
+    residual is added to.
 
     Raises InputError if it is none, or has no material.
     """
@@ -136,8 +138,8 @@ def _first(
 
 
 def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
-    """Of corners [3 n, 3] of triangles: places [m, 3] in steps from an origin, without what is there twice, in the
-    order of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm."""
+    """Weld corners [3 n, 3] of triangles. Returns places [m, 3] in steps from an origin, each once, in the order
+    of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm."""
     origin_mm = corners_mm.min(axis=0)
     step_mm = max(float(np.ptp(corners_mm, axis=0).max()), 1e-6) / PLACES
     steps = np.rint((corners_mm - origin_mm) / step_mm).astype(np.uint64)

@@ -1,4 +1,4 @@
-"""What a page shows of a scene: its triangles, and tables of what their layers reflect under each illuminant."""
+"""Contents of a page on a scene: its triangles, and tables of what their layers reflect under each illuminant."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ class _Materials:
 
 
 def look_of_scene(scene: Scene, folder: Path) -> Look:
-    """Of a scene whose paths are relative to `folder`. Raises InputError, with what can be shown."""
+    """Return the page's contents for a scene whose paths are relative to `folder`. Raises InputError, with what
+    can be shown."""
     scene = with_plain_lights(scene, folder)
     found, face = _Materials(folder), None
     parts: list[_Part] = []
@@ -126,7 +127,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
 
 
 def told(material: Material) -> str:
-    """In a few words, without what is as usual."""
+    """Describe a material in a few words, without what is as usual."""
     values = material.model_dump(mode="json", exclude_defaults=True)
     values.pop("kind", None)
     return f"{material.kind} {', '.join(f'{name} {_plain(value)}' for name, value in values.items())}".strip()

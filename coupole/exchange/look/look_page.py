@@ -20,7 +20,7 @@ from coupole.exchange.look.look_blocks import SCRIPT_BEGINS, Block, Look, in_scr
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 
 MOST_BYTES = 25_000_000
-"""Of a page that stands alone."""
+"""Greatest size of a page that stands alone."""
 _EARLY_BYTES = 3_000_000
 SCRIPTS = (
     "vectors.js",
@@ -47,7 +47,7 @@ SCRIPTS = (
     "app.js",
     "main.js",
 )
-"""In the order in which they are read."""
+"""Scripts in the order in which they are read."""
 SHADERS = (
     "common.glsl",
     "surface.vert",
@@ -118,7 +118,8 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
 
 
 def _early(look: Look, inside: list[Block]) -> int:
-    """How many of what is inside stand before the scripts, so that they begin with them while the rest is read."""
+    """Count the blocks inside the page that stand before the scripts: the scripts begin with them while the rest
+    is read."""
     if look.first:
         return 0
     sizes = accumulate(len(block.script) for block in inside)
@@ -126,8 +127,8 @@ def _early(look: Look, inside: list[Block]) -> int:
 
 
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
-    """Those that go into the page, and those that go beside it: all of what a page needs to begin, or none of it;
-    then as many of the others as have room, in their order."""
+    """Share out the blocks: those that go into the page, and those that go beside it. All that a page needs to
+    begin goes into it, or none of it; then as many of the others as have room, in their order."""
     needed = sum(len(block.script) for block in (*look.first, *look.blocks))
     free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - needed
     if free < 0:
@@ -159,7 +160,7 @@ def _earlier(data: Path) -> list[Path]:
 
 
 def _is_script(path: Path) -> bool:
-    """Whether a file is one of a page's data."""
+    """Tell whether a file is one of a page's data."""
     if path.suffix != ".js" or path.is_symlink() or not path.is_file():
         return False
     with path.open("rb") as file:

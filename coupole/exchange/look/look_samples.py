@@ -20,7 +20,7 @@ _BAND, _LEDS = 4096, 8
 """Triangles and LEDs that are read together: as they lie in the file."""
 _QUANTILE_95 = 1.959964
 _FAR = 10.0
-"""Of an end that is not bounded: the greatest that is written."""
+"""Greatest value that is written for an end of an interval that is not bounded."""
 
 
 def samples_of_result(
@@ -29,7 +29,7 @@ def samples_of_result(
     scan_noise_um: float,
     say: Callable[[str, int, int], None],
 ) -> tuple[list[dict[str, Any]], list[Block]]:
-    """What the page knows of the samples of all views, and their blocks."""
+    """Return what the page knows of the samples of all views, and their blocks."""
     told, blocks = [], []
     for view in result.views:
         of_view, mine = samples_of_view(result, view, support_from_base, scan_noise_um, say)
@@ -45,9 +45,10 @@ def samples_of_view(
     scan_noise_um: float,
     say: Callable[[str, int, int], None],
 ) -> tuple[dict[str, Any], list[Block]]:
-    """What the page knows of a view's samples, and its blocks: the numbers of triangles, places of LEDs, and of
-    `ROWS` triangles [3, ROWS, leds] codes of the channels' mean f cos_i, and of how far below and above it, as
-    shares of it, its 95 % interval ends: by all sources, as if all channels were off to the same side.
+    """Return what the page knows of a view's samples, and its blocks. These are the numbers of triangles, places
+    of LEDs, and for each `ROWS` triangles codes [3, ROWS, leds]: the channels' mean f cos_i, and how far below and
+    above it its 95 % interval ends, as shares of it. The interval is by all sources, as if all channels were off
+    to the same side.
 
     Raises InputError for samples that an earlier version made.
     """

@@ -25,7 +25,7 @@ class Tile:
     """[n, TILE_PX, TILE_PX]"""
 
     def name(self, of: str) -> str:
-        """Of its block."""
+        """Return the name of its block."""
         return f"{of}-{self.level}-{self.column}-{self.row}"
 
 
@@ -38,7 +38,7 @@ def levels_of(width: int, height: int) -> list[list[int]]:
 
 
 def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
-    """Of a picture's values [n, h, w], NaN where there is none."""
+    """Give the tiles of a picture's values [n, h, w], NaN where there is none."""
     height, width = values.shape[1:]
     for level, _ in enumerate(levels_of(width, height)):
         if level:

@@ -1,4 +1,4 @@
-"""What GGX leaves of each triangle, for a page: a few principal components of all residuals of a view.
+"""Residuals that GGX leaves of each triangle, for a page: a few principal components of all residuals of a view.
 
 A result's fit `ggx_rbf` gives each triangle, seen by one view, a share of its GGX and a hundred radial functions
 of the light's direction (`coupole.reflectance.slice_fit`). These are taken apart into components in the metric of
@@ -30,23 +30,23 @@ Floats = NDArray[np.float64]
 
 FIT = SLICES["ggx_rbf"]
 PLANES = 9
-"""By default: with three shares of GGX they fill whole groups of four bytes."""
+"""Planes by default: with three shares of GGX they fill whole groups of four bytes."""
 SIDE = 48
-"""Of a plane's table."""
+"""Side of a plane's table."""
 _STEPS = 127
 _SHARE_STEPS = 254
 _LEARNT, _JUDGED = 20_000, 1500
 """Triangles of a view that planes are found by, and that they are judged by."""
 _BLOCK = 1 << 14
 _DIRECTIONS = 600
-"""Of lights all around, by which planes are judged."""
+"""Directions of lights all around, by which planes are judged."""
 _FAR_MM = 1e5
 
 
 @dataclass(frozen=True)
 class ResidualPlanes:
-    """Of a view's triangles: f cos_i = max(share f_GGX cos_i + z sum_k number_k plane_k(light), 0), with z the
-    cosine of the light to the mesh's normal."""
+    """Planes of a view's triangles: f cos_i = max(share f_GGX cos_i + z sum_k number_k plane_k(light), 0), with z
+    the cosine of the light to the mesh's normal."""
 
     planes: NDArray[np.float16]
     """[planes, SIDE, SIDE, 3] 1/sr by y and x of `table_directions`, times the greatest number of the plane."""
@@ -68,8 +68,8 @@ def residual_fit(result: RunResult) -> str | None:
 def residual_blocks(
     result: RunResult, planes: int, say: Callable[[str, int, int], None]
 ) -> tuple[dict[str, Any], list[Block]]:
-    """What a page knows of residuals, and two blocks of each view: codes [3 + planes, triangles of the mesh] and
-    planes. `kept` is the share of the energy of all views' residuals."""
+    """Return what a page knows of residuals, and two blocks of each view: codes [3 + planes, triangles of the
+    mesh] and planes. `kept` is the share of the energy of all views' residuals."""
     views, blocks, missed, energy = [], [], 0.0, 0.0
     support_from_base = inverse(result.base_from_support)
     for number, view in enumerate(result.views):
@@ -123,8 +123,8 @@ def table_directions() -> Floats:
 
 
 def _components(learnt: Floats, count: int) -> tuple[Floats, Floats]:
-    """Of coefficients [n, channels, COUNT]: rows [count, channels * COUNT] that give numbers of components, and
-    back: coefficients of each component. Where there are fewer, the rest is 0."""
+    """Find the components of coefficients [n, channels, COUNT]. Returns rows [count, channels * COUNT] that give
+    numbers of components, and back: coefficients of each component. Where there are fewer, the rest is 0."""
     channels = learnt.shape[1]
     root = _metric()
     apart = (learnt @ root).reshape(len(learnt), -1)

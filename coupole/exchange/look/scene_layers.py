@@ -27,9 +27,9 @@ from coupole.errors import InputError
 
 ANGLES = 33
 COSINES: Array = np.maximum(np.linspace(0.0, 1.0, ANGLES) ** 2, 1e-9)
-"""Of angles of incidence at which a table has values; their roots have equal steps."""
+"""Cosines of the angles of incidence at which a table has values; their roots have equal steps."""
 LAYERS = 2
-"""Of each material."""
+"""Layers of each material."""
 COLUMNS = ANGLES + 2
 PATHS = 17
 """Lengths of way through lacquer for which a flake has values, from 0 to the longest."""

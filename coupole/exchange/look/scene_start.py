@@ -1,4 +1,4 @@
-"""Where a page of a scene begins: the scene's first camera, and its lights as the page has them."""
+"""Start of a page of a scene: the scene's first camera, and its lights as the page has them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Lamp:
 
     to_light: Array
     illuminance_lux: float
-    """On what faces it."""
+    """Illuminance on what faces the light."""
     radius_deg: float
     spectrum: Power
 
@@ -47,7 +47,7 @@ def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
 
 
 def named(spectrum: Power) -> str:
-    """As the page names it."""
+    """Return the name that the page has for a spectrum."""
     match spectrum:
         case Illuminant() | Source() | Values():
             return spectrum.name

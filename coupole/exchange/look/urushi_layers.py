@@ -26,7 +26,7 @@ from coupole.errors import InputError
 from coupole.exchange.look.scene_layers import ANGLES, COSINES, Layer
 
 _TRIANGLES = 200_000
-"""Of a body that is drawn on: about."""
+"""Approximate number of triangles of a body that is drawn on."""
 _FACE_ROUGHNESS = 0.02
 _RADIUS_SPREAD = 0.3
 """`nashiji.Slab.radius_spread`: flakes' areas are on average larger than that of the median radius."""

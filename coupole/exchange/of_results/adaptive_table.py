@@ -35,7 +35,7 @@ SIDES = (24, 32, 48, 64, 96, 128, 192)
 CROWDINGS = (1.0, 1.3)
 """Angles of incidence are pi/2 (1 - (1 - t)^c) of even steps t."""
 SHARE = 0.95
-"""Of the pairs of directions that miss less than is asked."""
+"""Share of the pairs of directions that miss less than is asked."""
 _NDF_NODES = 2048
 _PAIRS, _LOWEST_Z = 2000, 0.1
 
@@ -91,11 +91,11 @@ class AdaptiveTable:
 
     @property
     def size_bytes(self) -> int:
-        """Of the file, but for its small fields."""
+        """Size of the file, but for its small fields."""
         return 4 * 4 * self.thetas * self.side**2
 
     def read(self) -> RglTable:
-        """As readers of the file have it."""
+        """Return the table as readers of the file have it."""
         planes = np.ascontiguousarray(np.moveaxis(self.rgb, 2, -1))
         flat = np.ones((1, self.thetas, 2, 2))
         quarter = np.full((2, 2), 0.25)
@@ -148,7 +148,7 @@ def _smallest(material: Material, most_error: float, checked: tuple[Checked, ...
 
 
 def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
-    """With the next number of angles of incidence, of half vectors, or both, crowded or not."""
+    """Give tables with the next number of angles of incidence, of half vectors, or both, crowded or not."""
     thetas = [n for n in THETAS if n > table.thetas][:1]
     sides = [n for n in SIDES if n > table.side][:1]
     for crowding in CROWDINGS:
@@ -167,7 +167,8 @@ def _missed(table: AdaptiveTable, checked: tuple[Checked, ...]) -> Floats:
 
 
 def _pairs(material: Material) -> Iterator[Checked]:
-    """Of all directions alike, and of those about the mirror direction, by half vectors drawn from GGX's D."""
+    """Give pairs of directions: first of all directions alike, then about the mirror direction, by half vectors
+    drawn from GGX's D."""
     random = np.random.default_rng(1)
     ways = random.normal(size=(2, 2 * _PAIRS, 3))
     ways[..., 2] = np.abs(ways[..., 2])

@@ -15,7 +15,7 @@ from coupole.exchange.of_results.triangle_samples import SamplesOfTriangle, chan
 from coupole.storage.durable import write_synced
 
 _QUANTILE = 1.959964
-"""Of 95 %."""
+"""Quantile of the normal distribution for 95 %."""
 _OPEN = float(np.finfo(np.float32).max)
 
 

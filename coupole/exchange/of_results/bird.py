@@ -25,7 +25,7 @@ SCHEMA = (
     "https://raw.githubusercontent.com/BiRD-project/BiRD_view/master/BRDF_JSON_schema/brdf_json_schema_v1.0.json"
 )
 _DECIMALS = 6
-"""Of degrees."""
+"""Decimals of angles in degrees."""
 _NOT_SAID = "NA"
 """The format's own word."""
 _NOBODY = "not-stated@example.invalid"

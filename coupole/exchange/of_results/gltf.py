@@ -22,7 +22,7 @@ from coupole.exchange.srgb import srgb
 from coupole.storage.durable import write_synced
 
 _F0 = 0.04
-"""Of an index of 1.5."""
+"""Reflectance at normal incidence of an index of 1.5."""
 _NEAREST, _CLAMP = 9728, 33071
 _FLOAT, _ARRAY_BUFFER = 5126, 34962
 _JSON, _BIN = 0x4E4F534A, 0x004E4942

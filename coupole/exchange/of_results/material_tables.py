@@ -20,7 +20,7 @@ _MOST = 64
 
 @dataclass(frozen=True)
 class Material:
-    """Of one triangle, or of a cluster of triangles."""
+    """Material of one triangle, or of a cluster of triangles."""
 
     name: str
     kd: Floats
@@ -38,8 +38,8 @@ class Material:
 
 
 def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
-    """Those of the chosen triangles, else those of all clusters. Raises InputError if a triangle has none, or if
-    nothing is chosen and there are no clusters, or too many."""
+    """Give the materials of the chosen triangles, else those of all clusters. Raises InputError if a triangle has
+    none, or if nothing is chosen and there are no clusters, or too many."""
     chosen_triangles(surface, optional=True)
     for number in surface.chosen:
         yield Material(f"triangle{number}", surface.kd[number], surface.ks[number], float(surface.alpha[number]))

@@ -1,4 +1,4 @@
-"""What exporters take of a result of runs: the whole mesh, and for each triangle what is known of it."""
+"""Surface that exporters take of a result of runs: the whole mesh, and for each triangle what is known of it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from coupole.reflectance.run_result import RunResult, read_about
 Floats = NDArray[np.float64]
 _LEAST_PASSED = 0.05
 Y_UP_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""For the programs of computer graphics, in which y is up."""
+"""Rotation for the programs of computer graphics, in which y is up."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,15 @@ class MeasuredSurface:
 
     @property
     def remark(self) -> str:
-        """What files say of themselves, where their format lets them."""
+        """Remark of files on themselves, where their format lets them."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
         return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
 
 
 def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] = ()) -> MeasuredSurface:
-    """Of a whole result, with the material fit that missed least unless it is named. Raises InputError if there is
-    no such fit."""
+    """Read the surface of a whole result, with the material fit that missed least unless a fit is named. Raises
+    InputError if there is no such fit."""
     about = read_about(folder)
     result = RunResult(folder)
     name = fit or best_fit(result, MATERIALS)

@@ -32,8 +32,8 @@ def encode(material: Material) -> bytes:
 
 
 def encode_reflectance(reflectance: Callable[[Floats, Floats], Floats]) -> bytes:
-    """Of a function of unit directions [n, 3] to light and viewer, 1/sr [n, 3]: its values in the middle of each
-    step."""
+    """Encode a function of unit directions [n, 3] to light and viewer, 1/sr [n, 3]: its values in the middle of
+    each step."""
     theta_h = 0.5 * np.pi * ((np.arange(SIZE[0]) + 0.5) / SIZE[0]) ** 2
     theta_d = 0.5 * np.pi * (np.arange(SIZE[1]) + 0.5) / SIZE[1]
     phi_d = np.pi * (np.arange(SIZE[2]) + 0.5) / SIZE[2]

@@ -16,7 +16,7 @@ from coupole.reflectance.sample_uncertainty import bounds
 
 @dataclass(frozen=True)
 class SamplesOfTriangle:
-    """Of all views and LEDs that gave one; n of them."""
+    """Samples of one triangle, of all views and LEDs that gave one; n of them."""
 
     towards_light: Floats
     """[n, 3] unit; z is the mesh's normal, x lies where the support's x axis falls on the triangle."""

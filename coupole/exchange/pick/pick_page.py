@@ -16,10 +16,11 @@ from coupole.exchange.look.look_blocks import in_script
 from coupole.scan.simplify import simplified
 
 MOST_TRIANGLES = 100_000
-"""Of a page; a finer mesh is simplified, and takes its parts from the nearest triangle."""
+"""Greatest number of triangles of a page. A finer mesh is simplified, and takes its parts from the nearest
+triangle."""
 SCRIPTS = ("surface.js", "brush.js", "parts.js", "pick.js")
 _SHARED = ("vectors.js", "camera.js")
-"""Of the page to relight."""
+"""Scripts of the page to relight."""
 
 
 def write_pick_page(

@@ -18,7 +18,7 @@ from coupole.storage.run import Run
 
 @dataclass(frozen=True)
 class HowShown:
-    """What the formats leave open."""
+    """Options that the formats leave open."""
 
     basis: str = relight_web.BASES[0]
     planes: int = relight_web.PLANES[0]

@@ -26,7 +26,7 @@ EXAMPLE_URL = "https://example.org/iiif"
 _OF_ADDRESSES = re.compile(r"(?:[A-Za-z0-9\-._~:/?#\[\]@!$&'()*+,;=]|%[0-9A-Fa-f]{2})+")
 _TILE_PX = 512
 _LARGEST_WHOLE_PX = 1024
-"""Of the scaled pictures that can be had in one piece, besides the full one."""
+"""Largest size of the scaled pictures that can be had in one piece, besides the full one."""
 _QUALITY = 92
 _RAKING_ELEVATION_DEG = 25.0
 _SIDES = {"left": (-1.0, 0.0), "top": (0.0, 1.0), "right": (1.0, 0.0), "bottom": (0.0, -1.0)}
@@ -178,8 +178,8 @@ def _text(words: str) -> dict[str, list[str]]:
 
 
 def checked_base(base_url: str) -> str:
-    """Without slashes at its end. Raises InputError if it is no http address, or has what addresses do not hold
-    (RFC 3986, appendix A)."""
+    """Return the base without slashes at its end. Raises InputError if it is no http address, or has what
+    addresses do not hold (RFC 3986, appendix A)."""
     try:
         parts = urlsplit(base_url)
         fits = parts.scheme in ("http", "https") and parts.hostname and (parts.port or 1) > 0

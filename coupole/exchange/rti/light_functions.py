@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 _KERNEL = "linear"
 _DENSE_PER_NODE = 20
 _UNLIT_WEIGHT = 0.03
-"""Of directions far from any light, where interpolation says little, beside those among the lights."""
+"""Weight of directions far from any light, where interpolation says little, beside those among the lights."""
 
 
 def ptm(directions: Floats) -> Floats:

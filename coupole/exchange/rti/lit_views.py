@@ -26,7 +26,7 @@ Picture = NDArray[np.float32]
 Said = Callable[[str, int, int], None]
 
 WHITE_QUANTILE = 0.999
-"""Of the brightest value of each pixel under any light: what is white."""
+"""Quantile that counts as white, of the brightest value of each pixel under any light."""
 _BATCH = 8
 """Pictures that are held at a time."""
 _BLOCK = 1 << 16
@@ -59,7 +59,7 @@ class LitView:
         return encoded
 
     def some_pixels(self, most: int) -> slice:
-        """At equal steps, in the order of rows."""
+        """Choose pixels at equal steps, in the order of rows."""
         return slice(None, None, -(-self.size_px[0] * self.size_px[1] // most))
 
     def samples(self, pixels: slice, say: Said) -> Picture:
@@ -151,7 +151,7 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
 
 
 def _seen(*, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any) -> LitView:
-    """With the lights that viewers can have, those above the picture's plane, and white 1."""
+    """Return the view with the lights that viewers can have, those above the picture's plane, and white 1."""
     above = np.flatnonzero(directions[:, 2] > 0.0)
     if len(above) < FEWEST_LIGHTS:
         raise InputError(

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 RESOLUTION = 20
 """Nodes of the bilinear grid a side; docs/decisions/0037-rti-exports.md tells why not 8."""
 SIGMA = 0.125
-"""Of Gaussians between lights, in unit vectors: relight's own default."""
+"""Width of Gaussians between lights, in unit vectors: relight's own default."""
 _LEAST_SINGULAR = 1e-4
 
 
@@ -39,7 +39,7 @@ class PlaneCode:
     base: Floats
     """[lights, 3]"""
     about: dict[str, Any]
-    """What `info.json` says of the functions."""
+    """Facts that `info.json` says of the functions."""
     ranges: tuple[float, ...] = ()
     """[planes] by which tables of functions were multiplied to be of 8 bit; empty without tables."""
 
@@ -64,8 +64,8 @@ def eight_bits(values: Picture, low: Any, scale: Any) -> NDArray[np.uint8]:
 
 
 def of_terms(terms: Floats, name: str) -> PlaneCode:
-    """Of functions [lights, terms] that all pixels and channels share: plane 3 t + c has term t of channel c, by
-    least squares over the lights."""
+    """Return the code of functions [lights, terms] that all pixels and channels share: plane 3 t + c has term t of
+    channel c, by least squares over the lights."""
     lights, count = terms.shape
     if np.linalg.matrix_rank(terms, tol=_LEAST_SINGULAR * np.sqrt(lights)) < count:
         raise InputError(f"{name}: {lights} lights at these directions do not determine {count} coefficients")
@@ -79,8 +79,8 @@ def of_terms(terms: Floats, name: str) -> PlaneCode:
 
 
 def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int) -> PlaneCode:
-    """Of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`): functions of light are
-    tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
+    """Return the code of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`). Functions
+    of light are tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
     count = len(lights)
     seen = samples[:, samples.any(axis=(0, 2))]
     values = seen.transpose(1, 0, 2).reshape(seen.shape[1], -1)

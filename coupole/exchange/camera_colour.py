@@ -23,14 +23,14 @@ Neutral = Callable[[int | None], Floats]
 """[3] of white under an LED, by its id: what the channels give, the greatest 1."""
 
 _NOISE = 0.02
-"""Share of a table's greatest value by which it may fall below 0."""
+"""Share of a table's greatest value by which a value may fall below 0."""
 D65_CODE = 21
 """EXIF's LightSource."""
 _LARGEST_CONDITION = 1e5
 """Largest condition number of the covariance of what the channels give of reflectances; that of real sensors is
 below 1e4."""
 _CORRELATED_NM = 50.0
-"""Correlation of reflectances: the standard deviation of their covariance over wavelength."""
+"""Correlation length of reflectances: the standard deviation of their covariance over wavelength."""
 
 
 @dataclass(frozen=True)

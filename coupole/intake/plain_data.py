@@ -1,8 +1,8 @@
 """JSON, and YAML that is no plan or rig, as plain data: the one place where others' files and messages are parsed.
 
-Whoever wrote a text, it ends in data or in an InputError with file, line and column: also for text that is not
-UTF-8, lists in lists in lists, numbers of thousands of digits, NaN, and aliases that multiply each other, which
-would end in Python's own errors, or in a traceback elsewhere, much later. Plans and rigs are read by
+Every text gives data or an InputError with file, line and column. This holds also for text that is not UTF-8,
+lists in lists in lists, numbers of thousands of digits, NaN, and aliases that multiply each other, which would end
+in Python's own errors, or in a traceback elsewhere, much later. Plans and rigs are read by
 `coupole.plan.yamlfile`, which knows the place of each key; pydantic's own reader of JSON has such limits already.
 """
 
@@ -19,9 +19,9 @@ from coupole.errors import InputError, Problem
 MOST_BYTES = 256 * 1024**2
 MAX_DEPTH = 100
 MAX_DIGITS = 40
-"""Most digits of a whole number; 2^64 has 20."""
+"""Greatest number of digits of a whole number; 2^64 has 20."""
 MAX_VALUES = 1_000_000
-"""Most values of a YAML text, each alias counted as what it stands for."""
+"""Greatest number of values of a YAML text, each alias counted as what it stands for."""
 
 _STRING = re.compile(rb'"(?:[^"\\]|\\.)*"', re.DOTALL)
 _OTHER_THAN_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))

@@ -256,8 +256,8 @@ def _first_pose(sight: Sight, intrinsics: Intrinsics) -> Transform:
 
 
 def nominal_intrinsics(rig: Rig) -> Intrinsics:
-    """Return the lens's intrinsics by its maker's figures, focused as the rig says. The image distance is 1 / (1/f
-    - 1/focus)."""
+    """Return the lens's intrinsics by its maker's figures, focused as the rig says. The image distance is
+    1 / (1/f - 1/focus)."""
     lens, sensor = rig.lens, rig.sensor
     image_mm = 1.0 / (1.0 / lens.focal_length_mm - 1.0 / lens.focus_distance_mm)
     focal_px = image_mm * 1e3 / sensor.pixel_pitch_um

@@ -29,7 +29,7 @@ class Photographs:
     levels: int
     """Number of levels that a value can have."""
     raw: bool
-    """True if they are a sensor's values, without a transfer curve: a pixel for each 2 x 2 cells."""
+    """True if the values are a sensor's, without a transfer curve: a pixel for each 2 x 2 cells."""
 
 
 def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None = None) -> Photographs:

@@ -42,7 +42,7 @@ class Block:
 
     @property
     def script(self) -> str:
-        """Text of a script tag by which the page has the block."""
+        """Text of the script tag that gives the page this block."""
         about = in_script({"name": self.name, "dtype": self.dtype, "shape": self.shape})
         return f'{SCRIPT_BEGINS}{about},"{self.text}");\n'
 
@@ -52,7 +52,7 @@ class Look:
     """Contents of a page."""
 
     about: dict[str, Any]
-    """Facts that its scripts know of it; docs/reference/page.md."""
+    """Facts about the page that its scripts know; docs/reference/page.md."""
     blocks: tuple[Block, ...]
     """Blocks that its picture needs."""
     later: tuple[Block, ...] = ()
@@ -60,7 +60,7 @@ class Look:
     first: tuple[Block, ...] = ()
     """Blocks of `first-` and a name of `blocks` that stand for them, and are few: for a first picture."""
     errors: dict[str, str] = field(default_factory=dict)
-    """Loss by writing numbers short, by the name of a quantity."""
+    """Errors that come from writing numbers short, by the name of a quantity."""
 
 
 def block_of(name: str, values: NDArray[Any]) -> Block:

@@ -127,7 +127,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
 
 
 def told(material: Material) -> str:
-    """Describe a material in a few words, without what is as usual."""
+    """Describe a material in a few words, without values that are the defaults."""
     values = material.model_dump(mode="json", exclude_defaults=True)
     values.pop("kind", None)
     return f"{material.kind} {', '.join(f'{name} {_plain(value)}' for name, value in values.items())}".strip()

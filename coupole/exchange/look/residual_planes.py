@@ -30,16 +30,16 @@ Floats = NDArray[np.float64]
 
 FIT = SLICES["ggx_rbf"]
 PLANES = 9
-"""Planes by default: with three shares of GGX they fill whole groups of four bytes."""
+"""Default number of planes: with three shares of GGX they fill whole groups of four bytes."""
 SIDE = 48
-"""Side of a plane's table."""
+"""Number of entries on a side of a plane's table."""
 _STEPS = 127
 _SHARE_STEPS = 254
 _LEARNT, _JUDGED = 20_000, 1500
 """Triangles of a view that planes are found by, and that they are judged by."""
 _BLOCK = 1 << 14
 _DIRECTIONS = 600
-"""Directions of lights all around, by which planes are judged."""
+"""Number of lights all around, by which planes are judged."""
 _FAR_MM = 1e5
 
 
@@ -124,7 +124,8 @@ def table_directions() -> Floats:
 
 def _components(learnt: Floats, count: int) -> tuple[Floats, Floats]:
     """Find the components of coefficients [n, channels, COUNT]. Returns rows [count, channels * COUNT] that give
-    numbers of components, and back: coefficients of each component. Where there are fewer, the rest is 0."""
+    numbers of components, and the way back: coefficients of each component. Where there are fewer, the rest is
+    0."""
     channels = learnt.shape[1]
     root = _metric()
     apart = (learnt @ root).reshape(len(learnt), -1)

@@ -29,7 +29,7 @@ ANGLES = 33
 COSINES: Array = np.maximum(np.linspace(0.0, 1.0, ANGLES) ** 2, 1e-9)
 """Cosines of the angles of incidence at which a table has values; their roots have equal steps."""
 LAYERS = 2
-"""Layers of each material."""
+"""Number of layers of each material."""
 COLUMNS = ANGLES + 2
 PATHS = 17
 """Lengths of way through lacquer for which a flake has values, from 0 to the longest."""

@@ -32,7 +32,7 @@ class _Lamp:
 
     to_light: Array
     illuminance_lux: float
-    """Illuminance on what faces the light."""
+    """Illuminance on a surface that faces the light."""
     radius_deg: float
     spectrum: Power
 

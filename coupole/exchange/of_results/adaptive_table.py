@@ -91,7 +91,7 @@ class AdaptiveTable:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the file, but for its small fields."""
+        """Size of the file without its small fields."""
         return 4 * 4 * self.thetas * self.side**2
 
     def read(self) -> RglTable:

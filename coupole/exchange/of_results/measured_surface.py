@@ -65,7 +65,7 @@ class MeasuredSurface:
 
     @property
     def remark(self) -> str:
-        """Remark of files on themselves, where their format lets them."""
+        """Remark that files make on themselves, where their format lets them."""
         kind = "simulated" if self.about.get("simulated") else "measured"
         version, runs = self.about["software"]["coupole"], ", ".join(sorted(self.about["runs"]))
         return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"

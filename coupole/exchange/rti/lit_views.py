@@ -26,7 +26,7 @@ Picture = NDArray[np.float32]
 Said = Callable[[str, int, int], None]
 
 WHITE_QUANTILE = 0.999
-"""Quantile that counts as white, of the brightest value of each pixel under any light."""
+"""Quantile of the pixels' brightest values (under any light) that counts as white."""
 _BATCH = 8
 """Pictures that are held at a time."""
 _BLOCK = 1 << 16

@@ -39,7 +39,7 @@ class PlaneCode:
     base: Floats
     """[lights, 3]"""
     about: dict[str, Any]
-    """Facts that `info.json` says of the functions."""
+    """Facts about the functions, for `info.json`."""
     ranges: tuple[float, ...] = ()
     """[planes] by which tables of functions were multiplied to be of 8 bit; empty without tables."""
 

@@ -1,1 +1,1 @@
-"""From measured spectra to materials."""
+"""Analysis of materials from measured spectra."""

@@ -1,4 +1,4 @@
-"""Which classes three or so numbers of a camera leave: few of them can be told apart, and that is the answer.
+"""Classes that three or so numbers of a camera leave possible: few can be told apart, and that is the answer.
 
 A camera's channel is the mean of reflectance over its sensitivity and the light (`spectra.channels`). Every
 reference is seen at every concentration, K/S by factors of 1/4 to 16; classes that meet the channels within their
@@ -31,10 +31,10 @@ _WITHIN = {1: 3.84, 2: 5.99, 3: 7.81}
 
 @dataclass(frozen=True)
 class ChannelFinding:
-    """What the channels leave."""
+    """Classes that the channels leave possible."""
 
     candidates: tuple[Candidate, ...]
-    """Of each class the nearest reference, best first; probabilities among the library's classes."""
+    """Nearest reference of each class, best first; probabilities among the library's classes."""
     not_told_apart: tuple[str, ...]
     """Classes that meet the channels, best first; none if the library has no such colour."""
 

@@ -66,18 +66,18 @@ class ClassModel:
         return nearest
 
     def is_known(self, probabilities: Array) -> NDArray[np.bool_]:
-        """Whether the library has the class, of rows [q, classes + 1]."""
+        """Tell whether the library has the class, for rows [q, classes + 1]."""
         known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
         return known
 
     def is_sure(self, probabilities: Array) -> NDArray[np.bool_]:
-        """Whether the first class is probable enough if the library has the class."""
+        """Tell whether the first class is probable enough if the library has the class."""
         sure: NDArray[np.bool_] = probabilities[:, :-1].max(axis=1) >= _SURE * (1.0 - probabilities[:, -1])
         return sure
 
     @cached_property
     def held_out(self) -> HeldOut:
-        """Of the references as they were measured."""
+        """Held-out probabilities of the references as they were measured."""
         one, all_of_class = (_probabilities(found[: len(self._classes)], self._scale) for found in self._left_out)
         return HeldOut(one, all_of_class)
 

@@ -1,4 +1,4 @@
-"""How far apart two reflectances look under several lights: CIEDE2000, and the special index of metamerism."""
+"""Colour difference of two reflectances under several lights: CIEDE2000, and the special index of metamerism."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coupole.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Under one light."""
+    """Colours and difference of the pair under one light."""
 
     light: str
     delta_e00: float
@@ -28,7 +28,7 @@ class Match:
 def matches(
     target: Array, recipe: Array, lights: Sequence[str], observer: light.Observer = "10 deg"
 ) -> tuple[Match, ...]:
-    """Of reflectances [81], as seen in air; ends that are NaN are held.
+    """Compare reflectances [81], as seen in air, under each light. Ends that are NaN have the nearest known value.
 
     The special index (CIE 15:2004, 9.2.2.3) corrects the recipe's XYZ by the ratios that make it equal to the
     target under the first light. CIEDE2000 is colour-science's. Raises InputError for an unknown light.

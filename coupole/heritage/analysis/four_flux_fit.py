@@ -24,7 +24,7 @@ from coupole.heritage.analysis import layer_fit
 from coupole.heritage.analysis.layer_fit import Coefficients, Film
 
 DRAWS = 150
-"""Of all inputs, for uncertainties (JCGM 101)."""
+"""Number of draws of all inputs, for uncertainties (JCGM 101)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class FourFlux:
 
 
 def fit(black: Film, white: Film, directional: Directional, face: Face, noise: float, seed: int = 1) -> FourFlux:
-    """Of one film over two grounds; thickness, grounds and their uncertainties are those of the diffuse
-    `Film`s."""
+    """Fit the four fluxes of one film over two grounds. Thickness, grounds and their uncertainties are those of
+    the diffuse `Film`s."""
     rng = np.random.default_rng(seed)
     n = len(black.seen)
 

@@ -1,9 +1,9 @@
-"""Which class of pigments a reflectance spectrum shows, or that the library has none for it.
+"""Identification of the class of pigments that a reflectance spectrum shows; the library may have none for it.
 
 The library's classes have probabilities, and so has none of them (`class_model`). "match": the class is in the
 library, and it is this one; "ambiguous": it is one of several; "mixture": two references explain the spectrum
-together, and none alone (`unmixing`); "unknown": all else. What the verdict is worth, the library itself says:
-`references.HeldOutRates`.
+together, and none alone (`unmixing`); "unknown": all else. The library itself says what the verdict is
+worth: `references.HeldOutRates`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Candidate:
     name: str
     class_name: str
     probability: float
-    """Of the class."""
+    """Probability of the class."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Part:
     name: str
     class_name: str
     share: float
-    """Of the mixture's K/S."""
+    """Share of the mixture's K/S."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What each band says."""
+    """Evidence of each band."""
 
     wavelengths_nm: Array
     """[n]"""
@@ -56,7 +56,7 @@ class Evidence:
     best: Array
     """[n] reflectance of the nearest reference of the first class, with K/S by the factor that suits best."""
     runner_up: Array
-    """[n] of the second class's."""
+    """[n] the same of the second class."""
     log_odds: Array
     """[n] for the first class against the second: positive where the spectrum is nearer to the first, in units of
     the spread within classes. Bands are correlated: their sum exaggerates."""
@@ -76,10 +76,10 @@ class Finding:
     not_in_library: float
     """Probability; with the candidates' it sums to 1."""
     parts: tuple[Part, ...]
-    """Two, of a mixture."""
+    """Two pigments, if it is a mixture."""
     evidence: Evidence
     near_infrared: bool
-    """Whether bands beyond 780 nm were compared."""
+    """True if bands beyond 780 nm were compared."""
     remarks: tuple[str, ...]
     rates: HeldOutRates
 

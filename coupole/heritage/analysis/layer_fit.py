@@ -26,7 +26,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 COVERAGE_FACTOR = 1.96
-"""Of 95 %."""
+"""Coverage factor of 95 %."""
 LEAST_DETERMINED = 0.2
 """Relative standard uncertainty of S beyond which a band's S is called undetermined: the film hides its ground."""
 _LEAST_UNLIKE = 40.0
@@ -87,7 +87,7 @@ class Coefficients:
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What a film would show, with the standard uncertainty."""
+    """Spectrum that a film would show, with the standard uncertainty."""
 
     seen: Array
     u_seen: Array
@@ -96,7 +96,8 @@ class Predicted:
 def reflectance_inside(
     absorption: Array, scattering: Array, thickness_mm: float, ground: Array | float | None
 ) -> Array:
-    """Of a film over a ground, or opaque (None); see the module's text. K may be slightly negative."""
+    """Return the reflectance of a film over a ground, or of an opaque one (None); see the module's text. K may be
+    slightly negative."""
     h = 1.0 if ground is None else thickness_mm
     alpha, sigma = (absorption + scattering) * h, scattering * h
     square = alpha**2 - sigma**2
@@ -144,7 +145,7 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
 
 
 def predict(found: Coefficients, face: Face, thickness_mm: float, ground: Array | float | None) -> Predicted:
-    """What a film of a thickness over a ground (inside the binder, known exactly) would show."""
+    """Predict what a film of a thickness over a ground (inside the binder, known exactly) would show."""
     k, s = found.absorption, found.scattering
     one = [Film(k, None if ground is None else np.broadcast_to(ground, k.shape), thickness_mm=thickness_mm)]
     slope = _jacobian(k, s, one, face)[:, 0]
@@ -203,7 +204,7 @@ def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
 
 
 def _effects(k: Array, s: Array, films: Sequence[Film], face: Face) -> tuple[dict[str, Array], dict[str, Array]]:
-    """What one standard uncertainty of each ground, and of each thickness, does to each film [n, films]."""
+    """Return what one standard uncertainty of each ground, and of each thickness, does to each film [n, films]."""
     grounds: dict[str, Array] = {}
     thicknesses: dict[str, Array] = {}
     for number, film in enumerate(films):
@@ -239,7 +240,7 @@ def _unlike(y: Array, films: Sequence[Film], face: Face) -> Array:
 
 
 def _inverse(matrices: Array) -> Array:
-    """Of symmetric matrices [n, 2, 2]; zeros for one that has none."""
+    """Return the inverses of symmetric matrices [n, 2, 2]; zeros for one that has none."""
     a, b, d = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     determinant = a * d - b * b
     usable = determinant > 1e-300

@@ -1,4 +1,4 @@
-"""Which model a paint layer deserves, and the size of its grains (seed 000, sections 3.4 and 3.5).
+"""Choice of the model that a paint layer deserves, and the size of its grains (seed 000, sections 3.4 and 3.5).
 
 Two fluxes hold for light that is diffuse inside the layer: under diffuse illumination, or where the layer
 scatters so much that nothing reaches its ground unscattered. A thin or clear layer under directional light (a
@@ -46,7 +46,7 @@ class GrainRatio:
 
 
 def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -> Deserved:
-    """From K and S alone."""
+    """Choose the model from K and S alone."""
     sure = found.determined
     if not sure.any():
         return Deserved(
@@ -78,7 +78,7 @@ def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -
 def deserved_by_measurement(
     diffuse: tuple[Array, Array], directional: tuple[Array, Array], transmittance: Array, noise: float
 ) -> Deserved:
-    """From spectra of one film under both kinds of light, over black and over white [n]."""
+    """Choose the model from spectra of one film under both kinds of light, over black and over white [n]."""
     missed = np.stack([b - a for a, b in zip(diffuse, directional, strict=True)])
     chi2, count = float(np.sum(missed**2) / (2.0 * noise**2)), missed.size
     largest, unscattered = float(np.abs(missed).max()), float(transmittance.max())

@@ -49,14 +49,14 @@ class DirectionalGiven(_Given):
 
 
 class LayerGiven(_Given):
-    """What `coupole layer` works on."""
+    """Input of `coupole layer`."""
 
     name: str = "paint"
     binder_index: Annotated[float, Field(ge=1, le=3)] = 1.5
     """1: the paint has no glossy face."""
     geometry: Geometry = "gloss excluded"
     grounds: Literal["coated", "bare"] = "coated"
-    """Whether the grounds were measured under the same glossy face, as varnished cards, or without one."""
+    """Grounds as they were measured: under the same glossy face, as varnished cards, or without one."""
     noise: Annotated[float, Field(gt=0, le=0.1)] = 0.005
     """Standard uncertainty of a spectrum's value, as a fraction."""
     films: Annotated[tuple[FilmGiven, ...], Field(min_length=2)]

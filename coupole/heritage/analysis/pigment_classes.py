@@ -25,7 +25,7 @@ _COLUMNS = ("name", "class", "colour_index")
 
 @dataclass(frozen=True)
 class PigmentClass:
-    """What a table says of one spectrum."""
+    """Entry of a table for one spectrum."""
 
     class_name: str
     """Empty for mixtures and products of unknown composition."""

@@ -30,7 +30,7 @@ _WORTH = 16.0
 _UNTOLD = 6.0
 """Squared standard uncertainties within which two recipes are not told apart: 95 % of a chi-square of two."""
 TOLD_WITHIN = 0.02
-"""Of a share: what is asked of a recipe."""
+"""Accuracy of a share that is asked of a recipe."""
 _EXPLAINED = 1.5
 """Root mean square residual over its uncertainty up to which a recipe explains the target."""
 _LEAST_BANDS = 10
@@ -42,9 +42,9 @@ class Recipe:
     """The best mixture of a number of paints."""
 
     shares: dict[str, float]
-    """Of the paints used; they sum to 1."""
+    """Shares of the paints used; they sum to 1."""
     half_widths: dict[str, float]
-    """Of their 95 % intervals."""
+    """Half widths of the 95 % intervals of the shares."""
     seen: Array
     """[81], what the mixture shows, NaN in bands that were not compared."""
     rms: float
@@ -72,7 +72,8 @@ class Found:
     and of one more where it is nearer beyond noise, but not enough to be worth it."""
 
     def told_within(self, name: str) -> float:
-        """Within which a share of the best recipe is known: its 95 % interval, and what rivals have instead."""
+        """Return the bound within which a share of the best recipe is known: by its 95 % interval, and by what
+        rivals have instead."""
         share = self.best.shares[name]
         apart = [abs(other.get(name, 0.0) - share) for other in self.rivals]
         return max(self.best.half_widths[name], *apart, 0.0)
@@ -84,11 +85,11 @@ class Found:
 
     @property
     def is_explained(self) -> bool:
-        """Whether noise, and K and S of the paints, explain what the best recipe misses."""
+        """True if noise, and K and S of the paints, explain what the best recipe misses."""
         return self.best.misfit <= _EXPLAINED
 
     def verdict(self) -> str:
-        """In plain words."""
+        """Return the verdict in plain words."""
         best = self.best
         if self.is_explained:
             return f"the palette explains the target, missed by {best.misfit:.1f} times its uncertainty"

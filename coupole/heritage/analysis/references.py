@@ -25,7 +25,8 @@ _SAME = 1e-4
 _WIDEST_GAP_NM = 20.0
 _VIOLET_NM = 460.0
 _RISE_BEYOND, _RISE_BY = 0.1, 0.005
-"""Of the logarithm of reflectance over 20 nm, beyond that of the references; of reflectance."""
+"""Limits of the rise over 20 nm: of the logarithm of reflectance, beyond that of the references; of
+reflectance."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class HeldOutRates:
-    """What comes of the library's own spectra, each identified as if the library lacked it."""
+    """Rates of verdicts on the library's own spectra, each identified as if the library lacked it."""
 
     right: Rate
     """First candidate of the right class; of those with others of their class."""
@@ -80,7 +81,7 @@ class OfBands:
 
     @cached_property
     def rates(self) -> HeldOutRates:
-        """By leaving out each spectrum, and each class; mixtures are not looked for."""
+        """Rates by leaving out each spectrum, and each class; mixtures are not looked for."""
         model, classes = self.model, self.classes
         several = np.bincount(classes)[classes] > 1
         one, none = model.held_out.probabilities, model.held_out.without_class
@@ -127,7 +128,7 @@ class References:
     reflectance: Array
     """[n, 221] at `BANDS_NM`; NaN where it was not measured."""
     remarks: tuple[str, ...]
-    """What was left out, and why."""
+    """Remarks on what was left out, and why."""
     _prepared: dict[bytes, OfBands] = field(default_factory=dict)
 
     def of_bands(self, spectrum_name: str, reflectance: Array) -> OfBands:

@@ -1,4 +1,4 @@
-"""What is compared of reflectance spectra, and how the same paint may look to another instrument.
+"""Features by which reflectance spectra are compared, and how the same paint may look to another instrument.
 
 Bands are every 10 nm, ultraviolet to near infrared; those that were not measured are NaN.
 """

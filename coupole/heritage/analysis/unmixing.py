@@ -32,18 +32,18 @@ class Unmixed:
     references: tuple[int, int]
     """Their numbers, the larger share first."""
     shares: tuple[float, float]
-    """Of the mixture's K/S, mean over the bands; they sum to 1."""
+    """Shares of the mixture's K/S, mean over the bands; they sum to 1."""
     residual: float
     """Relative residual of K/S, rms."""
     gain: float
     """Schwarz's criterion of the best single reference less that of the pair; above 10 is very strong evidence
     (Kass and Raftery 1995)."""
     lead: float
-    """That of the best pair of other classes less that of the pair."""
+    """Schwarz's criterion of the best pair of other classes less that of this pair."""
 
     @property
     def is_settled(self) -> bool:
-        """Whether it is a mixture of these classes: K/S within 2 %, gain and lead of 20 or more."""
+        """True if the spectrum is a mixture of these classes: K/S within 2 %, gain and lead of 20 or more."""
         return self.residual <= _MOST_RESIDUAL and min(self.gain, self.lead) >= _LEAST_GAIN
 
 

@@ -1,5 +1,4 @@
-"""Which of many differences are real: p-values with a noise that the data themselves confirm, and false
-discoveries.
+"""Significance of many differences: p-values with a noise that the data themselves confirm, and false discoveries.
 
 If noise is correlated from point to point, or surfaces are sampled unevenly, differences scatter more than local
 fits say. Most of an object does not change, so the bulk of all differences shows their true scatter (an
@@ -46,7 +45,8 @@ def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tupl
 
 
 def discoveries(p: Floats, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
-    """Which of p-values [n] are marked, so that at most this share of them is expected to be false; NaN is not."""
+    """Mark those of the p-values [n] that are significant, so that at most this share of them is expected to be
+    false; NaN is not marked."""
     known = np.flatnonzero(np.isfinite(p))
     order = known[np.argsort(p[known])]
     under = p[order] <= false_share * np.arange(1, len(order) + 1) / max(1, len(order))

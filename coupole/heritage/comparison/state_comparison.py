@@ -25,10 +25,10 @@ from coupole.scan.registration.viewpoint import Viewpoint
 
 Say = Callable[[str, int, int], None]
 _REACH_SHARE, _REACH_SPACINGS = 0.02, 6.0
-"""How far apart surfaces may lie to be compared: the larger of this share of the size, and so many spacings."""
+"""Greatest distance of surfaces that are compared: the larger of this share of the size, and so many spacings."""
 _LEAST_REGION = 3
 _SMALLEST_SPREAD = 1e-4
-"""Of Lab values: finer than 8 bits tell, so that equal colours have an uncertainty too."""
+"""Smallest spread of Lab values: finer than 8 bits tell, so that equal colours have an uncertainty too."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changed from a state to another, at the points of the first."""
+    """Changes from one state to another, at the points of the first."""
 
     before: State
     after: State

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Colours:
-    """Of a state's points, as CIELAB under D65."""
+    """Colours of a state's points, as CIELAB under D65."""
 
     lab: Floats
     """[n, 3]; NaN where a point has none."""

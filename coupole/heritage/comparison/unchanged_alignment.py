@@ -38,7 +38,7 @@ class Alignment:
     noise_mm: float
     """Robust standard deviation of distances along normals."""
     given: bool
-    """Whether the states lay on each other in their files already."""
+    """True if the states lay on each other in their files already."""
 
     def uncertainty_mm(self, points_mm: Floats, normals: Floats) -> Floats:
         """[n] standard uncertainty of distances along normals [n, 3] at points [n, 3]."""
@@ -76,7 +76,7 @@ def _thinned(state: State, pitch_mm: float, most: int) -> Cloud:
 
 
 def _share(before: Cloud, after: Cloud, motion: Floats, pitch_mm: float) -> float:
-    """Of the after's points: on the other state, within half a cell along its normals."""
+    """Return the share of the after's points that lie on the other state, within half a cell along its normals."""
     moved = applied(motion, after.points_mm)
     away, nearest = before.tree.query(moved, distance_upper_bound=1.5 * pitch_mm)
     hit = np.isfinite(away)

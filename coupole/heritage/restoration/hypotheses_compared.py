@@ -1,4 +1,4 @@
-"""How far apart two hypotheses look: CIEDE2000 of each pixel of the object, and over each part."""
+"""Colour difference of two hypotheses: CIEDE2000 of each pixel of the object, and over each part."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ FULL_DE00 = 50.0
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Between two pictures of one camera."""
+    """Difference between two pictures of one camera."""
 
     de00: NDArray[np.float64]
     """[h, w], NaN where the object is not seen."""
     of_parts: dict[str, dict[str, Any]]
-    """For each part that is seen: `pixels`, `mean_de00` over them (noise adds to it), `de00_of_means`, the
+    """Figures of each part that is seen: `pixels`, `mean_de00` over them (noise adds to it), `de00_of_means`, the
     difference of the mean colours."""
 
 
@@ -36,7 +36,8 @@ def compared(
     eye: Eye,
     white_cd_m2: float,
 ) -> Difference:
-    """Of two pictures [h, w, 3] in cd/m^2 for an eye that is used to `white_cd_m2` of the first light's colour.
+    """Compare two pictures [h, w, 3] in cd/m^2 for an eye that is used to `white_cd_m2` of the first light's
+    colour.
 
     `seen` [h, w] are rows of `names`, negative where the object is not seen. CIEDE2000 (Luo, Cui, Rigg, Color Res.
     Appl. 26(5), 2001) is colour-science's.

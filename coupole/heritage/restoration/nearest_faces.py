@@ -1,4 +1,4 @@
-"""Which triangle of another mesh of the same surface each triangle lies on."""
+"""Assignment of triangles to those of another mesh of the same surface on which they lie."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coupole.heritage.restoration.painted_mesh import Floats, PaintedMesh
 _CANDIDATES = 12
 _CHUNK = 200_000
 _SAME_SHARE = 1e-6
-"""Of the mesh's size: corners that differ by less are the same."""
+"""Share of the mesh's size: corners that differ by less are the same."""
 
 
 def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -40,7 +40,7 @@ def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.
 
 
 def _nearest(tree: Any, corners: Floats, others: Floats, points: Floats, turned: Floats) -> NDArray[np.int64]:
-    """Of the candidates with the nearest middles, by the distances to their surfaces."""
+    """Choose among the candidates with the nearest middles, by the distances to their surfaces."""
     from trimesh.triangles import closest_point
 
     count = min(_CANDIDATES, len(corners))

@@ -44,7 +44,7 @@ class PaintedMesh:
         return np.asarray(self.corners_mm.mean(axis=1))
 
     def digest(self) -> str:
-        """Of its shape, whatever its colours."""
+        """Return the digest of its shape, whatever its colours."""
         found = hashlib.sha256(np.ascontiguousarray(self.vertices_mm).tobytes())
         found.update(np.ascontiguousarray(self.triangles).tobytes())
         return found.hexdigest()

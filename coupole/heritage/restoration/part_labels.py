@@ -1,4 +1,4 @@
-"""Which part each triangle of a mesh is of, by the rules of a parts file."""
+"""Parts of the triangles of a mesh, by the rules of a parts file."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
 
 
 def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float) -> tuple[NDArray[np.int64], str]:
-    """For each colour [n, 3] the nearest row of the table, or `NONE`; and which colours have none."""
+    """Return for each colour [n, 3] the nearest row of the table, or `NONE`; and which colours have none."""
     wanted = np.array([list(bytes.fromhex(code[1:])) for code in table.values()], float)
     colours, which, counts = np.unique(srgb, axis=0, return_inverse=True, return_counts=True)
     distance = np.full(len(colours), np.inf)

@@ -43,7 +43,7 @@ class Texture(Model):
     kind: Literal["texture"]
     colours: Annotated[dict[PartName, Colour], Field(min_length=1)]
     image: Path | None = None
-    """In place of the picture that the mesh names."""
+    """Picture in place of the one that the mesh names."""
     tolerance: Tolerance = 8.0
 
 
@@ -117,7 +117,7 @@ class PickedParts(Model):
 
 @dataclass(frozen=True, eq=False)
 class Picked:
-    """What a page gave, in numbers."""
+    """Parts that a page gave, in numbers."""
 
     names: tuple[str, ...]
     vertices_mm: NDArray[np.float32]

@@ -41,10 +41,10 @@ SourceText = Annotated[str, Field(min_length=1, max_length=2000)]
 
 
 class Source(Model):
-    """Who or what says so."""
+    """Source of a hypothesis: who or what says so."""
 
     says: SourceText
-    """What it says, in one's own words."""
+    """Statement of the source, in one's own words."""
     reference: SourceText
     """Publication, archive, analysis or person, as one would cite it."""
 
@@ -59,7 +59,7 @@ class Hypothesis(Model):
     title: SourceText
     sources: Annotated[tuple[Source, ...], Field(min_length=1)]
     materials: Annotated[dict[PartName, Material], Field(min_length=1)]
-    """Of every part."""
+    """Materials of every part."""
 
 
 class Turntable(Model):
@@ -86,7 +86,7 @@ class Cameras(Model):
 
 
 class Auto(Model):
-    """From the front, and turned by 35 degrees."""
+    """Views from the front, and turned by 35 degrees."""
 
     kind: Literal["auto"]
     width_px: Pixels = 800
@@ -152,7 +152,8 @@ def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
 def reduced(
     found: RestorationFile, samples: int | None, width_px: int | None, step_nm: int | None
 ) -> RestorationFile:
-    """With fewer samples, narrower pictures or coarser bands, for a quick look. Raises InputError for a step."""
+    """Return the file with fewer samples, narrower pictures or coarser bands, for a quick look. Raises InputError
+    for a step other than 5, 10, 20 or 40 nm."""
     if step_nm not in {None, 5, 10, 20, 40}:
         raise InputError(f"--step: expected 5, 10, 20 or 40, found {step_nm}; choose one of them")
     changed: dict[str, Any] = {}
@@ -171,7 +172,8 @@ def named_files(found: RestorationFile, document: Document) -> tuple[Path, ...]:
 
 
 def chosen(document: Document, found: RestorationFile, names: Sequence[str]) -> tuple[Hypothesis, ...]:
-    """Those of the names, in the file's order; all without names. Raises InputError for an unknown one."""
+    """Return the hypotheses with these names, in the file's order; all without names. Raises InputError for an
+    unknown name."""
     known = [hypothesis.name for hypothesis in found.hypotheses]
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known)} of {document.path}")

@@ -1,4 +1,4 @@
-"""From a mesh, its parts and hypotheses to spectral pictures; those that are there already are not made again."""
+"""Spectral pictures of a mesh with its parts and hypotheses; those that are there already are not made again."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Restoration:
 
     @property
     def folder(self) -> Path:
-        """To which paths of the restoration file are relative."""
+        """Folder to which paths of the restoration file are relative."""
         return self.document.path.parent
 
     @cached_property
@@ -115,7 +115,8 @@ class Restoration:
 
     @cached_property
     def _digest(self) -> str:
-        """Of what all pictures share: shape, parts, the scene but for display and cameras, files, renderer."""
+        """Digest of what all pictures share: shape, parts, the scene but for display and cameras, files,
+        renderer."""
         told = hashlib.sha256(
             f"{self.mesh.digest()} {self.parts.names} {variant.spectral(polarised=False)}".encode()
         )
@@ -127,7 +128,7 @@ class Restoration:
         return told.hexdigest()
 
     def digest(self, hypothesis: Hypothesis, camera: Camera) -> str:
-        """Of what one picture follows from."""
+        """Return the digest of what one picture follows from."""
         materials = {name: one.model_dump(mode="json") for name, one in hypothesis.materials.items()}
         told = f"{self._digest} {camera.model_dump_json()} {json.dumps(materials, sort_keys=True)}"
         return hashlib.sha256(told.encode()).hexdigest()
@@ -213,7 +214,7 @@ def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say:
 def _known(
     restoration: Restoration, hypothesis: Hypothesis, camera: Camera, folder: Path
 ) -> dict[str, Any] | None:
-    """What is told of the same picture, if it is there."""
+    """Return what is noted of the same picture, if it is there."""
     path = folder / f"{camera.name}.json"
     if not path.is_file() or not path.with_suffix(".exr").is_file():
         return None

@@ -1,4 +1,4 @@
-"""Which part of the object each pixel of a camera shows, by a ray through its middle."""
+"""Part of the object that each pixel of a camera shows, by a ray through its middle."""
 
 from __future__ import annotations
 

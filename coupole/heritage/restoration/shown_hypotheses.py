@@ -26,15 +26,15 @@ _GAP_PX = 6
 
 @dataclass(frozen=True)
 class Shown:
-    """What is written of one view."""
+    """Files and figures that are written of one view."""
 
     camera: str
     pictures: dict[str, Path]
-    """By the names of hypotheses."""
+    """Pictures by the names of hypotheses."""
     side_by_side: Path | None
     differences: dict[tuple[str, str], Path]
     of_parts: dict[tuple[str, str], dict[str, dict[str, Any]]]
-    """As `hypotheses_compared.Difference.of_parts`."""
+    """Figures of the parts, as `hypotheses_compared.Difference.of_parts`."""
 
 
 def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
 from coupole.reflectance.slice_basis import COUNT, HARMONICS, RADIAL, RESIDUAL, Basis
 from coupole.reflectance.slice_fit import slice_values
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles, model_values
@@ -40,6 +41,27 @@ class MaterialFit(Fit):
     ) -> TriangleMaterials:
         """From the samples `used` [samples]; `noise_um` of the mesh's vertices."""
         return fit_triangles(samples, used, noise_um if self.fits_normals else None, threads=threads)
+
+    def uncertainty(
+        self,
+        samples: TriangleSamples,
+        used: NDArray[np.bool_],
+        materials: TriangleMaterials,
+        noise_um: float,
+        middle_mm: NDArray[np.float64],
+        threads: int | None,
+    ) -> MaterialUncertainty:
+        """Compute covariances of the materials fitted to the samples `used` [samples]; `middle_mm` is the middle
+        of the object. A fit of another form than GGX's needs covariances of its own here."""
+        return covariances(
+            samples,
+            used,
+            materials,
+            noise_um,
+            fitted_normals=self.fits_normals,
+            middle_mm=middle_mm,
+            threads=threads,
+        )
 
     def values(self, samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
         """[b, samples, channels] f cos_i, 1/sr, that materials give."""

@@ -25,7 +25,7 @@ from coupole.reflectance.fits import (
     ViewFit,
     fitted_together,
 )
-from coupole.reflectance.material_uncertainty import MaterialUncertainty, covariances
+from coupole.reflectance.material_uncertainty import MaterialUncertainty
 from coupole.reflectance.model_bias import unbiased_normals
 from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, in_the_making, read_settings
 from coupole.reflectance.run_result import RunResult, ViewSamples
@@ -144,15 +144,7 @@ def _uncertain_block(
     samples = result.samples(block)
     if made.fits_normals:
         materials = recoloured(samples, used, materials, materials.normals, threads=threads)
-    return materials, covariances(
-        samples,
-        used,
-        materials,
-        job.noise_um,
-        fitted_normals=made.fits_normals,
-        middle_mm=result.middle_mm,
-        threads=threads,
-    )
+    return materials, made.uncertainty(samples, used, materials, job.noise_um, result.middle_mm, threads)
 
 
 def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:

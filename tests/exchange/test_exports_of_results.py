@@ -20,6 +20,7 @@ from checkers import gltf_messages, needs_checkers
 from lazily import lazily
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, unit, waves, write_result
 
+from coupole.exchange.formats import Source, formats_of
 from coupole.exchange.of_results import adaptive_table
 from coupole.exchange.of_results.adaptive_table import encode_adaptive
 from coupole.exchange.of_results.bsdf import encode as encode_bsdf
@@ -302,10 +303,7 @@ def test_a_merl_table_is_read_as_its_reader_does() -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (
-            ("--to", "dng"),
-            "expected one of ply, gltf, materialx, exr, bsdf, merl, bird, alta, rocrate for a result; found dng",
-        ),
+        (("--to", "dng"), f"expected one of {', '.join(formats_of(Source.RESULT))} for a result; found dng"),
         (("--to", "ply", "--fit", "sh"), "expected ggx or ggx_normal"),
         (
             ("--to", "ply", "--views", "top"),

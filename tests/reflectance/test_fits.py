@@ -13,6 +13,7 @@ from relight_cases import waves
 from residual_cases import write_backscatter
 
 from coupole.commands import completion
+from coupole.reflectance import run_fits
 from coupole.reflectance.fits import FITS, GGX, MATERIALS, RELIT, SLICES, MaterialFit, ViewFit, fitted_together
 from coupole.reflectance.run_fits import predicted
 from coupole.reflectance.run_result import RunResult
@@ -71,6 +72,21 @@ def test_a_material_of_another_form_is_asked_for_its_own_values(result: RunResul
     with mock.patch.dict(FITS, {"ggx_normal": Twice("ggx_normal", "", "", fits_normals=True)}):
         twice = predicted(result, "ggx_normal", view, slice(None), samples)
     np.testing.assert_array_equal(twice, 2.0 * plain)
+
+
+def test_a_material_of_another_form_states_its_own_uncertainty(result: RunResult) -> None:
+    """GGX's covariances of a fit without a lobe would be numbers of 600 %."""
+    stated = mock.sentinel.uncertainty
+
+    class Lambert(MaterialFit):
+        def uncertainty(self, *known):  # type: ignore[no-untyped-def]
+            return stated
+
+    block = slice(0, 4)
+    job = run_fits._Job(result.folder, "a test", left_out=[], memory_bytes=1 << 20, noise_um=30.0)
+    materials = run_fits._materials_block(job, GGX, 1, block)
+    lambert = Lambert("lambert", "", "", fits_normals=False)
+    assert run_fits._uncertain_block(job, lambert, 1, (block, materials)) == (materials, stated)
 
 
 def test_a_name_that_no_fit_has_is_no_ggx_fit(result: RunResult) -> None:

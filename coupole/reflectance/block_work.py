@@ -35,13 +35,13 @@ def silent(step: str, done: int, of: int) -> None:
 
 
 class Workshop(Protocol):
-    """Where blocks are done."""
+    """Place where blocks are processed."""
 
     threads: int | None
-    """That a block may use; None for as many as there are cores."""
+    """Number of threads that a block may use; None for as many as there are cores."""
 
     def most_rows(self, count: int) -> int:
-        """Triangles of a block, of so many in all."""
+        """Return the number of triangles of a block, of `count` in all."""
         ...
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
@@ -53,7 +53,7 @@ class Workshop(Protocol):
         ...
 
     def heard(self, say: Said) -> Said:
-        """What a block can tell while it is done."""
+        """Return the function by which a block can report its progress."""
         ...
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
@@ -63,7 +63,7 @@ class Workshop(Protocol):
 
 
 class Here:
-    """In this process, one block after the other."""
+    """Workshop in this process: one block after the other."""
 
     threads: int | None = None
 
@@ -84,7 +84,7 @@ class Here:
 
 
 class Cluster:
-    """In the workers of a scheduler, a block in each of their threads."""
+    """Workshop in the workers of a scheduler: a block in each of their threads."""
 
     threads: int | None = 1
 
@@ -92,7 +92,7 @@ class Cluster:
         self._client, self._address = client, address
 
     def most_rows(self, count: int) -> int:
-        """So few that no worker waits long for the last one's last block."""
+        """Return a number so small that no worker waits long for the last one's last block."""
         return int(np.clip(-(-count // (_BLOCKS_EACH * self._all_threads)), _FEWEST_ROWS, _MOST_ROWS))
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
@@ -152,7 +152,7 @@ def _seen_from_here(witness: Path) -> tuple[str | None, str]:
 
 
 def _done_alone(function: Callable[[Block], Done], block: Block) -> Done:
-    """In a worker: BLAS must not take threads that others work with."""
+    """Process a block in a worker. BLAS must not take threads that others work with."""
     threadpool_limits(1, user_api="blas")
     return function(block)
 

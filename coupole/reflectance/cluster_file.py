@@ -46,8 +46,8 @@ class Clusters:
     def at(
         self, own: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
     ) -> TriangleMaterials:
-        """Of triangles by their places in `RunResult.triangles`, with the normals of their `own` materials, or
-        the mesh's where they borrow."""
+        """Return the materials of triangles by their places in `RunResult.triangles`. Normals are those of their
+        `own` materials, or the mesh's where they borrow."""
         number, borrowed = self.cluster[block], self.borrowed[block, None]
         kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
         alpha[number < 0] = np.nan
@@ -56,7 +56,7 @@ class Clusters:
 
 
 def read_clusters(folder: Path) -> Clusters:
-    """Of a result of runs. Raises InputError if there are none."""
+    """Read the clusters of a result of runs. Raises InputError if there are none."""
     path = folder / CLUSTERS
     if not path.exists():
         raise InputError(f"{path}: is not there; `coupole reflectance cluster {folder}` makes it")

@@ -29,11 +29,12 @@ MOST_POOLED = 4096
 _LEAST_EACH = 8
 _SLANT_COS = math.cos(math.radians(30.0))
 _OFF_DEG = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0)
-"""Of the half vector to the normal: there materials are compared, lights and views slanted by 30 degrees."""
+"""Angles of the half vector to the normal at which materials are compared; lights and views are slanted by 30
+degrees."""
 _LEARNT_FROM = 20_000
 _ROUNDS = 10
 _DISTANCES = 1 << 23
-"""At a time."""
+"""Number of distances that are computed at a time."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Samples that something in the cell has shaded which nobody described, as a cable: found by their contradiction.
+"""Samples that something in the cell has shaded which nobody described, for example a cable: they are found by
+their contradiction.
 
 A cable's full shadow is too dark to give samples. At its edge a triangle is lit in part, and its sample is too low
 by any amount. Such a sample is darker than the triangle's material in all channels, where that is mostly diffuse
@@ -27,15 +28,15 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples,
 Floats = NDArray[np.float64]
 
 BESIDE = 6
-"""LEDs beside one."""
+"""Number of LEDs beside an LED that it is compared with."""
 _FEWEST_BESIDE = 4
-"""Of them, that have a sample."""
+"""Least number of these that have a sample."""
 _MOST_LEFT = 0.8
 """Share of its light that a sample has kept."""
 _AGREE = (0.9, 1.15)
 """Median of the LEDs beside it over the material."""
 _LEAST_DIFFUSE = 0.5
-"""Of what the material gives."""
+"""Least diffuse share of what the material gives."""
 _SIGMA = 5.0
 
 
@@ -48,7 +49,7 @@ class Neighbours:
 
     @classmethod
     def of(cls, led_mm: Floats, middle_mm: Floats) -> Neighbours:
-        """Those in the directions nearest to its own, as the object's middle has them."""
+        """Return the LEDs in the directions nearest to each LED's own, as seen from the object's middle."""
         ways = led_mm - middle_mm
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
         if len(ways) < 2:
@@ -86,19 +87,19 @@ def contradicted(
 
 @dataclass(frozen=True)
 class Found:
-    """What contradicts others among the samples of some rows of a view's file."""
+    """Samples that contradict others, among those of some rows of a view's file."""
 
     rows: slice
     places: NDArray[np.int64]
     """[2, n] rows, from the first on, and LEDs."""
     values: int
-    """That they have."""
+    """Number of values that these samples have."""
     all_values: int
-    """That the rows have."""
+    """Number of values that the rows have."""
 
 
 def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
-    """By `ggx_normal`."""
+    """Find samples that contradict others, by the materials of `ggx_normal`."""
     materials = result.materials(GGX_NORMAL.name, np.searchsorted(result.triangles, view.triangles[rows]))
     samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
     with h5py.File(view.path, "r") as file:

@@ -24,7 +24,7 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Those that are ours, or parts of it, with their parameters."""
+"""COLMAP's camera models that equal our lens model or a part of it, with their parameters."""
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 2: "SIMPLE_RADIAL", 3: "RADIAL", 4: "OPENCV", 6: "FULL_OPENCV"}
 _PLACES = (".", "sparse/0", "sparse", "0")
 _UNIT = 1e-3
@@ -38,7 +38,7 @@ class ColmapCamera:
     model: str
     size_px: tuple[int, int]
     parameters: dict[str, float]
-    """By the names in `MODELS`."""
+    """Parameters by the names in `MODELS`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ColmapImage:
     """A picture that was posed."""
 
     name: str
-    """Of its file."""
+    """Name of the image's file."""
     camera: int
     camera_from_world: Floats
     """[4, 4] x right, y down, z forward; in the model's unit."""
@@ -54,7 +54,7 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """What was read; `path` is the file of the images."""
+    """Model that was read; `path` is the file of the images."""
 
     path: Path
     cameras: dict[int, ColmapCamera]
@@ -62,8 +62,8 @@ class ColmapModel:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Of a folder that has `cameras` and `images` as .bin or .txt, by themselves or in `sparse/0`; binary ones
-    come first, as COLMAP has it. Raises InputError for another folder, and for damaged files."""
+    """Read the model of a folder that has `cameras` and `images` as .bin or .txt, directly or in `sparse/0`;
+    binary files come first, as COLMAP has it. Raises InputError for another folder, and for damaged files."""
     for place in _PLACES:
         for suffix, cameras, images in (
             (".bin", _binary_cameras, _binary_images),
@@ -150,7 +150,8 @@ Record = TypeVar("Record")
 
 
 def _records(path: Path, read: Callable[[bytes, int], tuple[Record, int]]) -> Iterator[Record]:
-    """What `read` makes of each record from its place on, with where the next one begins."""
+    """Yield each record that `read` makes of the data from a place on; `read` also returns where the next one
+    begins."""
     try:
         data = path.read_bytes()
         (count,), at = struct.unpack_from("<Q", data), 8

@@ -24,11 +24,12 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.storage.durable import sha256
 
 LEAST_FITTED = 3
-"""Views that fix a similarity."""
+"""Least number of views that fix a similarity."""
 _TO_CENTRE_PX = 0.5
-"""From our pixels to COLMAP's, in which the first one ends at 1."""
+"""Shift from our pixel coordinates to COLMAP's, px: there the first pixel ends at 1."""
 _SAME = 1e-6
-"""Parameters of the lens that the record does not estimate."""
+"""Allowed difference of lens parameters that the record does not estimate, as a share of the larger of their value
+and 1."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class ColmapPoses:
     """Poses of the views of a run."""
 
     path: Path
-    """Of COLMAP's images."""
+    """File of COLMAP's images."""
     base_from_camera: Floats
     """[v, 4, 4] mm, in the order of the run's views."""
     scale: float
@@ -47,7 +48,7 @@ class ColmapPoses:
     """[v, 2] shift and turn over the records' standard uncertainty."""
 
     def of(self, measured: MeasuredRun) -> MeasuredRun:
-        """The run with them."""
+        """Return the run with these poses."""
         views = zip(measured.views, self.base_from_camera, strict=True)
         return replace(
             measured,
@@ -55,7 +56,7 @@ class ColmapPoses:
         )
 
     def told(self) -> dict[str, Any]:
-        """What a result says of them."""
+        """Return what a result says of these poses."""
         shift_mm = np.linalg.norm(self.moved[:, :3], axis=1)
         turn_deg = np.degrees(np.linalg.norm(self.moved[:, 3:], axis=1))
         return {
@@ -69,8 +70,8 @@ class ColmapPoses:
 
 
 def read_poses(folder: Path, measured: MeasuredRun) -> ColmapPoses:
-    """Of a run by its records, and a folder of COLMAP's. Raises InputError: no model, a view that it lacks or has
-    twice, another lens, centres on a line, poses that the records do not allow."""
+    """Read the poses of a run, given by its records, from a folder of COLMAP's. Raises InputError: no model, a
+    view that it lacks or has twice, another lens, centres on a line, poses that the records do not allow."""
     model = read_model(folder)
     camera_from_world = _of_views(model, measured)
     recorded = np.stack([view.base_from_camera for view in measured.views])

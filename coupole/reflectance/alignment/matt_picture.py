@@ -66,8 +66,8 @@ def matt_picture(
 
 @numba.njit(cache=True, nogil=True)
 def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: ignore[no-untyped-def]
-    """Into `means` [h / 2, w / 2], where they are infinite and the frame is below `top_dn`: the two greens of a
-    block lie evenly about its middle."""
+    """Fill `means` [h / 2, w / 2] with the green signal of blocks, where they are infinite and the frame is below
+    `top_dn`. The two greens of a block lie evenly about its middle."""
     for row in range(means.shape[0]):
         for column in range(means.shape[1]):
             if not np.isinf(means[row, column]):

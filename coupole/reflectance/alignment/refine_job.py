@@ -38,7 +38,7 @@ MESH = "mesh.ply"
 
 @dataclass(frozen=True)
 class RefineRequest:
-    """What its user wants."""
+    """Request of a user for a refinement."""
 
     runs: tuple[Path, ...]
     mesh: Path | None = None
@@ -113,7 +113,8 @@ def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
 
 
 def _write_mesh(refined: Refined, measured: MeasuredRun, path: Path) -> None:
-    """In the unit and frame of the mesh that was given, without the vertices that no triangle uses."""
+    """Write the refined mesh in the unit and frame of the mesh that was given, without the vertices that no
+    triangle uses."""
     plan = read_plan(measured.run.plan_path, measured.run.rig_path).plan
     assert plan.object is not None  # read_measured_run refuses runs without
     base_from_object = measured.base_from_support @ plan.object.support_from_object.matrix()

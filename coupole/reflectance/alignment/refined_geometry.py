@@ -54,17 +54,17 @@ class RefinedGeometry:
     path: Path
     lens: Intrinsics
     base_from_camera: dict[tuple[str, str], Floats]
-    """By run and view."""
+    """Camera poses, by run and view."""
     vertices_mm: Floats
     mesh_sha256: str
     inputs: dict[str, dict[str, str]]
     """Name and SHA-256 of the files that were read, by run."""
     pointings: dict[tuple[str, str], Pointing]
-    """By run and view."""
+    """Uncertainty of where the cameras look, by run and view."""
 
     def of(self, measured: MeasuredRun) -> MeasuredRun:
-        """A run with them. Raises InputError for a run, view or mesh that was not refined, and for a run that has
-        changed since."""
+        """Return a run with this geometry. Raises InputError for a run, view or mesh that was not refined, and for
+        a run that has changed since."""
         if sha256(measured.mesh_path) != self.mesh_sha256:
             raise InputError(
                 f"{self.path}: another mesh than {measured.mesh_path} was refined; name that with --mesh"
@@ -93,7 +93,7 @@ class RefinedGeometry:
 
 
 def read_refined(folder: Path) -> RefinedGeometry:
-    """Of a folder of `coupole reflectance refine`. Raises InputError if it holds none."""
+    """Read the geometry from a folder of `coupole reflectance refine`. Raises InputError if it holds none."""
     path = folder / REFINED
     if not path.exists():
         raise InputError(f"{path}: is not there; `coupole reflectance refine RUN... --out {folder}` makes it")
@@ -115,7 +115,7 @@ def read_refined(folder: Path) -> RefinedGeometry:
 
 
 def what_was_refined(folder: Path) -> dict[str, Any]:
-    """What a result says of the refinement it was made with. Raises InputError if there is none."""
+    """Return what a result says of the refinement it was made with. Raises InputError if there is none."""
     return {"sha256": sha256(folder / REFINED), "disagreement": _told(folder, "disagreement")}
 
 
@@ -162,7 +162,7 @@ def write_refined(
 def _pointings(
     names: list[str], covariance: Floats, middle_mm: Floats, views: Sequence[tuple[str, str]]
 ) -> dict[tuple[str, str], Pointing]:
-    """How well it is known where cameras look, from the covariance of the unknowns of these names."""
+    """Return how well it is known where the cameras look, from the covariance of the unknowns of these names."""
     of_lens = [place for place, name in enumerate(names) if name.removesuffix("_px") in NAMES]
     of_mesh = [place for place, name in enumerate(names) if name.startswith("mesh.")]
     free = tuple(names[place].removesuffix("_px") for place in of_lens)
@@ -175,7 +175,7 @@ def _pointings(
 
 
 def _told(folder: Path, name: str) -> Any:
-    """What `refined.json` says under a name."""
+    """Return what `refined.json` says under a name."""
     path = folder / ABOUT
     try:
         return read_json(path, allow_nan=True)[name]

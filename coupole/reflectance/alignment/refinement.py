@@ -56,7 +56,7 @@ class Refined:
     before: Matches
     after: Matches
     noise_factor: float
-    """Of the matches, over what noise and texture alone would leave."""
+    """Noise of the matches, as a multiple of what noise and texture alone would leave."""
     rejected: int
     """Matches that did not count, in the last adjustment."""
 
@@ -85,7 +85,8 @@ class Refined:
 
     @property
     def determined(self) -> float:
-        """How many of the unknowns the pictures determine, each by the share of its information that they gave."""
+        """Number of unknowns that the pictures determine: each counts by the share of its information that they
+        gave."""
         return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
 
 
@@ -121,7 +122,7 @@ def refine(
 def surfaces_of(
     unknowns: Unknowns, steps: Floats, pictures: list[NDArray[np.float32]], threads: int
 ) -> list[ViewSurface]:
-    """What all views show of the mesh, by the geometry after some steps."""
+    """Return what all views show of the mesh, by the geometry after some steps."""
     corners = unknowns.vertices_at(steps)[unknowns.given.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)

@@ -1,4 +1,5 @@
-"""What is refined: one vector of steps from what the records say, with its covariance before the pictures count.
+"""Unknowns of the refinement: one vector of steps from what the records say, with its covariance before the
+pictures count.
 
 In this order: the lens's estimated parameters; six steps for each view's camera (mm along the base's axes, rad
 about the camera's, as `rotations.moved`); six of the whole mesh (mm along the base's axes, rad about axes through
@@ -28,7 +29,8 @@ MOST_CONTROLS = 600
 _TOGETHER = 1 << 16
 """Vertices."""
 _NUGGET = 1e-6
-"""Of a control point's variance, that it shares with no other: keeps the covariance's inverse exact."""
+"""Share of a control point's variance that it has in common with no other: keeps the covariance's inverse
+exact."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Unknowns:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """With units, in the vector's order."""
+        """Names of the unknowns with their units, in the vector's order."""
         steps = ("x_mm", "y_mm", "z_mm", "rx_rad", "ry_rad", "rz_rad")
         views = range(len(self.given.base_from_camera))
         return (

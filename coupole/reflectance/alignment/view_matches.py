@@ -1,4 +1,4 @@
-"""How far apart two views put the same spot of the surface: registration of their pictures on the mesh.
+"""Disagreement of two views on where a spot of the surface is: registration of their pictures on the mesh.
 
 A window of one view's picture is compared with the other's picture as the mesh says that the first would show it.
 The best whole shift is that of the greatest correlation; Gauss-Newton steps with gain and offset make it finer
@@ -28,7 +28,7 @@ MOST_REACH = 48
 """Blocks that are searched in each direction."""
 LEAST_CORRELATION = 0.7
 _LEAST_SHARE = 0.8
-"""Of a window's blocks that both views must show."""
+"""Least share of a window's blocks that both views must show."""
 _MARGIN = 3
 """Blocks around what is searched, for interpolation."""
 _HIDDEN_BEYOND = 4.0
@@ -264,7 +264,7 @@ def _best_shift(template, shown, warped, reach):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-untyped-def]
-    """Whether the steps converged, the shift, and its covariance [2, 2]."""
+    """Refine a whole shift; return whether the steps converged, the shift, and its covariance [2, 2]."""
     side, first = len(template), _MARGIN + reach
     x, y, gain, offset = float(right), float(down), 1.0, 0.0
     settled, change = False, np.zeros(4)

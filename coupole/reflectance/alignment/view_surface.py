@@ -1,4 +1,4 @@
-"""Where on the mesh a view's blocks of 2 x 2 pixels look, and from where a place is seen."""
+"""Places on the mesh at which a view's blocks of 2 x 2 pixels look, and the block from which a place is seen."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ViewSurface:
     where the picture is clipped."""
     base_from_camera: Floats
     lens: Intrinsics
-    """Of blocks."""
+    """Lens in units of blocks."""
 
     def project(self, points_mm: Floats) -> Floats:
         """[n, 2] blocks of places [n, 3]."""
@@ -74,7 +74,8 @@ def view_surface(
     base_from_camera: Floats,
     threads: int,
 ) -> ViewSurface:
-    """By rays to a mesh whose triangles have `normals` [n, 3]; `lens` is of pixels."""
+    """Return the surface that a view sees, by rays to a mesh whose triangles have `normals` [n, 3]; `lens` is of
+    pixels."""
     height, width = picture.shape
     blocks = block_lens(lens)
     surface = seen_surface(mesh, normals, blocks, base_from_camera, (width, height), threads=threads)

@@ -21,13 +21,13 @@ from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples,
 
 @dataclass(frozen=True)
 class Fit:
-    """What reports and charts call a fit."""
+    """Name, title and colour by which reports and charts show a fit."""
 
     name: str
-    """Of its file or folder in `fits/`, and of `--fit`."""
+    """Name of the fit's file or folder in `fits/`, and for `--fit`."""
     title: str
     colour: str
-    """In charts: Okabe and Ito's, which the colour-blind tell apart."""
+    """Colour in charts: Okabe and Ito's, which the colour-blind tell apart."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class MaterialFit(Fit):
     def fit(
         self, samples: TriangleSamples, used: NDArray[np.bool_], noise_um: float, threads: int | None
     ) -> TriangleMaterials:
-        """From the samples `used` [samples]; `noise_um` of the mesh's vertices."""
+        """Fit materials to the samples `used` [samples]; `noise_um` is that of the mesh's vertices."""
         return fit_triangles(samples, used, noise_um if self.fits_normals else None, threads=threads)
 
     def uncertainty(
@@ -74,11 +74,11 @@ class ViewFit(Fit):
 
     basis: Basis
     over: MaterialFit | None = None
-    """What it is added to; it was fitted to what that leaves."""
+    """Material fit that this fit is added to; this one was fitted to what that leaves."""
 
     @property
     def coefficients(self) -> int:
-        """Of each channel; the last one is the share of `over`, if there is one."""
+        """Number of coefficients of each channel; the last one is the share of `over`, if there is one."""
         return COUNT + (self.over is not None)
 
     def values(
@@ -98,7 +98,7 @@ def _named(*fits: _F) -> dict[str, _F]:
 GGX = MaterialFit("ggx", "GGX, mesh's normals", "#999999", fits_normals=False)
 GGX_NORMAL = MaterialFit("ggx_normal", "GGX, normals fitted", "#cc79a7", fits_normals=True)
 MATERIALS = _named(GGX, GGX_NORMAL)
-"""By name, in the order in which they are made."""
+"""Material fits by name, in the order in which they are made."""
 SLICES = _named(
     ViewFit("sh", "spherical harmonics", "#0072b2", HARMONICS),
     ViewFit("rbf", "radial functions", "#d55e00", RADIAL),
@@ -108,14 +108,14 @@ SLICES = _named(
 )
 FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}
 CLUSTERED, PAIR_HARMONICS = "clusters", "harmonics"
-"""What `coupole reflectance cluster` adds: materials of clusters, and harmonics of both directions."""
+"""Names of what `coupole reflectance cluster` adds: materials of clusters, and harmonics of both directions."""
 ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS)
-"""Hold from everywhere."""
+"""Fits that hold from everywhere."""
 RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS)
 """All that `--fit` of `coupole reflectance relight` takes."""
 
 
 def fitted_together() -> list[Sequence[ViewFit]]:
-    """Those of views in groups that share their functions, each fitted in one pass."""
+    """Return the fits of views in groups that share their functions; each group is fitted in one pass."""
     fits = sorted(SLICES.values(), key=lambda fit: not fit.basis.harmonic)
     return [list(group) for _, group in groupby(fits, key=lambda fit: fit.basis.harmonic)]

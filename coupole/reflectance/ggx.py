@@ -19,7 +19,8 @@ import math
 import numba
 
 UNKNOWNS = 5
-"""Of a fit: two tilts of the normal along its `tangents`, and the logarithms of kd, ks and alpha."""
+"""Number of unknowns of a fit: two tilts of the normal along its `tangents`, and the logarithms of kd, ks and
+alpha."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -84,7 +85,7 @@ def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
-    """How often a ray that is drawn from a lobe takes a direction, per sr (Heitz 2018, eq. 17)."""
+    """Return how often a ray that is drawn from a lobe takes a direction, per sr (Heitz 2018, eq. 17)."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
     return 0.5 * alpha2 / (math.pi * t * t * (nv + math.sqrt(alpha2 + (1.0 - alpha2) * nv * nv)))
@@ -92,8 +93,8 @@ def drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def reflected(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
-    """Into `way` [3] the view (unit, nv to the normal) mirrored at a normal that it sees, chosen by two numbers
-    from 0 to 1; the cosine of that normal (Heitz 2018, listing 1)."""
+    """Fill `way` [3] with the view (unit, nv to the normal) mirrored at a normal that it sees, which two numbers
+    from 0 to 1 choose; return the cosine of that normal (Heitz 2018, listing 1)."""
     x, y, z = normal[0], normal[1], normal[2]
     if abs(z) < 0.9:
         length = math.sqrt(x * x + y * y)

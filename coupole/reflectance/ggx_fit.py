@@ -26,8 +26,8 @@ from coupole.reflectance.normal_fit import (
 )
 
 ROWS = 11
-"""Of each pack of eight samples: the square root of the value, its light, half vector and view, and 1 where there
-is a sample."""
+"""Rows of each pack of eight samples: the square root of the value, its light, half vector and view, and 1 where
+there is a sample."""
 _OFF = UNKNOWNS
 _TOGETHER = 4
 """Packs whose product is taken, below what a double can hold: an error of 1e4 scales in each sample."""
@@ -35,7 +35,8 @@ _TOGETHER = 4
 
 @numba.njit(cache=True, nogil=True)
 def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-untyped-def]
-    """Into `packs` [n, 11, 8] the samples `good`; how many packs they fill. For the others see `fit_from`."""
+    """Fill `packs` [n, 11, 8] with the samples `good`; return how many packs they fill. For the other arguments
+    see `fit_from`."""
     count = (len(good) + LANES - 1) // LANES
     for number in range(count * LANES):
         one = packs[number // LANES, :, number % LANES]
@@ -125,8 +126,8 @@ def _dot(vector, values, first):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped-def]
-    """Into `rows` [6 packs, 8] the residuals' derivatives by the unknowns, then the residuals, times the square
-    root of the weight; sum of the logarithms, and weighted rms. The formulas are those of
+    """Fill `rows` [6 packs, 8] with the residuals' derivatives by the unknowns, then the residuals, times the
+    square root of the weight; return the sum of the logarithms, and the weighted rms. The formulas are those of
     `coupole.reflectance.ggx`."""
     normal = (unknowns[0], unknowns[1], unknowns[2])
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])

@@ -41,10 +41,10 @@ _POINTS = 4
 _PASSES = 3
 _MOST_BOUNCES = 8
 _LEAST_COSINE = 0.2
-"""Of light in the samples that a triangle's diffuse reflectance is found by."""
+"""Least cosine of light in the samples by which a triangle's diffuse reflectance is found."""
 _MOST_REFLECTED = 0.95
 MOST_SHARE = 0.5
-"""Of a sample; others are left out."""
+"""Upper bound of inter-reflection as a share of a sample; other samples are left out."""
 _SUPPORT_CELLS = 24
 _RAYS = 1_000_000
 
@@ -70,8 +70,8 @@ class Scene:
 
 
 def scene_of(corners_mm: Floats, *, support_z: tuple[Floats, Floats] | None = None) -> Scene:
-    """Of triangles [m, 3, 3]; `support_z` is a point of the support and its unit normal, if it reflects: a square
-    of three times the object's width comes to the scene."""
+    """Return the scene of triangles [m, 3, 3]. `support_z` is a point of the support and its unit normal, if it
+    reflects: a square of three times the object's width comes to the scene."""
     count = len(corners_mm)
     if support_z is not None:
         corners_mm = np.concatenate([corners_mm, _support(corners_mm, *support_z)])
@@ -297,7 +297,7 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
 
 
 def _fill_medians(found: Floats, samples: TriangleSamples) -> None:
-    """Into those of `found` [n, channels] that are NaN."""
+    """Fill those rows of `found` [n, channels] that have NaN with medians of the samples."""
     cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)

@@ -11,14 +11,14 @@ import numba
 
 @numba.njit(cache=True, nogil=True)
 def assign(to, values):  # type: ignore[no-untyped-def]
-    """Into `to` [n] the numbers `values` [n]; the lengths are not checked."""
+    """Copy the numbers `values` [n] to `to` [n]; the lengths are not checked."""
     for n in range(len(to)):
         to[n] = values[n]
 
 
 @numba.njit(cache=True, nogil=True)
 def assign_rows(to, values):  # type: ignore[no-untyped-def]
-    """Into `to` [m, n] the numbers `values` [m, n]; the shapes are not checked."""
+    """Copy the numbers `values` [m, n] to `to` [m, n]; the shapes are not checked."""
     for row in range(to.shape[0]):
         for column in range(to.shape[1]):
             to[row, column] = values[row, column]

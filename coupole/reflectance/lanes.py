@@ -40,7 +40,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _kind(*given: Any) -> Any:
-    """Of what comes of these: that of the lanes among them."""
+    """Return the type of what comes of these types: that of the lanes among them."""
     kinds = {kind for kind in given if isinstance(kind, _Lanes)}
     if len(kinds) != 1:
         raise errors.TypingError(f"expected lanes of one precision, got {', '.join(map(str, given))}")
@@ -142,7 +142,7 @@ root, absolute = _math("sqrt"), _math("fabs")
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) -> Any:
-    """Of an element of an array of any strides."""
+    """Return the address of an element of an array of any strides."""
     made = context.make_array(kind)(context, builder, array)
     address = builder.ptrtoint(made.data, ir.IntType(64))
     for number, place in enumerate(places):
@@ -171,7 +171,8 @@ def loaded(_context, array, row):  # type: ignore[no-untyped-def]
 
 @_compiled
 def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
-    """Into the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes' precision."""
+    """Store lanes as the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes'
+    precision."""
     if array.layout != "C" or array.dtype != numbers.number:
         raise errors.TypingError(f"expected an array of {numbers.number} in C order, got {array}")
 
@@ -312,7 +313,7 @@ def _refuse_but_singles(array: Any) -> None:
 
 @_compiled
 def store_halves(_context, numbers, bits):  # type: ignore[no-untyped-def]
-    """Into `bits` [8] of uint16 those of float16, each the nearest to its number."""
+    """Store eight numbers in `bits` [8] of uint16 as float16, each the nearest to its number."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         halves = builder.fptrunc(values[0], ir.VectorType(_HALF, LANES))

@@ -44,7 +44,7 @@ class Geometry:
     facets: Facets
 
     def of(self, triangles: NDArray[np.int64]) -> Facets:
-        """What a view sees of them: its triangles by their rising numbers."""
+        """Return the facets of the triangles that a view sees, given by their rising numbers."""
         place = np.full(len(self.facets.centres_mm), -1)
         place[triangles] = np.arange(len(triangles))
         sides = self.facets.neighbours[triangles]
@@ -105,7 +105,8 @@ def extract_view(
 def view_pass(
     measured: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
 ) -> tuple[ViewPass, SeenSurface]:
-    """What a view sees, ready for its frames. Raises InputError if it sees nothing of the mesh."""
+    """Return the pass of a view, ready for its frames, and what the view sees. Raises InputError if it sees
+    nothing of the mesh."""
     focal_mm, focus_mm, f_number = measured.optics
     surface = seen_surface(
         geometry.mesh,

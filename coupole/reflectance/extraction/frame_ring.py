@@ -25,7 +25,7 @@ class FrameRing:
     """`with FrameRing(...)` begins to read; errors of a frame are raised where it is taken."""
 
     def __init__(self, frames: Sequence[LightFrame], size_px: tuple[int, int], together: int) -> None:
-        """At most `together` frames are worked on at a time."""
+        """Prepare the ring; at most `together` frames are worked on at a time."""
         width, height = size_px
         self._shape, slots = (height, width), min(together + READERS, len(frames))
         stride = -(-2 * width * height // 4096) * 4096 + _SECTOR  # the same pixel of all frames: not one cache set

@@ -22,7 +22,7 @@ from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT, Radiometry
 from coupole.reflectance.extraction.sample_codes import REACHED
 
 MOST_FRAMES = 12
-"""Of a view; more LEDs than that are thinned out evenly."""
+"""Largest number of frames of a view; more LEDs than that are thinned out evenly."""
 
 
 def write_frames(

@@ -1,4 +1,4 @@
-"""Which LEDs light which triangles, and how much: shadows of the object, their penumbrae, irradiance.
+"""LEDs that light each triangle, and how much: shadows of the object, their penumbrae, irradiance.
 
 From a triangle's centre rays go to the centres of all LEDs, and near the edges of shadows to the LEDs' corners.
 """

@@ -1,4 +1,5 @@
-"""What a run was measured with: its frames, the object's triangles, and the calibrations that give them units.
+"""Data with which a run was measured: its frames, the object's triangles, and the calibrations that give them
+units.
 
 The run's own folder is enough: plan, rig, mesh and records are kept in it.
 """
@@ -41,10 +42,10 @@ USED = (*NEEDED, "dark", "response", "flat-field", "camera", "drift")
 U_SIGNAL = {"response": "uncertainty of linearity", "flat-field": "uncertainty", "drift": "uncertainty"}
 """Records of what makes all samples uncertain alike, and how the limit that says how much begins."""
 TYPICAL_PER_K = -0.003
-"""Of white power LEDs, relative."""
+"""Relative change of the power of white LEDs with temperature, per K."""
 SAME_GAIN_DB = 0.01
 MOST_MOVED_MM = 0.1
-"""Within a view; an arm comes back to a pose within less when a run is resumed."""
+"""Largest movement within a view; an arm comes back to a pose within less when a run is resumed."""
 _HOW = (
     "name them with --calibrations, or make them: `coupole calibrate all --rig RIG`; --uncalibrated gives "
     "relative values of single pixels without them"
@@ -60,7 +61,7 @@ class MeasuredView:
     """[4, 4] mm, by the hand-eye's record, the arm's axis zeros applied."""
     frames: tuple[LightFrame, ...]
     pointing: Pointing
-    """How well it is known where the camera looks."""
+    """Uncertainty of where the camera looks."""
 
     @cached_property
     def by_led(self) -> dict[int, list[LightFrame]]:
@@ -91,7 +92,7 @@ class Powers:
         return {int(led): number for number, led in enumerate(self.ids)}
 
     def of(self, leds: NDArray[np.int64]) -> Powers:
-        """Of some LEDs; NaN for those that the record does not have."""
+        """Return the powers of some LEDs; NaN for those that the record does not have."""
         rows = np.array([self._row.get(int(led), -1) for led in leds])
 
         def picked(values: Floats) -> Floats:
@@ -133,7 +134,7 @@ class MeasuredRun:
     powers: Powers
     emission: Emission
     records: Mapping[str, Path]
-    """By kind."""
+    """Files of the records, by kind."""
     led_u_mm: float
     """Standard uncertainty of each coordinate of an LED's place, as the record has it for the median LED."""
     mesh_path: Path
@@ -142,7 +143,7 @@ class MeasuredRun:
     base_from_support: Floats
     drift: Drift
     direct_light_alone: bool
-    """Whether the cell is simulated without light from surface to surface."""
+    """True if the cell is simulated without light from surface to surface."""
     camera: CameraPrior
     """Lens and hand-eye with their covariance; `axis_sensitivity` is that of `views`, in their order."""
     u_signal: float = 0.0
@@ -208,7 +209,8 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
 
 
 def _direct_light_alone(rig: Rig) -> bool:
-    """By the settings of the simulated world, as docs/reference/rig.md has them."""
+    """Tell whether light is direct alone, by the settings of the simulated world, as docs/reference/rig.md has
+    them."""
     world = {} if rig.world is None else rig.world.settings
     asked = world.get("interreflection")
     return world.get("shading") == "flat" if asked is None else asked is False
@@ -270,7 +272,8 @@ def _refuse_unknown_leds(path: Path, leds: Positions, views: Sequence[MeasuredVi
 
 
 def _drift(path: Path | None) -> Drift:
-    """By a record of the run's own drift; else white LEDs' usual loss of light with warmth."""
+    """Return the drift by a record of the run's own drift; without one, by white LEDs' usual loss of light with
+    warmth."""
     if path is None:
         return Drift()
     record = read_accepted(path, "drift")
@@ -278,7 +281,8 @@ def _drift(path: Path | None) -> Drift:
 
 
 def _u_signal(records: Mapping[str, Path]) -> float:
-    """By the figures with which records of these kinds were accepted."""
+    """Return the uncertainty of the signal, from the figures with which records of the kinds in `U_SIGNAL` were
+    accepted."""
     square = 0.0
     for kind, what in U_SIGNAL.items():
         if kind in records:

@@ -1,4 +1,4 @@
-"""How well it is known what a pixel looks at: lens, camera and mesh with their covariance."""
+"""Uncertainty of what a pixel looks at: lens, camera and mesh with their covariance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coupole.calibration.rotations import moved, rotation, skew
 Floats = NDArray[np.float64]
 
 _SMALL = 1e-3
-"""Of a standard uncertainty: steps of the differences that stand for derivatives."""
+"""Steps of the differences that stand for derivatives, as a share of a standard uncertainty."""
 _POINTS = 100
 """Places on the object that stand for all of a view."""
 
@@ -26,13 +26,13 @@ class Doubts:
     """Standard uncertainties that no record states."""
 
     arm_mm: float = 0.03
-    """Of the flange's position in each view, in each direction."""
+    """Standard uncertainty of the flange's position in each view, in each direction."""
     arm_deg: float = 0.003
     mesh_mm: float = 0.1
-    """Of the mesh's place in the base frame, in each direction."""
+    """Standard uncertainty of the mesh's place in the base frame, in each direction."""
     mesh_deg: float = 0.02
     shape_mm: float = 0.03
-    """Of the surface along its normals, alike over `scale_mm`."""
+    """Standard uncertainty of the surface along its normals, alike over `scale_mm`."""
     scale_mm: float = 20.0
 
     @property
@@ -42,7 +42,7 @@ class Doubts:
 
 
 STATED = Doubts()
-"""Unless a user states others."""
+"""Uncertainties that hold unless a user states others."""
 
 
 def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doubts) -> Floats:
@@ -100,7 +100,8 @@ class Pointing:
 
 
 def pointings(prior: CameraPrior, base_from_camera: Floats, middle_mm: Floats) -> tuple[Pointing, ...]:
-    """Of views at poses [v, 4, 4] of an object, by a camera's records and what no record states."""
+    """Return the pointings of the views of an object from poses [v, 4, 4], by a camera's records and what no
+    record states."""
     whole, lens = camera_covariance(prior, base_from_camera, STATED), len(prior.free)
     found = []
     for view in range(len(base_from_camera)):

@@ -1,4 +1,4 @@
-"""What turns DN into linear signal over the flat field, and which pixels each triangle has."""
+"""Conversion of DN to linear signal over the flat field, and the pixels that each triangle has."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
 
 RANGE_LEFT_OUT = 0.02
-"""Of the camera's range, at both ends (seed 003, 5.1)."""
+"""Share of the camera's range that is left out at both ends (seed 003, 5.1)."""
 
 
 class Radiometry:
-    """What turns the DN of a run's frames into linear signal, read once for all its views."""
+    """Data that turn the DN of a run's frames into linear signal, read once for all its views."""
 
     def __init__(self, measured: MeasuredRun) -> None:
         frames, records = measured.frames, measured.records
@@ -51,16 +51,16 @@ class PixelLists(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Of the camera's channels, for compiled code."""
+    """Response of the camera's channels, for compiled code."""
 
     curve: NDArray[np.float32]
     """[channels, 2] of the square and the cube of a signal in DN."""
     noise: NDArray[np.float32]
     """[channels, 2] variance in the dark, DN^2, and gain, DN/e; NaN where it is not known."""
     top_dn: np.float32
-    """Of the range that is used."""
+    """Upper end of the range that is used."""
     least_dn: np.float32
-    """Above the dark, of a triangle's mean."""
+    """Least mean of a triangle, above the dark."""
 
 
 class SignalReader:
@@ -94,7 +94,7 @@ class SignalReader:
         """[exposures, pixels] what frames have without light, DN, in the order of the lists."""
 
     def prepare(self, frames: Sequence[LightFrame]) -> None:
-        """What frames of their exposures have without light."""
+        """Set `exposures` and `darks`: what frames of these exposures have without light."""
         alike = {frame.exposure_us: frame for frame in frames}
         self.exposures = {exposure_us: number for number, exposure_us in enumerate(alike)}
         self.darks = np.empty((len(alike), len(self.lists.places)), np.float32)
@@ -139,7 +139,7 @@ def _count(triangle, channel, pixels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _list(triangle, channel, next_place, places):  # type: ignore[no-untyped-def]
-    """Into `places` the numbers of pixels; `next_place` [triangles channels] is where a list goes on."""
+    """Fill `places` with the numbers of pixels; `next_place` [triangles channels] is where a list goes on."""
     channels = len(next_place) // (triangle.max() + 1) if len(places) else 1
     width = triangle.shape[1]
     for row in range(triangle.shape[0]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 REACHED, AWAY, SHADED, PENUMBRA = range(4)
-"""By the object; AWAY: below `lamp_sight.MOST_INCIDENCE_DEG`, or behind the LED."""
+"""Codes that the object's own shape gives; AWAY: beyond `lamp_sight.MOST_INCIDENCE_DEG`, or behind the LED."""
 BY_CELL = PENUMBRA + 1
 """Arm, camera or tool may hide them from each other."""
 BY_UNKNOWN = BY_CELL + 1

@@ -59,14 +59,14 @@ class Lamps(NamedTuple):
     powers: Singles
     """[channels, 8] DN s^-1 m^2 sr; NaN where there is none."""
     paper: bool
-    """Whether the emitter's cosine counts twice (seed 003, Eq. 2)."""
+    """True if the emitter's cosine counts twice (seed 003, Eq. 2)."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normals, codes, f, u_own):  # type: ignore[no-untyped-def]
-    """Into `f` and `u_own` [b, leds, channels], bits of float16, the samples of b triangles from the `first` on
-    where `codes` [b, 8] say that light has reached them; `lists` are the view's PixelLists, `darks` [exposures,
-    pixels] what its frames have without light, `response` the camera's."""
+    """Fill `f` and `u_own` [b, leds, channels], bits of float16, with the samples of b triangles from the `first`
+    on, where `codes` [b, 8] say that light has reached them; `lists` are the view's PixelLists, `darks`
+    [exposures, pixels] what its frames have without light, `response` the camera's."""
     bits = np.empty((2, 8), np.uint16)
     for row in range(len(f)):
         if REACHED not in codes[row]:
@@ -122,8 +122,8 @@ def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
-    """Of one pass, and its variance. NaN where no pixel is, where one is at the range's top, where the mean is at
-    its bottom."""
+    """Return the mean of one pass, and its variance. NaN where no pixel is, where one is at the range's top, where
+    the mean is at its bottom."""
     none, one = np.float32(0.0), np.float32(1.0)
     square, cube = response.curve[channel, 0], response.curve[channel, 1]
     in_dark, gain = response.noise[channel, 0], response.noise[channel, 1]

@@ -1,8 +1,8 @@
-"""Which triangle each pixel of a view sees, and which pixels must not be used.
+"""Triangle that each pixel of a view sees, and pixels that must not be used.
 
-A ray through the centre of each pixel, by the lens of the camera's record, to the first triangle that it meets
-(Embree). Left out: pixels at a silhouette, where a neighbour sees another surface or none, and what is out of
-focus.
+A ray goes through the centre of each pixel, by the lens of the camera's record, to the first triangle that it
+meets (Embree). Left out: pixels at a silhouette, where a neighbour sees another surface or none, and what is out
+of focus.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ Floats = NDArray[np.float64]
 _GRID_PX = 8
 """Directions are computed for every eighth pixel, and interpolated: distortion bends them by less than 0.01 px."""
 _ROWS = 128
-"""Traced together."""
+"""Rows of pixels that are traced together."""
 _MOST_STEP = 5.0
-"""Of the surface from pixel to pixel, over that of the plane that the pixel sees: beyond it is a silhouette."""
+"""Largest step of the surface from pixel to pixel, over that of the plane that the pixel sees: beyond it is a
+silhouette."""
 _LEAST_COSINE = 0.1
-"""Between view and normal: 84 degrees."""
+"""Least cosine between view and normal: 84 degrees."""
 
 
 @dataclass(frozen=True)
 class SeenSurface:
-    """What the pixels of one view show of the object."""
+    """Triangles of the object that the pixels of one view see."""
 
     places: NDArray[np.int32]
     """[h, w] place in `triangles` of what a pixel sees, -1 where it is not used."""
@@ -96,7 +97,7 @@ def _circle(
 
 @numba.njit(cache=True, nogil=True)
 def _turned(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
-    """Into `ways` [rows, width, 3] the directions as unit vectors of the base frame."""
+    """Fill `ways` [rows, width, 3] with the directions as unit vectors of the base frame."""
     for row in range(ways.shape[0]):
         for column in range(ways.shape[1]):
             x, y, z = directions[row, column]

@@ -34,12 +34,12 @@ _AHEAD = 4
 
 @dataclass(frozen=True)
 class Samples:
-    """Of some LEDs and triangles of a view."""
+    """Samples of some LEDs and triangles of a view."""
 
     leds: slice
     """Places in the view's LEDs."""
     rows: slice
-    """Of the view's triangles."""
+    """Rows of the view's triangles."""
     codes: NDArray[np.uint8]
     """[triangles, leds]"""
     f: NDArray[np.float16]
@@ -128,7 +128,8 @@ class ViewPass:
 
 
 def _in_order(work: Iterable[Future[Samples]], most: int) -> Iterator[Samples]:
-    """What begun work gives, in its order; at most so many are begun, or wait to be taken, at a time."""
+    """Yield the results of the work in its order; at most `most` pieces are begun, or wait to be taken, at a
+    time."""
     begun: deque[Future[Samples]] = deque()
     for one in work:
         begun.append(one)

@@ -1,4 +1,4 @@
-"""What interpolation between lights gets wrong, learnt from the lights themselves.
+"""Correction of what interpolation between lights gets wrong, learnt from the lights themselves.
 
 Shadows and highlights move as the light moves; a weighted sum of pictures fades one into the next instead. How the
 truth differs from the sum is seen wherever a light is left out: a small network is trained on those differences,
@@ -27,7 +27,7 @@ Floats = NDArray[np.float32]
 NEAR = 6
 """Pictures of the nearest lights that are looked at."""
 AROUND = 4
-"""Of these so many are also looked at in the pixel's surroundings."""
+"""Number of these pictures that are also looked at in the pixel's surroundings."""
 SURROUNDINGS_PX = (3, 7, 5)
 """Widths of squares: two round the sum, one round the near pictures."""
 MARGIN_PX = 3
@@ -36,7 +36,7 @@ HIDDEN = (48, 48)
 _LEAK = 0.05
 _BATCH = 4096
 MOST_SAMPLES = 4_000_000
-"""That are kept for training."""
+"""Largest number of samples that are kept for training."""
 _MOST_STEPS, _LOOKS = 2500, 8
 """Training ends after so many steps, or when each sample was looked at so often."""
 _RATE = 3e-3
@@ -63,7 +63,7 @@ def strip_of(mask: NDArray[np.bool_], values: Floats, least_level: float) -> Str
 
 @dataclass(frozen=True)
 class Sight:
-    """What the network is told of one light at the pixels of a strip, and between what its answer must stay."""
+    """Input of the network for one light at the pixels of a strip, and the bounds of its answer."""
 
     summed: Floats
     """[pixels, 3] by the first kernel, as shares of the level."""
@@ -76,7 +76,8 @@ class Sight:
 def look(
     strip: Strip, directions: NDArray[np.float64], direction: NDArray[np.float64], kernels: Sequence[str]
 ) -> Sight:
-    """Of a new light from the strip's values under lights from `directions`; the sum is by the first kernel."""
+    """Return the input for a new light from the strip's values under lights from `directions`; the sum is by the
+    first kernel."""
     weights = np.concatenate(
         [light_interpolation.weights(directions, direction[None], kernel) for kernel in kernels]
     )
@@ -129,7 +130,8 @@ class Network:
         return outputs
 
     def gradients(self, outputs: list[Floats], slope: Floats) -> list[tuple[Floats, Floats]]:
-        """Of a cost whose derivative by the last output [n, 1] is `slope`, by matrices and offsets."""
+        """Return the gradients of a cost whose derivative by the last output [n, 1] is `slope`, by matrices and
+        offsets."""
         found = []
         for number in range(len(self.layers) - 1, -1, -1):
             found.append((outputs[number].T @ slope, slope.sum(axis=0)))
@@ -190,7 +192,7 @@ def lessons(
     share: float,
     generator: np.random.Generator,
 ) -> Iterator[Lesson]:
-    """Of each of these lights, with a share of the pixels drawn at random."""
+    """Yield the lesson of each of these lights, with a share of the pixels drawn at random."""
     for light in lights:
         left = left_without(directions, light, LEFT_OUT_WITH)
         sight = look(

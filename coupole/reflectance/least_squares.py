@@ -37,19 +37,20 @@ _dtrsm = _routine("blas", "dtrsm", _CHAR, _CHAR, _CHAR, _CHAR, _INT, _INT, _DOUB
 
 
 def one_thread() -> Any:
-    """While it is entered, BLAS takes one thread for each call."""
+    """Limit BLAS to one thread for each call, while this is entered."""
     return _libraries().limit(limits=1, user_api="blas")
 
 
 @functools.cache
 def _libraries() -> ThreadpoolController:
-    """Those that this process has loaded, NumPy's and SciPy's BLAS among them, looked for once."""
+    """Return the libraries that this process has loaded, NumPy's and SciPy's BLAS among them; they are looked for
+    once."""
     return ThreadpoolController()
 
 
 @numba.njit(cache=True, nogil=True)
 def gram(rows, product):  # type: ignore[no-untyped-def]
-    """Into `product` [n, n], rows rows^T of `rows` [n, samples]: the half that `factorise` reads."""
+    """Fill `product` [n, n] with rows rows^T of `rows` [n, samples]: the half that `factorise` reads."""
     upper, turned = np.array([85], np.uint8), np.array([84], np.uint8)  # U and T
     sizes = np.array([rows.shape[0], rows.shape[1]], np.intc)
     factors = np.array([1.0, 0.0])
@@ -61,7 +62,7 @@ def gram(rows, product):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def sums(rows, values, right):  # type: ignore[no-untyped-def]
-    """Into `right` [m, n], values rows^T of `values` [m, samples] and `rows` [n, samples]."""
+    """Fill `right` [m, n] with values rows^T of `values` [m, samples] and `rows` [n, samples]."""
     turned, plain = np.array([84], np.uint8), np.array([78], np.uint8)  # T and N
     sizes = np.array([len(rows), len(values), rows.shape[1]], np.intc)
     factors = np.array([1.0, 0.0])
@@ -73,7 +74,8 @@ def sums(rows, values, right):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
-    """Into `factor` [n, n], Cholesky's of what `gram` left + diag(penalty); whether there is one."""
+    """Fill `factor` [n, n] with the Cholesky factor of what `gram` left + diag(penalty); return whether there is
+    one."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(penalty), 0], np.intc)
     assign_rows(factor, product)
@@ -85,7 +87,7 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve(factor, right):  # type: ignore[no-untyped-def]
-    """In place: the solutions for `right` [m, n], by what `factorise` left."""
+    """Solve in place for `right` [m, n], by what `factorise` left."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(factor), len(right), 0], np.intc)
     _dpotrs(
@@ -96,8 +98,8 @@ def solve(factor, right):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ignore[no-untyped-def]
-    """Into `right` [m, n] what `gram`, `factorise`, `sums` and `solve` make of `rows` [n, samples] and `values`
-    [m, samples], with less work for fewer samples than rows; whether there is a solution.
+    """Fill `right` [m, n] with what `gram`, `factorise`, `sums` and `solve` make of `rows` [n, samples] and
+    `values` [m, samples], with less work for fewer samples than rows; return whether there is a solution.
 
     x = P^-1 R (R^T P^-1 R + 1)^-1 y has a matrix of the samples (Golub and Van Loan, Matrix Computations, 2.1.4:
     the Sherman-Morrison-Woodbury formula). Cholesky's of that is left in `factor` [samples, samples], its inverse
@@ -123,7 +125,7 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
 
 @numba.njit(cache=True, nogil=True)
 def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-untyped-def]
-    """Into `off` [m, ...] by how much every `step`-th sample is missed by the fit to all the others.
+    """Fill `off` [m, ...] with the amount by which each `step`-th sample is missed by the fit to all the others.
 
     `rows` [n, samples], `coefficients` [m, n] and `factor` are those of a solution. For fewer samples than rows
     `values` [m, samples] are what `solve_by_samples` left, else the samples. That is what the fit to all leaves
@@ -155,7 +157,7 @@ def left_out(rows, values, coefficients, factor, step, off):  # type: ignore[no-
 
 @numba.njit(cache=True, nogil=True)
 def _half_solve(factor, right):  # type: ignore[no-untyped-def]
-    """In place: L^-1 of each row of `right` [m, n], with L L^T what was factorised."""
+    """Replace each row of `right` [m, n] by L^-1 times it, with L L^T what was factorised."""
     letters = np.array([76, 85, 84, 78], np.uint8)  # from the left, upper, transposed, not of diagonal 1
     sizes = np.array([len(factor), len(right)], np.intc)
     one = np.array([1.0])

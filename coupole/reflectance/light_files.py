@@ -23,25 +23,26 @@ from coupole.intake.plain_data import json_of
 Floats = NDArray[np.float64]
 
 _PLACES = {"spherical": "positionsSphere", "lights3d": "positions3d"}
-"""Where relight has the lights, by `lightConfiguration`; else, and where the list is empty, in `directions`."""
+"""Keys under which relight has the lights, by `lightConfiguration`; else, and where the list is empty, they are in
+`directions`."""
 _MOST_DIGITS = 9
-"""Of a number of lights."""
+"""Largest number of digits in a number of lights."""
 
 
 @dataclass(frozen=True)
 class LightFile:
-    """What a file says of the lights."""
+    """Lights as a file describes them."""
 
     directions: Floats
     """[n, 3] of any length, from the object to the light: x right, y up, z to the camera."""
     names: tuple[str, ...] = ()
-    """Of the pictures; empty if the file has none."""
+    """Names of the pictures; empty if the file has none."""
     intensities: Floats | None = None
     """[n, 3] by which values are divided."""
     srgb: bool = False
-    """Whether it says that the pictures are encoded for displays."""
+    """True if the file says that the pictures are encoded for displays."""
     lines: tuple[int, ...] = ()
-    """In which each direction stands; empty for JSON."""
+    """Lines of the file in which the directions stand; empty for JSON."""
 
 
 def read_lights(path: Path) -> LightFile:
@@ -172,7 +173,7 @@ def read_lp(path: Path) -> LightFile:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Of a text in UTF-8, with or without a mark of its beginning. Raises InputError."""
+    """Read the lines of a text in UTF-8, with or without a byte order mark. Raises InputError."""
     return _text(path).split("\n")
 
 

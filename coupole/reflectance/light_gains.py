@@ -1,4 +1,4 @@
-"""How bright each picture is beside what all together say: wrong intensities, other exposures, faulty files.
+"""Brightness of each picture beside what all together say: wrong intensities, other exposures, faulty files.
 
 A picture's gain is the median over pixels of its value over that of the fitted materials; the fit is robust, so a
 few faulty pictures of many do not move it.

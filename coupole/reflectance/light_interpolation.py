@@ -1,4 +1,4 @@
-"""What a point looks like under a light between measured ones: a weighted sum of the measured values.
+"""Values of a point under a light between measured ones: a weighted sum of the measured values.
 
 Radial basis functions of the lights' directions with a linear tail (seed 003, 5.2): the weights of the measured
 lights depend on directions alone, so one solution serves all pixels. Which kernel is best depends on the object

@@ -37,11 +37,12 @@ from coupole.reflectance.triangle_fit import (
 Floats = NDArray[np.float64]
 
 GROUPS = 8
+"""Number of groups of LEDs, of each view."""
 _FEWEST_GROUPS = 6
-"""Fewer say too little of what they share: single samples are counted too."""
-"""Of LEDs, of each view."""
+"""Least number of groups: fewer say too little of what they share, and single samples are counted too."""
 _LEAST_KS = 1e-3
-"""Of kd: below it the logarithm's covariance would say nothing of the highlight that may be there."""
+"""Least ks, as a share of kd: below it the logarithm's covariance would say nothing of the highlight that may be
+there."""
 _LEAST_KNOWN = 1e-2
 """1 over the variance of the logarithm of a kd of which the samples say nothing."""
 _PART = 256
@@ -49,7 +50,7 @@ _PART = 256
 
 @dataclass(frozen=True)
 class MaterialUncertainty:
-    """Of b triangles; NaN without material."""
+    """Uncertainty of the materials of b triangles; NaN without material."""
 
     covariance: Floats
     """[b, 5, 5] of the `ggx.UNKNOWNS`, for the channels' mean."""
@@ -84,8 +85,8 @@ def covariances(
     middle_mm: Floats,
     threads: int | None = None,
 ) -> MaterialUncertainty:
-    """Of materials that were fitted to the samples `used` [samples]; `noise_um` is that of the mesh's vertices,
-    `middle_mm` the middle of the object."""
+    """Return the covariances of materials that were fitted to the samples `used` [samples]; `noise_um` is that of
+    the mesh's vertices, `middle_mm` the middle of the object."""
     prior = prior_stiffness(samples.areas_mm2, noise_um)
     held = prior if fitted_normals else np.full(len(prior), HELD)
     group = groups_of(samples, middle_mm)

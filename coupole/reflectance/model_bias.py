@@ -1,4 +1,4 @@
-"""What leans all fitted normals of a material alike, and is taken off them.
+"""Common tilt of all fitted normals of a material, which is taken off them.
 
 A material that is not of the fit's form makes its normals lean, towards the cameras or away from them: the error
 that the fit would have in its form shows as a tilt. From single triangles it cannot be told, and their residuals
@@ -27,7 +27,8 @@ _TOGETHER, _MOST_GROUPS = 1000, 8
 _NEAREST = 50
 """Triangles whose mean normal says in which direction the surface faces."""
 _USUAL_TILT = np.radians(3.0)
-"""Of fitted normals: it keeps large triangles, whose normals the scanner knows well, from deciding alone."""
+"""Usual tilt of fitted normals, rad: it keeps large triangles, whose normals the scanner knows well, from deciding
+alone."""
 _CHUNK = 1 << 16
 
 

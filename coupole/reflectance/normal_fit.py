@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 RANKS = (0.2, 0.8)
 _STARTS = (0.08, 0.2, 0.45)
-"""Of alpha; the best end is kept."""
+"""Values of alpha from which fits start; the best end is kept."""
 _LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 CAUCHY = 0.05
@@ -41,7 +41,7 @@ _BLOCK = 2000
 
 @dataclass(frozen=True)
 class PointMaterials:
-    """Of n pixels; NaN where there were too few samples."""
+    """Materials of n pixels; NaN where there were too few samples."""
 
     normals: Floats
     """[n, 3] unit."""
@@ -52,7 +52,7 @@ class PointMaterials:
     """Weighted rms of the square roots, as a share of sqrt(kd)."""
 
     def at(self, pixels: slice) -> PointMaterials:
-        """Of some of the pixels."""
+        """Return the materials of some of the pixels."""
         return PointMaterials(*(getattr(self, field.name)[pixels] for field in fields(self)))
 
 
@@ -154,7 +154,7 @@ def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, k
 
 @numba.njit(cache=True, nogil=True)
 def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
-    """Of a sample in `colours_from`: values [channels] where grey gives `model`."""
+    """Return the weight of a sample in `colours_from`: values [channels] where grey gives `model`."""
     off = (math.sqrt(model) - math.sqrt(max(0.0, values.mean()))) / (CAUCHY * math.sqrt(grey_kd))
     return 1.0 / ((1.0 + off * off) * max(model, 1e-12))
 
@@ -229,7 +229,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
 
 @numba.njit(cache=True, nogil=True)
 def _least_cosine(normal, views):  # type: ignore[no-untyped-def]
-    """Between the normal and the views."""
+    """Return the least cosine between the normal and the views."""
     least = 1.0
     for view in range(len(views)):
         cosine = normal[0] * views[view, 0] + normal[1] * views[view, 1] + normal[2] * views[view, 2]

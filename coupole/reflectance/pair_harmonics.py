@@ -85,7 +85,7 @@ def _orders(degrees: int) -> list[tuple[int, int, int]]:
 
 @numba.njit(cache=True, nogil=True)
 def _legendre(z, degrees, a, b, first, found):  # type: ignore[no-untyped-def]
-    """Into `found` [degrees, degrees] P(l, m) of z, without the power of the distance from the axis."""
+    """Fill `found` [degrees, degrees] with P(l, m) of z, without the power of the distance from the axis."""
     p_mm = math.sqrt(0.25 / math.pi)
     for m in range(degrees):
         p_mm *= first[m]

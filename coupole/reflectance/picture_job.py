@@ -1,4 +1,4 @@
-"""From pictures under known lights to normals, materials and what relights them, into a result folder.
+"""Job from pictures under known lights to normals, materials and what relights them, in a result folder.
 
 Each step leaves one file, complete or not there; a job that was killed goes on with the first that is missing.
 """
@@ -53,7 +53,7 @@ Said = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Checked:
-    """How a light that was left out was made."""
+    """Errors of the picture that was made for a light that was left out."""
 
     light: int
     psnr_db: float
@@ -137,7 +137,7 @@ _FIELDS = {"normal": 3, "kd": 3, "ks": 3, "alpha": 1, "residual": 1, "grey_kd": 
 
 
 def _fit_twice(result: PictureResult, lights: NDArray[np.int64], say: Said) -> None:
-    """With all lights; then, if there are suspect pictures, again without them."""
+    """Fit with all lights; then, if there are suspect pictures, again without them."""
     first, last = result.folder / _FIRST, result.folder / MATERIALS
     if not first.exists():
         _fit(result, lights, first, "normals and materials", say)
@@ -175,7 +175,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
 
 
 def read_materials(path: Path) -> PointMaterials:
-    """Of the grey values, [pixels] of the mask."""
+    """Read the materials of the grey values, [pixels] of the mask."""
     with opened(path) as file:
         names = ("normal", "grey_kd", "grey_ks", "alpha", "residual")
         return PointMaterials(*(np.asarray(file[name], dtype=np.float64) for name in names))
@@ -203,7 +203,7 @@ def check(result: PictureResult, interpolation: Interpolation, light: int, peak:
 
 
 def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:
-    """Of all left-out lights together; None without any."""
+    """Return the PSNR of all left-out lights together; None without any."""
     if not checked:
         return None
     return float(-10.0 * np.log10(np.mean([10.0 ** (-one.psnr_db / 10.0) for one in checked])))

@@ -23,7 +23,7 @@ FEWEST_LIGHTS = 6
 
 @dataclass(frozen=True)
 class PictureSet:
-    """What the files say; the pictures themselves are read one by one."""
+    """Set of pictures as the files describe it; the pictures themselves are read one by one."""
 
     files: tuple[Path, ...]
     directions: NDArray[np.float64]
@@ -35,11 +35,11 @@ class PictureSet:
     full_scale: int
     """Largest value that a picture can hold."""
     srgb: bool = False
-    """Whether files are encoded for displays; their values are decoded to 16 bit."""
+    """True if files are encoded for displays; their values are decoded to 16 bit."""
     uncalibrated_run: str = ""
     """The run that these are pictures of, with nominal lights; empty for others."""
     simulated: bool | None = None
-    """Whether they were simulated; None where nobody knows."""
+    """True if the pictures were simulated; None where nobody knows."""
 
     def __len__(self) -> int:
         return len(self.files)

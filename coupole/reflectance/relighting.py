@@ -23,26 +23,27 @@ from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, ope
 Floats = NDArray[np.float32]
 
 STRIP_PIXELS = 60_000
-"""In which pictures are made; more only if a row has more."""
+"""Pixels of a strip in which pictures are made; more only if a row has more."""
 _TAUGHT_PIXELS = 60_000
-"""Of so many, in strips drawn at random, the correction is learnt."""
+"""Number of pixels, in strips drawn at random, from which the correction is learnt."""
 _TAUGHT_ROWS = 32
 _KERNEL_PIXELS = 20_000
 LEAST_LEVEL = 1e-3
-"""Of the values' 99.9 % quantile: pixels darker than this count as if they were so bright."""
+"""Least level, as a share of the values' 99.9 % quantile: pixels darker than this count as if they were so
+bright."""
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    """How pictures between the lights are made."""
+    """Data from which pictures between the lights are made."""
 
     lights: NDArray[np.int64]
-    """Which of the result's lights are used, rising."""
+    """Numbers of the result's lights that are used, rising."""
     gains: NDArray[np.float64]
     """[lights] of their pictures; values are divided by them."""
     kernel: str
     left_out_rms: dict[str, float]
-    """By kernel: rms of what it says of a light that was left out, in full scales."""
+    """Rms error of each kernel for a light that was left out, in full scales."""
     peak: float
     """99.9 % quantile of the values."""
     network: Network | None
@@ -58,7 +59,7 @@ class Interpolation:
 
 
 def read_interpolation(folder: Path) -> Interpolation:
-    """Of a result folder. Raises InputError."""
+    """Read the interpolation of a result folder. Raises InputError."""
     with opened(folder / INTERPOLATION) as file:
         layers = [
             (np.asarray(file[f"network/{number}/matrix"]), np.asarray(file[f"network/{number}/offset"]))
@@ -116,7 +117,8 @@ def _joined(parts: Sequence[learned.Lesson]) -> learned.Lesson:
 
 
 def left_out_rms(values: Floats, directions: NDArray[np.float64]) -> dict[str, float]:
-    """By kernel, of values [lights, pixels, 3]: rms over all lights, each left out with its nearest neighbour."""
+    """Return the rms error of each kernel, from values [lights, pixels, 3]: over all lights, each left out with
+    its nearest neighbour."""
     flat = values.reshape(len(values), -1)
     squares = dict.fromkeys(KERNELS, 0.0)
     for light in range(len(values)):

@@ -22,8 +22,8 @@ from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
 _LONGEST_STEP = 0.02
-"""Of tilts (rad) and alpha's logarithm, to both sides: small enough for a derivative, large enough for float32. In
-kd and ks pictures are linear."""
+"""Longest step of tilts (rad) and alpha's logarithm, to both sides: small enough for a derivative, large enough
+for float32. Pictures are linear in kd and ks."""
 _NOT_LINEAR = (0, 1, 4)
 
 
@@ -78,9 +78,9 @@ def refuse_uncertain(result: RunResult, fit: str) -> None:
 
 
 def _uncertain(scene: RelitScene) -> tuple[Floats, Floats, Floats]:
-    """Of the surface's triangles: covariance [n, 5, 5] of tilts and logarithms; [n, 2, channels] uncertainty of
-    each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n] that all light from a
-    triangle has."""
+    """Return for the surface's triangles: covariance [n, 5, 5] of tilts and logarithms; [n, 2, channels]
+    uncertainty of each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n] that
+    all light from a triangle has."""
     places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
     covariance = scene.result.material_covariances(scene.fit, places)
     of_means = np.sqrt(np.einsum("nii->ni", covariance)[:, 2:4, None])

@@ -37,7 +37,7 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
 
 
 def read_settings(out: Path) -> dict[str, Any]:
-    """What a result was begun with. Raises InputError if there is none."""
+    """Read the settings with which a result was begun. Raises InputError if there are none."""
     path = out / SETTINGS
     try:
         settings = read_json(path, allow_nan=True)
@@ -65,8 +65,8 @@ def complete(path: Path, write: Callable[[Path], Any], *, unless: Path | None = 
 
 @contextmanager
 def in_the_making(path: Path, unless: Path | None = None) -> Iterator[Path]:
-    """Where to write a file that is put in its place, whole, when all has gone well. The name is used once: a
-    writer that is believed dead disturbs no other."""
+    """Yield the path of a part file, which is put in the place of `path`, whole, when all has gone well. The name
+    is used once: a writer that is believed dead disturbs no other."""
     part = path.with_name(f"{path.name}.{uuid4().hex}.part")
     path.parent.mkdir(exist_ok=True)
     try:

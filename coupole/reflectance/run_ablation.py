@@ -1,6 +1,6 @@
-"""How much each fit depends on the number of LEDs, on grazing samples and on the number of coefficients.
+"""Dependence of each fit on the number of LEDs, on grazing samples and on the number of coefficients.
 
-By some triangles of a result, spread over it: their fits are made anew from fewer samples or coefficients, and
+Some triangles of a result, spread over it, are fitted anew from fewer samples or coefficients. The fits are
 compared under the LEDs that were left out of all of them (seed 003, 6.3 and 6.4).
 """
 
@@ -42,7 +42,7 @@ _BLOCKS, _TRIANGLES = 16, 48
 
 @dataclass(frozen=True)
 class Variant:
-    """What a fit is given."""
+    """Samples and coefficients that a fit is given."""
 
     led_step: int = 1
     most_incidence_deg: float = 89
@@ -57,8 +57,8 @@ VARIANTS: dict[str, list[tuple[float, Variant]]] = {
 
 
 def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict[str, Any]:
-    """By each setting, the mean absolute error of each fit as a share of the camera's range; written to the
-    result too. Raises InputError if its samples are not all there, StorageError if the disk takes nothing."""
+    """Return, by each setting, the mean absolute error of each fit as a share of the camera's range; write it to
+    the result too. Raises InputError if its samples are not all there, StorageError if the disk takes nothing."""
     settings = read_settings(out)
     result = RunResult(out)
     result.refuse_unfinished(settings)
@@ -94,7 +94,7 @@ def _mean(off: list[Floats]) -> float | None:
 
 
 def _blocks(result: RunResult) -> list[slice]:
-    """Of places in `triangles`."""
+    """Return blocks of places in `triangles`."""
     count = len(result.triangles)
     firsts = np.unique(np.linspace(0, max(0, count - _TRIANGLES), _BLOCKS).astype(int))
     return [slice(int(first), min(int(first) + _TRIANGLES, count)) for first in firsts]
@@ -135,7 +135,7 @@ def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
 
 
 def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
-    """Of each fit, under the LEDs that were left out, where every fit has something."""
+    """Return the errors of each fit, under the LEDs that were left out, where every fit has something."""
     of_leds = np.unique(case.leds[~case.held])[:: variant.led_step]
     used = np.isin(case.leds, of_leds)
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)

@@ -1,7 +1,7 @@
-"""What the fits of runs miss under LEDs that they have not seen, and what `result.json` says.
+"""Errors of the fits of runs under LEDs that they have not seen, and what `result.json` says.
 
-They are compared with pictures, block by block of 2 x 2 pixels (seed 003, 6.3), and with the samples, which are
-means over triangles and have less noise. Inter-reflection that was taken off the samples is taken off the
+The fits are compared with pictures, block by block of 2 x 2 pixels (seed 003, 6.3), and with the samples, which
+are means over triangles and have less noise. Inter-reflection that was taken off the samples is taken off the
 pictures too.
 """
 
@@ -36,12 +36,12 @@ from coupole.storage.durable import write_synced
 Said = Callable[[str, int, int], None]
 PEAK_QUANTILE = 0.999
 _LEVELS, _LEVELS_OF_RANGE = 1 << 17, 1 << 16
-"""Of a histogram of shares of the camera's range, up to twice of it."""
+"""Levels of a histogram of shares of the camera's range, up to twice the range; levels of the range."""
 
 
 @dataclass
 class _Missed:
-    """Grows block by block: what one fit misses."""
+    """Errors of one fit; they grow block by block."""
 
     absolute: float = 0.0
     square: float = 0.0
@@ -62,20 +62,20 @@ class _Missed:
 
 @dataclass
 class _Check:
-    """What all fits miss."""
+    """Errors of all fits."""
 
     pictures: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
     triangles: dict[str, _Missed] = field(default_factory=lambda: {name: _Missed() for name in FITS})
     noise: list[float] = field(default_factory=list)
     """Mean absolute error of the pictures by noise, of each."""
     levels: NDArray[np.int64] = field(default_factory=lambda: np.zeros(_LEVELS, np.int64))
-    """How many values of the pictures there are at each level."""
+    """Number of values of the pictures at each level."""
     inside: dict[str, list[int]] = field(default_factory=lambda: {name: [0, 0] for name in MATERIALS})
-    """Of triangles' samples, how many lie in the interval of what the material gives, and of how many."""
+    """Number of triangles' samples that lie in the interval of what the material gives, and of how many."""
 
     @property
     def peak(self) -> float:
-        """Of the pictures, by which PSNR is told."""
+        """Peak of the pictures, by which PSNR is told."""
         upper = np.searchsorted(np.cumsum(self.levels), PEAK_QUANTILE * self.levels.sum())
         return float(upper + 0.5) / _LEVELS_OF_RANGE
 
@@ -136,7 +136,7 @@ def _check_view(
 def _made(
     result: RunResult, view: ViewSamples, rows: slice, samples: TriangleSamples, share: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
-    """What all fits make of some samples, in shares of the camera's range."""
+    """Return what all fits make of some samples, in shares of the camera's range."""
 
     def of(name: str) -> NDArray[np.float64]:
         return predicted(result, name, view, rows, samples) * share
@@ -151,8 +151,8 @@ def _inside(
     measured: NDArray[np.float32],
     noise: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Of the channels' means of samples [n, leds, channels] that have all: whether they lie in the interval of
-    what was made, by its uncertainty [n, leds] and theirs."""
+    """Tell whether the channels' means of samples [n, leds, channels] lie in the interval of what was made, by its
+    uncertainty [n, leds] and theirs. Only samples that have all channels count."""
     middle = made.mean(axis=2)
     variance = (relative * middle) ** 2 + np.sum((noise * measured) ** 2, axis=2) / measured.shape[2] ** 2
     off = np.abs(measured.mean(axis=2) - middle)
@@ -175,7 +175,7 @@ def _compare(
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
-    """Of the median sample; None if it is not known, or all are open."""
+    """Return the interval of the median sample; None if it is not known, or all are open."""
     if uncertainty is None or uncertainty["interval"]["median"] is None:
         return None
     low, high = uncertainty["interval"]["median"]

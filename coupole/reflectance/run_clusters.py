@@ -35,10 +35,11 @@ ABOUT_CLUSTERS = "clusters.json"
 FEWEST_TO_BORROW = 4
 """Samples that tell which cluster a triangle belongs to."""
 USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS = 400, 16, 1000
-"""Of clusters whose number is not given: as the paper has them, and some for small objects."""
+"""Members of a cluster, and bounds on the number of clusters, where that number is not given: as the paper has
+them, and some for small objects."""
 _FROM = GGX_NORMAL.name
 _WAYS = ("own", "clustered", "harmonics", "borrowed")
-"""To make what a triangle shows, each judged by itself."""
+"""Ways to make what a triangle shows, each judged by itself."""
 
 
 def cluster_result(
@@ -159,8 +160,9 @@ def _missed(
 def _mae(
     result: RunResult, settings: dict[str, Any], views: Sequence[ViewSamples], memory_bytes: int, say: Said
 ) -> dict[str, dict[str, float | None]]:
-    """Of pictures by blocks of pixels, and of means of triangles: of those with a material of their own by it, by
-    their cluster's, and by its harmonics, where all three give a value; of those that borrowed one."""
+    """Return the errors of pictures by blocks of pixels, and of means of triangles. Triangles with a material of
+    their own are judged by it, by their cluster's, and by its harmonics, where all three give a value; those that
+    borrowed one, by that."""
     clusters = result.clusters
     pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
     for view in views:
@@ -184,14 +186,14 @@ def _mae(
 
 
 def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
-    """What the ways but the last give, where all of them do: harmonics have no value below the horizon of the
-    fitted normal, where GGX has one."""
+    """Return what all ways but the last give, where all of them give a value: harmonics have no value below the
+    horizon of the fitted normal, where GGX has one."""
     all_do = np.logical_and.reduce([np.isfinite(one) for one in values])
     return {name: np.where(all_do, one, np.nan) for name, one in zip(_WAYS[:-1], values, strict=True)}
 
 
 def _add(sums: list[float], off: NDArray[np.floating]) -> None:
-    """To the sum of magnitudes, and their number."""
+    """Add to the sum of magnitudes, and to their number."""
     known = np.isfinite(off)
     sums[0] += float(np.abs(off[known]).sum())
     sums[1] += int(np.count_nonzero(known))

@@ -46,8 +46,8 @@ class Beam:
     strength: Floats
     """[channels]"""
     density: float = 0.0
-    """Of the beams that stand for an emitter: in a steradian as the surface sees them, if distant; else in a m^2
-    of the emitter. 0 for what has no size."""
+    """Density of the beams that stand for an emitter: number per steradian as the surface sees them, if distant;
+    else per m^2 of the emitter. 0 for what has no size."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class Emitter:
     radiance: NDArray[np.float32]
     """[h, w, channels]; [1, 1, channels] of an area."""
     density: float
-    """Of its beams: in a m^2 of an area; of an environment, over the colours' mean radiance, in a steradian."""
+    """Density of its beams: number per m^2 of an area; of an environment, over the colours' mean radiance, per
+    steradian."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def _area(light: AreaLight, base_from_support: Floats, strength: Floats, samples
 
 
 def _beams_of_area(area: Emitter, samples: int) -> list[Beam]:
-    """On a lattice of golden sections."""
+    """Return the beams of an area, on a lattice of golden sections."""
     number = np.arange(samples)
     across = 2.0 * (number + 0.5) / samples - 1.0
     along = 2.0 * ((number * _GOLDEN + 0.5) % 1.0) - 1.0

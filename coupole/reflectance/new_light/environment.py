@@ -37,7 +37,7 @@ class Environment:
     """[3, 3] rows: middle, left, up."""
 
     def turned(self, angle_deg: float) -> Environment:
-        """About up, from the middle to the left."""
+        """Return the environment turned about up, from the middle to the left."""
         cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, axes=turn @ self.axes)
@@ -81,7 +81,7 @@ class Environment:
 
 
 def _placed(cumulated: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Which part of a growing sum shares of it fall into, and how far into it."""
+    """Return the parts of a growing sum into which shares of it fall, and how far into the part."""
     at = shares * cumulated[-1]
     part = np.clip(np.searchsorted(cumulated, at, side="right") - 1, 0, len(cumulated) - 2)
     within = (at - cumulated[part]) / np.maximum(cumulated[part + 1] - cumulated[part], 1e-300)

@@ -39,12 +39,12 @@ def _with_length(vector: Vector) -> Vector:
 
 Way = Annotated[Vector, AfterValidator(_with_length)]
 MOST_MM = 20_000.0
-"""Of a coordinate or side: more than any cell has."""
+"""Largest coordinate or side: more than any cell has."""
 Factor = Annotated[float, Field(ge=0.0, le=1e9)]
 
 
 class Light(Model):
-    """What all lights have."""
+    """Properties that all lights have."""
 
     strength: Factor | tuple[Factor, Factor, Factor] = 1.0
 
@@ -71,7 +71,7 @@ class PointLight(Light):
 
 
 _LEVEL = (1.0, 0.0, 0.0)
-"""Of the width, where the normal is z."""
+"""Direction of the width, where the normal is z."""
 
 
 class AreaLight(Light):
@@ -79,13 +79,13 @@ class AreaLight(Light):
 
     kind: Literal["area"] = "area"
     at_mm: Vector
-    """Of its centre."""
+    """Place of its centre."""
     normal: Way
     across: Way | None = None
-    """Of the width; what of it is across the normal counts."""
+    """Direction of the width; only its part across the normal counts."""
     width_mm: Length
     height_mm: Length | None = None
-    """Its width without it."""
+    """Height; equal to the width if it is not given."""
 
 
 class EnvironmentLight(Light):
@@ -94,7 +94,7 @@ class EnvironmentLight(Light):
     kind: Literal["environment"] = "environment"
     file: FilePath
     turn_deg: float = 0.0
-    """About up, from the middle of the picture to its left."""
+    """Angle by which it is turned about up, from the middle of the picture to its left."""
 
 
 AnyLight = Annotated[
@@ -107,7 +107,7 @@ class LightsFile(Model):
 
 
 def read_lights(path: Path) -> list[AnyLight]:
-    """Those of a file. Raises InputError with file:line:column."""
+    """Read the lights of a file. Raises InputError with file:line:column."""
     document = yamlfile.read(path)
     lights = document.validate(LightsFile).lights
     return [

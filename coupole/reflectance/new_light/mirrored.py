@@ -60,8 +60,9 @@ def _mirror(  # type: ignore[no-untyped-def]
     pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
     halves_mm, radiance, density, ray, lobe_rays, met, gains, ways_mm
 ):  # fmt: skip
-    """How many of the rays of this number from pixels [n, 2] point at a bright part of an emitter: into `met`
-    which, into `gains` what they bring if nothing is in their way, into `ways_mm` how they get there."""
+    """Return how many of the rays of number `ray` from pixels [n, 2] point at a bright part of an emitter. Fill
+    `met` with their pixels, `gains` with what they bring if nothing is in their way, `ways_mm` with how they get
+    there."""
     way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]
@@ -118,7 +119,8 @@ def _asking(seen, places_mm, camera_mm, coats, near, axes, centre_mm, density, l
 
 @numba.njit(cache=True, nogil=True)
 def _two_numbers(row, column, ray):  # type: ignore[no-untyped-def]
-    """From 0 to 1: those of this number in a sequence, shifted for each pixel (Wang's hash)."""
+    """Return two numbers from 0 to 1: those of number `ray` in a sequence, shifted for each pixel (Wang's
+    hash)."""
     seed = np.uint32(row * 65536 + column)
     seed = (seed ^ np.uint32(61)) ^ (seed >> np.uint32(16))
     seed = np.uint32(seed * np.uint32(9))
@@ -152,7 +154,7 @@ def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[n
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_environment(way, axes, radiance, density):  # type: ignore[no-untyped-def]
-    """How far shadows of an environment reach; its beams per sr in a direction; its pixel there."""
+    """Return how far shadows of an environment reach, its beams per sr in a direction, and its pixel there."""
     height, width, channels = radiance.shape
     middle, left, up = 0.0, 0.0, 0.0
     for k in range(3):

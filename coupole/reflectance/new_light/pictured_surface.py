@@ -27,17 +27,17 @@ from coupole.reflectance.run_result import RunResult, ViewSamples
 Floats = NDArray[np.float64]
 
 _DEGREE = 5
-"""Of the polynomial: Brown's k2, and a homography up to 1e-6."""
+"""Degree of the polynomial: for Brown's k2, and a homography up to 1e-6."""
 _LEAST_TRIANGLES = 4 * (_DEGREE + 1) * (_DEGREE + 2) // 2
 _OUTLIER = 4.0
-"""Over the median departure: triangles that are seen in part."""
+"""Largest departure of a triangle, over the median departure: beyond it are triangles that are seen in part."""
 _MARGIN = 1.05
-"""About the object, in a picture whose field of view is not given."""
+"""Factor for a margin about the object, in a picture whose field of view is not given."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What the pixels of a picture [h, w] see."""
+    """Surface that the pixels of a picture [h, w] see."""
 
     seen: NDArray[np.int32]
     """[h, w] place in `triangles`; -1 for none."""
@@ -73,7 +73,8 @@ class FreeCamera:
 
 
 def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
-    """Of a measured view; a mesh of fewer than some hundred seen triangles is seen at the triangles' centres."""
+    """Return the surface of a measured view; a mesh of fewer than some hundred seen triangles is seen at the
+    triangles' centres."""
     with h5py.File(view.path, "r") as file:
         seen, centres_mm, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]
     places_mm = np.full((*seen.shape, 3), np.nan, np.float32)
@@ -87,8 +88,8 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
 
 
 def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
-    """Of the triangles that any view has seen, from a camera anywhere; others hide what is behind them, as do
-    those of `mesh` that none has seen. Raises InputError if the camera sees none."""
+    """Return the surface of the triangles that any view has seen, from a camera anywhere. Those of `mesh` that no
+    view has seen hide what is behind them, as others do. Raises InputError if the camera sees none."""
     triangles = result.triangles
     corners_mm = result.corners_mm[triangles].astype(np.float64)
     normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
@@ -160,7 +161,7 @@ def _aimed(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
 def _directions(
     seen: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
-    """What turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
+    """Return what turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
     coefficients of column^i row^j, [3, 3] rows: axes of the directions' frame, the last forward. None for too few
     triangles."""
     row, column = np.nonzero(seen >= 0)
@@ -197,7 +198,8 @@ def _directions(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _meet(first_row, seen, pixel_scale, coefficients, frame, camera_mm, centres_mm, normals, places_mm):  # type: ignore[no-untyped-def]
-    """Where the rays of rows of pixels meet the planes of the triangles that they see."""
+    """Fill `places_mm` with the places where the rays of rows of pixels meet the planes of the triangles that they
+    see."""
     order = len(coefficients)
     along = np.empty((order, 2))
     way = np.empty(3)

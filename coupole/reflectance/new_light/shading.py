@@ -94,8 +94,8 @@ def add_beams(
 
 
 def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, beam: Beam) -> None:
-    """As `add_beams` of a single one that is no part of an emitter, where `codes` [h, w] say that it reaches;
-    the picture lies in C order."""
+    """Add the same as `add_beams` for a single beam that is no part of an emitter, where `codes` [h, w] say that
+    it reaches; the picture lies in C order."""
     three = np.resize(beam.strength, 3)
     single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, three))
     camera_mm, place, axis, strength = single
@@ -126,7 +126,8 @@ def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-untyped-def]
-    """Into `way` [3] the direction from a pixel's place to a beam's; cos^k / d^2 in m^-2, 1 of distant light."""
+    """Fill `way` [3] with the direction from a pixel's place to a beam's; return cos^k / d^2 in m^-2, 1 for
+    distant light."""
     if not near:
         way[0], way[1], way[2] = place[0], place[1], place[2]
         return 1.0
@@ -143,7 +144,7 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-def]
-    """As `_towards`, of eight beams: three coordinates of their directions, and cos^k / d^2."""
+    """Return the same as `_towards` for eight beams: three coordinates of their directions, and cos^k / d^2."""
     dx, dy, dz = loaded(places, 0), loaded(places, 1), loaded(places, 2)
     if not near:
         return dx, dy, dz, lanes(np.float32(1.0))
@@ -230,7 +231,7 @@ def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, expon
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untyped-def]
-    """As `_reach`, of one beam from eight places."""
+    """Return the same as `_reach`, for one beam from eight places."""
     if not near:
         return lanes(place[0]), lanes(place[1]), lanes(place[2]), lanes(np.float32(1.0))
     dx, dy, dz = place[0] - x, place[1] - y, place[2] - z
@@ -289,7 +290,7 @@ def _add_values(seen, places_mm, codes, values, near, place, axis, exponent, str
 
 @numba.njit(cache=True, nogil=True)
 def shines(coat):  # type: ignore[no-untyped-def]
-    """Whether a material has a lobe at all."""
+    """Tell whether a material has a lobe at all."""
     found = False
     for number in range(KS, len(coat)):
         found |= coat[number] > 0.0

@@ -1,4 +1,4 @@
-"""Which pixels of a surface a beam reaches.
+"""Pixels of a surface that a beam reaches.
 
 Rays are traced from every fourth pixel in both directions, and from all between where these differ; then shadows'
 edges are followed from cell to cell until they end. What is missed is a spot of light or shadow that lies between
@@ -22,17 +22,17 @@ from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 Codes = NDArray[np.uint8]
 
 NONE, AWAY, LIT, SHADED, ASKED = range(5)
-"""Of a pixel: no surface; it or the emitter looks away; what a ray found; a ray is needed."""
+"""Codes of a pixel: no surface; it or the emitter looks away; what a ray found; a ray is needed."""
 CELL_PX = 4
 DISTANT_MM = 3000.0
-"""What is farther casts no shadow of distant light."""
+"""Distance beyond which nothing casts a shadow of distant light."""
 _RAYS = 1 << 15
 _PACKET = 4
 """Rays of the grid down and across that go together."""
 
 
 def reached(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
-    """Into `codes` [h, w] which pixels are; `mesh` is what throws shadows."""
+    """Fill `codes` [h, w] with whether the beam reaches each pixel; `mesh` is what throws shadows."""
     by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
     in_strips(len(codes), lambda rows: _begin(surface.seen[rows], surface.places_mm[rows], *by, codes[rows]))
     _trace(mesh, surface, beam, _asked_on_grid(codes), codes)
@@ -118,8 +118,8 @@ def _begin(seen, places_mm, facing, place, axis, exponent, codes):  # type: igno
 
 @numba.njit(cache=True, nogil=True)
 def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
-    """Of rows of cells [n, cells across] from a first one on, which have others below and to the right: those stay
-    open whose rays at the corners are missing or differ, or where the surface ends."""
+    """Close cells of rows [n, cells across] from a `first` one on, which have others below and to the right. Those
+    stay open whose rays at the corners are missing or differ, or where the surface ends."""
     down, across = open_cells.shape
     for i in range(down):
         for j in range(across - 1):
@@ -173,7 +173,7 @@ def _spread(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _differs(codes, row, column, down, across, one):  # type: ignore[no-untyped-def]
-    """Whether one of a cell's pixels at its side was found to be other than `one`."""
+    """Tell whether one of a cell's pixels at its side was found to be other than `one`."""
     height, width = codes.shape
     other = SHADED if one == LIT else LIT
     for step in range(CELL_PX):
@@ -186,7 +186,7 @@ def _differs(codes, row, column, down, across, one):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, nogil=True)
 def _fill(codes, first, end):  # type: ignore[no-untyped-def]
-    """What is still asked in some rows lies in closed cells and is as their corners."""
+    """Fill in what is still asked in some rows: it lies in closed cells and is as their corners."""
     for row in range(first, end):
         for column in range(codes.shape[1]):
             if codes[row, column] == ASKED:

@@ -36,7 +36,8 @@ from coupole.storage.durable import write_synced
 Said = Callable[[str, int, int], None]
 PEAK_QUANTILE = 0.999
 _LEVELS, _LEVELS_OF_RANGE = 1 << 17, 1 << 16
-"""Levels of a histogram of shares of the camera's range, up to twice the range; levels of the range."""
+"""Number of levels of a histogram of shares of the camera's range, up to twice the range; how many of them the
+range has."""
 
 
 @dataclass

@@ -46,15 +46,15 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Job:
-    """What all blocks of a job share."""
+    """Data that all blocks of a job share."""
 
     folder: Path
     token: str
-    """Of this job alone."""
+    """Token of this job alone."""
     left_out: list[int]
     memory_bytes: int
     noise_um: float
-    """Of the mesh's vertices."""
+    """Noise of the mesh's vertices."""
 
 
 def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, say: Said = silent) -> None:
@@ -225,7 +225,7 @@ def _slices_block(
 def _under(
     result: RunResult, fit: ViewFit, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32] | None:
-    """What the material gives that a fit is added to."""
+    """Return what the material gives that a fit is added to; None for a fit without one."""
     return None if fit.over is None else predicted(result, fit.over.name, view, rows, samples)
 
 

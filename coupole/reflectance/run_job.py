@@ -1,4 +1,4 @@
-"""From runs of the cell to samples, materials and what they miss, into a result folder.
+"""Job from runs of the cell to samples, materials and their errors, in a result folder.
 
 Each view's samples and each fit are files of their own, whole or not there; a job that was killed goes on with the
 first that is missing.
@@ -40,12 +40,12 @@ from coupole.storage.durable import sha256, write_synced
 from coupole.storage.run_json import RUN_JSON
 
 HELD_OUT_EVERY, HELD_OUT_FIRST = 12, 4
-"""Of the LEDs, if none are named: they are kept for the check."""
+"""Step and first place of the LEDs that are kept for the check, if none are named."""
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What its user wants."""
+    """Request of a user for a result."""
 
     runs: tuple[Path, ...]
     mesh: Path | None = None
@@ -55,7 +55,7 @@ class RunRequest:
     scan_noise_um: float = 30.0
     memory_bytes: int = 2_000_000_000
     support_reflectance: float = 0.0
-    """Of the disk, from which light comes to the object too."""
+    """Reflectance of the disk, from which light comes to the object too."""
     keep_inter_reflection: bool = False
     """Do not take it off the samples."""
     refined: Path | None = None
@@ -65,7 +65,7 @@ class RunRequest:
 
     @property
     def sources(self) -> _Sources:
-        """Where the runs' geometry is from, by whole paths."""
+        """Sources of the runs' geometry, by whole paths."""
         mesh, refined, poses = (path and path.resolve() for path in (self.mesh, self.refined, self.poses))
         return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined, poses)
 
@@ -143,7 +143,7 @@ def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredR
 
 
 def _posed(request: RunRequest, token: str) -> dict[str, Any]:
-    """What a result says of poses by COLMAP."""
+    """Return what a result says of poses by COLMAP."""
     if request.poses is None:
         return {}
     return {"poses": read_poses(request.poses, _recorded(token, request.runs[0], request.sources)).told()}
@@ -203,7 +203,7 @@ def _extract_one(
 
 @lru_cache(maxsize=1)
 def _prepared(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
-    """What all views of a run share, once in each process and job (`token`)."""
+    """Return what all views of a run share, made once in each process and job (`token`)."""
     measured = _measured(token, run, sources)
     return measured, geometry_of(measured), Radiometry(measured)
 
@@ -218,7 +218,7 @@ def _measured(token: str, run: Path, sources: _Sources) -> MeasuredRun:
 
 @lru_cache(maxsize=16)
 def _recorded(_token: str, run: Path, sources: _Sources) -> MeasuredRun:
-    """By the records alone."""
+    """Read a run by the records alone."""
     return read_measured_run(run, sources.mesh, sources.records)
 
 
@@ -229,5 +229,5 @@ def _forget() -> None:
 
 
 def _name(measured_runs: Sequence[MeasuredRun], measured: MeasuredRun, view: MeasuredView) -> str:
-    """Of a view's files: its own, with its run's before where there are several."""
+    """Return the name of a view's files: its own, with its run's before where there are several."""
     return view.name if len(measured_runs) == 1 else f"{measured.run.folder.name}-{view.name}"

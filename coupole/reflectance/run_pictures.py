@@ -18,7 +18,7 @@ from coupole.reflectance.triangle_fit import TriangleSamples
 
 @dataclass(frozen=True)
 class CheckFrames:
-    """Of one view."""
+    """Pictures of one view for the check."""
 
     share: NDArray[np.float16]
     """[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none."""
@@ -29,8 +29,8 @@ class CheckFrames:
     """[channels, h / 2, w / 2] place of what a pixel sees in the triangles of the view's file, or -1."""
 
     def pairs(self, rows: slice, channel: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Of the blocks whose pixel sees one of some rows of the view's file: its place among them [blocks], and
-        `share` [blocks, leds]."""
+        """Return, for the blocks whose pixel sees one of some rows of the view's file, its place among these rows
+        [blocks], and `share` [blocks, leds]."""
         order, places = self._sorted[channel]
         first, end = np.searchsorted(places, [rows.start, rows.stop])
         leds, height, width, channels = self.share.shape
@@ -44,7 +44,7 @@ class CheckFrames:
 
     @cached_property
     def _sorted(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """By channel: blocks in the order of what they see, and what they see."""
+        """Blocks of each channel in the order of what they see, and what they see."""
         found = []
         for places in self.triangle.reshape(len(self.triangle), -1):
             order = np.argsort(places, kind="stable")
@@ -68,16 +68,16 @@ class HeldOut:
     """Some triangles of a view under the LEDs that were kept for the check: samples, and blocks of pictures."""
 
     rows: slice
-    """Of the view's file."""
+    """Rows of the view's file."""
     places: NDArray[np.int64]
     """[n] in the triangles of the fits."""
     samples: TriangleSamples
     share: NDArray[np.float64]
     """[n, leds, channels] of the camera's range that f cos_i of 1 gives."""
     columns: list[int]
-    """Of the pictures' LEDs in those of the samples."""
+    """Places of the pictures' LEDs among those of the samples."""
     blocks: tuple[tuple[NDArray[np.int64], NDArray[np.float32]], ...]
-    """By channel: the triangle [blocks] that each sees, and what was measured [blocks, pictures]."""
+    """Triangle [blocks] that each block sees, and what was measured [blocks, pictures]; by channel."""
 
     def pixels(self, values: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
         """[blocks, pictures] of values [n, leds, channels]."""

@@ -52,7 +52,7 @@ Say = Callable[[int, int], None]
 SAMPLES = 256
 """Beams of an area or an environment."""
 _FAR_MM = 1e5
-"""Where distant light is for a slice."""
+"""Distance of distant light for a slice."""
 _TRIANGLES = 1 << 13
 
 
@@ -70,7 +70,7 @@ class Slices:
     fit: ViewFit
     coefficients: NDArray[np.float32]
     under: TriangleMaterials | None
-    """What they are added to."""
+    """Materials that the slices are added to."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,11 @@ class RelitScene:
     fit: str
     surface: Surface
     reflecting: Coats | Slices | Pairs
-    """Of the surface's triangles."""
+    """Reflectance of the surface's triangles."""
     views: tuple[ViewSamples, ...]
-    """In the order in which LEDs are looked for."""
+    """Views in the order in which LEDs are looked for."""
     mesh: PacketMesh
-    """What throws shadows."""
+    """Mesh that throws shadows."""
 
     def picture(
         self,
@@ -204,8 +204,8 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
 
 
 def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
-    """What a camera anywhere sees. Raises InputError for a fit that does not hold there, or one that is not there;
-    if the camera sees nothing."""
+    """Return the scene that a camera anywhere sees. Raises InputError for a fit that does not hold there, or one
+    that is not there; if the camera sees nothing."""
     _refuse_unknown(fit)
     if fit is not None and fit not in ANYWHERE:
         raise InputError(
@@ -231,7 +231,7 @@ def _from_anywhere(result: RunResult, name: str, surface: Surface) -> Coats | Pa
 
 
 def materials_of(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
-    """Of the surface's triangles. Raises InputError if there are none."""
+    """Return the materials of the surface's triangles. Raises InputError if there are none."""
     places = np.searchsorted(result.triangles, surface.triangles)
     own = GGX_NORMAL.name if name == CLUSTERED else name
     if not result.materials_path(own).exists():

@@ -28,13 +28,13 @@ FRAMES = "samples/frames"
 Block = slice | NDArray[np.int64]
 """Places of triangles; numbers rise."""
 INTER_REFLECTION = "inter_reflection"
-"""Attribute of a file of samples that it was taken from."""
+"""Attribute of a file of samples that inter-reflection was taken from."""
 CONTRADICTED = "contradicted"
 """Attribute too: samples that were left out because they contradict others."""
 SAMPLES = "samples"
 """Attribute too: how many are left."""
 AS_MEASURED = "as_measured.h5"
-"""Reflectance before that, from the folder."""
+"""File of the reflectance before inter-reflection was taken off, from the folder."""
 U_OF_INTER_REFLECTION = 0.2
 """Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
 MOST_ROWS = 1 << 16
@@ -48,7 +48,7 @@ _TOLD = {
     "scan_noise_um": int | float,
     "simulated": bool,
 }
-"""Of result.json, what others than its report read."""
+"""Keys of result.json that others than its report read, and their types."""
 FIELDS = {
     "normals": "unit, base frame",
     "kd": "1/sr, by channel",
@@ -117,7 +117,7 @@ class RunResult:
 
     @cached_property
     def middle_mm(self) -> NDArray[np.float64]:
-        """Of the triangles that any view sees."""
+        """Middle of the triangles that any view sees."""
         return np.asarray(self.corners_mm[self.triangles].mean(axis=(0, 1), dtype=np.float64))
 
     @property
@@ -135,7 +135,7 @@ class RunResult:
 
     @property
     def summaries(self) -> list[dict[str, Any]]:
-        """What extraction said of each view."""
+        """Summaries that extraction gave of each view."""
         files = sorted((self.folder / "samples").glob("*.json"))
         told = [read_json(path, allow_nan=True) for path in files]
         return [
@@ -180,7 +180,7 @@ class RunResult:
         return _parts(len(view.triangles), len(view.leds), budget_bytes, most)
 
     def samples(self, block: slice) -> TriangleSamples:
-        """Those of the triangles of a block, in all views that see one of them."""
+        """Return the samples of the triangles of a block, in all views that see one of them."""
         wanted = self.triangles[block]
         values: list[NDArray[np.float32]] = []
         seeing = [view for view in self.views if _rows(view, wanted)]
@@ -206,7 +206,7 @@ class RunResult:
     def view_samples(
         self, view: ViewSamples, rows: slice, leds: NDArray[np.bool_] | None = None
     ) -> TriangleSamples:
-        """Those of some rows of a view's file, under some of its LEDs [leds]."""
+        """Return the samples of some rows of a view's file, under some of its LEDs [leds]."""
         columns = np.arange(len(view.leds)) if leds is None else np.flatnonzero(leds)
         with h5py.File(view.path, "r") as file:
             values = file["f"][rows] if leds is None else file["f"][rows][:, columns]
@@ -362,7 +362,8 @@ def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[s
 
 
 def _rows(view: ViewSamples, wanted: NDArray[np.int64]) -> range:
-    """Of a view's file that hold rising numbers of triangles; none of them may lie between and not be wanted."""
+    """Return the rows of a view's file that hold the `wanted` triangles, whose numbers rise; no other triangle may
+    lie between them."""
     first, end = np.searchsorted(view.triangles, [wanted[0], wanted[-1] + 1])
     return range(int(first), int(end))
 

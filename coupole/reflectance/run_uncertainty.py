@@ -17,13 +17,13 @@ Said = Callable[[str, int, int], None]
 
 COVERAGE, QUANTILE = 0.95, 1.959964
 TABLE_COVERAGE, TABLE_QUANTILE = 0.68, 0.994458
-"""Of the table, as in seed 003, 6.1."""
+"""Coverage and quantile of the table, as in seed 003, 6.1."""
 _TYPICAL = 200_000
 """Samples of all views, for what is typical."""
 _TRIANGLES = 2000
-"""Of each view, which they are taken of."""
+"""Triangles of each view of which the samples are taken."""
 _LEDS = 128
-"""Of each view."""
+"""LEDs of each view of which the samples are taken."""
 _DRAWN, _DRAWS = 1000, 300
 """Samples, of all views, and draws for each."""
 
@@ -31,7 +31,8 @@ _DRAWN, _DRAWS = 1000, 300
 def uncertainty_of(
     result: RunResult, scan_noise_um: float, *, paper: bool, say: Said = lambda step, done, of: None
 ) -> dict[str, Any] | None:
-    """What `result.json` says of it; None without a record of the response, by which noise is known."""
+    """Return what `result.json` says of the uncertainty; None without a record of the response, by which noise is
+    known."""
     most = _TYPICAL // len(result.views)
     known = [
         known_samples(result, view, result.channels // 2, scan_noise_um, most=most, of_triangles=_TRIANGLES)
@@ -79,7 +80,7 @@ def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
 def known_samples(
     result: RunResult, view: ViewSamples, channel: int, scan_noise_um: float, *, most: int, of_triangles: int
 ) -> ChannelSamples:
-    """At most `most` samples that have a value, of triangles and LEDs that are spread over the view, about
+    """Return at most `most` samples that have a value, of triangles and LEDs that are spread over the view, about
     `of_triangles` of the former."""
     rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
     leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))

@@ -1,4 +1,4 @@
-"""What is uncertain in samples of a view, put together from its file: for bounds, tables and exports."""
+"""Sources of uncertainty in samples of a view, put together from its file: for bounds, tables and exports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _SIDES = 8
-"""Of a triangle, on which others are looked for."""
+"""Number of sides of a triangle on which others are looked for."""
 _BESIDE = 1.2
 """Distance of a neighbour over the square root of a triangle's area: at least so far the others are."""
 
@@ -57,9 +57,9 @@ def channel_samples(
     scan_noise_um: float,
     beside: Beside | None = None,
 ) -> ChannelSamples:
-    """Of some rows of a view's file, rising, and some of its LEDs; without a channel, of the channels' mean, as if
-    all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew. Raises InputError for
-    a file that an earlier version made."""
+    """Return the samples of some rows of a view's file, rising, and some of its LEDs; without a channel, of the
+    channels' mean, as if all were off to the same side. `beside` saves finding the rows' `triangles_beside` anew.
+    Raises InputError for a file that an earlier version made."""
     beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
@@ -138,7 +138,7 @@ class Beside:
 
 @lru_cache(maxsize=4)
 def _centres(path: Path) -> tuple[Floats, Floats, cKDTree]:
-    """Of a view's triangles, mm; the projection centre; the former in a tree."""
+    """Return the centres of a view's triangles, mm; the projection centre; and a tree of the centres."""
     with h5py.File(path, "r") as file:
         centres_mm = file["centres_mm"][()]
         return centres_mm, file["camera_mm"][()], cKDTree(centres_mm)

@@ -70,7 +70,7 @@ class Sources:
 
 @dataclass(frozen=True)
 class Places:
-    """Where n samples were measured, mm, base frame."""
+    """Places where n samples were measured, mm, base frame."""
 
     corners_mm: Floats
     """[n, 3, 3] of their triangles."""

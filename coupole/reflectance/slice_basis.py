@@ -18,7 +18,7 @@ COUNT = 100
 """Coefficients of each basis, as in seed 003, 6.3."""
 _DEGREES = 10
 TIKHONOV = 0.1
-"""Of the highest degree of the harmonics (seed 003, 5.2)."""
+"""Penalty of the highest degree of the harmonics (seed 003, 5.2)."""
 _TAIL = 4
 _RADIAL, _RESIDUAL = 1e-3, 0.1
 """Ridge of the radial functions: of reflectance, and of what a material leaves of it, which is noise for the most
@@ -27,7 +27,7 @@ USUAL_LEFT = 2e-4
 """Share of the samples' square that a material of the fit's form leaves: where it leaves more, the ridge of what
 it leaves is as much smaller, down to that of reflectance."""
 LEAST_RESIDUAL = _RADIAL / _RESIDUAL
-"""Of that ridge, where a material leaves much."""
+"""Least factor on the ridge of what a material leaves, where it leaves much."""
 _TAIL_SHARE = 0.01
 _HELD = 1e9
 """Ridge of a coefficient that is to be 0."""

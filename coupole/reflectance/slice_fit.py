@@ -43,10 +43,11 @@ def fit_slices(
     *fits: tuple[Basis, NDArray[np.float32] | None],
     threads: int | None = None,
 ) -> list[NDArray[np.float32]]:
-    """For each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few samples.
+    """Return, for each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few
+    samples.
 
-    From those `used` [samples] of one view's samples. With a model [b, samples, channels] they are added to a
-    share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one to the
+    The fits are to the samples `used` [samples] of one view. With a model [b, samples, channels] they are added to
+    a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one to the
     samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
@@ -93,7 +94,7 @@ def slice_values(
 
 @numba.njit(cache=True, nogil=True)
 def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
-    """Into `frame` [3, 3] the axes of a slice, row by row."""
+    """Fill `frame` [3, 3] with the axes of a slice, row by row."""
     x, y, z = normal
     o0, o1, o2 = camera_mm[0] - centre_mm[0], camera_mm[1] - centre_mm[1], camera_mm[2] - centre_mm[2]
     across = o0 * x + o1 * y + o2 * z
@@ -110,7 +111,8 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _directions(frame, centre_mm, led_mm, which, x, y, z):  # type: ignore[no-untyped-def]
-    """Of the LEDs `which` [n], in a slice's frame; LEDs below the surface get z = 0. How many are above it."""
+    """Fill `x`, `y` and `z` with the directions of the LEDs `which` [n] in a slice's frame; LEDs below the surface
+    get z = 0. Return how many are above it."""
     above = 0
     for n in range(len(which)):
         led = led_mm[which[n]]
@@ -164,7 +166,8 @@ def _fit_part(  # type: ignore[no-untyped-def]
 def _fit_one(  # type: ignore[no-untyped-def]
     rows, product, values, left, which, first, penalty, over, memories, found
 ):
-    """Into `found` [channels, COUNT + 1] a fit to `left` of the samples `which` [n] in channels from `first`."""
+    """Fill `found` [channels, COUNT + 1] with a fit to `left` of the samples `which` [n] in channels from
+    `first`."""
     channels, n, size = len(found), len(which), min(len(which), COUNT)
     held, matrix, room, wanted, solution = memories
     mine, right = wanted[: channels * n].reshape(channels, n), solution[:channels]
@@ -191,7 +194,7 @@ def _fit_one(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _wanted(values, which, first, wanted):  # type: ignore[no-untyped-def]
-    """Into `wanted` [channels, n] the samples `which` [n] in the channels from `first`."""
+    """Fill `wanted` [channels, n] with the samples `which` [n] in the channels from `first`."""
     for channel in range(len(wanted)):
         for number in range(len(which)):
             wanted[channel, number] = values[which[number], first + channel]
@@ -228,8 +231,8 @@ def _held_by(left, values, which, first):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore[no-untyped-def]
-    """Into `right` the coefficients, the shorter way; whether there are some. `product` is of `gram` where samples
-    are as many as functions."""
+    """Fill `right` with the coefficients, the shorter way; return whether there are some. `product` is of `gram`
+    where samples are as many as functions."""
     if rows.shape[1] < COUNT:
         return solve_by_samples(rows, penalty, values, room, factor, right)
     if not factorise(product, penalty, factor):
@@ -241,7 +244,7 @@ def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore
 
 @numba.njit(cache=True, nogil=True)
 def _known(values, used, which):  # type: ignore[no-untyped-def]
-    """Into `which` those of the samples `used` that a channel has; how many."""
+    """Fill `which` with those of the samples `used` that a channel has; return how many."""
     n = 0
     for sample in used:
         if not math.isnan(values[sample]):
@@ -252,7 +255,7 @@ def _known(values, used, which):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _same(values, used, channel):  # type: ignore[no-untyped-def]
-    """Whether a channel has the same samples as the one before."""
+    """Tell whether a channel has the same samples as the one before."""
     same = True
     for number in used:
         same &= math.isnan(values[number, channel]) == math.isnan(values[number, channel - 1])

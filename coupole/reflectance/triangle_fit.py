@@ -66,14 +66,14 @@ class TriangleSamples:
     """[b]"""
 
     def of_triangles(self, rows: NDArray[np.int64]) -> TriangleSamples:
-        """Those of some of the triangles."""
+        """Return the samples of some of the triangles."""
         of_all = ("values", "centres_mm", "normals", "areas_mm2")
         return replace(self, **{name: getattr(self, name)[rows] for name in of_all})
 
 
 @dataclass(frozen=True)
 class TriangleMaterials:
-    """Of b triangles; NaN where there were too few samples."""
+    """Materials of b triangles; NaN where there were too few samples."""
 
     normals: Floats
     kd: Floats
@@ -84,12 +84,12 @@ class TriangleMaterials:
     """Weighted rms of the square roots, as a share of sqrt(kd)."""
 
     def at(self, triangles: NDArray[np.int64]) -> TriangleMaterials:
-        """Of some of the triangles."""
+        """Return the materials of some of the triangles."""
         return TriangleMaterials(*(getattr(self, field.name)[triangles] for field in fields(self)))
 
 
 def joined(parts: Sequence[TriangleMaterials]) -> TriangleMaterials:
-    """Of blocks, one after the other."""
+    """Join the materials of blocks, one after the other."""
     names = [field.name for field in fields(TriangleMaterials)]
     return TriangleMaterials(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
@@ -237,7 +237,7 @@ def gather(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, packs):  # type: ignore[no-untyped-def]
-    """Where the best of the starts ends, about, by some of the samples; `packs` is memory."""
+    """Return about where the best of the starts ends, by some of the samples; `packs` is memory."""
     kd = _first_kd(roots, good, lights, normal)
     step = max(1, len(good) // _TO_CHOOSE)
     count = pack(roots[::step], good[::step], lights, half, views, view_of, packs)

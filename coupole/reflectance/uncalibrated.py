@@ -32,20 +32,20 @@ FILES = LIGHTS, INTENSITIES, MASK = "lights.txt", "intensities.txt", "mask.png"
 ABOUT = "pictures.json"
 _MOST_CLIPPED = 1e-3
 _LEAST_SHARE = 0.02
-"""Of the range, that a pixel of the mask has under its brightest LED."""
+"""Least share of the range that a pixel of the mask has under its brightest LED."""
 
 
 @dataclass(frozen=True)
 class PicturedView:
-    """What the pictures of a view were taken with, of nominal places."""
+    """LEDs, lights and pictures of a view, by nominal places."""
 
     leds: tuple[int, ...]
     files: tuple[Path, ...]
-    """In the order of the LEDs; none if they were not asked for."""
+    """Files in the order of the LEDs; none if they were not asked for."""
     lights_mm: NDArray[np.float64]
     """[n, 3] LEDs from the point that the camera is focused on: x right, y up, z to the camera."""
     width_mm: float
-    """Of what a row of pixels shows at that distance."""
+    """Width of what a row of pixels shows at that distance."""
     simulated: bool
 
 
@@ -88,7 +88,8 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
 
 
 def lights_of_view(folder: Path, view: str | None) -> PicturedView:
-    """What the pictures of a view of a run are taken with, without writing them. Raises as `write_pictures`."""
+    """Return what the pictures of a view of a run are taken with, without writing them. Raises as
+    `write_pictures`."""
     run = Run(folder)
     chosen = frames_of_leds(folder, open_light_frames([folder]), view)
     return _nominal(read_plan(run.plan_path, run.rig_path), chosen, run.simulated)
@@ -119,7 +120,7 @@ def _refuse_others(path: Path, text: str) -> None:
 
 
 def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[int, LightFrame]:
-    """Of each LED the longest exposure that is hardly clipped, else the shortest."""
+    """Return for each LED the frame of the longest exposure that is hardly clipped, else of the shortest."""
     views = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
     if not views:
         raise InputError(f"{folder}: no proven frame under a single LED; acquire the plan first")

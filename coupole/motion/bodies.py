@@ -61,9 +61,15 @@ def bodies_of_capsules(capsules: Sequence[Capsule]) -> list[Body]:
     """One body for each name, in order."""
     bodies = []
     for name in dict.fromkeys(c.body for c in capsules):
-        own = [c for c in capsules if c.body == name]
-        ends = np.array([[c.start_mm, c.end_mm] for c in own], dtype=np.float64)
-        bodies.append(Body(name, own[0].link, spheres_of(ends, np.array([c.radius_mm for c in own], dtype=float))))
+        body_capsules = [c for c in capsules if c.body == name]
+        ends = np.array([[c.start_mm, c.end_mm] for c in body_capsules], dtype=np.float64)
+        bodies.append(
+            Body(
+                name,
+                body_capsules[0].link,
+                spheres_of(ends, np.array([c.radius_mm for c in body_capsules], dtype=float)),
+            )
+        )
     return bodies
 
 
@@ -130,8 +136,8 @@ def part_apart(
     apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)
-        at, others = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other))
-        distances_mm = np.linalg.norm(at[:, None] - others, axis=2) - other.spheres.radii_mm
+        at, other_centers_mm = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other))
+        distances_mm = np.linalg.norm(at[:, None] - other_centers_mm, axis=2) - other.spheres.radii_mm
         apart &= distances_mm.min(axis=1) > body.spheres.radii_mm + by_mm
     if not apart.any():
         return None

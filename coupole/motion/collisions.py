@@ -209,16 +209,22 @@ class CellBodies:
         kept_apart = {(pair.body, pair.other): pair.near_by_design_deg for pair in self._described.kept_apart}
         for body in (*self._tools, *self._links):
             kind = TOOL if body in self._tools else body.name
-            for other in self._links:
-                if (kind, other.name) not in kept_apart:
+            for other_body in self._links:
+                if (kind, other_body.name) not in kept_apart:
                     continue
-                near_deg = kept_apart[kind, other.name]
+                near_deg = kept_apart[kind, other_body.name]
                 postures_deg = list(product(*near_deg)) if near_deg and self._drawn_large(kind) else []
-                part = part_apart(self._arm, body, other, postures_deg, _NEIGHBOURLY_MM) if postures_deg else body
+                part = (
+                    part_apart(self._arm, body, other_body, postures_deg, _NEIGHBOURLY_MM)
+                    if postures_deg
+                    else body
+                )
                 if part is not None:
-                    reach = reach_mm(self._arm, part, from_link=other.link)
+                    reach = reach_mm(self._arm, part, from_link=other_body.link)
                     required_mm = self._required_mm(self._keep.self_mm, reach)
-                    pairs.append(_Pair(part, f"the arm's {other.name}", required_mm, reach, SHAPE, other=other))
+                    pairs.append(
+                        _Pair(part, f"the arm's {other_body.name}", required_mm, reach, SHAPE, other=other_body)
+                    )
         return pairs
 
     def _drawn_large(self, kind: str) -> bool:
@@ -241,10 +247,10 @@ class CellBodies:
         tree_of = {id(body): tree for tree, body in enumerate(bodies)}
         numbers, figures = [], np.zeros((len(self._pairs), 13))
         for row, pair in zip(figures, self._pairs, strict=True):
-            other = pair.other or pair.body
+            obstacle = pair.other or pair.body
             on_link = pair.other.link if pair.other and pair.other.link != SUPPORT_FRAME else 0
-            trees = tree_of[id(pair.body)], tree_of[id(other)]
-            numbers.append((trees[0], pair.body.link, pair.kind, trees[1], other.link, on_link))
+            trees = tree_of[id(pair.body)], tree_of[id(obstacle)]
+            numbers.append((trees[0], pair.body.link, pair.kind, trees[1], obstacle.link, on_link))
             row[0], row[1:7] = pair.required_mm, pair.reach_mm
             row[7 : 7 + len(pair.figures)] = pair.figures
         chain = self._arm.chain

@@ -151,17 +151,17 @@ def _to_tree(nodes, begin, first_leaf, x, y, z, best, hasty):  # type: ignore[no
 def _to_obstacle(nodes, trees, numbers, figures, frames, pair, n, best, hasty):  # type: ignore[no-untyped-def]
     """Distance of node n, in the frame of the pair's link, to the pair's obstacle, at most `best`; `hasty` as in
     `_to_tree`."""
-    link, other = numbers[pair, 1], numbers[pair, 4]
+    link, obstacle_link = numbers[pair, 1], numbers[pair, 4]
     bx, by, bz, radius = nodes[n, 0], nodes[n, 1], nodes[n, 2], nodes[n, 3]
     x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
     y = frames[link, 1, 0] * bx + frames[link, 1, 1] * by + frames[link, 1, 2] * bz + frames[link, 1, 3]
     z = frames[link, 2, 0] * bx + frames[link, 2, 1] * by + frames[link, 2, 2] * bz + frames[link, 2, 3]
     if numbers[pair, 2] != SHAPE:
         return _to_solid(numbers[pair, 2], figures, pair, x, y, z) - radius
-    x, y, z = x - frames[other, 0, 3], y - frames[other, 1, 3], z - frames[other, 2, 3]
-    own_x = frames[other, 0, 0] * x + frames[other, 1, 0] * y + frames[other, 2, 0] * z
-    own_y = frames[other, 0, 1] * x + frames[other, 1, 1] * y + frames[other, 2, 1] * z
-    own_z = frames[other, 0, 2] * x + frames[other, 1, 2] * y + frames[other, 2, 2] * z
+    x, y, z = x - frames[obstacle_link, 0, 3], y - frames[obstacle_link, 1, 3], z - frames[obstacle_link, 2, 3]
+    own_x = frames[obstacle_link, 0, 0] * x + frames[obstacle_link, 1, 0] * y + frames[obstacle_link, 2, 0] * z
+    own_y = frames[obstacle_link, 0, 1] * x + frames[obstacle_link, 1, 1] * y + frames[obstacle_link, 2, 1] * z
+    own_z = frames[obstacle_link, 0, 2] * x + frames[obstacle_link, 1, 2] * y + frames[obstacle_link, 2, 2] * z
     tree = numbers[pair, 3]
     return _to_tree(nodes, trees[tree, 0], trees[tree, 1], own_x, own_y, own_z, best + radius, hasty) - radius
 
@@ -171,12 +171,14 @@ def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: 
     """Least distance of a pair minus its clearance, at most `far`. If `hasty`, the first value found below
     `far`."""
     begin, first_leaf = trees[numbers[pair, 0], 0], trees[numbers[pair, 0], 1]
-    required = figures[pair, 0]
+    clearance_mm = figures[pair, 0]
     best = far
     i = 1
     while i:
-        reached = best + required
-        margin = _to_obstacle(nodes, trees, numbers, figures, frames, pair, begin + i, reached, hasty) - required
+        bound_mm = best + clearance_mm
+        margin = (
+            _to_obstacle(nodes, trees, numbers, figures, frames, pair, begin + i, bound_mm, hasty) - clearance_mm
+        )
         if margin > best - ROUNDING_MM:
             i = _after(i)
         elif i < first_leaf:
@@ -201,14 +203,14 @@ def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # 
     x = frames[link, 0, 0] * bx + frames[link, 0, 1] * by + frames[link, 0, 2] * bz + frames[link, 0, 3]
     y = frames[link, 1, 0] * bx + frames[link, 1, 1] * by + frames[link, 1, 2] * bz + frames[link, 1, 3]
     z = frames[link, 2, 0] * bx + frames[link, 2, 1] * by + frames[link, 2, 2] * bz + frames[link, 2, 3]
-    moved = 0.0
+    motion_mm = 0.0
     for k in range(min(link, 6) - 1, numbers[pair, 5] - 1, -1):
         axis = int(joints[k, 4])
         ux, uy, uz = frames[k + 1, 0, axis], frames[k + 1, 1, axis], frames[k + 1, 2, axis]
         dx, dy, dz = x - frames[k + 1, 0, 3], y - frames[k + 1, 1, 3], z - frames[k + 1, 2, 3]
         away = _length(uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx)
-        moved += turned[k] * min(figures[pair, 1 + k], away + radius + moved)
-    return moved
+        motion_mm += turned[k] * min(figures[pair, 1 + k], away + radius + motion_mm)
+    return motion_mm
 
 
 @numba.njit(cache=True, nogil=True)
@@ -234,20 +236,20 @@ def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
     segment's ends; other segments are halved.
     """
     numbers, figures = model.numbers, model.figures
-    frames, here_deg, turned = np.empty((9, 3, 4)), np.empty(6), np.empty(6)
+    frames, here_deg, turns_rad = np.empty((9, 3, 4)), np.empty(6), np.empty(6)
     most_mm = 0.0
     for pair in range(numbers.shape[0]):
-        moved = 0.0
+        motion_mm = 0.0
         for k in range(6):
-            moved += figures[pair, 1 + k] * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
-        most_mm = max(most_mm, moved)
+            motion_mm += figures[pair, 1 + k] * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
+        most_mm = max(most_mm, motion_mm)
     size = int(2.0 * most_mm / RESOLUTION_MM) + 4
     middles, unclear = np.empty(size), np.empty(size)
     middles[0], count, half = 0.5, 1, 0.5
     while count:
-        found = 0
+        unclear_count = 0
         for k in range(6):
-            turned[k] = half * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
+            turns_rad[k] = half * abs(end_deg[k] - start_deg[k]) * (np.pi / 180.0)
         for m in range(count):
             for k in range(6):
                 here_deg[k] = start_deg[k] + middles[m] * (end_deg[k] - start_deg[k])
@@ -255,19 +257,19 @@ def blocked_at(model, start_deg, end_deg):  # type: ignore[no-untyped-def]
             for pair in range(numbers.shape[0]):
                 first = pair == 0 or numbers[pair, 0] != numbers[pair - 1, 0]
                 if first or numbers[pair, 5] != numbers[pair - 1, 5]:
-                    moved = _moved_mm(
-                        model.nodes, model.trees, numbers, figures, model.joints, frames, pair, turned
+                    motion_mm = _moved_mm(
+                        model.nodes, model.trees, numbers, figures, model.joints, frames, pair, turns_rad
                     )
-                margin = _margin(model.nodes, model.trees, numbers, figures, frames, pair, moved, True)
-                if margin == moved:
+                margin = _margin(model.nodes, model.trees, numbers, figures, frames, pair, motion_mm, True)
+                if margin == motion_mm:
                     continue
-                if margin < 0.0 or moved < RESOLUTION_MM:
-                    return pair, middles[m], moved
-                unclear[found] = middles[m]
-                found += 1
+                if margin < 0.0 or motion_mm < RESOLUTION_MM:
+                    return pair, middles[m], motion_mm
+                unclear[unclear_count] = middles[m]
+                unclear_count += 1
                 break
         half /= 2.0
-        for m in range(found):
+        for m in range(unclear_count):
             middles[2 * m], middles[2 * m + 1] = unclear[m] - half, unclear[m] + half
-        count = 2 * found
+        count = 2 * unclear_count
     return CLEAR, 0.0, 0.0

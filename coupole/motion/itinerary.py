@@ -56,10 +56,10 @@ left out."""
 def arm_of(rig: Rig) -> kinematics.Arm:
     """The rig's arm with the speeds and limits for plans: those of its driver, within the posture limits of its
     description. Raises InputError if the arm has no description."""
-    arm, described = planning_arm(rig), described_arm(rig)
-    if arm is None or described is None:
+    arm, description = planning_arm(rig), described_arm(rig)
+    if arm is None or description is None:
         raise undescribed(rig)
-    limits_deg = zip(arm.limits_deg, described.posture_limits_deg, strict=True)
+    limits_deg = zip(arm.limits_deg, description.posture_limits_deg, strict=True)
     return replace(arm, limits_deg=tuple((max(a[0], b[0]), min(a[1], b[1])) for a, b in limits_deg))
 
 
@@ -160,19 +160,19 @@ def plan_itinerary(
         tour = shortest_tour(
             planner, start, list(choices.values()), posture_cost_s, as_written=order == "as_written"
         )
-        visited = [list(choices)[group] for group in tour.order]
+        visit_indices = [list(choices)[group] for group in tour.order]
         contacts = [leg.contact for leg in tour.legs]
         cut_off = next((k for k, contact in enumerate(contacts) if contact is not None), None)
         if cut_off is None:
             break
-        before = f"view {views[visited[cut_off - 1]].name}" if cut_off else "where the arm stands"
-        name = views[visited[cut_off]].name
+        before = f"view {views[visit_indices[cut_off - 1]].name}" if cut_off else "where the arm stands"
+        name = views[visit_indices[cut_off]].name
         refusals.append(f"view {name}: no path to it was found from {before}: {contacts[cut_off]}")
-        del choices[visited[cut_off]]  # later views may still be reachable without it
+        del choices[visit_indices[cut_off]]  # later views may still be reachable without it
     visits: list[Visit | None] = [None] * len(views)
-    for index, joints, leg in zip(visited, tour.places, tour.legs, strict=True):
+    for index, joints, leg in zip(visit_indices, tour.places, tour.legs, strict=True):
         visits[index] = Visit(joints, leg)
-    return Itinerary(tuple(visits), tuple(refusals), tuple(visited))
+    return Itinerary(tuple(visits), tuple(refusals), tuple(visit_indices))
 
 
 def _rig_refusals(rig: Rig) -> list[str]:

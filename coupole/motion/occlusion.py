@@ -126,10 +126,10 @@ class Occlusions:
         codes[(by >= 0) & (by < len(links))] = BY_ARM
         codes[by >= len(links)] = BY_TOOL
         arm = slice(len(links))
-        seen = self._seen(
+        visible = self._seen(
             sight_of(self.rig, frames[FLANGE] @ self.rig.flange_from_camera.matrix()), axes_mm[arm], radii_mm[arm]
         )
-        return Occlusion(codes, seen, self.patches.areas_mm2)
+        return Occlusion(codes, visible, self.patches.areas_mm2)
 
     def _seen(
         self, sight: Sight, axes_mm: NDArray[np.float64], radii_mm: NDArray[np.float64]
@@ -139,12 +139,12 @@ class Occlusions:
         starts_mm = ray_starts(self.patches)
         pixels, depth_mm = sight.project(starts_mm)
         inside = (pixels >= -0.5) & (pixels <= np.array((sight.width_px, sight.height_px)) - 0.5)
-        seen = (depth_mm > 0) & inside.all(axis=1)
-        seen &= np.einsum("pk,pk->p", eye_mm - starts_mm, self.patches.normals) > 0
-        seen &= hidden_by(starts_mm, eye_mm[None], axes_mm, radii_mm, seen[:, None])[:, 0] < 0
-        asked = np.flatnonzero(seen)
-        seen[asked] = ~blocked(self.mesh, starts_mm[asked], np.tile(eye_mm, (len(asked), 1)))
-        return seen
+        visible = (depth_mm > 0) & inside.all(axis=1)
+        visible &= np.einsum("pk,pk->p", eye_mm - starts_mm, self.patches.normals) > 0
+        visible &= hidden_by(starts_mm, eye_mm[None], axes_mm, radii_mm, visible[:, None])[:, 0] < 0
+        candidates = np.flatnonzero(visible)
+        visible[candidates] = ~blocked(self.mesh, starts_mm[candidates], np.tile(eye_mm, (len(candidates), 1)))
+        return visible
 
 
 def occlusions_of(
@@ -211,9 +211,9 @@ def blocked(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float
 
 def blocked_along(mesh: Any, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
     """[n] True where the way [n, 3] from a start to its end meets a triangle of a `ray_mesh`."""
-    met = mesh.run(starts_mm, ways_mm, dists=np.ones(len(starts_mm), np.float32), query="OCCLUDED")
-    found: NDArray[np.bool_] = met >= 0
-    return found
+    triangles = mesh.run(starts_mm, ways_mm, dists=np.ones(len(starts_mm), np.float32), query="OCCLUDED")
+    are_blocked: NDArray[np.bool_] = triangles >= 0
+    return are_blocked
 
 
 def capsule_axes(
@@ -233,12 +233,21 @@ def hidden_by(
 ) -> NDArray[np.int16]:
     """Find for each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k])
     that it meets, [n, m]; -1 where it meets none, or where `asked` [n, m] is False."""
-    found = np.full(asked.shape, -1, np.int16)
+    capsule_numbers = np.full(asked.shape, -1, np.int16)
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)
         reach_mm = float(np.linalg.norm(starts_mm - center_mm, axis=1).max())
-        _first_met(starts_mm, np.ascontiguousarray(ends_mm), axes_mm, radii_mm, asked, center_mm, reach_mm, found)
-    return found
+        _first_met(
+            starts_mm,
+            np.ascontiguousarray(ends_mm),
+            axes_mm,
+            radii_mm,
+            asked,
+            center_mm,
+            reach_mm,
+            capsule_numbers,
+        )
+    return capsule_numbers
 
 
 def sight_of(rig: Rig, support_from_camera: Transform) -> Sight:

@@ -75,12 +75,12 @@ def shortest_tour(
     order = np.arange(len(choices))
     best, best_s = (order, order), np.inf
     for seed in range(1 if as_written else _RESTARTS):
-        order, picked = _settled(times, groups, order, seed, as_written=as_written)
-        total_s = _way_s(times.seconds, groups, picked)
+        order, place_indices = _settled(times, groups, order, seed, as_written=as_written)
+        total_s = _way_s(times.seconds, groups, place_indices)
         if total_s < best_s:
-            best, best_s = (order, picked), total_s
-    order, picked = best
-    places = [start, *groups.places[picked]]
+            best, best_s = (order, place_indices), total_s
+    order, place_indices = best
+    places = [start, *groups.places[place_indices]]
     return Tour(tuple(order.tolist()), tuple(places[1:]), tuple(planner.leg(a, b) for a, b in pairwise(places)))
 
 
@@ -88,18 +88,18 @@ def _settled(
     times: _Times, groups: _Groups, order: NDArray[np.int64], seed: int, *, as_written: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """An order and its places that are still best when all legs of the tour are known."""
-    picked = _best_places(times.seconds, groups, order)
+    place_indices = _best_places(times.seconds, groups, order)
     for count in range(_ROUNDS):
         if not as_written and len(order) > 1:
-            order, picked = _best_order(times.seconds, groups, order, picked, seed, again=count > 0)
-        picked = _best_places(times.seconds, groups, order)
+            order, place_indices = _best_order(times.seconds, groups, order, place_indices, seed, again=count > 0)
+        place_indices = _best_places(times.seconds, groups, order)
         news = False
-        while times.learn_blocked(picked):
-            news, picked = True, _best_places(times.seconds, groups, order)
-        if not news and not times.learn_detours(picked):
+        while times.learn_blocked(place_indices):
+            news, place_indices = True, _best_places(times.seconds, groups, order)
+        if not news and not times.learn_detours(place_indices):
             break
-    times.learn_detours(picked)
-    return order, picked
+    times.learn_detours(place_indices)
+    return order, place_indices
 
 
 class _Times:
@@ -114,23 +114,23 @@ class _Times:
     def learn_blocked(self, picked: NDArray[np.int64]) -> bool:
         """Check the straight motions of a tour; True if one is blocked, whose time is then increased by a
         detour."""
-        blocked = False
+        is_blocked = False
         for a, b in self._legs(picked):
             if not self._looked_at[a, b]:
                 self._looked_at[a, b] = self._looked_at[b, a] = True
                 if not self._planner.is_straight(self._places[a], self._places[b]):
-                    blocked = True
+                    is_blocked = True
                     self._to_find.add((a, b))
                     self._set(a, b, self.seconds[a, b] + _DETOUR_S)
-        return blocked
+        return is_blocked
 
     def learn_detours(self, picked: NDArray[np.int64]) -> bool:
         """Plan the legs of a tour that are not straight; True if there was one to plan."""
-        wanted = self._to_find.intersection(self._legs(picked))
-        for a, b in sorted(wanted):
+        detours = self._to_find.intersection(self._legs(picked))
+        for a, b in sorted(detours):
             self._set(a, b, self._planner.leg(self._places[a], self._places[b]).duration_s)
-        self._to_find -= wanted
-        return bool(wanted)
+        self._to_find -= detours
+        return bool(detours)
 
     def _legs(self, picked: NDArray[np.int64]) -> list[tuple[int, int]]:
         return [(min(a, b), max(a, b)) for a, b in pairwise([0, *picked.tolist()])]
@@ -154,11 +154,11 @@ def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> 
         came_from.append(costs_s.argmin(axis=0))
         before, total_s = here, costs_s.min(axis=0) + groups.posture_cost_s[here]
     k = int(total_s.argmin())
-    picked = []
+    place_indices = []
     for group, back in zip(order[::-1], came_from[::-1], strict=True):
-        picked.append(groups.first[group] + k)
+        place_indices.append(groups.first[group] + k)
         k = int(back[k])
-    return np.array(picked[::-1])
+    return np.array(place_indices[::-1])
 
 
 def _best_order(
@@ -177,7 +177,7 @@ def _best_order(
     changes = int(share * min(_CHANGES_PER_PLACE * len(groups.places), _MOST_CHANGES))
     hottest_s = max(share * float(np.median(seconds[0, 1:])), 2 * _COLDEST_S)
     rolls = np.random.default_rng(seed).random((changes, 5))
-    found: tuple[Any, Any] = anneal(
+    order_and_places: tuple[Any, Any] = anneal(
         seconds, groups.posture_cost_s, groups.first, order, picked, rolls, hottest_s, _COLDEST_S
     )
-    return found
+    return order_and_places

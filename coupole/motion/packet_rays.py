@@ -83,16 +83,16 @@ class PacketMesh:
         self, starts_mm: NDArray[np.float32], asked: NDArray[np.int64], end_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
         """[asked] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the end."""
-        found = np.empty(len(asked), np.bool_)
-        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, ARGUMENTS, found)
-        return found
+        are_blocked = np.empty(len(asked), np.bool_)
+        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, ARGUMENTS, are_blocked)
+        return are_blocked
 
     def blocked_along(self, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[n] True where the way [n, 3], or the one way [1, 3] of all, from a start [n, 3] to its end meets a
         triangle. They are traced one by one: of ways that lead everywhere, packets would be slower."""
-        found = np.empty(len(starts_mm), np.bool_)
-        _blocked_one_by_one(_address("rtcOccluded1"), self.scene, starts_mm, ways_mm, ARGUMENTS, found)
-        return found
+        are_blocked = np.empty(len(starts_mm), np.bool_)
+        _blocked_one_by_one(_address("rtcOccluded1"), self.scene, starts_mm, ways_mm, ARGUMENTS, are_blocked)
+        return are_blocked
 
 
 def blocked16() -> np.uint64:
@@ -221,6 +221,6 @@ def _first_met(function, scene, start, ways, arguments, number, distance):  # ty
                 rays[k, lane], rays[4 + k, lane] = np.float32(start[k]), ways[first + lane, k]
         trace(function, scene, rays, words, valid, lanes, np.float32(np.inf), arguments)
         for lane in range(lanes):
-            met = words[_GEOMETRY, lane] != _NONE
-            number[first + lane] = np.int32(words[_NUMBER, lane]) if met else -1
-            distance[first + lane] = rays[FAR, lane] if met else np.nan
+            is_hit = words[_GEOMETRY, lane] != _NONE
+            number[first + lane] = np.int32(words[_NUMBER, lane]) if is_hit else -1
+            distance[first + lane] = rays[FAR, lane] if is_hit else np.nan

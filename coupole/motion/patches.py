@@ -32,9 +32,9 @@ class Patches:
 
     def of_triangles(self, triangles: int) -> NDArray[np.int64]:
         """A patch for each of a mesh's triangles [triangles]: that of one of its pieces, -1 without area."""
-        found = np.full(triangles, -1)
-        found[self.piece_triangle] = self.piece_patch
-        return found
+        patch_of_triangle = np.full(triangles, -1)
+        patch_of_triangle[self.piece_triangle] = self.piece_patch
+        return patch_of_triangle
 
 
 def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches:
@@ -55,17 +55,19 @@ def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches
     centers_mm = pieces_mm.mean(axis=1)
     traits = np.hstack([centers_mm, _TURN_WIDTHS * width_mm * normals])
     patch = np.zeros(len(pieces_mm), np.int64)
-    chosen = []
+    representatives = []
     for number, members in enumerate(_halved(traits, areas_mm2, min(count, len(pieces_mm)))):
         patch[members] = number
         mean = _mean(traits[members], areas_mm2[members])
-        chosen.append(members[np.argmin(np.linalg.norm(traits[members] - mean, axis=1))])
+        representatives.append(members[np.argmin(np.linalg.norm(traits[members] - mean, axis=1))])
     total_mm2 = np.bincount(patch, areas_mm2).astype(np.float64)
     mean_normals = np.stack([np.bincount(patch, areas_mm2 * component) for component in normals.T], axis=1)
     length = np.linalg.norm(mean_normals, axis=1, keepdims=True)
     # The normals of a patch around a thin edge may cancel: then the normal of its point is used.
-    unit = np.where(length > 1e-6 * total_mm2[:, None], mean_normals / np.maximum(length, 1e-300), normals[chosen])
-    return Patches(centers_mm[chosen], unit, total_mm2, patch, triangle)
+    unit = np.where(
+        length > 1e-6 * total_mm2[:, None], mean_normals / np.maximum(length, 1e-300), normals[representatives]
+    )
+    return Patches(centers_mm[representatives], unit, total_mm2, patch, triangle)
 
 
 def patches_at(points_mm: ArrayLike) -> Patches:
@@ -114,12 +116,12 @@ def _halved(traits: NDArray[np.float64], weights: NDArray[np.float64], count: in
         if parts <= 1:
             groups += [members] * parts
             continue
-        spread = traits[members] - _mean(traits[members], weights[members])
-        widest = int(np.argmax(weights[members] @ spread**2))
+        deviations = traits[members] - _mean(traits[members], weights[members])
+        widest = int(np.argmax(weights[members] @ deviations**2))
         members = members[np.argsort(traits[members, widest], kind="stable")]
         first_parts = parts // 2
-        reached = np.cumsum(weights[members])
-        cut = int(np.searchsorted(reached, reached[-1] * first_parts / parts))
-        cut = min(max(cut, first_parts), len(members) - (parts - first_parts))
-        open_groups += [(members[cut:], parts - first_parts), (members[:cut], first_parts)]
+        cumulative_weights = np.cumsum(weights[members])
+        split = int(np.searchsorted(cumulative_weights, cumulative_weights[-1] * first_parts / parts))
+        split = min(max(split, first_parts), len(members) - (parts - first_parts))
+        open_groups += [(members[split:], parts - first_parts), (members[:split], first_parts)]
     return groups

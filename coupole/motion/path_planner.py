@@ -74,10 +74,10 @@ class PathPlanner:
         key = (a.tobytes(), b.tobytes())
         if key not in self._chains:
             self._chains[key] = self._find(a, b)
-        found = self._chains[key]
-        if isinstance(found, Contact):
-            return Leg((), NO_WAY_S, found)
-        chain = found if a is start else found[::-1]
+        chain_or_contact = self._chains[key]
+        if isinstance(chain_or_contact, Contact):
+            return Leg((), NO_WAY_S, chain_or_contact)
+        chain = chain_or_contact if a is start else chain_or_contact[::-1]
         return Leg(tuple(chain[1:]), self._chain_s(chain))
 
     def _find(self, start: Joints, goal: Joints) -> list[Joints] | Contact:
@@ -151,21 +151,23 @@ class PathPlanner:
         grow = 0
         for _ in range(_RRT_TRIES):
             target = random.uniform(low, high)
-            reached = self._extend(trees[grow], parents[grow], target, greedy=False)
-            if reached is not None:
-                place = trees[grow][reached]
-                met = self._extend(trees[1 - grow], parents[1 - grow], place, greedy=True)
-                if met is not None and np.array_equal(trees[1 - grow][met], place):
-                    branches = [_branch(trees[k], parents[k], n) for k, n in ((grow, reached), (1 - grow, met))]
-                    ours, theirs = branches if grow == 0 else branches[::-1]
-                    return ours + theirs[::-1][1:]
+            new_node = self._extend(trees[grow], parents[grow], target, greedy=False)
+            if new_node is not None:
+                place = trees[grow][new_node]
+                meeting_node = self._extend(trees[1 - grow], parents[1 - grow], place, greedy=True)
+                if meeting_node is not None and np.array_equal(trees[1 - grow][meeting_node], place):
+                    branches = [
+                        _branch(trees[k], parents[k], n) for k, n in ((grow, new_node), (1 - grow, meeting_node))
+                    ]
+                    start_branch, goal_branch = branches if grow == 0 else branches[::-1]
+                    return start_branch + goal_branch[::-1][1:]
             grow = 1 - grow
         return None
 
     def _extend(self, tree: list[Joints], parents: list[int], target: Joints, *, greedy: bool) -> int | None:
         """Grow a tree towards `target` by one step, or until blocked; returns the last node reached."""
         node = int(np.argmin(np.abs(np.array(tree) - target).max(axis=1)))
-        reached: int | None = None
+        last_node: int | None = None
         while True:
             away = target - tree[node]
             distance = float(np.abs(away).max())
@@ -173,12 +175,12 @@ class PathPlanner:
                 return node
             there = target if distance <= _RRT_STEP_DEG else tree[node] + away * (_RRT_STEP_DEG / distance)
             if not self._clear(tree[node], there):
-                return reached
+                return last_node
             tree.append(there)
             parents.append(node)
-            node = reached = len(tree) - 1
+            node = last_node = len(tree) - 1
             if not greedy:
-                return reached
+                return last_node
 
     def _shortened(self, chain: list[Joints]) -> list[Joints]:
         """Leave out via points that are not needed, then cut corners at random."""

@@ -41,18 +41,27 @@ _FREE_LIMIT_MARGIN_DEG = 10.0
 def distances(arm: Arm, joints_deg: ArrayLike) -> tuple[NDArray[np.float64], ...]:
     """Distances of joint angles [..., 6] from the singularities of wrist (deg), elbow (deg) and shoulder (mm),
     [...] each. Raises ValueError for an arm without `structure_of`."""
-    found = structure_of(arm)
-    if found is None:
+    structure = structure_of(arm)
+    if structure is None:
         raise ValueError(f"the singularities of {arm.name} are not known: its chain has no closed solution")
-    theta = found.theta(joints_deg)
+    theta = structure.theta(joints_deg)
     _, t2, t3, t4, t5, _ = np.moveaxis(theta, -1, 0)
-    if isinstance(found, SphericalWrist):
-        bend, fore = t3 + np.arctan2(found.a2_mm, found.c3_mm), t2 + t3
-        out_mm = found.c2_mm * np.sin(t2) + found.c3_mm * np.sin(fore) + found.a2_mm * np.cos(fore) + found.a1_mm
-        shoulder_mm = np.hypot(out_mm, found.b_mm)
+    if isinstance(structure, SphericalWrist):
+        bend, fore = t3 + np.arctan2(structure.a2_mm, structure.c3_mm), t2 + t3
+        out_mm = (
+            structure.c2_mm * np.sin(t2)
+            + structure.c3_mm * np.sin(fore)
+            + structure.a2_mm * np.cos(fore)
+            + structure.a1_mm
+        )
+        shoulder_mm = np.hypot(out_mm, structure.b_mm)
     else:
         bend = t3
-        out_mm = found.a2_mm * np.cos(t2) + found.a3_mm * np.cos(t2 + t3) + found.d5_mm * np.sin(t2 + t3 + t4)
+        out_mm = (
+            structure.a2_mm * np.cos(t2)
+            + structure.a3_mm * np.cos(t2 + t3)
+            + structure.d5_mm * np.sin(t2 + t3 + t4)
+        )
         shoulder_mm = np.abs(out_mm)
     return _from_half_turn_deg(t5), _from_half_turn_deg(bend), shoulder_mm
 

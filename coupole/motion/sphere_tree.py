@@ -68,19 +68,19 @@ def surface_points(corners_mm: Floats, step_mm: float = MESH_STEP_MM) -> Floats:
     cell_mm = (step_mm - edge_mm / np.sqrt(3)) / np.sqrt(3)
     longest_mm = np.linalg.norm(corners_mm - np.roll(corners_mm, 1, axis=1), axis=2).max(axis=1, initial=0.0)
     parts = np.maximum(1, np.ceil(longest_mm / edge_mm)).astype(np.int64)
-    found = [np.zeros((0, 3))]
+    point_sets_mm = [np.zeros((0, 3))]
     for count in np.unique(parts):
         first, second = np.indices((count + 1, count + 1)).reshape(2, -1)
         shares = np.stack([count - first - second, first, second], axis=1)[first + second <= count] / count
-        found.append(_one_per_cell((shares @ corners_mm[parts == count]).reshape(-1, 3), cell_mm))
-    return _one_per_cell(np.concatenate(found), cell_mm)
+        point_sets_mm.append(_one_per_cell((shares @ corners_mm[parts == count]).reshape(-1, 3), cell_mm))
+    return _one_per_cell(np.concatenate(point_sets_mm), cell_mm)
 
 
 def _one_per_cell(points: Floats, cell_mm: float) -> Floats:
     cells = np.floor(points / cell_mm).astype(np.int64) + 2**20
     _, first = np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)
-    kept: Floats = points[first]
-    return kept
+    cell_points: Floats = points[first]
+    return cell_points
 
 
 def sphere_trees_of(shapes: Sequence[Spheres]) -> SphereTrees:

@@ -84,14 +84,14 @@ def check_job(
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
     views = job.schedule.left(proven).views if proven else job.schedule.views
-    planned = job.motion.itinerary if paths else job.motion.unchecked_itinerary
-    itinerary = planned(views, home_deg)
+    plan_views = job.motion.itinerary if paths else job.motion.unchecked_itinerary
+    itinerary = plan_views(views, home_deg)
     all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
     history = ledger_of(job.cell, job.plan.object.id).read() if job.plan.object else History()
     before = history.total_lux_h
 
     def checked(pace: Pace) -> tuple[Job, Report]:
-        paced = at_pace(job, pace)
+        paced_job = at_pace(job, pace)
         checking = partial(
             check,
             job.plan,
@@ -102,10 +102,10 @@ def check_job(
             dose_budget_lux_h=history.budget_lux_h,
         )
         if all_views is None:
-            return paced, checking(paced.schedule, itinerary=itinerary, dose_before_lux_h=before)
-        of_all = checking(paced.schedule, itinerary=all_views)
-        left = checking(
-            paced.schedule.left(proven),
+            return paced_job, checking(paced_job.schedule, itinerary=itinerary, dose_before_lux_h=before)
+        of_all = checking(paced_job.schedule, itinerary=all_views)
+        remaining_report = checking(
+            paced_job.schedule.left(proven),
             itinerary=itinerary,
             dose_before_lux_h=before,
             whole=Whole(
@@ -117,7 +117,7 @@ def check_job(
                 of_all.dose_lux_h,
             ),
         )
-        return paced, left
+        return paced_job, remaining_report
 
     job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
     report.object_check = _object_check(job, itinerary, proven)
@@ -145,11 +145,11 @@ def allowed_lux_h(job: Job, history: History) -> float | None:
 
 def light_refusals(job: Job, history: History) -> list[str]:
     """Reasons why the object may receive no more light at all."""
-    measured, budget = job.plan.object, allowed_lux_h(job, history)
-    if measured is None or budget is None or history.total_lux_h < budget:
+    plan_object, budget = job.plan.object, allowed_lux_h(job, history)
+    if plan_object is None or budget is None or history.total_lux_h < budget:
         return []
     return [
-        f"object {measured.id}: it has received {history.total_lux_h:.2f} lux.h; its budget is {budget:g} lux.h"
+        f"object {plan_object.id}: it has received {history.total_lux_h:.2f} lux.h; its budget is {budget:g} lux.h"
     ]
 
 
@@ -170,9 +170,9 @@ def ledger_warnings(job: Job, history: History, more_lux_h: float) -> list[str]:
             f"object {name}: nobody has said how much light it may receive: `coupole dose {name} --budget LUX_H "
             "--name NAME` does"
         )
-    if others := similar_ids(job.cell.ledger_folder, name):
+    if ids := similar_ids(job.cell.ledger_folder, name):
         warnings.append(
-            f"object {name}: there is also a ledger of `{others[0]}`, whose light is not counted. Is it the same "
+            f"object {name}: there is also a ledger of `{ids[0]}`, whose light is not counted. Is it the same "
             "object?"
         )
     if history.unreadable:

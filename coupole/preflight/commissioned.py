@@ -86,17 +86,19 @@ class CommissioningRecord(Model):
     sha256: Sha256
 
     def result(self, step: Step) -> StepResult | None:
-        return next((one for one in self.steps if one.step == step), None)
+        return next((step_result for step_result in self.steps if step_result.step == step), None)
 
     @property
     def passed(self) -> bool:
         """True if every step was done and passed."""
-        return all((found := self.result(step)) is not None and found.passed for step in STEPS)
+        return all((step_result := self.result(step)) is not None and step_result.passed for step in STEPS)
 
     def with_result(self, result: StepResult) -> CommissioningRecord:
         """The same record with a new result in place of an older one of that step."""
-        kept = {one.step: one for one in self.steps} | {result.step: result}
-        return _sealed(self.rig, tuple(kept[step] for step in STEPS if step in kept), simulated=self.simulated)
+        results = {step_result.step: step_result for step_result in self.steps} | {result.step: result}
+        return _sealed(
+            self.rig, tuple(results[step] for step in STEPS if step in results), simulated=self.simulated
+        )
 
 
 def record_path(cell: Cell) -> Path:
@@ -116,18 +118,20 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
     records = {path: _read(path) for path in paths if path.exists()}
-    simulated = in_world(cell.rig, dry_run=False)
-    own = {path: record for path, record in records.items() if record.simulated == simulated}
-    if not own:
+    is_simulated = in_world(cell.rig, dry_run=False)
+    own_records = {path: record for path, record in records.items() if record.simulated == is_simulated}
+    if not own_records:
         return next(iter(records.values()), None)
-    if list(own) == [record_path(cell)]:
-        return own[record_path(cell)]
+    if list(own_records) == [record_path(cell)]:
+        return own_records[record_path(cell)]
     steps = []
     for step in STEPS:
-        results = [found for record in own.values() if (found := record.result(step)) is not None]
+        results = [
+            step_result for record in own_records.values() if (step_result := record.result(step)) is not None
+        ]
         fitting = [result for result in results if not outdated(cell, result)]
         steps += sorted(fitting or results, key=lambda result: result.ended)[-1:]
-    return _sealed(cell.rig.name, tuple(steps), simulated=simulated)
+    return _sealed(cell.rig.name, tuple(steps), simulated=is_simulated)
 
 
 def _read(path: Path) -> CommissioningRecord:
@@ -155,10 +159,18 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
     """The devices of a step, as its result keeps them."""
     return {
         kind: " ".join(
-            filter(None, (one.vendor, one.model, one.serial, f"({one.firmware})" if one.firmware else ""))
+            filter(
+                None,
+                (
+                    identity.vendor,
+                    identity.model,
+                    identity.serial,
+                    f"({identity.firmware})" if identity.firmware else "",
+                ),
+            )
         )
         for kind in _DEVICES[step]
-        for one in (identities[kind],)
+        for identity in (identities[kind],)
     }
 
 
@@ -170,7 +182,7 @@ def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] 
     if result.covers is None:
         if places := _places(key for key in now if key not in before):
             lacking = [f"it was done by an earlier version, which did not cover {places}"]
-        before, now = ({key: kept[key] for key in before if key in now} for kept in (before, now))
+        before, now = ({key: fingerprints[key] for key in before if key in now} for fingerprints in (before, now))
     changes = _changes(before, now)
     if identities is not None:
         changes += _changes(result.devices, devices_of(result.step, identities))
@@ -223,7 +235,7 @@ def _short(value: Any) -> str:
 
 
 def _sealed(rig: str, steps: tuple[StepResult, ...], *, simulated: bool) -> CommissioningRecord:
-    unsealed = CommissioningRecord.model_construct(
+    record = CommissioningRecord.model_construct(
         schema_version=1,
         kind="commissioning",
         rig=rig,
@@ -232,5 +244,5 @@ def _sealed(rig: str, steps: tuple[StepResult, ...], *, simulated: bool) -> Comm
         steps=steps,
         sha256="",
     )
-    plain = json.loads(unsealed.model_dump_json())
+    plain = json.loads(record.model_dump_json())
     return CommissioningRecord.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))

@@ -110,10 +110,10 @@ def everything(cell: Cell) -> dict[str, Any]:
 def _complete_settings(cell: Cell, kind: str) -> dict[str, Any]:
     """Return the settings of the driver that a run opens, with its defaults; without the arm, which has keys of
     its own."""
-    driver, given = device_for(cell.rig, kind, dry_run=False)
+    driver, settings = device_for(cell.rig, kind, dry_run=False)
     model = settings_class(driver)
     places = {name: value for name, value in NOWHERE[kind].items() if name in model.model_fields}
-    return model(**{**places, **given}).model_dump(mode="json", exclude={"arm_model"})
+    return model(**{**places, **settings}).model_dump(mode="json", exclude={"arm_model"})
 
 
 def _is_at(key: str, place: str) -> bool:

@@ -102,7 +102,7 @@ class Advice:
             "exposure": self.exposure.model_dump(mode="json"),
             "remarks": self.remarks,
             "noise": asdict(self.noise),
-            "views": {seen.view: asdict(seen) for seen in self.views},
+            "views": {advice.view: asdict(advice) for advice in self.views},
         }
 
 
@@ -118,20 +118,20 @@ def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
         exposure = BracketExposure(kind="bracket", exposures_us=tuple(exposures_us))
     changes: dict[str, Any] = {"exposure": exposure, "repeats": _REPEATS, "darks_per_view": 0}
     if len(rows):
-        spread = rows[_spread(leds.positions_mm[rows], METERING_LIGHTS)]
-        changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[spread]))
+        metering_rows = rows[_spread(leds.positions_mm[rows], METERING_LIGHTS)]
+        changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[metering_rows]))
         changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
     return plan.model_copy(update=changes)
 
 
 def _spread(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """`count` of the positions [n, 3], each as far as possible from those before it."""
-    chosen = [0]
+    indices = [0]
     apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
-    while len(chosen) < min(count, len(positions_mm)):
-        chosen.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[chosen[-1]], axis=1))
-    return np.array(sorted(chosen))
+    while len(indices) < min(count, len(positions_mm)):
+        indices.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[indices[-1]], axis=1))
+    return np.array(sorted(indices))
 
 
 @dataclass
@@ -153,21 +153,21 @@ def noise_of(views: Iterable[Metered]) -> Noise:
     """Photon transfer line through all pairs: mean squared difference / 2 against mean signal, in levels with as
     many pixels each, weighted by the uncertainty of a level's variance; rounding noise only if everything is
     saturated."""
-    signal, squared = [np.zeros(0)], [np.zeros(0)]
-    for metered in views:
-        white = metered.frame_format.white_dn - metered.frame_format.black_dn
-        for samples in (s for by_exposure in metered.samples.values() for s in by_exposure.values()):
+    signal, half_squares = [np.zeros(0)], [np.zeros(0)]
+    for view in views:
+        white = view.frame_format.white_dn - view.frame_format.black_dn
+        for samples in (s for by_exposure in view.samples.values() for s in by_exposure.values()):
             for a, b in zip(samples[::2], samples[1::2], strict=False):
-                unsaturated = np.maximum(a, b) < white
-                signal.append((a[unsaturated] + b[unsaturated]) / 2.0)
-                squared.append((a[unsaturated] - b[unsaturated]) ** 2 / 2.0)
+                below_white = np.maximum(a, b) < white
+                signal.append((a[below_white] + b[below_white]) / 2.0)
+                half_squares.append((a[below_white] - b[below_white]) ** 2 / 2.0)
     if sum(map(len, signal)) < _LEVELS:
         return Noise(_ROUNDING_DN, _ROUNDING_DN)
     order = np.argsort(all_signal := np.concatenate(signal), kind="stable")
     levels = np.array_split(all_signal[order], _LEVELS)
-    spreads = np.array_split(np.concatenate(squared)[order], _LEVELS)
+    spreads = np.array_split(np.concatenate(half_squares)[order], _LEVELS)
     mean = np.array([level.mean() for level in levels])
-    variance = np.array([spread.mean() for spread in spreads])
+    variance = np.array([squares.mean() for squares in spreads])
     weight = np.sqrt([len(level) for level in levels]) / np.maximum(variance, 1e-3)
     design = np.stack([np.ones_like(mean), mean], axis=1)
     (offset, gain), *_ = np.linalg.lstsq(design * weight[:, None], variance * weight, rcond=None)
@@ -204,19 +204,19 @@ def advise_view(view: str, metered: Metered, request: Request, noise: Noise) -> 
 def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -> Advice:
     """The exposure or bracket for all views; LEDs can be on for an exposure of at most `longest_us`."""
     noise = noise_of(views.values())
-    found = tuple(advise_view(view, metered, request, noise) for view, metered in views.items())
+    advices = tuple(advise_view(view, metered_view, request, noise) for view, metered_view in views.items())
     remarks = [
-        f"view {a.view}: nothing but noise is seen; is the object lit?" for a in found if not a.object_share
+        f"view {a.view}: nothing but noise is seen; is the object lit?" for a in advices if not a.object_share
     ]
     remarks += [
         f"view {a.view}: saturated at all metered exposures; meter again with this exposure"
-        for a in found
+        for a in advices
         if a.saturated_at_shortest
     ]
     low_us, high_us = _SHORTEST_US, longest_us
-    brightest_us = min(a.longest_us for a in found)
-    seen = [a.shortest_us for a in found if a.object_share]
-    shortest_us = max(seen, default=brightest_us)
+    brightest_us = min(a.longest_us for a in advices)
+    shortest_times_us = [a.shortest_us for a in advices if a.object_share]
+    shortest_us = max(shortest_times_us, default=brightest_us)
     if brightest_us < low_us:
         remarks.append(f"even {low_us} us saturate more than allowed: close the aperture or dim the lights")
     if shortest_us > high_us:
@@ -226,7 +226,7 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
         )
     first = _rounded(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
     if shortest_us <= brightest_us:
-        return Advice(noise, found, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
+        return Advice(noise, advices, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
     exposures_us = [first]
     while exposures_us[-1] < min(shortest_us, high_us) and len(exposures_us) < 16:
         exposures_us.append(_rounded(min(exposures_us[-1] * _BRACKET_STEP, shortest_us, high_us), up=True))
@@ -234,9 +234,9 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
             exposures_us.pop()
             break
     if len(exposures_us) == 1:
-        return Advice(noise, found, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
+        return Advice(noise, advices, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
     bracket = BracketExposure(kind="bracket", exposures_us=tuple(min(e, high_us) for e in exposures_us))
-    return Advice(noise, found, bracket, tuple(remarks))
+    return Advice(noise, advices, bracket, tuple(remarks))
 
 
 def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExposure) -> None:
@@ -251,9 +251,9 @@ def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExpos
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, 4096
     document = yaml.load(plan.text)
-    written = CommentedMap(exposure.model_dump(mode="json"))
-    written.fa.set_flow_style()
-    document["exposure"] = written
+    exposure_map = CommentedMap(exposure.model_dump(mode="json"))
+    exposure_map.fa.set_flow_style()
+    document["exposure"] = exposure_map
     try:
         with out.open("x", encoding="utf-8") as file:
             yaml.dump(document, file)

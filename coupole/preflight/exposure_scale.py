@@ -72,10 +72,10 @@ def exposure_scale(job: Job) -> ExposureScale | None:
         if record.kind == "led-power" and "gain_db" in record.fixed and record.validity.f_number is not None:
             power = _power(item.path, record, job.cell.files, leds.ids) * 10.0 ** (-record.fixed["gain_db"] / 20.0)
             return ExposureScale(power * per_flux / np.pi, str(item.path))
-    told = rig.white_response
-    if told is None or abs(told.f_number - rig.lens.f_number) > 1e-3 * told.f_number:
+    white_response = rig.white_response
+    if white_response is None or abs(white_response.f_number - rig.lens.f_number) > 1e-3 * white_response.f_number:
         return None
-    return ExposureScale(leds.flux_lm * per_flux * told.dn_per_lux_s, "the rig's white_response")
+    return ExposureScale(leds.flux_lm * per_flux * white_response.dn_per_lux_s, "the rig's white_response")
 
 
 def exposed_white(job: Job, scale: ExposureScale) -> list[ExposedWhite]:
@@ -109,5 +109,5 @@ def _power(path: Path, record: Record, files: InputFiles, ids: NDArray[np.int64]
         of_led = {int(row["id"]): max(float(row[channel]) for channel in channels) for row in rows}
     except (OSError, UnicodeDecodeError, ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(f"{table}: expected the table of LED powers beside {path.name}: {error}") from error
-    found = np.array([of_led.get(int(led), 0.0) for led in ids])
-    return np.where(np.isfinite(found), found, 0.0)
+    powers = np.array([of_led.get(int(led), 0.0) for led in ids])
+    return np.where(np.isfinite(powers), powers, 0.0)

@@ -95,11 +95,11 @@ def check_object(
         pose = _camera_pose(view, number, rig, itinerary)
         framings.append(framing_of(view.name, sight_of(rig, pose), sharp_mm, mesh, points_mm))
     refusals, warnings = _judged_placement(name, placement, rig.support.diameter_mm / 2)
-    aimed = [
+    takes_aim = [
         view.target_mm is not None and any(burst.is_light().any() and not burst.panel for burst in bursts)
         for view, bursts in zip(schedule.views, schedule.bursts, strict=True)
     ]
-    more_refusals, more_warnings = _judged_views(name, framings, aimed, sharp_mm)
+    more_refusals, more_warnings = _judged_views(name, framings, takes_aim, sharp_mm)
     return ObjectCheck(
         placement, sharp_mm, tuple(framings), (*refusals, *more_refusals), (*warnings, *more_warnings)
     )
@@ -123,8 +123,8 @@ def depth_of_field_mm(lens: Lens, pixel_pitch_um: float) -> tuple[float, float]:
     """Nearest and farthest distance from the projection centre that is sharp; the farthest may be infinite."""
     image_mm = 1 / (1 / lens.focal_length_mm - 1 / lens.focus_distance_mm)
     slack = SHARP_PX * pixel_pitch_um * 1e-3 * lens.f_number / (lens.focal_length_mm * image_mm)
-    focused = 1 / lens.focus_distance_mm
-    return 1 / (focused + slack), 1 / (focused - slack) if focused > slack else np.inf
+    focus_per_mm = 1 / lens.focus_distance_mm
+    return 1 / (focus_per_mm + slack), 1 / (focus_per_mm - slack) if focus_per_mm > slack else np.inf
 
 
 def surface_samples(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,11 +134,11 @@ def surface_samples(corners_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     if not areas.sum() > 0.0:
         return np.asarray(corners_mm.mean(axis=1)[:_SAMPLES])
     at = np.cumsum(areas) / areas.sum()
-    chosen = np.minimum(np.searchsorted(at, (np.arange(_SAMPLES) + 0.5) / _SAMPLES), len(at) - 1)
+    triangles = np.minimum(np.searchsorted(at, (np.arange(_SAMPLES) + 0.5) / _SAMPLES), len(at) - 1)
     number = np.arange(_SAMPLES) + 0.5
     u, v = np.sqrt(number * _R2[0] % 1.0), number * _R2[1] % 1.0
     weights = np.stack([1 - u, u * (1 - v), u * v], axis=1)
-    points: NDArray[np.float64] = np.einsum("nk,nkj->nj", weights, corners_mm[chosen])
+    points: NDArray[np.float64] = np.einsum("nk,nkj->nj", weights, corners_mm[triangles])
     return points
 
 
@@ -149,18 +149,20 @@ def framing_of(
     depth_mm = seen_depths_mm(sight, mesh)
     visible, inside, depth_of_points_mm = points_shown(sight, mesh, points_mm)
     near_mm, far_mm = sharp_mm
-    shown = depth_mm[np.isfinite(depth_mm)]
-    if len(shown) == 0:  # too small for the raster, or nothing
-        shown = depth_of_points_mm[inside]
-    nothing = len(shown) == 0
-    nearest, farthest = (np.nan, np.nan) if nothing else (float(shown.min()), float(shown.max()))
+    visible_depths_mm = depth_mm[np.isfinite(depth_mm)]
+    if len(visible_depths_mm) == 0:  # too small for the raster, or nothing
+        visible_depths_mm = depth_of_points_mm[inside]
+    nothing = len(visible_depths_mm) == 0
+    nearest, farthest = (
+        (np.nan, np.nan) if nothing else (float(visible_depths_mm.min()), float(visible_depths_mm.max()))
+    )
     return Framing(
         view,
         float(inside.sum() / max(1, visible.sum())),
         float(np.isfinite(depth_mm).mean()),
         nearest,
         farthest,
-        0.0 if nothing else float(np.mean((shown >= near_mm) & (shown <= far_mm))),
+        0.0 if nothing else float(np.mean((visible_depths_mm >= near_mm) & (visible_depths_mm <= far_mm))),
         (sight.focal_px / farthest, sight.focal_px / nearest),
     )
 
@@ -176,8 +178,8 @@ def seen_depths_mm(sight: Sight, mesh: Any) -> NDArray[np.float64]:
     towards = (ways @ sight.support_from_camera[:3, :3].T).astype(np.float32)
     eyes = np.tile(sight.support_from_camera[:3, 3], (len(ways), 1)).astype(np.float32)
     depth = np.asarray(mesh.run(eyes, towards, query="DISTANCE"), np.float64)
-    found: NDArray[np.float64] = np.where(depth < _NO_HIT_MM, depth, np.inf).reshape(rows, columns)
-    return found
+    depths_mm: NDArray[np.float64] = np.where(depth < _NO_HIT_MM, depth, np.inf).reshape(rows, columns)
+    return depths_mm
 
 
 def points_shown(
@@ -234,32 +236,32 @@ def _judged_views(
     """Refusals and warnings about what views see. Views that light nothing, or take no aim, are only warned of."""
     refusals: list[str] = []
     warnings: list[str] = []
-    partly, blurred = [], []
+    partly, blurred_framings = [], []
     sharp = f"{sharp_mm[0]:.0f} to {sharp_mm[1]:.0f} mm"
-    for seen, is_aimed in zip(framings, aimed, strict=True):
+    for framing, is_aimed in zip(framings, aimed, strict=True):
         problem = ""
-        if not seen.fills and not seen.in_field:
-            problem = f"view {seen.view}: object {name} is out of its field"
-        elif not seen.in_focus:
+        if not framing.fills and not framing.in_field:
+            problem = f"view {framing.view}: object {name} is out of its field"
+        elif not framing.in_focus:
             problem = (
-                f"view {seen.view}: nothing of object {name} is in focus: what it sees is {seen.nearest_mm:.0f} "
-                f"to {seen.farthest_mm:.0f} mm away, sharp is {sharp}"
+                f"view {framing.view}: nothing of object {name} is in focus: what it sees is "
+                f"{framing.nearest_mm:.0f} to {framing.farthest_mm:.0f} mm away, sharp is {sharp}"
             )
         if problem:
             (refusals if is_aimed else warnings).append(problem)
             continue
-        partly += [seen] if seen.in_field < _ALL else []
-        blurred += [seen] if seen.in_focus < _MOST else []
+        partly += [framing] if framing.in_field < _ALL else []
+        blurred_framings += [framing] if framing.in_focus < _MOST else []
     if partly:
         least = min(partly, key=lambda seen: seen.in_field)
         warnings.append(
             f"object {name}: {_count(partly, framings)} part of it out of the field; view {least.view} has "
             f"{least.in_field:.0%} of what it could see"
         )
-    if blurred:
-        least = min(blurred, key=lambda seen: seen.in_focus)
+    if blurred_framings:
+        least = min(blurred_framings, key=lambda seen: seen.in_focus)
         warnings.append(
-            f"object {name}: {_count(blurred, framings)} part of it out of focus; in view {least.view} "
+            f"object {name}: {_count(blurred_framings, framings)} part of it out of focus; in view {least.view} "
             f"{least.in_focus:.0%} is sharp ({sharp}; it is {least.nearest_mm:.0f} to "
             f"{least.farthest_mm:.0f} mm away)"
         )

@@ -50,10 +50,12 @@ class Job:
     @property
     def inputs(self) -> Inputs:
         """Files that a run of this job depends on."""
-        others = [self.cell.leds_path] + ([self.shape.mesh_path] if self.shape.mesh_path else [])
-        others += [item.path for item in self.calibrations or ()]
+        other_paths = [self.cell.leds_path] + ([self.shape.mesh_path] if self.shape.mesh_path else [])
+        other_paths += [item.path for item in self.calibrations or ()]
         rig = self.cell.document.path
-        return Inputs(self.document.path, rig, tuple(others), described_arm(self.cell.rig), files=self.cell.files)
+        return Inputs(
+            self.document.path, rig, tuple(other_paths), described_arm(self.cell.rig), files=self.cell.files
+        )
 
 
 def read_job(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> Job:
@@ -105,18 +107,18 @@ def without_hidden(job: Job, known: Mapping[str, Sequence[int]] | None = None) -
     paths from home."""
     if job.plan.hidden_lights != "skip":
         return job
-    hidden = dict(known) if known is not None else _hidden_from_home(job)
-    return replace(job, schedule=job.schedule.without(hidden), hidden_leds=hidden)
+    hidden_leds = dict(known) if known is not None else _hidden_from_home(job)
+    return replace(job, schedule=job.schedule.without(hidden_leds), hidden_leds=hidden_leds)
 
 
 def _hidden_from_home(job: Job) -> dict[str, list[int]]:
     itinerary = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
-    hidden: dict[str, list[int]] = {}
+    hidden_leds: dict[str, list[int]] = {}
     for view, visit, bursts in zip(job.schedule.views, itinerary.visits, job.schedule.bursts, strict=True):
         if visit is None:
             continue
         lit = {int(led) for burst in bursts for led in burst.table["led"]}
-        occluded = job.motion.occluded_leds(job.motion.occlusions.at(visit.joints_deg))
-        if leds := [led for led in occluded if led in lit]:
-            hidden[view.name] = leds
-    return hidden
+        occluded_leds = job.motion.occluded_leds(job.motion.occlusions.at(visit.joints_deg))
+        if leds := [led for led in occluded_leds if led in lit]:
+            hidden_leds[view.name] = leds
+    return hidden_leds

@@ -30,8 +30,8 @@ def refuse_on_times(bursts_of_views: Sequence[Sequence[Burst]], limits: LedLimit
             views_of.setdefault(alike, []).append(burst.view)
     refusals = []
     for alike, (burst, step) in first_of.items():
-        others = len(set(views_of[alike])) - 1
-        also = f" (and in {others} more views)" if others else ""
+        other_count = len(set(views_of[alike])) - 1
+        also = f" (and in {other_count} more views)" if other_count else ""
         refusals.append(
             f"shot {burst.view}/{burst.labels[step]}{also}: LED {burst.table['led'][step]} would be on for "
             f"{burst.table['on_us'][step]} us; the limits are {low_us} to {high_us} us"
@@ -80,9 +80,9 @@ def heat_of(
                     f"lit for {on_s[k]:.3f} s; it needs {limits.cooldown_ratio * on_s[k]:.3f} s"
                 )
             off_since[led] = t_s + starts_s[lit] + on_s
-            warmed = np.array([board_of_led[int(n)] for n in led], np.int64)
+            board_numbers = np.array([board_of_led[int(n)] for n in led], np.int64)
             last_s = np.zeros(n_boards)
-            peak = max(peak, _warm(rise, last_s, warmed, starts_s[lit] + on_s, on_s, model))
+            peak = max(peak, _warm(rise, last_s, board_numbers, starts_s[lit] + on_s, on_s, model))
             rise *= np.exp(-(burst.duration_s - last_s) / model.time_constant_s)
             t_s += burst.duration_s
     peak_c = model.ambient_c + peak

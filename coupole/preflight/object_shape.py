@@ -90,11 +90,11 @@ def _other_unit(size_mm: float, unit: str, diameter_mm: float) -> str:
     """The units in which the object would have an ordinary size, as a sentence; empty if there is none."""
     raw = size_mm / MM_PER_UNIT[unit]
     fitting = {
-        other: raw * mm
-        for other, mm in MM_PER_UNIT.items()
-        if other != unit and _DOUBTFUL_MM <= raw * mm <= diameter_mm
+        other_unit: raw * mm
+        for other_unit, mm in MM_PER_UNIT.items()
+        if other_unit != unit and _DOUBTFUL_MM <= raw * mm <= diameter_mm
     }
-    choices = [f"`mesh_unit: {other}` makes it {other_mm:.4g} mm" for other, other_mm in fitting.items()]
+    choices = [f"`mesh_unit: {other_unit}` makes it {other_mm:.4g} mm" for other_unit, other_mm in fitting.items()]
     return f"Is its unit right? {'; '.join(choices)}." if choices else ""
 
 

@@ -126,7 +126,9 @@ def check(
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = dose_before_lux_h
     budgets = [dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
-    report.dose_budget_lux_h = min((one for one in budgets if one is not None), default=None)
+    report.dose_budget_lux_h = min(
+        (budget_lux_h for budget_lux_h in budgets if budget_lux_h is not None), default=None
+    )
     report.refusals += itinerary.refusals
     report.refusals += _refuse_names(schedule)
     report.refusals += _refuse_optics(plan, rig)
@@ -148,12 +150,12 @@ def _refuse_names(schedule: Schedule) -> list[str]:
 
 def _refuse_optics(plan: Plan, rig: Rig) -> list[str]:
     refusals = []
-    for name, asked, have in (
+    for name, plan_setting, have in (
         ("focus distance", plan.optics.focus_distance_mm, rig.lens.focus_distance_mm),
         ("f-number", plan.optics.f_number, rig.lens.f_number),
     ):
-        if asked is not None and abs(asked - have) > 1e-3 * have:
-            refusals.append(f"optics: the plan is for {name} {asked:g}, the rig's lens is set to {have:g}")
+        if plan_setting is not None and abs(plan_setting - have) > 1e-3 * have:
+            refusals.append(f"optics: the plan is for {name} {plan_setting:g}, the rig's lens is set to {have:g}")
     return refusals
 
 

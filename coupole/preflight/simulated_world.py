@@ -101,8 +101,12 @@ def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]
             return str(copy)
 
         objects = [
-            {**one, "path": copied(one["path"], f"object{number}"), "pictures_beside": one["path"]}
-            for number, one in enumerate(scene["objects"])
+            {
+                **scene_object,
+                "path": copied(scene_object["path"], f"object{number}"),
+                "pictures_beside": scene_object["path"],
+            }
+            for number, scene_object in enumerate(scene["objects"])
         ]
         yield {**config, "scene": {**scene, "leds": copied(scene["leds"], "dome"), "objects": objects}}
 

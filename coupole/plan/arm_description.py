@@ -164,11 +164,11 @@ def description_problems(document: Document, description: ArmDescription, at: Ke
     """Mistakes of a description that involve several keys; `at` is its key path in the document."""
     problems = []
     for k, joint in enumerate(description.joints):
-        (low, high), planned = joint.limits_deg, joint.posture_limits_deg or joint.limits_deg
+        (low, high), posture_limits_deg = joint.limits_deg, joint.posture_limits_deg or joint.limits_deg
         if not low < high:
             message = f"expected the lower limit first, found {low:g} and {high:g} deg"
             problems.append(document.problem((*at, "joints", k, "limits_deg"), message))
-        elif not low <= planned[0] < planned[1] <= high:
+        elif not low <= posture_limits_deg[0] < posture_limits_deg[1] <= high:
             message = f"expected a part of the joint's limits, {low:g} to {high:g} deg"
             problems.append(document.problem((*at, "joints", k, "posture_limits_deg"), message))
     if structure_of(description.arm) is None:
@@ -207,8 +207,8 @@ def shipped_arm(name: str) -> ArmDescription:
     for folder in FOLDERS:
         if (path := folder / f"{name}.yaml").is_file():
             return read_arm(path)
-    found = sorted(path.stem for folder in FOLDERS for path in folder.glob("*.yaml"))
-    why = f"expected one of {', '.join(found)}; another arm is named by its file, under the rig's `arm:`"
+    names = sorted(path.stem for folder in FOLDERS for path in folder.glob("*.yaml"))
+    why = f"expected one of {', '.join(names)}; another arm is named by its file, under the rig's `arm:`"
     raise InputError(f"no description of the arm `{name}` comes with Coupole: {why}")
 
 

@@ -91,8 +91,8 @@ class Burst:
 
     def without(self, leds: Collection[int]) -> Burst:
         """The same burst without the shots under these LEDs."""
-        dropped = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
-        return self.only({label for label, drop in zip(self.labels, dropped, strict=True) if label and not drop})
+        drops = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
+        return self.only({label for label, drop in zip(self.labels, drops, strict=True) if label and not drop})
 
     def only(self, wanted: Collection[ShotLabel]) -> Burst:
         """The same burst with those shots only, and new marks."""
@@ -100,8 +100,8 @@ class Burst:
         keep = [i for i in inner if self.labels[i] in wanted]
         marks = [label if label in wanted else None for i, label in enumerate(self.labels) if i not in inner]
         dark = _dark_step(self.timing, sends_edge=self.hardware)
-        own = [self.labels[i] for i in keep]
-        table, labels = with_marks(self.marks, self.table[keep], own, marks, dark)
+        own_labels = [self.labels[i] for i in keep]
+        table, labels = with_marks(self.marks, self.table[keep], own_labels, marks, dark)
         return replace(self, table=table, labels=tuple(labels))
 
 
@@ -168,9 +168,9 @@ def _burst(
     dark = _dark_step(timing, sends_edge=hardware)
     steps = np.repeat(dark, len(lights))
     steps["led"] = [light.id if isinstance(light, Led) else NO_LED for light in lights]
-    own = [ShotLabel(light, exposure_index, repeat) for light in lights]
+    own_labels = [ShotLabel(light, exposure_index, repeat) for light in lights]
     mark_labels = [ShotLabel(light, exposure_index, repeat) for light in mark_lights]
-    table, labels = with_marks(marks, steps, own, mark_labels, dark)
+    table, labels = with_marks(marks, steps, own_labels, mark_labels, dark)
     return Burst("", exposure_index, repeat, panel, hardware, marks, timing, table, tuple(labels))
 
 

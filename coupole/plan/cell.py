@@ -52,8 +52,8 @@ class Cell:
     @property
     def state_folder(self) -> Path:
         """Folder for what is true of the cell whatever is acquired."""
-        given = self.rig.storage.state
-        return self.document.resolve(given) if given is not None else self.storage_folder / "state"
+        folder = self.rig.storage.state
+        return self.document.resolve(folder) if folder is not None else self.storage_folder / "state"
 
     @property
     def ledger_folder(self) -> Path:
@@ -63,8 +63,8 @@ class Cell:
     @property
     def controllers_folder(self) -> Path:
         """Folder for what is true of arms' controllers (`coupole.plan.controller_places`)."""
-        given = self.rig.controllers
-        return self.document.resolve(given) if given is not None else users_data_folder() / "controllers"
+        folder = self.rig.controllers
+        return self.document.resolve(folder) if folder is not None else users_data_folder() / "controllers"
 
     @property
     def former_ledger_folder(self) -> Path:
@@ -80,8 +80,8 @@ def users_ledger_folder() -> Path:
 def users_data_folder() -> Path:
     """Return Coupole's folder in the user's data folder (XDG Base Directory Specification; a relative path is
     ignored there)."""
-    given = Path(os.environ.get("XDG_DATA_HOME", ""))
-    return (given if given.is_absolute() else Path.home() / ".local/share") / "coupole"
+    folder = Path(os.environ.get("XDG_DATA_HOME", ""))
+    return (folder if folder.is_absolute() else Path.home() / ".local/share") / "coupole"
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:

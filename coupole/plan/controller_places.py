@@ -67,9 +67,9 @@ def _address(model: type[BaseModel], settings: dict[str, object]) -> tuple[str, 
     """Return where a driver with these settings finds its controller, and the setting that says so, if any."""
     for name in _ADDRESSES:
         field = model.model_fields.get(name)
-        given = settings.get(name, field.default if field is not None else "")
-        if field is not None and isinstance(given, str) and given.strip():
-            host = given.strip().lower()
+        address = settings.get(name, field.default if field is not None else "")
+        if field is not None and isinstance(address, str) and address.strip():
+            host = address.strip().lower()
             return (host if name == _OWN_SOCKET else host.partition(":")[0]), name
     return "", "unknown"
 

@@ -18,11 +18,11 @@ from pydantic import BaseModel
 
 def key_descriptions(model: type[BaseModel]) -> dict[str, str]:
     """Return the docstring of each field that has one, its own or inherited."""
-    described: dict[str, str] = {}
+    descriptions: dict[str, str] = {}
     for parent in reversed(model.__mro__):
         if issubclass(parent, BaseModel) and parent is not BaseModel:
-            described |= _by_class(inspect.getsourcefile(parent) or "").get(parent.__qualname__, {})
-    return described
+            descriptions |= _by_class(inspect.getsourcefile(parent) or "").get(parent.__qualname__, {})
+    return descriptions
 
 
 @lru_cache

@@ -66,12 +66,12 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
         lines = files.read(path).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
-    numbered = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]
-    header = numbered[0] if numbered else (0, "")
+    numbered_lines = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]
+    header = numbered_lines[0] if numbered_lines else (0, "")
     if tuple(field.strip() for field in header[1].split(",")) != COLUMNS:
         wrong(header[0], f"expected the header `{','.join(COLUMNS)}`, found `{header[1]}`")
         raise InputError(problems)
-    for line, text in numbered[1:]:
+    for line, text in numbered_lines[1:]:
         try:
             values = [float(field) for field in next(csv.reader([text]))]
         except (ValueError, csv.Error) as error:

@@ -74,10 +74,12 @@ def missing_lights(
     plan: Plan, leds: LedTable, base_from_support: Transform
 ) -> list[tuple[tuple[str | int, ...], str]]:
     """Key path and message for each light of the plan that the dome does not have, and for a cone without any."""
-    own = [(("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None]
+    view_lights = [
+        (("views", i, "lights"), view.lights) for i, view in enumerate(plan.views) if view.lights is not None
+    ]
     return [
         (where + key, message)
-        for where, lights in [(("lights",), plan.lights), *own]
+        for where, lights in [(("lights",), plan.lights), *view_lights]
         for key, message in _missing(lights, leds, base_from_support)
     ]
 
@@ -87,10 +89,10 @@ def _missing(
 ) -> list[tuple[tuple[str | int, ...], str]]:
     match lights:
         case LightIds(ids=ids):
-            have, key, what = set(leds.ids.tolist()), "ids", "LED"
-            asked: tuple[int, ...] = ids
+            have, key, noun = set(leds.ids.tolist()), "ids", "LED"
+            numbers: tuple[int, ...] = ids
         case LightBoards(boards=boards):
-            have, key, what, asked = set(leds.boards.tolist()), "boards", "board", boards
+            have, key, noun, numbers = set(leds.boards.tolist()), "boards", "board", boards
         case EveryLight(offset=offset) if offset >= len(leds.ids):
             return [(("offset",), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
         case LightCone() if not len(select_leds(lights, leds, base_from_support)):
@@ -100,8 +102,8 @@ def _missing(
         case _:
             assert_never(lights)
     return [
-        ((key, i), f"the dome has no {what} {n}; it has {min(have)} to {max(have)}")
-        for i, n in enumerate(asked)
+        ((key, i), f"the dome has no {noun} {n}; it has {min(have)} to {max(have)}")
+        for i, n in enumerate(numbers)
         if n not in have
     ]
 
@@ -110,6 +112,6 @@ def interleave(boards: NDArray[np.int64]) -> NDArray[np.int64]:
     """Order of LEDs [n] in which consecutive LEDs are on different boards: one LED of each board in turn."""
     turn = np.zeros(len(boards), np.int64)
     for board in np.unique(boards):
-        mine = np.flatnonzero(boards == board)
-        turn[mine] = np.arange(len(mine))
+        board_indices = np.flatnonzero(boards == board)
+        turn[board_indices] = np.arange(len(board_indices))
     return np.lexsort((boards, turn))

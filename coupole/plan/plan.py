@@ -312,6 +312,6 @@ class Plan(Model):
     @model_validator(mode="after")
     def _something_to_shoot(self) -> Plan:
         lights = [view.lights or self.lights for view in self.views]
-        if any(isinstance(one, NoLights) for one in lights) and self.darks_per_view == 0:
+        if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
             raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
         return self

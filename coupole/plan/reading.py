@@ -68,21 +68,21 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
 
 
 def _named_rig(document: Document) -> Path | None:
-    named = document.data.get("rig")
+    rig_name = document.data.get("rig")
     try:
-        return document.resolve(possible_path(Path(named))) if isinstance(named, str) else None
+        return document.resolve(possible_path(Path(rig_name))) if isinstance(rig_name, str) else None
     except ValueError:  # the plan's own problems say so
         return None
 
 
 def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:
     """Files of the records that the plan names, or else its rig (None for `none`), and the missing ones."""
-    named = plan.calibrations
-    if named is None:
-        document, named = cell.document, cell.rig.calibrations
-    if named == "none":
+    record_names = plan.calibrations
+    if record_names is None:
+        document, record_names = cell.document, cell.rig.calibrations
+    if record_names == "none":
         return None, []
-    paths = tuple(document.resolve(path) for path in named)
+    paths = tuple(document.resolve(path) for path in record_names)
     return paths, [
         document.problem(("calibrations", i), f"expected a calibration record; there is no {path}")
         for i, path in enumerate(paths)

@@ -98,11 +98,11 @@ def current_name(name: str) -> str:
 def load_class(name: str) -> type[Any]:
     """The class behind `package.module:Class`. Raises ImportError or AttributeError."""
     module, _, attribute = current_name(name).partition(":")
-    found: type[Any] = getattr(importlib.import_module(module), attribute)
-    return found
+    named_class: type[Any] = getattr(importlib.import_module(module), attribute)
+    return named_class
 
 
 def settings_class(name: str) -> type[BaseModel]:
     """The `Settings` model in the module of a driver's class."""
-    found: type[BaseModel] = load_class(current_name(name).partition(":")[0] + ":Settings")
-    return found
+    settings_model: type[BaseModel] = load_class(current_name(name).partition(":")[0] + ":Settings")
+    return settings_model

@@ -72,29 +72,29 @@ def _short(value: Any) -> str:
 def rewritten(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
     """The document's `text` with other values at these key paths; a key that is not there yet is added at the top
     level. Comments stay where the file's form allows it; else the result is JSON, which is YAML too."""
-    wanted = _changed(document.data, changes)
+    new_data = _changed(document.data, changes)
     try:
-        edited = _edited(document, text, changes)
-        if yamlfile.parse(document.path, edited).data == wanted:
-            return edited
+        edited_text = _edited(document, text, changes)
+        if yamlfile.parse(document.path, edited_text).data == new_data:
+            return edited_text
     except (InputError, LookupError):  # an alias, a merged mapping, or a file in braces that lacks a key
         pass
-    return json.dumps(wanted, indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(new_data, indent=1, ensure_ascii=False) + "\n"
 
 
 def _changed(data: dict[str, Any], changes: Mapping[KeyPath, str]) -> dict[str, Any]:
-    wanted = copy.deepcopy(data)
+    changed_data = copy.deepcopy(data)
     for (*parents, last), value in changes.items():
-        part: Any = wanted
+        part: Any = changed_data
         for key in parents:
             part = part[key]
         part[last] = value
-    return wanted
+    return changed_data
 
 
 def _edited(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
     root = yamlfile.compose(document.path, text)
-    spans, added = [], ""
+    spans, added_text = [], ""
     for at, value in changes.items():
         if at in document.value_places:
             node = _node(root, at)
@@ -102,10 +102,10 @@ def _edited(document: Document, text: str, changes: Mapping[KeyPath, str]) -> st
         elif isinstance(root, MappingNode) and root.flow_style:
             raise LookupError(f"a file in braces lacks {at[-1]}")
         else:
-            added += f"{at[-1]}: {json.dumps(value, ensure_ascii=False)}\n"
+            added_text += f"{at[-1]}: {json.dumps(value, ensure_ascii=False)}\n"
     for begin, end, value in sorted(spans, reverse=True):
         text = text[:begin] + value + text[end:]
-    return text if not added else text.rstrip("\n") + "\n" + added
+    return text if not added_text else text.rstrip("\n") + "\n" + added_text
 
 
 def _node(root: Node | None, at: KeyPath) -> ScalarNode:

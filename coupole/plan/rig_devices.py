@@ -93,8 +93,8 @@ def runs_tables(rig: Rig) -> bool:
 
 def upload_s(rig: Rig, steps: int) -> float:
     """Time to bring a table of so many steps into the rig's LED box, from its driver; 0 if unknown."""
-    described = _ledbox_settings(rig)
-    return float(described.upload_s(steps)) if hasattr(described, "upload_s") else 0.0
+    settings = _ledbox_settings(rig)
+    return float(settings.upload_s(steps)) if hasattr(settings, "upload_s") else 0.0
 
 
 def _ledbox_settings(rig: Rig) -> BaseModel:
@@ -105,8 +105,8 @@ def _ledbox_settings(rig: Rig) -> BaseModel:
 def longest_light_s(rig: Rig, on_us: int) -> float:
     """Longest time that the rig's LED box leaves a light of `on_us` on, should the host die: by its driver's
     settings, or else that time."""
-    described = _ledbox_settings(rig)
-    return float(described.longest_light_s(on_us)) if hasattr(described, "longest_light_s") else on_us * 1e-6
+    settings = _ledbox_settings(rig)
+    return float(settings.longest_light_s(on_us)) if hasattr(settings, "longest_light_s") else on_us * 1e-6
 
 
 def watchdog_s(rig: Rig) -> float:
@@ -127,8 +127,8 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
     if dry_run and device.twin is not None:
         driver, settings = device.twin.driver, dict(device.twin.settings)
     elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
-        known = driver in ROBOT_STAND_INS or driver in LEDBOX_STAND_INS
-        driver = driver if known else DEFAULT_TWINS[kind]
+        has_stand_in = driver in ROBOT_STAND_INS or driver in LEDBOX_STAND_INS
+        driver = driver if has_stand_in else DEFAULT_TWINS[kind]
         settings = _known(settings, settings_class(driver))
     if kind == "robot":
         settings = _known(_robot_settings(rig), settings_class(driver)) | settings
@@ -139,8 +139,10 @@ def stand_in_for(rig: Rig, *, dry_run: bool) -> StandIn:
     """Kind of the robot's stand-in in this rig's world: that of its driver, or of the twin's driver if the world
     is for dry runs only. For a driver not included with Coupole the rig must give it."""
     driver, _ = device_for(rig, "robot", dry_run=dry_run or not in_world(rig, dry_run=False))
-    told = rig.world.settings.get("robot") if rig.world else None
-    return ROBOT_STAND_INS.get(driver) or StandIn(told.get("kind", "rsi") if isinstance(told, dict) else "rsi")
+    robot_settings = rig.world.settings.get("robot") if rig.world else None
+    return ROBOT_STAND_INS.get(driver) or StandIn(
+        robot_settings.get("kind", "rsi") if isinstance(robot_settings, dict) else "rsi"
+    )
 
 
 def ledbox_stand_in(rig: Rig, *, dry_run: bool) -> StandIn:
@@ -160,8 +162,8 @@ def trusted_by_name(rig: Rig) -> tuple[str, ...]:
     nothing for a cell of stand-ins, whose devices nobody else can reach."""
     if in_world(rig, dry_run=False):
         return ()
-    said = ((kind, key, getattr(rig, kind).settings.get(key)) for kind in DEVICES for key in _WORDS)
-    return tuple(f"{kind}: {_WORDS[key]}, by the word of {name}" for kind, key, name in said if name)
+    permissions = ((kind, key, getattr(rig, kind).settings.get(key)) for kind in DEVICES for key in _WORDS)
+    return tuple(f"{kind}: {_WORDS[key]}, by the word of {name}" for kind, key, name in permissions if name)
 
 
 def driver_problems(document: Document, rig: Rig) -> list[Problem]:
@@ -174,10 +176,10 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
             ((kind, "twin"), device.twin, True),
         ):
             if part is not None:
-                given = NOWHERE[kind] if has_endpoint else {}
+                given_settings = NOWHERE[kind] if has_endpoint else {}
                 if kind == "robot":
-                    given = given | _robot_settings(rig)
-                problems += _settings_problems(document, at, part.driver, given)
+                    given_settings = given_settings | _robot_settings(rig)
+                problems += _settings_problems(document, at, part.driver, given_settings)
     if not problems and not hasattr(load_class(rig.ledbox.driver), "runs_tables"):
         message = "expected a class that declares `runs_tables`, as `coupole.devices.LedBox` asks"
         problems.append(document.problem(("ledbox", "driver"), message))
@@ -187,8 +189,8 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
         problems += world_problems(document, rig, rig.world.settings)
         kinds = {"camera": camera_kind(rig, dry_run=False), "ledbox": ledbox_stand_in(rig, dry_run=False).kind}
         for name, other_end in kinds.items():
-            told = rig.world.settings.get(name)
-            if isinstance(told, dict) and told.get("kind", other_end) != other_end:
+            end_settings = rig.world.settings.get(name)
+            if isinstance(end_settings, dict) and end_settings.get("kind", other_end) != other_end:
                 message = f"expected {other_end}, which is at the other end of the {name}'s driver"
                 problems.append(document.problem(("world", "settings", name, "kind"), message))
     return problems
@@ -197,15 +199,15 @@ def driver_problems(document: Document, rig: Rig) -> list[Problem]:
 def _unlike_stand_in(document: Document, rig: Rig) -> list[Problem]:
     """An arm that the stand-in does not move, in a rig of stand-ins: poses would be the arm's, pictures the
     stand-in's. (A UR's stand-in moves the driver's `model`, or its settings are refused.)"""
-    moved, described = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
-    if moved is None or described is None or not in_world(rig, dry_run=False):
+    moved_arm, arm = ARMS_OF_DRIVERS.get(rig.robot.driver), described_arm(rig)
+    if moved_arm is None or arm is None or not in_world(rig, dry_run=False):
         return []
-    stand_in = shipped_arm(moved)
-    if described.arm.chain == stand_in.arm.chain:
+    stand_in = shipped_arm(moved_arm)
+    if arm.arm.chain == stand_in.arm.chain:
         return []
     message = (
         f"expected the chain of a {stand_in.name}, the only one that the stand-in of `{rig.robot.driver}` moves, "
-        f"found that of `{described.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
+        f"found that of `{arm.name}`. Name your devices and leave `world:` out; `check` and `view` open none"
     )
     return [document.problem(("arm",), message)]
 
@@ -225,8 +227,8 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
     if isinstance(ledbox, dict):
         ledbox = {"kind": ledbox_stand_in(rig, dry_run=False).kind, **ledbox}
     completed_settings = {**settings, "robot": robot, "camera": camera, "ledbox": ledbox}
-    completed = replace(document, data={**document.data, "world": {"settings": completed_settings}})
-    return _settings_problems(completed, ("world",), rig.world.driver if rig.world else WORLD, {})
+    completed_document = replace(document, data={**document.data, "world": {"settings": completed_settings}})
+    return _settings_problems(completed_document, ("world",), rig.world.driver if rig.world else WORLD, {})
 
 
 def _settings_problems(

@@ -61,28 +61,30 @@ class Schedule:
     def left(self, proven: Collection[ShotId]) -> Schedule:
         """Return the schedule of what is still to be taken: views with unproven frames, with their bursts reduced
         to these."""
-        left = [bursts_left(bursts, proven) for bursts in self.bursts]
-        numbers = [n for n, bursts in enumerate(left) if bursts]
+        remaining_bursts = [bursts_left(bursts, proven) for bursts in self.bursts]
+        numbers = [n for n, bursts in enumerate(remaining_bursts) if bursts]
         return Schedule(
             tuple(self.views[n] for n in numbers),
-            tuple(tuple(left[n]) for n in numbers),
+            tuple(tuple(remaining_bursts[n]) for n in numbers),
             tuple(self.labels[n] for n in numbers),
         )
 
 
 def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
     """Bursts with unproven frames, reduced to these."""
-    left = []
+    remaining_bursts = []
     for burst in bursts:
-        wanted = {shot.label for shot in burst.shots if shot and shot not in proven}
-        if wanted:
-            left.append(burst if len(wanted) == len(burst.labels) else burst.only(wanted))
-    return left
+        missing_labels = {shot.label for shot in burst.shots if shot and shot not in proven}
+        if missing_labels:
+            remaining_bursts.append(
+                burst if len(missing_labels) == len(burst.labels) else burst.only(missing_labels)
+            )
+    return remaining_bursts
 
 
 def views_of_grid(grid: Grid) -> list[LookAt]:
     """Each of its views, named; whether a name is too long is asked elsewhere."""
-    given = {
+    grid_keys = {
         key: getattr(grid, key) for key in grid.model_fields_set & LookAt.model_fields.keys() - {"kind", "name"}
     }
     return [
@@ -91,7 +93,7 @@ def views_of_grid(grid: Grid) -> list[LookAt]:
             name=f"{grid.name}-az{azimuth:g}-el{elevation:g}",
             azimuth_deg=azimuth,
             elevation_deg=elevation,
-            **given,
+            **grid_keys,
         )
         for elevation in grid.elevations_deg
         for azimuth in grid.azimuths_deg
@@ -105,7 +107,7 @@ def expand_view(view: View) -> list[ViewPose]:
             pose = look_at(view.target_mm, view.distance_mm, view.azimuth_deg, view.elevation_deg, view.roll_deg)
             return [ViewPose(view.name, pose, None, view.target_mm)]
         case Grid():
-            return [pose for one in views_of_grid(view) for pose in expand_view(one)]
+            return [pose for grid_view in views_of_grid(view) for pose in expand_view(grid_view)]
         case Joints():
             return [ViewPose(view.name, None, view.joints_deg, None)]
         case _:
@@ -159,7 +161,9 @@ def build_schedule(
         for pose in expand_view(view):
             views.append(pose)
             bursts.append([replace(burst, view=pose.name) for burst in bursts_of[lights]])
-    labels = tuple(tuple(label for burst in own for label in burst.labels if label) for own in bursts)
+    labels = tuple(
+        tuple(label for burst in view_bursts for label in burst.labels if label) for view_bursts in bursts
+    )
     return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
 
 

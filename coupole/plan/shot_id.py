@@ -91,10 +91,10 @@ class ShotLabel:
     @staticmethod
     def parse(text: str) -> ShotLabel:
         """The label that `str` wrote. Raises ValueError for any other text."""
-        found = _LABEL.fullmatch(text)
-        if found is None:
+        match = _LABEL.fullmatch(text)
+        if match is None:
             raise ValueError(f"expected a shot such as led0417/e0, found {text[:MAX_CHARACTERS]!r}")
-        label = ShotLabel(_light(found), int(found["exposure"]), int(found["repeat"] or 0))
+        label = ShotLabel(_light(match), int(match["exposure"]), int(match["repeat"] or 0))
         if str(label) != text:
             raise ValueError(f"expected {label}, found {text[:MAX_CHARACTERS]!r}")
         return label

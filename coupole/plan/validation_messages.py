@@ -68,10 +68,10 @@ def mistakes_of(model: type[BaseModel], value: Any, error: ValidationError) -> l
 def did_you_mean(word: str, valid: Iterable[str]) -> str | None:
     """The valid word nearest to a misspelt one, if any is near."""
     by_folded = {name.casefold(): name for name in valid}
-    folded = word.casefold()
-    near = difflib.get_close_matches(folded, by_folded, n=1, cutoff=0.6)
-    begun = [name for name in by_folded if len(folded) >= 3 and name.startswith(folded)]
-    return by_folded[(begun or near)[0]] if begun or near else None
+    folded_word = word.casefold()
+    near = difflib.get_close_matches(folded_word, by_folded, n=1, cutoff=0.6)
+    longer_words = [name for name in by_folded if len(folded_word) >= 3 and name.startswith(folded_word)]
+    return by_folded[(longer_words or near)[0]] if longer_words or near else None
 
 
 class _Explainer:
@@ -103,7 +103,7 @@ class _Explainer:
 
     def mistakes(self, path: KeyPath, value: Any, errors: Errors) -> Iterator[Mistake]:
         """Mistakes of `value`, which is at `path` and has this node's schema."""
-        own = [error for rest, error in errors if not rest]
+        own_errors = [error for rest, error in errors if not rest]
         below: dict[str | int, Errors] = {}
         for rest, error in errors:
             if rest:
@@ -111,17 +111,17 @@ class _Explainer:
         if self.kind == "union" and below:
             yield from self._union(path, value, list(below.values()))
         elif self.kind == "tagged-union" and isinstance(value, dict):
-            yield from self._tagged(path, value, own, below)
+            yield from self._tagged(path, value, own_errors, below)
         elif self.kind == "model" and isinstance(value, dict):
-            yield from self._model(path, value, own, below)
+            yield from self._model(path, value, own_errors, below)
         elif self.kind in ("tuple", "list", "set") and isinstance(value, list):
-            yield from self._list(path, value, own, below)
+            yield from self._list(path, value, own_errors, below)
         elif self.kind == "dict" and isinstance(value, dict):
-            yield from self._own(path, value, own)
+            yield from self._own(path, value, own_errors)
             for key, inner in below.items():
                 yield from self._inner(self.node["values_schema"]).mistakes((*path, key), value.get(key), inner)
         else:
-            yield from self._own(path, value, own or [error for _, error in errors])
+            yield from self._own(path, value, own_errors or [error for _, error in errors])
 
     def _own(self, path: KeyPath, value: Any, own: list[dict[str, Any]]) -> Iterator[Mistake]:
         """The first error of the value itself: a validator's message, or what was expected and found."""
@@ -157,8 +157,10 @@ class _Explainer:
             hint = f"; did you mean `{near}`?" if near else ""
             yield Mistake((*path, key), f"expected one of {_quoted(tags)}, found {found(tag)}{hint}")
         elif own:
-            known = {name for choice in self.node["choices"].values() for name in self._inner(choice).fields()}
-            near = did_you_mean(key, [name for name in value if name not in known])
+            known_keys = {
+                name for choice in self.node["choices"].values() for name in self._inner(choice).fields()
+            }
+            near = did_you_mean(key, [name for name in value if name not in known_keys])
             tags_text = f"one of {_quoted(self.node['choices'])}"
             if near:
                 yield Mistake(

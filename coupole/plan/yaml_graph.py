@@ -66,7 +66,7 @@ def _converted(node: yaml.Node) -> Node:
         return ScalarNode(tag, node.value, *marks, style=node.style or None)
     kind = SequenceNode if isinstance(node, yaml.SequenceNode) else MappingNode
     inner = (
-        [_converted(one) for one in node.value]
+        [_converted(child) for child in node.value]
         if isinstance(node, yaml.SequenceNode)
         else [(_converted(key), _converted(value)) for key, value in node.value]
     )

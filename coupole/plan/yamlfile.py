@@ -103,8 +103,8 @@ class Document:
         try:
             return model.model_validate_json(json.dumps(_finite(part)), strict=True), []
         except ValidationError as error:
-            found = [self._mistake(at, mistake) for mistake in mistakes_of(model, part, error)]
-        return None, sorted(found, key=lambda problem: (problem.line, problem.column))
+            problems = [self._mistake(at, mistake) for mistake in mistakes_of(model, part, error)]
+        return None, sorted(problems, key=lambda problem: (problem.line, problem.column))
 
     def _part(self, at: KeyPath) -> Any:
         part: Any = self.data
@@ -265,31 +265,31 @@ class _Builder:
 
     def _entries(self, node: MappingNode, key_path: KeyPath, depth: int = 0) -> Iterator[tuple[str, Node]]:
         """Keys and value nodes; keys of the mapping itself win over merged ones (`<<`)."""
-        own: dict[str, tuple[ScalarNode, Node]] = {}
-        merged: list[Node] = []
+        own_entries: dict[str, tuple[ScalarNode, Node]] = {}
+        merged_nodes: list[Node] = []
         for key_node, value_node in node.value:
             if not isinstance(key_node, ScalarNode):
                 self.complain(key_node, key_path, "a key must be text, not a list or a mapping")
             elif key_node.tag == _YAML_TAG + "merge":
-                merged += value_node.value if isinstance(value_node, SequenceNode) else [value_node]
-            elif (key := key_node.value) in own:
-                first, again = _place(own[key][0]), _place(key_node)
+                merged_nodes += value_node.value if isinstance(value_node, SequenceNode) else [value_node]
+            elif (key := key_node.value) in own_entries:
+                first, again = _place(own_entries[key][0]), _place(key_node)
                 message = f"duplicate key `{key}`: first given at line {first[0]}, again at line {again[0]}"
                 self.complain(key_node, (*key_path, key), message)
             else:
                 self._check_text(key_node, key_path)
-                own[key] = key_node, value_node
-        for key, (key_node, value_node) in own.items():
+                own_entries[key] = key_node, value_node
+        for key, (key_node, value_node) in own_entries.items():
             self.key_places[(*key_path, key)] = _place(key_node)
             yield key, value_node
-        taken = set(own)
-        for part in merged:
+        taken_keys = set(own_entries)
+        for part in merged_nodes:
             if not isinstance(part, MappingNode) or depth > MAX_DEPTH:
                 self.complain(part, key_path, "`<<` merges a mapping or a list of mappings, never itself")
                 continue
             for key, value_node in self._entries(part, key_path, depth + 1):
-                if key not in taken:
-                    taken.add(key)
+                if key not in taken_keys:
+                    taken_keys.add(key)
                     yield key, value_node
 
     def _scalar(self, node: ScalarNode, key_path: KeyPath) -> str | int | float | bool | None:

@@ -72,10 +72,10 @@ def serve(
         with _parts(cell, folder, plans, origins_of(url, known_as), f"coupole_session_{port}") as service:
             app = make_app(service)
             add_screens(app, service)
-            told = {"url": url, "token": service.accounts.first_token, "pid": os.getpid()}
+            address = {"url": url, "token": service.accounts.first_token, "pid": os.getpid()}
             asyncio.run(
                 run_servers(
-                    app, listening, service_socket(cell), context, lambda: tell(told), service.loop_watch.beat
+                    app, listening, service_socket(cell), context, lambda: tell(address), service.loop_watch.beat
                 )
             )
 

@@ -71,7 +71,11 @@ class StepResult(Model):
 
     @property
     def passed(self) -> bool:
-        return not self.failure and all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
+        return (
+            not self.failure
+            and all(limit.passed for limit in self.limits)
+            and all(answer.yes for answer in self.answers)
+        )
 
 
 class CommissioningRecord(Model):

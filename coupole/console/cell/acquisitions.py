@@ -106,8 +106,8 @@ class Acquisitions:
     def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
         """Return what an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`,
         once they are there."""
-        said, figures = self._files(entry)
-        return end_of_file(said, _MOST_SAID_BYTES), _last_document(figures)
+        output_path, figures = self._files(entry)
+        return end_of_file(output_path, _MOST_SAID_BYTES), _last_document(figures)
 
     def _had_by(self) -> str:
         """Return who has the cell; empty if nobody has it."""
@@ -155,26 +155,26 @@ class Acquisitions:
 
     def _at_work(self) -> State | None:
         """The state of this cell's run; `silent`, and else as last known, while its process does not answer."""
-        found, entry = running(), self._queue.running
+        states, entry = running(), self._queue.running
         last = self.state
         if last is None and entry is not None and entry.run:  # begun by a service before this one
             last = {"run": entry.run, "rig": self._rig, "pid": entry.pid, "light_after_lux_h": {}}
         if last is not None:
             socket = named_after(Path(last["run"]), "sock").name
-            if any(state["state"] == "silent" and state["socket"] == socket for state in found):
+            if any(state["state"] == "silent" and state["socket"] == socket for state in states):
                 return {**last, "state": "silent"}
-        return next((state for state in found if self._is_ours(state)), None)
+        return next((state for state in states if self._is_ours(state)), None)
 
     def _begin(self, entry: Entry) -> None:
         self._queue.change(entry.id, state="running", begun=utc_now())  # first: it must never be begun twice
-        said, figures = self._files(entry)
+        output_path, figures = self._files(entry)
         command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *self._arguments(entry)]
         try:
-            with said.open("wb") as errors, figures.open("wb") as found:
+            with output_path.open("wb") as errors, figures.open("wb") as figures_file:
                 self._process = subprocess.Popen(
                     [*command, "--yes", "--json", "--begun-by-console"],
                     stdin=subprocess.DEVNULL,
-                    stdout=found,
+                    stdout=figures_file,
                     stderr=errors,
                     start_new_session=True,
                 )
@@ -207,27 +207,27 @@ class Acquisitions:
         return b"acquire" in words and (entry.plan or entry.resume).encode() in words
 
     def _conclude(self, entry: Entry) -> None:
-        said, figures = self._files(entry)
-        found = _last_document(figures)
-        code = found.get("exit_code", 0 if "proven" in found else None)
+        output_path, figures = self._files(entry)
+        last_figures = _last_document(figures)
+        code = last_figures.get("exit_code", 0 if "proven" in last_figures else None)
         if self._process is not None and self._process.pid == entry.pid:
             code = self._process.returncode
             if code < 0:  # by a signal: those that end a session may come before the process obeys them
                 code = 128 - code if 128 - code in _STOPPED else None
         self._process = None
         state = "done" if code == 0 else "stopped" if code in _STOPPED else "failed"
-        last = _last_line(said) if code is not None else ""
-        why = "" if code == 0 else found.get("error") or last or "its process was killed"
+        last = _last_line(output_path) if code is not None else ""
+        why = "" if code == 0 else last_figures.get("error") or last or "its process was killed"
         halt = "" if code == 0 else f"{entry.words}: {why}"
-        run = str(found.get("run", entry.run))
+        run = str(last_figures.get("run", entry.run))
         self._queue.conclude(entry.id, halt=halt, state=state, ended=utc_now(), exit_code=code, run=run, said=why)
         self._forget_old()
 
     def _forget_old(self) -> None:
         """Take away what processes printed whose entries the queue has no longer."""
-        known = {entry.id for entry in self._queue.entries}
+        entry_ids = {entry.id for entry in self._queue.entries}
         for path in self._folder.iterdir():
-            if path.suffix in (".log", ".json") and path.stem not in known:
+            if path.suffix in (".log", ".json") and path.stem not in entry_ids:
                 with contextlib.suppress(OSError):
                     path.unlink()
 
@@ -238,10 +238,10 @@ class Acquisitions:
 def _last_document(path: Path) -> dict[str, Any]:
     """The last line of JSON; empty if there is none."""
     try:
-        found = json_of(path.read_bytes().strip().splitlines()[-1], str(path), allow_nan=True)
+        document = json_of(path.read_bytes().strip().splitlines()[-1], str(path), allow_nan=True)
     except (OSError, InputError, IndexError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return document if isinstance(document, dict) else {}
 
 
 def _last_line(path: Path) -> str:

@@ -197,12 +197,12 @@ class Bench:
             return
         self._asked_s = now_s
         try:
-            found = obeyed(ask_bench(self._cell, "state")) if bench_socket(self._cell).exists() else None
+            state = obeyed(ask_bench(self._cell, "state")) if bench_socket(self._cell).exists() else None
         except CoupoleError:
-            found = None
-        if not self._closing and (found is not None or self._running is None):
-            self.state = found
+            state = None
+        if not self._closing and (state is not None or self._running is None):
+            self.state = state
         if self.work.get("state") == "running":
             self._acted_s = now_s
-        if self.is_own and found is not None and now_s - self._acted_s > IDLE_S:
+        if self.is_own and state is not None and now_s - self._acted_s > IDLE_S:
             self._close(f"nobody has used them for {IDLE_S / 60:g} minutes")

@@ -88,16 +88,18 @@ class CalibrationStatus:
     def records(self) -> list[RecordRow]:
         """All kinds that a cell usually has, and others in force. Raises InputError: the rig is wrong."""
         cell = read_cell(self.rig_path)
-        named = cell.rig.calibrations
-        rows = [_row(cell.document.resolve(path), cell) for path in ([] if named == "none" else named)]
+        record_names = cell.rig.calibrations
+        rows = [
+            _row(cell.document.resolve(path), cell) for path in ([] if record_names == "none" else record_names)
+        ]
         kinds = [*USUAL, *(kind for kind in get_args(Kind) if kind not in USUAL), ""]
-        found = [row for kind in kinds for row in rows if row.kind == kind]
+        rows_in_force = [row for kind in kinds for row in rows if row.kind == kind]
         missing = [
             RecordRow(kind, needed=bool(rows) and kind in NEEDED)
             for kind in USUAL
-            if kind not in {r.kind for r in found}
+            if kind not in {r.kind for r in rows_in_force}
         ]
-        return sorted([*found, *missing], key=lambda row: kinds.index(row.kind))
+        return sorted([*rows_in_force, *missing], key=lambda row: kinds.index(row.kind))
 
     def plans(self) -> list[PlanRow]:
         """Plans for this rig, by name."""
@@ -114,26 +116,28 @@ class CalibrationStatus:
             files = read_plan(path)
             if files.record_paths is None:
                 return PlanRow(name, wants=False, against=())
-            named = [InForce(one, self._record(one)) for one in files.record_paths]
+            records_in_force = [
+                InForce(record_path, self._record(record_path)) for record_path in files.record_paths
+            ]
         except InputError as error:
             return PlanRow(str(path.relative_to(self._plans)), wants=True, against=tuple(str(error).splitlines()))
-        return PlanRow(name, wants=True, against=tuple(refusals(named, situation_of(files.cell.rig))))
+        return PlanRow(name, wants=True, against=tuple(refusals(records_in_force, situation_of(files.cell.rig))))
 
     def _record(self, path: Path) -> Record:
         """Read once for all plans, as long as it is the same file."""
-        changed = path.stat().st_mtime_ns
-        known, record = self._known.get(str(path), (None, None))
-        if known != changed or not isinstance(record, Record):
+        mtime_ns = path.stat().st_mtime_ns
+        known_mtime_ns, record = self._known.get(str(path), (None, None))
+        if known_mtime_ns != mtime_ns or not isinstance(record, Record):
             record = read_record(path)
-            self._known[str(path)] = changed, record
+            self._known[str(path)] = mtime_ns, record
         return record
 
     # -- campaigns --------------------------------------------------------------------------------------------
 
     def campaign(self) -> Path | None:
         """The folder of the newest; None without one."""
-        found = sorted(self._campaigns.iterdir()) if self._campaigns.is_dir() else []
-        return found[-1] if found else None
+        folders = sorted(self._campaigns.iterdir()) if self._campaigns.is_dir() else []
+        return folders[-1] if folders else None
 
     def new_campaign(self) -> Path:
         """A folder for new records. Raises StorageError."""
@@ -174,7 +178,7 @@ def _row(path: Path, cell: Cell) -> RecordRow:
 
 
 def _step(step: Step, folder: Path) -> StepNow:
-    made, missed = [], []
+    passed_kinds, problems = [], []
     for kind in step.records:
         path = folder / f"{kind}.yaml"
         if not path.is_file():
@@ -182,11 +186,14 @@ def _step(step: Step, folder: Path) -> StepNow:
         try:
             wrong = [limit for limit in read_record(path).limits if not limit.passed]
         except CoupoleError as error:
-            missed.append(str(error))
+            problems.append(str(error))
             continue
-        missed += [f"{kind}: {_limit_words(one.what, one.found, one.limit, one.unit)}" for one in wrong]
-        made += [] if wrong else [kind]
-    return StepNow(step, tuple(made), tuple(missed))
+        problems += [
+            f"{kind}: {_limit_words(failed_limit.what, failed_limit.found, failed_limit.limit, failed_limit.unit)}"
+            for failed_limit in wrong
+        ]
+        passed_kinds += [] if wrong else [kind]
+    return StepNow(step, tuple(passed_kinds), tuple(problems))
 
 
 def _limit_words(what: str, found: float, limit: float, unit: str) -> str:

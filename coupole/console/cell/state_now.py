@@ -63,12 +63,12 @@ def state_of(
     at_work, entry = acquisitions.state or {}, queue.running
     if not at_work:
         _forget_runs()
-    begun = "halted" if queue.halted else "idle"
+    own_state = "halted" if queue.halted else "idle"
     if entry is not None:
-        begun = "concluding" if entry.run else "starting"
+        own_state = "concluding" if entry.run else "starting"
     faults = faults_of(cell).standing()
     return StateNow(
-        state=at_work.get("state", begun),
+        state=at_work.get("state", own_state),
         rig=cell.rig.name,
         simulated=in_world(cell.rig, dry_run=False),
         run=Path(at_work["run"]).name if at_work else None,
@@ -93,14 +93,14 @@ def state_of(
 
 def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
     times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
-    ended = [entry.id for entry in queue.entries if entry.ended]
-    found = []
+    ended_ids = [entry.id for entry in queue.entries if entry.ended]
+    entries = []
     for entry in queue.entries:
-        if entry.id in ended[:-_ENDED_TOLD]:
+        if entry.id in ended_ids[:-_ENDED_TOLD]:
             continue
         begin, end = (utc_text(_rounded(time)) if time else None for time in times.get(entry.id, (None, None)))
-        found.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
-    return found
+        entries.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
+    return entries
 
 
 def _rounded(time: datetime) -> datetime:
@@ -129,23 +129,23 @@ def _object_of(cell: Cell, run: str) -> dict[str, Any]:
     """Return the object of a run that is being acquired, the light on it that is not this run's, and its budget,
     both as the ledger has them now; no object if this cannot be read."""
     try:
-        ledger, named, plans_budget = _ledger_when(cell.ledger_folder, cell.former_ledger_folder, run)
+        ledger, object_id, plans_budget = _ledger_when(cell.ledger_folder, cell.former_ledger_folder, run)
         history = ledger.newest() if ledger else History()
     except CoupoleError:
         return _NO_OBJECT
     name = Path(run).name
     before = sum(entry.dose_lux_h for entry in history.entries if entry.run != name)
-    return {"object": named, "dose_before": before, "dose_budget": history.allowed_lux_h(plans_budget)}
+    return {"object": object_id, "dose_before": before, "dose_budget": history.allowed_lux_h(plans_budget)}
 
 
 @functools.lru_cache(4)
 def _ledger_when(ledgers: Path, former: Path, run: str) -> tuple[Ledger | None, str, float | None]:
     """The ledger of a run's object, its id, and its budget by the plan; they do not change while it runs. Raises
     InputError."""
-    opened = Run(Path(run))
-    named = opened.about.get("object") or ""
-    budget = (yamlfile.read(opened.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
-    return Ledger(ledgers, named, former) if named else None, named, budget
+    opened_run = Run(Path(run))
+    object_id = opened_run.about.get("object") or ""
+    budget = (yamlfile.read(opened_run.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
+    return Ledger(ledgers, object_id, former) if object_id else None, object_id, budget
 
 
 def _forget_runs() -> None:

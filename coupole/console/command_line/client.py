@@ -81,7 +81,7 @@ def call(
         with _told_if_given_up(rig, begins_nothing(method, path)):
             _await(connection.sock, place, rig, end_s, given_up)
         reply = connection.getresponse()
-        found = json_of(reply.read(), "its answer", allow_nan=True)
+        answer = json_of(reply.read(), "its answer", allow_nan=True)
     except (NotServed, GivenUp):
         raise
     except (OSError, ValueError, InputError) as error:
@@ -89,8 +89,8 @@ def call(
     finally:
         connection.close()
     if reply.status >= 400:
-        raise InputError(str(found.get("detail", found)))
-    return found
+        raise InputError(str(answer.get("detail", answer)))
+    return answer
 
 
 def _place(cell: Cell) -> str:
@@ -102,7 +102,7 @@ def _place(cell: Cell) -> str:
 
 def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[], bool]) -> None:
     """Connect, waiting for a console that has the cell and does not listen yet. Raises NotServed: none has it."""
-    rig, begun_s, said = cell.document.path, time.monotonic(), False
+    rig, begun_s, has_spoken = cell.document.path, time.monotonic(), False
     while True:
         try:
             connection.connect()
@@ -118,8 +118,8 @@ def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[
                     f"process {owner} has this cell, but does not listen by the name of {rig}: name the rig that "
                     "it serves, if that is another one"
                 ) from error
-            if not said and time.monotonic() - begun_s > _SAID_AFTER_S:
-                said = True
+            if not has_spoken and time.monotonic() - begun_s > _SAID_AFTER_S:
+                has_spoken = True
                 alarm(
                     f"{rig}: a console has this cell and does not listen by this rig's name: {_state_of(owner)}. "
                     "It may be starting, or be that of another rig with the same storage folder; waiting for it"
@@ -133,20 +133,20 @@ def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[
 
 def _await(sock: socket.socket, place: str, rig: Path, end_s: float, given_up: Callable[[], bool]) -> None:
     """Wait for an answer. Raises TimeoutError, GivenUp."""
-    pid, begun_s, probed_s, said = peer_pid(sock), time.monotonic(), 0.0, False
+    pid, begun_s, probed_s, has_spoken = peer_pid(sock), time.monotonic(), 0.0, False
     while not select.select([sock], [], [], _LOOK_EVERY_S)[0]:
         now_s = time.monotonic()
         if given_up():
             raise GivenUp(f"{rig}: given up")
         if now_s > end_s:
             raise TimeoutError(_state_of(pid))
-        if said or now_s - begun_s < _SAID_AFTER_S:
+        if has_spoken or now_s - begun_s < _SAID_AFTER_S:
             continue
         silent = is_stopped(pid)
         if not silent and now_s - probed_s > _PROBED_EVERY_S:
             probed_s, silent = now_s, not _answers(place)
         if silent:
-            said = True
+            has_spoken = True
             alarm(f"{rig}: its console does not answer: {_state_of(pid)}; waiting for it")
 
 

@@ -53,10 +53,10 @@ def acquire_by_console(
     if confirm and not in_world(cell.rig, dry_run=False):
         _confirm(cell, console, asked)
     control = Control()
-    followed = _Followed(cell, console, control)
-    with obeyed_by(control, followed.stop):
-        followed.enter(asked)
-        followed.to_its_end(found)
+    follower = _Followed(cell, console, control)
+    with obeyed_by(control, follower.stop):
+        follower.enter(asked)
+        follower.to_its_end(found)
 
 
 def _confirm(cell: Cell, console: Console, asked: dict[str, Any]) -> None:
@@ -131,8 +131,8 @@ class _Followed:
     def to_its_end(self, found: dict[str, Any]) -> None:
         """Show what the process says and does; raises what it raised."""
         keys = {"p": self._pause_or_go_on, "q": self.stop}
-        with obeyed(keys) as read, self._bars:
-            if read:
+        with obeyed(keys) as has_keys, self._bars:
+            if has_keys:
                 self._console.print("keys: p pauses after the burst, and goes on; q stops")
             for output in self._outputs():
                 self._entry = output["entry"]
@@ -144,7 +144,7 @@ class _Followed:
     def _outputs(self) -> Iterator[dict[str, Any]]:
         """Yield the output until the entry has ended. Raises Interrupted: the entry was taken out before it began;
         DeviceLost: the console has ended, and after it what it had begun."""
-        told = False
+        is_announced = False
         while not self._ended:
             try:
                 yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
@@ -159,8 +159,8 @@ class _Followed:
                         happened=reason(error),
                         remedy=f"`coupole status {run}` says what became of it, `coupole stop {run}` stops it.",
                     ) from error
-                if not told:
-                    told = True
+                if not is_announced:
+                    is_announced = True
                     alarm(
                         "the console is gone; the run GOES ON, with its arm and lamps. Ctrl-C and q stop it "
                         f"still, as does `coupole stop {run}`"
@@ -182,8 +182,8 @@ class _Followed:
         state = self._state()
         if state is not None and self._run is not None:
             with contextlib.suppress(InputError):
-                paused = state["state"] in ("paused", "pausing")
-                ask(self._run, "go-on" if paused else "pause")
+                is_paused = state["state"] in ("paused", "pausing")
+                ask(self._run, "go-on" if is_paused else "pause")
 
     def _say(self, said: str) -> None:
         """Print what is new in the process's output, in whole lines."""
@@ -230,7 +230,7 @@ class _Followed:
 def _as_raised(figures: dict[str, Any]) -> CoupoleError:
     """The error that the figures of a process's `--json` tell."""
     kind = getattr(errors, figures["kind"], CoupoleError)
-    told: CoupoleError = kind.__new__(kind)
-    Exception.__init__(told, figures["error"])
-    told.exit_code = figures["exit_code"]
-    return told
+    error: CoupoleError = kind.__new__(kind)
+    Exception.__init__(error, figures["error"])
+    error.exit_code = figures["exit_code"]
+    return error

@@ -21,7 +21,7 @@ def owner_of(cell: Cell) -> int | None:
     lock = console_lock(cell)
     holder = holder_of(lock)
     try:
-        said = lock.read_text(encoding="ascii") if holder else ""
+        lock_text = lock.read_text(encoding="ascii") if holder else ""
     except OSError:
         return None
-    return holder if f'"pid": {holder}}}' in said else None
+    return holder if f'"pid": {holder}}}' in lock_text else None

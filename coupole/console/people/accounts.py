@@ -83,15 +83,15 @@ class Accounts:
 
     def listed(self) -> list[Account]:
         """Return all accounts, by name."""
-        return [Account(name, Role.of(kept["role"])) for name, kept in sorted(self._stored.items())]
+        return [Account(name, Role.of(entry["role"])) for name, entry in sorted(self._stored.items())]
 
     def holds(self, account: Account) -> bool:
         """Tell whether an account that has signed in still holds: it is there, with this role. The first
         engineer's holds while no engineer has an account."""
         if account == FIRST_ENGINEER:
             return not _has_engineer(self._stored)
-        kept = self._stored.get(account.name)
-        return kept is not None and kept["role"] == account.role.word and _key(kept) == account.key
+        entry = self._stored.get(account.name)
+        return entry is not None and entry["role"] == account.role.word and _key(entry) == account.key
 
     def add(self, name: str, password: str, role: Role) -> Account:
         """A new account, on the disk when this returns. Raises InputError, StorageError."""
@@ -103,11 +103,11 @@ class Accounts:
             raise InputError(f"name: {name} is whoever signs in with the token")
         if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
             raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
-        hashed = self._hasher.hash(password)
+        password_hash = self._hasher.hash(password)
         with self._lock:
-            if alike := [known for known in self._stored if _seen(known) == _seen(name)]:
+            if alike := [other_name for other_name in self._stored if _seen(other_name) == _seen(name)]:
                 raise InputError(f"name: {alike[0]} has an account already")
-            self._keep({**self._stored, name: {"role": role.word, "password": hashed}})
+            self._keep({**self._stored, name: {"role": role.word, "password": password_hash}})
             if role is Role.ENGINEER:
                 self.first_token = ""
         return Account(name, role)
@@ -117,20 +117,22 @@ class Accounts:
         with self._lock:
             if name not in self._stored:
                 raise InputError(f"name: {name} has no account")
-            changed = {**self._stored, name: {**self._stored[name], "role": role.word}}
-            if _has_engineer(self._stored) and not _has_engineer(changed):
+            accounts = {**self._stored, name: {**self._stored[name], "role": role.word}}
+            if _has_engineer(self._stored) and not _has_engineer(accounts):
                 raise InputError("name: this is the last engineer; nobody could keep the accounts")
-            self._keep(changed)
+            self._keep(accounts)
 
     def remove(self, name: str) -> None:
         """Raises InputError: no such account, or the last engineer's; StorageError."""
         with self._lock:
             if name not in self._stored:
                 raise InputError(f"name: {name} has no account")
-            left = {other: kept for other, kept in self._stored.items() if other != name}
-            if _has_engineer(self._stored) and not _has_engineer(left):
+            remaining_accounts = {
+                other_name: entry for other_name, entry in self._stored.items() if other_name != name
+            }
+            if _has_engineer(self._stored) and not _has_engineer(remaining_accounts):
                 raise InputError("name: this is the last engineer; nobody could keep the accounts")
-            self._keep(left)
+            self._keep(remaining_accounts)
 
     def sign_in(self, name: str, password: str, *, here: bool) -> Account | None:
         """The account with this name and password; None if there is none, and for a minute after five failures.
@@ -140,18 +142,26 @@ class Accounts:
         """
         with self._checking:
             now_s = time.monotonic()
-            recent = [one for one in self._failures if now_s - one[0] < _FORGOTTEN_AFTER_S and one[1] == here]
-            of_name = sum(failed == name for _, _, failed in recent)
+            recent = [
+                failure
+                for failure in self._failures
+                if now_s - failure[0] < _FORGOTTEN_AFTER_S and failure[1] == here
+            ]
+            of_name = sum(failed_name == name for _, _, failed_name in recent)
             if of_name >= _MOST_FAILURES or (len(recent) >= _MOST_FROM_ELSEWHERE and not here):
                 return None
-            kept = self._stored.get(name)
+            entry = self._stored.get(name)
             try:
-                self._hasher.verify(kept["password"] if kept else self._nobodys_hash, password[:LONGEST_PASSWORD])
+                self._hasher.verify(
+                    entry["password"] if entry else self._nobodys_hash, password[:LONGEST_PASSWORD]
+                )
             except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
-                others = [one for one in self._failures if now_s - one[0] < _FORGOTTEN_AFTER_S]
-                self._failures = [*others[-_MOST_KEPT:], (now_s, here, name)]
+                recent_failures = [
+                    failure for failure in self._failures if now_s - failure[0] < _FORGOTTEN_AFTER_S
+                ]
+                self._failures = [*recent_failures[-_MOST_KEPT:], (now_s, here, name)]
                 return None
-        return Account(name, Role.of(kept["role"]), _key(kept)) if kept else None
+        return Account(name, Role.of(entry["role"]), _key(entry)) if entry else None
 
     def sign_in_first(self, token: str) -> Account | None:
         """An engineer with the token of a start without an engineer's account; once."""
@@ -185,4 +195,4 @@ def _seen(name: str) -> str:
 
 
 def _has_engineer(stored: dict[str, dict[str, Any]]) -> bool:
-    return any(kept["role"] == Role.ENGINEER.word for kept in stored.values())
+    return any(entry["role"] == Role.ENGINEER.word for entry in stored.values())

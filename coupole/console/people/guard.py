@@ -51,8 +51,8 @@ def guard(app: FastAPI, service: Service) -> None:
             if request.method not in _READING:
                 session = getattr(request.state, "session", None)
                 name = session.account.name if session else ""
-                asked, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
-                log = (name, asked, status, address_of(request), about)
+                action, about = f"{request.method} {request.url.path}", getattr(request.state, "about", "")
+                log = (name, action, status, address_of(request), about)
                 await to_thread.run_sync(service.audit.note, *log)
         return response
 
@@ -73,8 +73,8 @@ def guard(app: FastAPI, service: Service) -> None:
             ambient = not is_command_line(request) and not bearer_of(request)
             if ambient and not service.sessions.spend(session, request.headers.get("x-coupole-token", "")):
                 return _no(403, "expected in X-Coupole-Token a fresh token of /api/v1/token, good for once")
-        if not begins_nothing(request.method, request.url.path) and (unwanted := why_unwanted(request, service)):
-            return _no(409, unwanted)
+        if not begins_nothing(request.method, request.url.path) and (refusal := why_unwanted(request, service)):
+            return _no(409, refusal)
         response: Response = await call_next(request)
         if not request.url.path.startswith(_STATIC) and "Cache-Control" not in response.headers:
             response.headers["Cache-Control"] = "no-store"
@@ -93,7 +93,9 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(InputError)
     async def wrong(_: Request, error: InputError) -> Response:
-        return JSONResponse({"detail": str(error), "problems": [asdict(one) for one in error.problems]}, 422)
+        return JSONResponse(
+            {"detail": str(error), "problems": [asdict(problem) for problem in error.problems]}, 422
+        )
 
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> Response:
@@ -126,8 +128,8 @@ class _WebSocketGuard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
             socket = WebSocket(scope, receive, send)
-            own = socket.headers.get("origin") in self._service.origins
-            if not own or session_of(socket, self._service) is None:
+            is_own_origin = socket.headers.get("origin") in self._service.origins
+            if not is_own_origin or session_of(socket, self._service) is None:
                 await socket.close(1008)
                 return
         await self._app(scope, receive, send)

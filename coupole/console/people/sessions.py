@@ -48,7 +48,9 @@ class Sessions:
         secret = secrets.token_urlsafe(32)
         now_s = self._now_s()
         with self._lock:
-            self._by_hash = {key: one for key, one in self._by_hash.items() if now_s - one.seen_s <= IDLE_S}
+            self._by_hash = {
+                key: session for key, session in self._by_hash.items() if now_s - session.seen_s <= IDLE_S
+            }
             self._by_hash[_hash(secret)] = Session(account, now_s, script)
         return secret
 
@@ -81,9 +83,9 @@ class Sessions:
     def spend(self, session: Session, token: str) -> bool:
         """True once for each of the session's tokens."""
         with self._lock:
-            known = token in session.tokens
+            is_valid = token in session.tokens
             session.tokens.discard(token)
-            return known
+            return is_valid
 
 
 def _hash(secret: str) -> str:

@@ -96,23 +96,23 @@ class Desk:
         """None if it is no longer wanted when its turn comes. Raises InputError: it takes too long, or the process
         died of it."""
         async with self._turn:
-            found: Checked | None = await self._do_now(check_draft, draft) if is_wanted() else None
-        return found
+            checked_draft: Checked | None = await self._do_now(check_draft, draft) if is_wanted() else None
+        return checked_draft
 
     async def draw(self, draft: Draft, folder: Path) -> tuple[Path, Path]:
         """Raises InputError."""
-        found: tuple[Path, Path] = await self._do(draw_draft, draft, folder)
-        return found
+        paths: tuple[Path, Path] = await self._do(draw_draft, draft, folder)
+        return paths
 
     async def draw_object(self, draft: Draft, path: Path) -> Path:
         """Raises InputError."""
-        found: Path = await self._do(draw_object, draft, path)
-        return found
+        picture_path: Path = await self._do(draw_object, draft, path)
+        return picture_path
 
     async def bounds(self, draft: Draft) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Raises InputError."""
-        found: tuple[tuple[float, ...], tuple[float, ...]] = await self._do(bounds_of_mesh, draft)
-        return found
+        bounds_mm: tuple[tuple[float, ...], tuple[float, ...]] = await self._do(bounds_of_mesh, draft)
+        return bounds_mm
 
     async def _do(self, work: Any, *arguments: Any) -> Any:
         async with self._turn:

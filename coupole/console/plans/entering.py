@@ -76,9 +76,11 @@ class Entering:
 
     def move(self, number: str, before: str) -> None:
         """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
-        moved = self._queue.order_after(number, before)
-        if more := self._more_light(moved):
-            raise InputError([_problem(entry.words, more[entry.id]) for entry in moved if entry.id in more])
+        reordered_entries = self._queue.order_after(number, before)
+        if more := self._more_light(reordered_entries):
+            raise InputError(
+                [_problem(entry.words, more[entry.id]) for entry in reordered_entries if entry.id in more]
+            )
         self._queue.move(number, before)
 
     def _plan(self, name: str, *, anywhere: bool) -> PlanFiles:
@@ -104,36 +106,36 @@ class Entering:
         """Raises InputError: preflight refuses it, with all refusals."""
         run = Path(fields["resume"]) if fields["resume"] else None
         plan, rig = (Path(fields["plan"]), self._rig) if fields["plan"] else (files.document.path, None)
-        asked = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
+        entry_files = Files(plan, rig, run, Path(fields["output"]) if fields["output"] else None)
         begun_s = time.monotonic()
-        told = self.preflight.of(asked, by, beside_a_run=self._acquisitions.state is not None)
-        if told.problems:
-            raise InputError(told.problems)
-        found = told.document
+        verdict = self.preflight.of(entry_files, by, beside_a_run=self._acquisitions.state is not None)
+        if verdict.problems:
+            raise InputError(verdict.problems)
+        document = verdict.document
         thing = files.plan.object
         return Needs(
-            duration_s=found["duration_s"],
+            duration_s=document["duration_s"],
             preparation_s=time.monotonic() - begun_s,
-            dose_lux_h=found["dose_lux_h"],
-            bytes=found["bytes"],
-            frames=found["frames"],
+            dose_lux_h=document["dose_lux_h"],
+            bytes=document["bytes"],
+            frames=document["frames"],
             object=thing.id if thing else None,
             dose_budget_lux_h=thing.dose_budget_lux_h if thing else None,
             folder=fields["resume"] or fields["output"] or str(self._cell.storage_folder.resolve()),
-            warnings=tuple(found["warnings"]),
+            warnings=tuple(document["warnings"]),
         )
 
     # -- with what runs and waits before ------------------------------------------------------------------------
 
     def _refuse(self, new: Entry, before: str) -> None:
-        named = new.plan or new.resume
+        name = new.plan or new.resume
         waiting = list(self._queue.waiting)
         place = waiting.index(self._queue.waiting_entry(before)) if before else len(waiting)
         entries = [*waiting[:place], new, *waiting[place:]]
-        problems = [_problem(named, refusal) for refusal in self._more_light(entries).values()]
+        problems = [_problem(name, refusal) for refusal in self._more_light(entries).values()]
         rig = self._cell.rig
         problems += [
-            _problem(named, refusal)
+            _problem(name, refusal)
             for refusal in too_little_disk(
                 entries,
                 at_work_of(self._acquisitions.state, rig.frame_bytes),
@@ -155,8 +157,8 @@ class Entering:
             return ledger_of(self._cell, name).read().budget_lux_h
 
         now = too_much_light(self._queue.waiting, received_lux_h, at_work, budget_lux_h)
-        found = too_much_light(entries, received_lux_h, at_work, budget_lux_h)
-        return {number: refusal for number, refusal in found.items() if number not in now}
+        refusals = too_much_light(entries, received_lux_h, at_work, budget_lux_h)
+        return {number: refusal for number, refusal in refusals.items() if number not in now}
 
 
 def _place(key: str, folder: Path, name: str, *, anywhere: bool) -> Path:

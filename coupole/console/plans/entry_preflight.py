@@ -33,14 +33,14 @@ def check_entry(files: Files, *, measure: bool) -> Found:
     """Preflight of files; what is wrong with them is in `problems`."""
     from coupole.viewing.preflight_table import document_of
 
-    named = str(files.resume or files.plan)
+    name = str(files.resume or files.plan)
     try:
         report = check_files(files, measure=measure, say=say)[1]
     except InputError as error:
-        return Found(problems=tuple(error.problems) or (Problem(named, 0, 0, "", str(error)),))
+        return Found(problems=tuple(error.problems) or (Problem(name, 0, 0, "", str(error)),))
     except CoupoleError as error:
-        return Found(problems=(Problem(named, 0, 0, "", str(error)),))
-    return Found(tuple(Problem(named, 0, 0, "", one) for one in report.refusals), document_of(report))
+        return Found(problems=(Problem(name, 0, 0, "", str(error)),))
+    return Found(tuple(Problem(name, 0, 0, "", refusal) for refusal in report.refusals), document_of(report))
 
 
 class EntryPreflight:
@@ -53,9 +53,9 @@ class EntryPreflight:
     @property
     def words(self) -> str:
         """Words on what is being checked, for whom, since when, and how far it is; empty if nothing is."""
-        if not (known := self._for):
+        if not (subject := self._for):
             return ""
-        return f"{known}: {self._process.step or 'it begins'}"
+        return f"{subject}: {self._process.step or 'it begins'}"
 
     def of(self, files: Files, by: str, *, beside_a_run: bool) -> Found:
         """Return what preflight says of files. Raises InputError: it takes too long, is given up, or its process

@@ -39,10 +39,10 @@ class ObjectFiles:
     def ids(self) -> list[str]:
         """Return the ids of all objects that a plan, a run or a ledger names."""
         ledgers = [*self._cell.ledger_folder.glob("*.jsonl"), *self._cell.former_ledger_folder.glob("*.jsonl")]
-        found = {path.stem for path in ledgers}
-        found |= {row.object for row in self._runs.rows() if row.object}
-        found |= set(self._named())
-        return sorted(found)
+        object_ids = {path.stem for path in ledgers}
+        object_ids |= {row.object for row in self._runs.rows() if row.object}
+        object_ids |= set(self._named())
+        return sorted(object_ids)
 
     def plans_of(self, object_id: str) -> list[NamedBy]:
         return self._named().get(object_id, [])
@@ -78,8 +78,8 @@ class ObjectFiles:
         from PIL import Image, ImageOps, UnidentifiedImageError
 
         try:
-            with Image.open(io.BytesIO(data)) as read:
-                picture = ImageOps.exif_transpose(read).convert("RGB")
+            with Image.open(io.BytesIO(data)) as image:
+                picture = ImageOps.exif_transpose(image).convert("RGB")
         except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
             raise InputError("expected a picture: JPEG, PNG or TIFF") from error
         picture.thumbnail((_PHOTOGRAPH_PX, _PHOTOGRAPH_PX))
@@ -98,16 +98,16 @@ class ObjectFiles:
         return self._folder / f"{object_id}.jpg"
 
     def _named(self) -> dict[str, list[NamedBy]]:
-        found: dict[str, list[NamedBy]] = {}
+        plans_by_object: dict[str, list[NamedBy]] = {}
         for name in self._plans.names():
             try:
-                measured = yamlfile.parse(self._plans.path(name), self._plans.read(name)).data.get("object")
+                object_keys = yamlfile.parse(self._plans.path(name), self._plans.read(name)).data.get("object")
             except CoupoleError:
                 continue
-            if isinstance(measured, dict) and isinstance(measured.get("id"), str):
-                budget = measured.get("dose_budget_lux_h")
-                named = NamedBy(
-                    name, bool(measured.get("mesh")), budget if isinstance(budget, int | float) else None
+            if isinstance(object_keys, dict) and isinstance(object_keys.get("id"), str):
+                budget = object_keys.get("dose_budget_lux_h")
+                named_by = NamedBy(
+                    name, bool(object_keys.get("mesh")), budget if isinstance(budget, int | float) else None
                 )
-                found.setdefault(measured["id"], []).append(named)
-        return found
+                plans_by_object.setdefault(object_keys["id"], []).append(named_by)
+        return plans_by_object

@@ -26,21 +26,21 @@ def expected_times(
 ) -> dict[str, tuple[datetime | None, datetime | None]]:
     """Begin and end of each entry that runs or waits, by its id; None where a person decides on it (a hold, a
     queue that is halted), or where it is not known. `left_s` of the run at work."""
-    found: dict[str, tuple[datetime | None, datetime | None]] = {}
+    times: dict[str, tuple[datetime | None, datetime | None]] = {}
     free_at: datetime | None = None if halted else now
     for entry in entries:
         if entry.state == "running":
-            begun = datetime.fromisoformat(entry.begun)
-            free_at = _end_of_running(entry, begun, now, left_s)
-            found[entry.id] = begun, free_at
+            begun_at = datetime.fromisoformat(entry.begun)
+            free_at = _end_of_running(entry, begun_at, now, left_s)
+            times[entry.id] = begun_at, free_at
             free_at = None if halted else free_at
     for entry in entries:
         if entry.state == "waiting":
             begins = free_at
             ends = begins + timedelta(seconds=_whole_s(entry)) if begins and entry.needs else None
-            found[entry.id] = begins, ends
+            times[entry.id] = begins, ends
             free_at = ends
-    return found
+    return times
 
 
 def _end_of_running(entry: Entry, begun: datetime, now: datetime, left_s: float | None) -> datetime | None:
@@ -65,7 +65,7 @@ def too_much_light(
     plan's own budget can only be stricter.
     """
     light: dict[str, float] = {}
-    refused: dict[str, str] = {}
+    refusals: dict[str, str] = {}
     for entry in entries:
         needs = entry.needs
         if entry.state != "waiting" or needs is None or needs.object is None:
@@ -74,13 +74,13 @@ def too_much_light(
         if name not in light:
             light[name] = max(received_lux_h(name), at_work.light_after_lux_h.get(name, 0.0))
         before, light[name] = light[name], light[name] + needs.dose_lux_h
-        known = [one for one in (needs.dose_budget_lux_h, budget_lux_h(name)) if one is not None]
-        if known and light[name] > min(known):
-            refused[entry.id] = (
+        budgets_lux_h = [budget for budget in (needs.dose_budget_lux_h, budget_lux_h(name)) if budget is not None]
+        if budgets_lux_h and light[name] > min(budgets_lux_h):
+            refusals[entry.id] = (
                 f"object {name}: {needs.dose_lux_h:.2f} lux.h after {before:.2f} lux.h with what runs and waits "
-                f"before it; its budget is {min(known):g} lux.h"
+                f"before it; its budget is {min(budgets_lux_h):g} lux.h"
             )
-    return refused
+    return refusals
 
 
 def too_little_disk(
@@ -91,17 +91,17 @@ def too_little_disk(
     reserve_bytes: int,
 ) -> list[str]:
     """Refusals of the disks that cannot take all that runs and waits; `reserve_bytes` must stay free."""
-    wanted: dict[int, tuple[Path, int]] = {}
+    needs_of_disk: dict[int, tuple[Path, int]] = {}
     folders: list[tuple[str, int]] = [(at_work.folder, at_work.bytes_left)] if at_work.folder else []
     folders += [(e.needs.folder, e.needs.bytes) for e in entries if e.state == "waiting" and e.needs]
     for folder, size in folders:
         existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
         disk = existing.stat().st_dev
-        wanted[disk] = existing, wanted.get(disk, (existing, 0))[1] + size
+        needs_of_disk[disk] = existing, needs_of_disk.get(disk, (existing, 0))[1] + size
     return [
         f"storage {folder}: all that runs and waits needs {size / 1e9:.2f} GB and {reserve_bytes / 1e9:.2f} GB "
         f"must stay free; {free_bytes(folder) / 1e9:.2f} GB are free"
-        for folder, size in wanted.values()
+        for folder, size in needs_of_disk.values()
         if size + reserve_bytes > free_bytes(folder)
     ]
 
@@ -110,5 +110,5 @@ def at_work_of(state: Mapping[str, Any] | None, frame_bytes: int) -> AtWork:
     """Return what a run still takes, by its state as its process tells it; nothing if there is no state."""
     if state is None:
         return AtWork()
-    left = max(0, state.get("frames", 0) - state.get("proven", 0))
-    return AtWork(state["run"], left * frame_bytes, state["light_after_lux_h"])
+    frames_left = max(0, state.get("frames", 0) - state.get("proven", 0))
+    return AtWork(state["run"], frames_left * frame_bytes, state["light_after_lux_h"])

@@ -52,13 +52,13 @@ def fields_of(path: Path, text: str) -> PlanFields:
     if len(text) > LONGEST:
         raise InputError(f"a text of more than {LONGEST:,} characters: write it in an editor of texts")
     data = yamlfile.parse(path, text).data
-    measured = data.get("object") if isinstance(data.get("object"), dict) else {}
-    assert isinstance(measured, dict)
+    object_keys = data.get("object") if isinstance(data.get("object"), dict) else {}
+    assert isinstance(object_keys, dict)
     fields = PlanFields(
-        object_id=str(measured.get("id", "")),
-        mesh=str(measured.get("mesh") or ""),
-        mesh_unit=str(measured.get("mesh_unit", "mm")),
-        budget_lux_h=_number(measured.get("dose_budget_lux_h")),
+        object_id=str(object_keys.get("id", "")),
+        mesh=str(object_keys.get("mesh") or ""),
+        mesh_unit=str(object_keys.get("mesh_unit", "mm")),
+        budget_lux_h=_number(object_keys.get("dose_budget_lux_h")),
         darks_per_view=_whole(data.get("darks_per_view")),
         exposures_us=_exposures(data.get("exposure")),
     )
@@ -79,14 +79,14 @@ def _rewritten(text: str, before: PlanFields, fields: PlanFields, target_mm: tup
     yaml = YAML(typ="rt")
     yaml.width, yaml.preserve_quotes = 110, True
     data = yaml.load(text)
-    measured = data.get("object")
-    if measured is None and (fields.object_id or fields.mesh):
-        measured = data["object"] = CommentedMap()
-    if measured is not None:
-        _set(measured, "id", fields.object_id or None, before.object_id or None)
-        _set(measured, "mesh", fields.mesh or None, before.mesh or None)
-        _set(measured, "mesh_unit", fields.mesh_unit, before.mesh_unit)
-        _set(measured, "dose_budget_lux_h", fields.budget_lux_h, before.budget_lux_h)
+    object_keys = data.get("object")
+    if object_keys is None and (fields.object_id or fields.mesh):
+        object_keys = data["object"] = CommentedMap()
+    if object_keys is not None:
+        _set(object_keys, "id", fields.object_id or None, before.object_id or None)
+        _set(object_keys, "mesh", fields.mesh or None, before.mesh or None)
+        _set(object_keys, "mesh_unit", fields.mesh_unit, before.mesh_unit)
+        _set(object_keys, "dose_budget_lux_h", fields.budget_lux_h, before.budget_lux_h)
     _set(data, "darks_per_view", fields.darks_per_view, before.darks_per_view)
     if fields.exposures_us and fields.exposures_us != before.exposures_us:
         data["exposure"] = _flow(_exposure(fields.exposures_us))
@@ -118,15 +118,15 @@ def _set(mapping: Any, key: str, value: Any, before: Any) -> None:
 
 
 def _flow(mapping: dict[str, Any]) -> CommentedMap:
-    made = CommentedMap(mapping)
-    made.fa.set_flow_style()
-    return made
+    flow_map = CommentedMap(mapping)
+    flow_map.fa.set_flow_style()
+    return flow_map
 
 
 def _listed(values: Any) -> CommentedSeq:
-    made = CommentedSeq(values)
-    made.fa.set_flow_style()
-    return made
+    flow_sequence = CommentedSeq(values)
+    flow_sequence.fa.set_flow_style()
+    return flow_sequence
 
 
 def _exposure(exposures_us: tuple[int, ...]) -> dict[str, Any]:
@@ -139,9 +139,9 @@ def _exposures(exposure: Any) -> tuple[int, ...]:
     if not isinstance(exposure, dict):
         return ()
     several = exposure.get("exposures_us")
-    found = several if isinstance(several, list) else [exposure.get("exposure_us")]
-    whole = [value for value in map(_whole, found) if value is not None]
-    return tuple(whole) if len(whole) == len(found) else ()
+    exposures_us = several if isinstance(several, list) else [exposure.get("exposure_us")]
+    whole = [value for value in map(_whole, exposures_us) if value is not None]
+    return tuple(whole) if len(whole) == len(exposures_us) else ()
 
 
 def _with_lights(fields: PlanFields, lights: Any) -> PlanFields:
@@ -157,10 +157,14 @@ def _with_views(fields: PlanFields, views: Any) -> PlanFields:
     if isinstance(views, list) and len(views) == 1 and isinstance(views[0], dict):
         grid = views[0]
         azimuths, elevations = grid.get("azimuths_deg"), grid.get("elevations_deg")
-        known = {"kind", "name", "target_mm", "distance_mm", "azimuths_deg", "elevations_deg"}
-        if grid.get("kind") == "grid" and set(grid) == known and isinstance(azimuths, list):
+        grid_keys = {"kind", "name", "target_mm", "distance_mm", "azimuths_deg", "elevations_deg"}
+        if grid.get("kind") == "grid" and set(grid) == grid_keys and isinstance(azimuths, list):
             even = azimuths == list(_azimuths(len(azimuths)))
-            if even and isinstance(elevations, list) and all(_number(one) is not None for one in elevations):
+            if (
+                even
+                and isinstance(elevations, list)
+                and all(_number(elevation) is not None for elevation in elevations)
+            ):
                 return replace(
                     fields,
                     azimuths=len(azimuths),
@@ -188,8 +192,8 @@ def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
 
 def _azimuths(count: int) -> tuple[float, ...]:
     """Evenly round the object, beginning at -90: towards who stands before the cell."""
-    found = [round((-90.0 + 360.0 * number / count + 180.0) % 360.0 - 180.0, 3) for number in range(count)]
-    return tuple(int(angle) if angle == int(angle) else angle for angle in found)
+    angles_deg = [round((-90.0 + 360.0 * number / count + 180.0) % 360.0 - 180.0, 3) for number in range(count)]
+    return tuple(int(angle) if angle == int(angle) else angle for angle in angles_deg)
 
 
 def _target(views: Any) -> tuple[float, ...]:

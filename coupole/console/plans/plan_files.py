@@ -38,16 +38,16 @@ class PlanFiles:
 
     def names(self) -> list[str]:
         """Return the names of all plans, sorted. A plan is a file with `views`."""
-        found = []
+        names = []
         for path in self.folder.rglob("*.yaml"):
             inside = path.relative_to(self.folder)
             if len(inside.parts) <= _DEEPEST and not any(part.startswith(".") for part in inside.parts):
                 try:
                     if re.search(r'^\s*"?views"?\s*:', path.read_text(encoding="utf-8"), re.MULTILINE):
-                        found.append(str(inside))
+                        names.append(str(inside))
                 except (OSError, UnicodeDecodeError):
                     continue
-        return sorted(found)
+        return sorted(names)
 
     def path(self, name: str) -> Path:
         """Raises InputError: not below the folder."""
@@ -80,8 +80,8 @@ class PlanFiles:
     def retake(self, run: Run, view: str) -> str:
         """A new plan that takes one view of a run again; its name. Raises InputError, StorageError."""
         with self._lock:
-            taken = {Path(name).stem for name in self.names()}
-            path = self.path(f"{name_of_retake(run, view, taken)}.yaml")
+            names_in_use = {Path(name).stem for name in self.names()}
+            path = self.path(f"{name_of_retake(run, view, names_in_use)}.yaml")
             self._write(path, retaking_plan(run, view, path.stem, self._rig))
         return path.name
 

@@ -156,13 +156,15 @@ class PlanQueue:
         entry = self.waiting_entry(number)
         if before == number:
             raise InputError(f"queue: {number} cannot be put before itself")
-        return self._with(entry, before, tuple(other for other in self.entries if other.id != number))
+        return self._with(
+            entry, before, tuple(other_entry for other_entry in self.entries if other_entry.id != number)
+        )
 
     def remove(self, number: str) -> None:
         """Take out an entry that waits. Raises InputError, StorageError."""
         with self._lock:
             self.waiting_entry(number)
-            self._keep(tuple(other for other in self.entries if other.id != number), self.halted)
+            self._keep(tuple(entry for entry in self.entries if entry.id != number), self.halted)
 
     def waiting_entry(self, number: str) -> Entry:
         """Raises InputError: none with this id waits."""
@@ -184,29 +186,31 @@ class PlanQueue:
             return f"{self.running.words} is being acquired"
         if self.waiting:
             return f"{self.waiting[0].words} waits" + (f": {self.halted}" if self.halted else "")
-        ended = [entry for entry in self.entries if entry.ended]
-        return self.halted if self.halted and ended and ended[-1].hold else ""
+        ended_entries = [entry for entry in self.entries if entry.ended]
+        return self.halted if self.halted and ended_entries and ended_entries[-1].hold else ""
 
     def entry(self, number: str) -> Entry:
         """Raises InputError: there is none with this id."""
-        found = next((entry for entry in self.entries if entry.id == number), None)
-        if found is None:
+        matching_entry = next((entry for entry in self.entries if entry.id == number), None)
+        if matching_entry is None:
             raise InputError(f"queue: no entry {number!r}")
-        return found
+        return matching_entry
 
     def change(self, number: str, **fields: object) -> Entry:
         """An entry with other fields. Raises InputError, StorageError."""
         with self._lock:
-            changed = self.entry(number).model_copy(update=fields)
-            self._keep(tuple(changed if other.id == number else other for other in self.entries), self.halted)
-            return changed
+            changed_entry = self.entry(number).model_copy(update=fields)
+            self._keep(
+                tuple(changed_entry if entry.id == number else entry for entry in self.entries), self.halted
+            )
+            return changed_entry
 
     def conclude(self, number: str, *, halt: str = "", **fields: object) -> None:
         """An entry with other fields, and why nothing more begins, in one change. Raises InputError, StorageError:
         nothing more begins all the same."""
         with self._lock:
-            changed = self.entry(number).model_copy(update=fields)
-            entries = tuple(changed if other.id == number else other for other in self.entries)
+            changed_entry = self.entry(number).model_copy(update=fields)
+            entries = tuple(changed_entry if entry.id == number else entry for entry in self.entries)
             self._keep(entries, halt or self.halted)
 
     def halt(self, why: str) -> None:
@@ -225,12 +229,12 @@ class PlanQueue:
             self._keep(self.entries, "")
 
     def _keep(self, entries: tuple[Entry, ...], halted: str) -> None:
-        forgotten = {entry.id for entry in [entry for entry in entries if entry.ended][:-MOST_ENDED]}
-        entries = tuple(entry for entry in entries if entry.id not in forgotten)
-        kept = _Kept(halted=halted, entries=entries)
+        old_ids = {entry.id for entry in [entry for entry in entries if entry.ended][:-MOST_ENDED]}
+        entries = tuple(entry for entry in entries if entry.id not in old_ids)
+        queue = _Kept(halted=halted, entries=entries)
         try:
             make_folder(self._path.parent)
-            write_synced(self._path, json.dumps(kept.model_dump(), indent=2, ensure_ascii=False))
+            write_synced(self._path, json.dumps(queue.model_dump(), indent=2, ensure_ascii=False))
         except OSError as error:
             raise StorageError(f"{self._path}: the queue cannot be kept: {error.strerror}") from error
-        self._kept = kept
+        self._kept = queue

@@ -20,8 +20,8 @@ def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
     keeps. Raises InputError: there is no such view, or the run's plan cannot be read."""
     files = read_plan(run.plan_path)
     plan = files.plan
-    chosen = next((one for one in map(_single, _expanded(plan)) if one["name"] == view), None)
-    if chosen is None:
+    view_keys = next((candidate for candidate in map(_single, _expanded(plan)) if candidate["name"] == view), None)
+    if view_keys is None:
         raise InputError(f"{view!r}: no view of {run.folder.name}")
     whole = plan.model_dump(mode="json", exclude_unset=True)
     for key_path, path in named_paths(plan):
@@ -30,7 +30,7 @@ def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
         for key in parents:
             part = part[key]
         part[last] = str(files.document.resolve(path))
-    whole |= {"name": name, "rig": str(rig.resolve()), "views": [chosen]}
+    whole |= {"name": name, "rig": str(rig.resolve()), "views": [view_keys]}
     return (
         f"# View {view} of {run.folder.name}, once more.\n"
         + json.dumps(whole, indent=1, ensure_ascii=False)
@@ -46,12 +46,12 @@ def name_of_retake(run: Run, view: str, taken: set[str]) -> str:
 
 
 def _expanded(plan: Plan) -> list[View]:
-    found: list[View] = []
+    views: list[View] = []
     for view in plan.views:
-        found += views_of_grid(view) if isinstance(view, Grid) else [view]
-    return found
+        views += views_of_grid(view) if isinstance(view, Grid) else [view]
+    return views
 
 
 def _single(view: View) -> dict[str, Any]:
-    found: dict[str, Any] = view.model_dump(mode="json", exclude_unset=True)
-    return found
+    view_keys: dict[str, Any] = view.model_dump(mode="json", exclude_unset=True)
+    return view_keys

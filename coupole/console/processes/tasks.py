@@ -80,10 +80,10 @@ class Task:
         if self._found is None:
             try:
                 path = self.folder / f"{self.id}.json"
-                found = json_of(path.read_bytes().splitlines()[-1], str(path), allow_nan=True)
+                figures = json_of(path.read_bytes().splitlines()[-1], str(path), allow_nan=True)
             except (OSError, InputError, IndexError):
-                found = {}
-            self._found = found if isinstance(found, dict) else {}
+                figures = {}
+            self._found = figures if isinstance(figures, dict) else {}
         return self._found
 
     @property
@@ -122,8 +122,8 @@ class Tasks:
             if sum(task.running for task in self._tasks.values()) >= MOST_AT_ONCE:
                 raise InputError(f"{words}: {MOST_AT_ONCE} commands are under way; wait for one to end")
             number = secrets.token_hex(6)
-            said, found = self._folder / f"{number}.log", self._folder / f"{number}.json"
-            with said.open("wb") as errors, found.open("wb") as figures:
+            output_path, figures_path = self._folder / f"{number}.log", self._folder / f"{number}.json"
+            with output_path.open("wb") as errors, figures_path.open("wb") as figures:
                 process = self._beginner.submit(_begun, [*_COUPOLE, *command, "--json"], figures, errors).result()
             task = Task(number, words, tuple(command), by, utc_now(), process, self._folder)
             self._tasks[number] = task

@@ -75,12 +75,12 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
         if account is None:
             raise NotAllowed(401, "name or password are wrong, or were wrong too often: try again in a minute")
         secret = service.sessions.begin(account, script=asked.script)
-        told = {"name": account.name, "role": account.role.word}
+        answer = {"name": account.name, "role": account.role.word}
         if asked.script:
-            return {**told, "session": secret}
+            return {**answer, "session": secret}
         safe = request.url.scheme == "https"
         response.set_cookie(service.cookie, secret, httponly=True, samesite="strict", secure=safe)
-        return told
+        return answer
 
     @app.post("/api/v1/sign-out")
     def sign_out(who: Who, request: Request, response: Response) -> dict[str, str]:
@@ -121,8 +121,8 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         def may_still() -> None:
             if session_of(request, service) is None:
                 raise NotAllowed(401, "the session is over: sign in again")
-            if unwanted := why_unwanted(request, service):
-                raise NotAllowed(409, unwanted)
+            if refusal := why_unwanted(request, service):
+                raise NotAllowed(409, refusal)
             allow(service, who, Role.OPERATOR, "queue", acts=True)
 
         enter = partial(service.entering.enter, asked, who.name, by_command_line=here, may_still=may_still)
@@ -164,9 +164,9 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
     before, said_s = "", 0.0
     while session_of(request, service, used=False) is not None:
         now = service.newest()
-        known = now.model_dump_json(exclude={"t"})
-        if known != before or time.monotonic() - said_s > _ALIVE_EVERY_S:
-            before, said_s = known, time.monotonic()
+        state_text = now.model_dump_json(exclude={"t"})
+        if state_text != before or time.monotonic() - said_s > _ALIVE_EVERY_S:
+            before, said_s = state_text, time.monotonic()
             yield f"event: state\ndata: {now.model_dump_json()}\n\n"
         await asyncio.sleep(_EVENT_EVERY_S)
 
@@ -192,7 +192,7 @@ def _add_people(app: FastAPI, service: Service) -> None:
         """All accounts, for engineers."""
         if who.role < Role.ENGINEER:
             raise NotAllowed(403, "accounts: only for engineers")
-        return [{"name": one.name, "role": one.role.word} for one in service.accounts.listed()]
+        return [{"name": account.name, "role": account.role.word} for account in service.accounts.listed()]
 
     @app.post("/api/v1/accounts", responses=REFUSALS)
     def new_account(asked: NewAccount, who: Who) -> dict[str, str]:

@@ -44,9 +44,9 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/queue/{entry}/output", responses=REFUSALS)
     def output(entry: Text) -> Output:
         """Return what the process of an entry has told."""
-        found = service.queue.entry(entry)
-        said, figures = service.acquisitions.output(found)
-        return Output(entry=found, said=said, figures=figures)
+        queue_entry = service.queue.entry(entry)
+        output_text, figures = service.acquisitions.output(queue_entry)
+        return Output(entry=queue_entry, said=output_text, figures=figures)
 
 
 def _add_loan(app: FastAPI, service: Service) -> None:

@@ -28,13 +28,13 @@ def add_bench_routes(app: FastAPI, service: Service) -> None:
     @app.get("/api/v1/bench")
     def bench() -> dict[str, Any]:
         """`phase` (closed, opening, open, closing), `plan`, `closed_because`; `state` as the bench tells it."""
-        found = service.bench
-        found.looked_at()
+        keeper = service.bench
+        keeper.looked_at()
         return {
-            "phase": found.phase,
-            "plan": found.plan,
-            "closed_because": found.closed_because,
-            "state": found.state,
+            "phase": keeper.phase,
+            "plan": keeper.plan,
+            "closed_because": keeper.closed_because,
+            "state": keeper.state,
         }
 
     @app.get("/api/v1/bench/pictures/{name}", response_class=Response)
@@ -65,34 +65,34 @@ class _Hold:
         self._asked: dict[str, Any] = {}
 
     async def serve(self) -> None:
-        ended, begun = "the button was let go", False
+        outcome, is_moving = "the button was let go", False
         try:
             while True:
-                asked = await self._socket.receive_json()
-                work = await to_thread.run_sync(self._renewed, asked)
-                if not begun:
-                    begun = True
-                    self._note(f"begins to move {_words(asked)}", 200)
+                jog_request = await self._socket.receive_json()
+                work = await to_thread.run_sync(self._renewed, jog_request)
+                if not is_moving:
+                    is_moving = True
+                    self._note(f"begins to move {_words(jog_request)}", 200)
                 await self._socket.send_json({"state": work["state"]})
                 if work["state"] != "running":
-                    ended = str(work.get("ended") or work["why"] or work["state"])
+                    outcome = str(work.get("ended") or work["why"] or work["state"])
                     break
         except (WebSocketDisconnect, ValueError, KeyError):
-            ended = await to_thread.run_sync(self._let_go)
+            outcome = await to_thread.run_sync(self._let_go)
         except (NotAllowed, CoupoleError) as error:
-            ended = str(error)
+            outcome = str(error)
             await to_thread.run_sync(self._let_go)
-        self._note(f"ends: {ended}" if begun else f"is refused: {ended}", 200 if begun else 409)
+        self._note(f"ends: {outcome}" if is_moving else f"is refused: {outcome}", 200 if is_moving else 409)
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-            await self._socket.send_json({"ended": ended})
+            await self._socket.send_json({"ended": outcome})
             await self._socket.close()
 
     def _renewed(self, asked: Any) -> dict[str, Any]:
         """Press or renew. Raises NotAllowed, InputError."""
         if not isinstance(asked, dict) or set(asked) != _RENEWED:
             raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
-        if unwanted := self._service.loop_watch.refusal(HELD_STOOD_STILL_S):
-            raise NotAllowed(409, unwanted)
+        if refusal := self._service.loop_watch.refusal(HELD_STOOD_STILL_S):
+            raise NotAllowed(409, refusal)
         allow(self._service, self._who(), Role.OPERATOR, "move by hand", acts=True)
         goes_on = {"hold": self._number} if self._number is not None else {}
         self._asked = {**asked, "from": address_of(self._socket)}
@@ -104,9 +104,9 @@ class _Hold:
         """End the motion at once: a renewal the other way ends a hold."""
         if self._number is None:
             return "the button was let go"
-        other = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}
+        reversed_jog = {**self._asked, "direction": -self._asked["direction"], "hold": self._number}
         with contextlib.suppress(CoupoleError):
-            self._service.bench.ask("jog", **other)
+            self._service.bench.ask("jog", **reversed_jog)
         return "the button was let go, or the connection was lost"
 
     def _who(self) -> Account:

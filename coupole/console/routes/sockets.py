@@ -134,5 +134,5 @@ def origins_of(url: str, hosts: Sequence[str]) -> frozenset[str]:
     """Return the origins of pages at these hosts; browsers leave out the port that is their scheme's own."""
     scheme, port = url.partition("://")[0], url.rpartition(":")[2]
     places = {f"{scheme}://{in_url(host)}" for host in hosts}
-    own = port == {"http": "80", "https": "443"}[scheme]
-    return frozenset({f"{place}:{port}" for place in places} | (places if own else set()))
+    is_default_port = port == {"http": "80", "https": "443"}[scheme]
+    return frozenset({f"{place}:{port}" for place in places} | (places if is_default_port else set()))

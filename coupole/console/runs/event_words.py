@@ -38,8 +38,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
         case SessionResumed():
             return "; ".join(("resumed: the devices are open", *event.trusted))
         case ViewBegun():
-            hidden = f"; {len(event.hidden_leds)} LEDs are hidden from it" if event.hidden_leds else ""
-            return f"view {event.view}{hidden}"
+            hidden_words = f"; {len(event.hidden_leds)} LEDs are hidden from it" if event.hidden_leds else ""
+            return f"view {event.view}{hidden_words}"
         case MoveBegun():
             return f"the arm moves to {event.view}"
         case BurstBegun():

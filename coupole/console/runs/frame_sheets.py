@@ -84,34 +84,38 @@ class FrameSheets:
 
     def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
         """Return those of `means` that were read before. Raises InputError, StorageError."""
-        kept, proven = self._kept(name), self._runs.proven(name)
-        found = {shot: kept.get(proven[one].xxh3) for shot in shots if (one := ShotId.parse(shot)) in proven}
-        return {shot: mean for shot, mean in found.items() if mean is not None}
+        known_means, proven = self._kept(name), self._runs.proven(name)
+        mean_of_shot = {
+            shot: known_means.get(proven[shot_id].xxh3)
+            for shot in shots
+            if (shot_id := ShotId.parse(shot)) in proven
+        }
+        return {shot: mean for shot, mean in mean_of_shot.items() if mean is not None}
 
     def means(self, name: str, shots: Sequence[str], tell: Callable[[int, int], object]) -> dict[str, float]:
         """The mean above black of each of these proven frames of one view, as a share of full scale, by at most
         256 pairs of rows; `tell` is told how many of how many are read. Raises InputError, StorageError."""
         with self._reading:
-            kept, proven = self._kept(name), self._runs.proven(name)
+            known_means, proven = self._kept(name), self._runs.proven(name)
             events = [proven[ShotId.parse(shot)] for shot in shots]
-            missing = [event for event in events if event.xxh3 not in kept]
+            missing = [event for event in events if event.xxh3 not in known_means]
             view = self._runs.view(name, missing) if missing else None
-            for done, event in enumerate(missing, 1):
+            for count, event in enumerate(missing, 1):
                 assert view is not None
-                kept[event.xxh3] = _mean(view.pixels(event.index), view)
-                tell(done, len(missing))
-                if done % _KEPT_EVERY == 0 or done == len(missing):
-                    self._keep(name, kept)
-        return {shot: kept[event.xxh3] for shot, event in zip(shots, events, strict=True)}
+                known_means[event.xxh3] = _mean(view.pixels(event.index), view)
+                tell(count, len(missing))
+                if count % _KEPT_EVERY == 0 or count == len(missing):
+                    self._keep(name, known_means)
+        return {shot: known_means[event.xxh3] for shot, event in zip(shots, events, strict=True)}
 
     def _kept(self, name: str) -> dict[str, float]:
         """Means by the frames' checksums."""
         self._runs.run(name)
         try:
-            found: dict[str, float] = read_json(self._folder / f"{name}.json", allow_nan=True)
+            means: dict[str, float] = read_json(self._folder / f"{name}.json", allow_nan=True)
         except (OSError, InputError):
             return {}
-        return found
+        return means
 
     def _keep(self, name: str, kept: dict[str, float]) -> None:
         make_folder(self._folder)

@@ -118,8 +118,8 @@ class RunFiles:
         """The newest first."""
         if not self.folder.is_dir():
             return []
-        found = [path.parent.name for path in self.folder.glob(f"*/{RUN_JSON}")]
-        return sorted(found, reverse=True)
+        names = [path.parent.name for path in self.folder.glob(f"*/{RUN_JSON}")]
+        return sorted(names, reverse=True)
 
     def run(self, name: str) -> Run:
         """Raises InputError: no run of this cell has this name."""
@@ -143,11 +143,11 @@ class RunFiles:
         """The frames of the runs that were asked for last are kept."""
         path = self.run(name).journal_path
         with self._lock:
-            found = self._followed.setdefault(name, _Followed(path))
+            follower = self._followed.setdefault(name, _Followed(path))
             self._followed.move_to_end(name)
             while len(self._followed) > _RUNS_FOLLOWED:
                 self._followed.popitem(last=False)
-        return found
+        return follower
 
     def view(self, name: str, events: Sequence[FrameProven]) -> View:
         """The file that has these frames, of one view. Raises InputError, StorageError."""
@@ -187,15 +187,15 @@ class RunFiles:
         """Return a checksum of names, sizes and times of all files in a run's folder: it changes once any file was
         written, put in or taken out."""
         folder = self.folder / name
-        found = hashlib.sha256()
+        checksum = hashlib.sha256()
         for path in sorted(folder.rglob("*")):
             try:
                 about = path.stat()
             except OSError:  # it was taken away while we looked
                 continue
             if not path.is_dir():
-                found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
-        return found.hexdigest()
+                checksum.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\0".encode())
+        return checksum.hexdigest()
 
     def note_verified(self, name: str, t: str, before: str) -> None:
         """It was read back at `t` without a fault. Nothing is noted unless its `fingerprint` is still the one from
@@ -206,28 +206,28 @@ class RunFiles:
 
     def _verified(self, name: str, fingerprint: str) -> str:
         try:
-            t, noted = (self._notes / name).read_text(encoding="utf-8").split()
+            t, noted_fingerprint = (self._notes / name).read_text(encoding="utf-8").split()
         except (OSError, ValueError):
             return ""
-        return t if noted == fingerprint else ""
+        return t if noted_fingerprint == fingerprint else ""
 
     def row(self, name: str) -> RunRow:
         """One of them."""
         fingerprint = self.fingerprint(name)
-        known, row = self._rows.get(name, ("", None))
-        if row is None or known != fingerprint or row.state in ("running", "paused", "created"):
+        known_fingerprint, row = self._rows.get(name, ("", None))
+        if row is None or known_fingerprint != fingerprint or row.state in ("running", "paused", "created"):
             row = self._read_row(name)
             self._rows[name] = fingerprint, row
-        verified = self._verified(name, fingerprint)
-        return row if verified == row.verified else RunRow(**{**vars(row), "verified": verified})
+        verified_at = self._verified(name, fingerprint)
+        return row if verified_at == row.verified else RunRow(**{**vars(row), "verified": verified_at})
 
     def _read_row(self, name: str) -> RunRow:
         try:
             run = self.run(name)
-            found = status(run)
-            proven = sum(count for count, _ in found.views.values())
+            run_status = status(run)
+            proven = sum(count for count, _ in run_status.views.values())
             thumbnail = _typical(run) if proven else ""
-            archived = bool(proven) and all(
+            is_archived = bool(proven) and all(
                 frame_file.read_layout(run.view_path(view)).archived for view in run.about["views"]
             )
         except (CoupoleError, KeyError, OSError) as error:
@@ -235,25 +235,25 @@ class RunFiles:
         views = (run.folder / "views").glob("*.h5")
         return RunRow(
             name=name,
-            state=found.state,
+            state=run_status.state,
             object=run.about.get("object") or "",
             created=run.about["created"],
             operator=str(run.about.get("operator", "")),
             simulated=run.simulated,
             proven=proven,
-            frames=sum(count for _, count in found.views.values()),
+            frames=sum(count for _, count in run_status.views.values()),
             bytes=sum(path.stat().st_blocks * 512 for path in views),
-            archived=archived,
+            archived=is_archived,
             verified="",
             thumbnail=thumbnail,
         )
 
     def _event(self, name: str, shot: str) -> FrameProven:
         try:
-            wanted = ShotId.parse(shot)
+            shot_id = ShotId.parse(shot)
         except ValueError as error:
             raise InputError(f"{shot!r}: expected a shot such as top/led0417/e0") from error
-        event = self._follow(name).event(wanted)
+        event = self._follow(name).event(shot_id)
         if event is None:
             raise InputError(f"{shot}: not proven in {name}")
         return event

@@ -73,15 +73,15 @@ class RunWatch:
     def of(self, name: str) -> Watched:
         """A run of this cell. Raises InputError, StorageError."""
         with self._lock:
-            followed = self._followed
-            if followed is None or followed.run.folder.name != name:
+            followed_run = self._followed
+            if followed_run is None or followed_run.run.folder.name != name:
                 run = self._runs.run(name)
-                expected = Counter(shot.view for shot in run.expected_shots())
-                followed = self._followed = _Followed(run, Follower(run.journal_path), expected)
+                shots_of_view = Counter(shot.view for shot in run.expected_shots())
+                followed_run = self._followed = _Followed(run, Follower(run.journal_path), shots_of_view)
                 self._read_s = 0.0
             if self._known is None or self._known.run != name or time.monotonic() - self._read_s > _NO_OFTENER_S:
-                followed.read()
-                self._known, self._read_s = _watched(followed), time.monotonic()
+                followed_run.read()
+                self._known, self._read_s = _watched(followed_run), time.monotonic()
             return self._known
 
 

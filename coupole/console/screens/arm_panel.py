@@ -95,19 +95,19 @@ class ArmPanel:
         self._forget()
         self._words.text = "The path is planned."
         self._show_path.set_enabled(False)
-        found = await self._visit.act(
+        path = await self._visit.act(
             f"path to {self._to.value}", lambda: self._bench.ask("plan_path", to=self._goal()), acts=False
         )
-        self._path = found
+        self._path = path
         self._enable()
-        if found is None:
+        if path is None:
             self._words.text = "There is no path."
             return
-        corners = len(found["waypoints_deg"]) - 1
-        self._picture.show_way(found["camera_mm"], found["links_mm"][-1])
+        corners = len(path["waypoints_deg"]) - 1
+        self._picture.show_way(path["camera_mm"], path["links_mm"][-1])
         motions = "one straight motion" if corners == 1 else f"{corners} straight motions"
         self._words.text = (
-            f"To {found['to']}: {motions} in joint space, {duration_text(found['duration_s'])}. The blue line is "
+            f"To {path['to']}: {motions} in joint space, {duration_text(path['duration_s'])}. The blue line is "
             "the camera's way, violet is the arm at its end."
         )
 
@@ -138,8 +138,8 @@ class ArmPanel:
             return
         self._driven = ""
         self._picture.show_way()
-        arrived = f"The arm is at {work['to']}."
-        self._words.text = arrived if work["state"] == "done" else f"The arm has stopped: {work['why']}"
+        arrival_words = f"The arm is at {work['to']}."
+        self._words.text = arrival_words if work["state"] == "done" else f"The arm has stopped: {work['why']}"
 
 
 def _condition(arm: dict[str, Any]) -> dict[str, str]:

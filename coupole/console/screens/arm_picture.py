@@ -144,8 +144,8 @@ class _Model:
         self._moving: list[Any] = []
 
     def show(self, arm_mm: Points | None, way_mm: Points | None, goal_mm: Points | None) -> None:
-        for one in self._moving:
-            one.delete()
+        for shape in self._moving:
+            shape.delete()
         self._moving = []
         with self._scene as scene:
             for points_mm, colour, opacity in ((goal_mm, _GOAL, 0.35), (arm_mm, _INK, 1.0)):

@@ -38,8 +38,8 @@ class BenchBar:
 
     async def _opened(self) -> None:
         account, plan = self._visit.account, self._plan.value
-        who = account.name if account else ""
-        await self._visit.act(f"open the devices, {plan or 'empty'}", lambda: self._bench.open(who, plan))
+        name = account.name if account else ""
+        await self._visit.act(f"open the devices, {plan or 'empty'}", lambda: self._bench.open(name, plan))
 
     async def _closed(self) -> None:
         trouble = await self._visit.act("close the devices", self._bench.close)
@@ -52,15 +52,15 @@ class BenchBar:
         bench, now = self._bench, self._visit.now
         phase, may = bench.phase, self._visit.may_act
         busy = bool(now.run) or now.state in ("starting", "concluding")
-        known = phase, may, busy, bench.closed_because, bench.plan, bench.state
-        if known == self._shown:
+        state = phase, may, busy, bench.closed_because, bench.plan, bench.state
+        if state == self._shown:
             return
-        self._shown = known
+        self._shown = state
         self._words.text = self._phase_words(phase, busy=busy)
-        closed = phase == "closed"
-        self._open.set_visibility(closed)
-        self._plan.set_visibility(closed)
-        self._close.set_visibility(not closed)
+        is_closed = phase == "closed"
+        self._open.set_visibility(is_closed)
+        self._plan.set_visibility(is_closed)
+        self._close.set_visibility(not is_closed)
         self._open.set_enabled(may and not busy)
         self._close.set_enabled(may and phase in ("open", "opening"))
         self._show(bench.state if phase == "open" else None)

@@ -47,10 +47,14 @@ class _InForce:
         except CoupoleError as error:
             self._words.set_text(str(error))
             return
-        refused = sum(bool(row.against) for row in plans)
+        refused_count = sum(bool(row.against) for row in plans)
         self._words.set_text(
             f"{count(len(plans), 'plan')} of this rig in the folder of plans. "
-            + (f"{refused} would be refused as things are." if refused else "None is refused by its records.")
+            + (
+                f"{refused_count} would be refused as things are."
+                if refused_count
+                else "None is refused by its records."
+            )
         )
         self._plans.set_content(table_html(("plan", "by its records"), [_plan_cells(row) for row in plans]))
 
@@ -64,14 +68,14 @@ def _record_cells(row: RecordRow) -> list[str]:
         return [row.kind, why, "", "", "", "", ""]
     if not row.kind:
         return [row.path.name, f"bad|{' '.join(row.against)}", "", "", "", "", ""]
-    left = f"in {count(round(row.left_days), 'day')}" if row.left_days > 0 else "bad|expired"
+    expiry = f"in {count(round(row.left_days), 'day')}" if row.left_days > 0 else "bad|expired"
     if 0 < row.left_days < _SOON_DAYS:
-        left = f"warm|{left}"
+        expiry = f"warm|{expiry}"
     margin = "" if row.margin is None else f"{row.margin:{'.1%' if abs(row.margin) < _NARROW else '.0%'}}"
     if row.margin is not None and row.margin < _NARROW:
         margin = f"{'bad' if row.margin < 0 else 'warm'}|{margin}"
     state = f"bad|{'; '.join(row.against)}" if row.against else "good|holds"
-    return [row.kind, state, moment(row.created), count(round(row.age_days), "day"), left, margin, row.tightest]
+    return [row.kind, state, moment(row.created), count(round(row.age_days), "day"), expiry, margin, row.tightest]
 
 
 def _plan_cells(row: PlanRow) -> list[str]:
@@ -109,10 +113,10 @@ class _Campaign:
         self._where.set_text(
             f"Plans, runs and records are in {folder}." if folder else "Nothing is begun. An engineer begins."
         )
-        known = f"{folder} {steps} {under_way}"
-        if known == self._shown:
+        state = f"{folder} {steps} {under_way}"
+        if state == self._shown:
             return
-        self._shown = known
+        self._shown = state
         self._steps.clear()
         with self._steps:
             following = next((step.step.name for step in steps if not step.done), "")

@@ -58,14 +58,14 @@ class ContactSheet:
 
     def _draw(self) -> None:
         first = self._page * PER_PAGE
-        shown = self._frames[first : first + PER_PAGE]
+        page_frames = self._frames[first : first + PER_PAGE]
         pages = max(1, -(-len(self._frames) // PER_PAGE))
         self._where.text = f"page {self._page + 1} of {pages}, {len(self._frames)} frames"
         self._before.set_enabled(self._page > 0)
         self._after.set_enabled(self._page + 1 < pages)
         self._sheet.set_content(
-            f'<div class="sheet">{"".join(map(self._thumbnail, shown))}</div>'
-            if shown
+            f'<div class="sheet">{"".join(map(self._thumbnail, page_frames))}</div>'
+            if page_frames
             else '<p class="hint">No proven frame here.</p>'
         )
 

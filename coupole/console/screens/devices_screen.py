@@ -42,11 +42,13 @@ class _Screen:
         """Have a device test itself."""
         card = self._cards[kind]
         card.busy(True)
-        found = await self._visit.act(f"self-test of {kind}", lambda: self._bench.ask("self_test", device=kind))
+        test_report = await self._visit.act(
+            f"self-test of {kind}", lambda: self._bench.ask("self_test", device=kind)
+        )
         card.busy(False)
-        if found is not None:
-            words = "has passed its test" if found["passed"] else "has failed its test"
-            self._visit.say(f"{_CARDS[kind]} {words}", bad=not found["passed"])
+        if test_report is not None:
+            words = "has passed its test" if test_report["passed"] else "has failed its test"
+            self._visit.say(f"{_CARDS[kind]} {words}", bad=not test_report["passed"])
 
 
 class _Card:
@@ -74,11 +76,11 @@ class _Card:
         if device is None:
             self._facts.set_content("<p>The rig has none.</p>")
             return
-        who, heard_s = device["identity"], device["heard_s_ago"]
+        identity, heard_s = device["identity"], device["heard_s_ago"]
         rows = {
-            "is": f"{who['vendor']} {who['model']}",
-            "serial number": who["serial"] or "not told",
-            "firmware": who["firmware"] or "not told",
+            "is": f"{identity['vendor']} {identity['model']}",
+            "serial number": identity["serial"] or "not told",
+            "firmware": identity["firmware"] or "not told",
             "link": device["link"] or "not told",
             "last heard": "just now" if heard_s < 5 else f"{heard_s:.0f} s ago",
         }

@@ -40,10 +40,10 @@ class ExportDialog:
 
     async def command(self) -> list[str]:
         """The arguments of `coupole` that do it; none if it was cancelled."""
-        said = await self._dialog
+        is_confirmed = await self._dialog
         form, licence, view = self._form.value, self._licence.value, self._view.value
         self._dialog.delete()
-        if not said:
+        if not is_confirmed:
             return []
         command = ["export", str(self._run.folder), "--to", form, "--out", str(self._folder(form))]
         options = FORMATS[form].options

@@ -32,12 +32,12 @@ class FaultOfArm:
         account, cause = self._visit.account, str(self._cause.value or "").strip()
         faults = faults_of(self._visit.service.cell)
 
-        seen = self._words.text
+        shown_message = self._words.text
 
         def confirm() -> bool:
             if not cause or account is None:
                 raise InputError("expected what the cause was")
-            if (standing := faults.standing()) and standing[-1].message != seen:
+            if (standing := faults.standing()) and standing[-1].message != shown_message:
                 raise InputError(f"another fault stands by now: {standing[-1].message}")
             faults.confirm(account.name, cause)
             return True

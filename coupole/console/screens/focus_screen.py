@@ -190,14 +190,14 @@ class _Screen:
 
     async def _expose(self, *, live: bool) -> None:
         self._asking = True
-        found: dict[str, Any] | None = None
+        picture: dict[str, Any] | None = None
         try:
-            asked, words = self._settings.request(), self._settings.light_words
-            compared = self._settings.compared
+            request, words = self._settings.request(), self._settings.light_words
+            comparison_key = self._settings.compared
             if live:
-                found = await self._taken_live(asked)
+                picture = await self._taken_live(request)
             else:
-                found = await self._visit.act(f"picture, {words}", lambda: self._bench.ask("frame", **asked))
+                picture = await self._visit.act(f"picture, {words}", lambda: self._bench.ask("frame", **request))
         except (CoupoleError, NotAllowed) as error:
             if live and await self._stopped_meanwhile():
                 self._ending = "stopped"
@@ -205,8 +205,8 @@ class _Screen:
                 self._refused.text, self._ending = str(error), "a picture was refused"
         finally:
             self._asking = False
-        if found is not None:
-            self._show_picture(found, asked, words, compared)
+        if picture is not None:
+            self._show_picture(picture, request, words, comparison_key)
         self._enable()
 
     async def _taken_live(self, asked: dict[str, Any]) -> dict[str, Any]:
@@ -214,10 +214,10 @@ class _Screen:
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
         allow(self._visit.service, account, Role.OPERATOR, "live pictures", acts=True)
-        found = await in_thread(self._bench.ask, "frame", **asked, stops=self._stops)
+        picture = await in_thread(self._bench.ask, "frame", **asked, stops=self._stops)
         self._taken += 1
-        self._given_lux_h += found["dose_lux_h"]
-        return found
+        self._given_lux_h += picture["dose_lux_h"]
+        return picture
 
     def _show_picture(self, found: dict[str, Any], asked: dict[str, Any], words: str, compared: object) -> None:
         self._picture.show(found, asked["gains"])
@@ -247,8 +247,8 @@ class _Screen:
         rows = {"since the devices were opened": f"{dose['bench_lux_h']:.4f} lux h"}
         if dose["total_lux_h"] is not None:
             rows["on the object in its life"] = f"{dose['total_lux_h']:.3f} lux h"
-            left = dose["left_lux_h"]
-            rows["left of its budget"] = "no budget is set" if left is None else f"{left:.4f} lux h"
+            left_lux_h = dose["left_lux_h"]
+            rows["left of its budget"] = "no budget is set" if left_lux_h is None else f"{left_lux_h:.4f} lux h"
         else:
             rows["object"] = "none; counted at the support's centre"
         if dose["warning"]:
@@ -266,9 +266,11 @@ def why_live_ends(*, watched: bool, untouched_s: float, stopped: bool) -> str:
 
 
 def _white_words(gains: list[float], region: dict[str, Any] | None, white: list[float] | None) -> str:
-    shown = "R, G, B times " + ", ".join(f"{gain:.3f}" for gain in gains)
+    gain_words = "R, G, B times " + ", ".join(f"{gain:.3f}" for gain in gains)
     if region is None:
-        return f"{shown}. Draw a region on something neutral for another white point."
+        return f"{gain_words}. Draw a region on something neutral for another white point."
     return (
-        shown if white else f"{shown}. The region gives no white point: it is clipped, too dark or has no colours."
+        gain_words
+        if white
+        else f"{gain_words}. The region gives no white point: it is clipped, too dark or has no colours."
     )

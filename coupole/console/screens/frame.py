@@ -113,9 +113,11 @@ def _buttons(visit: Visit) -> None:
         entry = next((entry for entry in now.queue if entry.state == "running"), None)
         if now.run:
             run = now.run
-            said = await visit.act(f"stop {run}", lambda: visit.service.acquisitions.tell(run, "stop"), acts=False)
-            if said is not None:
-                trouble = said.get("trouble") or []
+            answer = await visit.act(
+                f"stop {run}", lambda: visit.service.acquisitions.tell(run, "stop"), acts=False
+            )
+            if answer is not None:
+                trouble = answer.get("trouble") or []
                 words = "; ".join(trouble) or "stopped: lights off, arm told to stop, camera disarmed"
                 visit.say(words, bad=bool(trouble))
         elif entry is not None:
@@ -131,9 +133,9 @@ def _buttons(visit: Visit) -> None:
     stopping.tooltip(NO_EMERGENCY_STOP)
 
     def show(now: StateNow) -> None:
-        held = now.state in ("paused", "pausing")
-        pausing.set_text("Go on" if held else "Pause")
-        pausing.props(f"icon={'play_arrow' if held else 'pause'}")
+        is_paused = now.state in ("paused", "pausing")
+        pausing.set_text("Go on" if is_paused else "Pause")
+        pausing.props(f"icon={'play_arrow' if is_paused else 'pause'}")
         pausing.set_enabled(visit.may_act and now.run is not None and now.state in _LIVE)
         stopping.set_enabled(visit.may_act and can_be_stopped(now))
 
@@ -160,9 +162,9 @@ def light_words(now: StateNow) -> str:
 
 async def stop_bench(visit: Visit) -> None:
     """Stop what the open devices do."""
-    said = await visit.act("stop the devices", visit.service.bench.stop, acts=False)
-    if said is not None:
-        visit.say("; ".join(said) or "stopped: lights off, arm told to stop", bad=bool(said))
+    troubles = await visit.act("stop the devices", visit.service.bench.stop, acts=False)
+    if troubles is not None:
+        visit.say("; ".join(troubles) or "stopped: lights off, arm told to stop", bad=bool(troubles))
 
 
 def _person(visit: Visit) -> None:
@@ -175,7 +177,7 @@ def _person(visit: Visit) -> None:
         ui.column().classes("menu"),
     ):
         ui.label(f"{account.name}, {account.role.word}")
-        who = ui.label()
+        control_label = ui.label()
         ui.label(NO_EMERGENCY_STOP).classes("small")
         control = visit.service.control
 
@@ -191,13 +193,13 @@ def _person(visit: Visit) -> None:
         button("Sign out", lambda: _sign_out(visit), name="sign-out", kind="flat")
 
         def show(now: StateNow) -> None:
-            mine = now.in_control == account.name
-            who.text = ("you are in control" if mine else f"in control: {now.in_control or 'nobody'}") + (
-                f"; asked by {now.asked_by}" if now.asked_by else ""
-            )
-            taking.set_visibility(not mine and visit.may_act)
+            has_control = now.in_control == account.name
+            control_label.text = (
+                "you are in control" if has_control else f"in control: {now.in_control or 'nobody'}"
+            ) + (f"; asked by {now.asked_by}" if now.asked_by else "")
+            taking.set_visibility(not has_control and visit.may_act)
             taking.set_text("Ask for control" if now.in_control and not visit.is_engineer else "Take control")
-            giving.set_visibility(mine)
+            giving.set_visibility(has_control)
             giving.set_text(f"Give control to {now.asked_by}" if now.asked_by else "Give control up")
 
         visit.follow(show)

@@ -50,8 +50,8 @@ class LedChooser:
             leds = self.leds
         except InputError:
             leds = []
-        chosen = [one for one in leds if one != led] if led in leds else [*leds, led]
-        self._field.set_value(", ".join(map(str, chosen)))
+        chosen_leds = [other_led for other_led in leds if other_led != led] if led in leds else [*leds, led]
+        self._field.set_value(", ".join(map(str, chosen_leds)))
 
     def _typed(self) -> None:
         self._draw()

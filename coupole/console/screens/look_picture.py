@@ -64,29 +64,31 @@ class LookPicture:
             return
         x, y, width, height = self._region or (0, 0, *self._size_px)
         middle = at_px or (x + width // 2, y + height // 2)
-        shown = [min(loupe, size) for loupe, size in zip(_LOUPE_PX, self._size_px, strict=True)]
+        part_px = [min(loupe, size) for loupe, size in zip(_LOUPE_PX, self._size_px, strict=True)]
         corner = [
             max(0, min(size - part, at - part // 2))
-            for at, part, size in zip(middle, shown, self._size_px, strict=True)
+            for at, part, size in zip(middle, part_px, self._size_px, strict=True)
         ]
         try:
-            found = await in_thread(self._bench.ask, "loupe", region=[*corner, *shown], gains=list(self._gains))
+            picture = await in_thread(
+                self._bench.ask, "loupe", region=[*corner, *part_px], gains=list(self._gains)
+            )
         except CoupoleError as error:
             self._visit.say(str(error), bad=True)
             return
-        left, top, width, height = found["region"]
-        source = f"/api/v1/bench/pictures/loupe.png?{found['number']}-{left}-{top}"
+        left_px, top, width, height = picture["region"]
+        source = f"/api/v1/bench/pictures/loupe.png?{picture['number']}-{left_px}-{top}"
         self._loupe.set_content(
-            f'<img src="{source}" alt="loupe into picture {found["number"]} at {left}, {top}">'
-            f'<p class="hint">{width} x {height} px of picture {found["number"]}, from {left}, {top}</p>'
+            f'<img src="{source}" alt="loupe into picture {picture["number"]} at {left_px}, {top}">'
+            f'<p class="hint">{width} x {height} px of picture {picture["number"]}, from {left_px}, {top}</p>'
         )
 
     async def _picked(self, event: events.GenericEventArguments) -> None:
-        picked = event.args
-        if "region" in picked:
-            self._on_region([int(value) for value in picked["region"]])
+        selection = event.args
+        if "region" in selection:
+            self._on_region([int(value) for value in selection["region"]])
         else:
-            await self.loupe([int(value) for value in picked["point"]])
+            await self.loupe([int(value) for value in selection["point"]])
 
     def _draw(self) -> None:
         width, height = self._size_px

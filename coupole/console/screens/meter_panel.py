@@ -30,17 +30,17 @@ class MeterPanel:
     def show(self, work: dict[str, Any]) -> None:
         """The bench's last work."""
         plan, may = self._bench.plan, self._visit.may_act
-        known = work, plan, may
-        if known == self._shown:
+        state = work, plan, may
+        if state == self._shown:
             return
-        self._shown = known
+        self._shown = state
         metering = work.get("kind") == "meter"
-        runs, done = work.get("state") == "running", metering and work.get("state") == "done"
-        self._exposures_us = _exposures_us(work["exposure"]) if done else ()
+        runs, is_done = work.get("state") == "running", metering and work.get("state") == "done"
+        self._exposures_us = _exposures_us(work["exposure"]) if is_done else ()
         self._words.text = self._words_of(work) if metering else _IDLE if plan else _NO_PLAN
-        self._result.set_content(_advice(work) if done else "")
+        self._result.set_content(_advice(work) if is_done else "")
         self._meter.set_enabled(may and bool(plan) and not runs)
-        self._put.set_visibility(done and bool(plan))
+        self._put.set_visibility(is_done and bool(plan))
         self._put.set_enabled(may)
 
     def _words_of(self, work: dict[str, Any]) -> str:
@@ -66,8 +66,10 @@ class MeterPanel:
             fields = replace(fields_of(path, text), exposures_us=exposures_us)
             return plans.write(name, text_with(path, text, fields), text)
 
-        said = ", ".join(f"{one / 1000:g} ms" for one in exposures_us)
-        await self._visit.act(f"exposure of {name}: {said}", keep, acts=False, done=f"{name} has {said} now")
+        exposure_words = ", ".join(f"{exposure_us / 1000:g} ms" for exposure_us in exposures_us)
+        await self._visit.act(
+            f"exposure of {name}: {exposure_words}", keep, acts=False, done=f"{name} has {exposure_words} now"
+        )
 
 
 _IDLE = (
@@ -84,12 +86,12 @@ def _exposures_us(exposure: dict[str, Any]) -> tuple[int, ...]:
 
 
 def _advice(work: dict[str, Any]) -> str:
-    said = ", ".join(f"{one / 1000:g} ms" for one in _exposures_us(work["exposure"]))
-    rows = {"exposure": said}
-    for name, seen in work["views"].items():
+    exposure_words = ", ".join(f"{exposure_us / 1000:g} ms" for exposure_us in _exposures_us(work["exposure"]))
+    rows = {"exposure": exposure_words}
+    for name, view in work["views"].items():
         rows[f"view {name}"] = (
-            f"at least {seen['shortest_us'] / 1000:.2f} ms, at most {seen['longest_us'] / 1000:.2f} ms; object on "
-            f"{seen['object_share']:.0%} of the picture"
+            f"at least {view['shortest_us'] / 1000:.2f} ms, at most {view['longest_us'] / 1000:.2f} ms; object on "
+            f"{view['object_share']:.0%} of the picture"
         )
     remarks = "".join(f'<p class="warm small">{html.escape(remark)}</p>' for remark in work["remarks"])
     return facts_html(rows) + remarks

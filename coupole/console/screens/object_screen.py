@@ -54,7 +54,7 @@ class _Screen:
             self._sums.set_content("<p>No plan, run or ledger names an object yet.</p>")
             return
         here = self._visit.now.object
-        self._chooser.set_options({one: one for one in ids}, here if here in ids else "")
+        self._chooser.set_options({object_id: object_id for object_id in ids}, here if here in ids else "")
         await self._show()
 
     async def _show(self) -> None:
@@ -68,21 +68,23 @@ class _Screen:
         except CoupoleError as error:
             self._visit.say(str(error), bad=True)
             return
-        strictest = min((one.budget_lux_h for one in plans if one.budget_lux_h is not None), default=None)
+        strictest = min(
+            (named_by.budget_lux_h for named_by in plans if named_by.budget_lux_h is not None), default=None
+        )
         self._show_light(history, strictest, similar)
         operators = {row.name: row.operator for row in runs}
         self._runs.set_content(_light_table(history, operators))
         self._show_photograph(object_id, there=photograph is not None)
-        with_mesh = [one.plan for one in plans if one.mesh]
+        with_mesh = [named_by.plan for named_by in plans if named_by.mesh]
         self._plans.set_options({name: name for name in with_mesh})
         await self._draw()
 
     def _show_light(self, history: History, plans_budget: float | None, similar: list[str]) -> None:
         total, budget = history.total_lux_h, history.budget_lux_h
         figures = {"in its life": f"{total:.3f} lux h"}
-        for one in history.budgets[-1:]:
-            because = f" ({one.reason})" if one.reason else ""
-            figures["it may receive"] = f"{one.dose_lux_h:g} lux h, by {one.name}{because}"
+        for newest_budget in history.budgets[-1:]:
+            because = f" ({newest_budget.reason})" if newest_budget.reason else ""
+            figures["it may receive"] = f"{newest_budget.dose_lux_h:g} lux h, by {newest_budget.name}{because}"
         if plans_budget is not None and (budget is None or plans_budget < budget):
             budget = plans_budget
             figures["by the strictest of its plans"] = f"{budget:g} lux h"
@@ -92,14 +94,14 @@ class _Screen:
             figures["of which at most"] = f"{history.unsettled_lux_h:.3f} lux h: how a burst ended is not known"
         if history.of_unknown_spectrum_lux_h < total:
             figures["damaging, 300 to 780 nm"] = f"{1e3 * history.damage_wh_m2:.4f} mW h/m2 weighted"
-        said = facts_html(figures)
+        light_html = facts_html(figures)
         if self._visit.now.simulated:
-            said += '<p class="hint">Light of a simulated cell is none: its runs enter nothing here.</p>'
-        for other in similar:
-            said += f'<p class="warm">There is also an object {html.escape(other)}: is it the same?</p>'
+            light_html += '<p class="hint">Light of a simulated cell is none: its runs enter nothing here.</p>'
+        for other_id in similar:
+            light_html += f'<p class="warm">There is also an object {html.escape(other_id)}: is it the same?</p>'
         if history.unreadable:
-            said += f'<p class="bad">{history.unreadable} lines of the ledger cannot be read.</p>'
-        self._sums.set_content(said)
+            light_html += f'<p class="bad">{history.unreadable} lines of the ledger cannot be read.</p>'
+        self._sums.set_content(light_html)
         self._bar.set_visibility(budget is not None)
         self._bar.set_value(min(1.0, total / budget) if budget else 0.0)
 
@@ -112,18 +114,18 @@ class _Screen:
 
             async def enter() -> None:
                 object_id, account = self._chooser.value, self._visit.account
-                said = f"{note.value or ''}".strip()
+                note_text = f"{note.value or ''}".strip()
                 by = f" (entered by {account.name})" if account else ""
                 dose = float(amount.value) if amount.value else math.nan
 
                 def do() -> bool:
-                    if not said:
+                    if not note_text:
                         raise InputError("expected what that light was")
-                    self._objects.enter_light(object_id, dose, said + by)
+                    self._objects.enter_light(object_id, dose, note_text + by)
                     return True
 
                 if await self._visit.act(
-                    f"dose {object_id}: {dose:g} lux h, {said}", do, acts=False, done="entered"
+                    f"dose {object_id}: {dose:g} lux h, {note_text}", do, acts=False, done="entered"
                 ):
                     amount.set_value(None)
                     note.set_value("")
@@ -138,16 +140,16 @@ class _Screen:
 
             async def enter() -> None:
                 object_id, account = self._chooser.value, self._visit.account
-                said, budget = f"{reason.value or ''}".strip(), amount.value
+                reason_text, budget = f"{reason.value or ''}".strip(), amount.value
 
                 def do() -> bool:
                     if account is None or budget is None:
                         raise InputError("expected how many lux hours")
-                    self._objects.set_budget(object_id, float(budget), account.name, said)
+                    self._objects.set_budget(object_id, float(budget), account.name, reason_text)
                     return True
 
                 if await self._visit.act(
-                    f"budget {object_id}: {budget} lux h, {said}", do, acts=False, done="the budget is set"
+                    f"budget {object_id}: {budget} lux h, {reason_text}", do, acts=False, done="the budget is set"
                 ):
                     amount.set_value(None)
                     reason.set_value("")

@@ -24,8 +24,8 @@ def button(
     kind: Literal["main", "quiet", "flat", "stop"] = "quiet",
 ) -> ui.button:
     """Build a button with one of the four looks; `name` is its `data-name` in the page."""
-    made = ui.button(words, icon=icon, on_click=on_click, color=None)
-    return named(made.classes(f"b-{kind}").props("unelevated no-caps"), name)
+    element = ui.button(words, icon=icon, on_click=on_click, color=None)
+    return named(element.classes(f"b-{kind}").props("unelevated no-caps"), name)
 
 
 def named(element: E, name: str) -> E:
@@ -72,7 +72,7 @@ def table_html(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
             return f'<td class="{kind}">{html.escape(rest)}</td>'
         return f"<td>{html.escape(words)}</td>"
 
-    heads = "".join(f'<th scope="col">{html.escape(one)}</th>' for one in head)
+    heads = "".join(f'<th scope="col">{html.escape(title)}</th>' for title in head)
     body = "".join(f"<tr>{''.join(map(cell, row))}</tr>" for row in rows)
     return (
         '<div class="wide" tabindex="0" role="region" aria-label="table"><table class="plain">'
@@ -82,8 +82,8 @@ def table_html(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def picture_address(run: str, shot: str, width_px: int, *, saturation: bool = False) -> str:
     """Return the address at which the interface serves a shot's picture."""
-    marked = "&saturation=true" if saturation else ""
-    return f"/api/v1/runs/{quote(run)}/picture?shot={quote(shot, safe='')}&width={width_px}{marked}"
+    saturation_query = "&saturation=true" if saturation else ""
+    return f"/api/v1/runs/{quote(run)}/picture?shot={quote(shot, safe='')}&width={width_px}{saturation_query}"
 
 
 def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
@@ -122,9 +122,9 @@ async def sure(title: str, words: str, yes: str) -> bool:
         with ui.row():
             button(yes, lambda: dialog.submit(True), name="yes", kind="main")
             button("Cancel", lambda: dialog.submit(False), name="cancel")
-    said = await dialog
+    answer = await dialog
     dialog.delete()
-    return bool(said)
+    return bool(answer)
 
 
 def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
@@ -161,9 +161,9 @@ class Choice:
         """Others; nobody is told."""
         self._options, self.value = dict(options), value or next(iter(options), "")
         inner = "".join(
-            f'<option value="{html.escape(one)}"{" selected" if one == self.value else ""}>{html.escape(words)}'
+            f'<option value="{html.escape(key)}"{" selected" if key == self.value else ""}>{html.escape(words)}'
             "</option>"
-            for one, words in self._options.items()
+            for key, words in self._options.items()
         )
         words = html.escape(self._words)
         self._box.set_content(

@@ -56,14 +56,14 @@ class PeoplePanel:
     async def _add(self) -> None:
         accounts, name, role = self._visit.service.accounts, self._name.value.strip(), Role.of(self._role.value)
         password, self._password.value = self._password.value, ""
-        made = await self._visit.act(
+        account = await self._visit.act(
             f"add account {name} ({role.word})",
             lambda: accounts.add(name, password, role),
             role=Role.ENGINEER,
             acts=False,
             done=f"{name} may sign in",
         )
-        if made is not None:
+        if account is not None:
             self._name.value = ""
         self._show()
 

@@ -75,15 +75,15 @@ class PictureSettings:
     @property
     def light_words(self) -> str:
         """Light and exposure in words, for the log and for people."""
-        asked = self.request()
-        lights = [*(f"LED {led}" for led in asked["lights"]), *(f"panel {one}" for one in asked["panels"])]
-        return f"{', '.join(lights) or 'no light'}, {asked['exposure_us'] / 1000:g} ms"
+        request = self.request()
+        lights = [*(f"LED {led}" for led in request["lights"]), *(f"panel {panel}" for panel in request["panels"])]
+        return f"{', '.join(lights) or 'no light'}, {request['exposure_us'] / 1000:g} ms"
 
     @property
     def compared(self) -> object:
         """Sharpness is comparable as long as this stays the same."""
-        asked = self.request()
-        return asked["lights"], asked["panels"], asked["region"]
+        request = self.request()
+        return request["lights"], request["panels"], request["region"]
 
     def request(self) -> dict[str, Any]:
         """Fields of a `frame`. Raises InputError."""

@@ -101,23 +101,23 @@ class _Screen:
         if not await dialog:
             return
         visit, plans = self._visit, self._plans
-        made = await visit.act(
+        new_name = await visit.act(
             f"new plan {name.value}", lambda: plans.create(str(name.value or ""), kind.value), acts=False
         )
-        if made is not None:
+        if new_name is not None:
             names = await in_thread(plans.names)
-            self._chooser.set_options({name: name for name in names}, made)
+            self._chooser.set_options({name: name for name in names}, new_name)
             await self._chosen()
 
     async def _save_plan(self) -> bool:
-        name, text, saved = self._name, self._text, self._saved
-        done = await self._visit.act(
-            f"save plan {name}", lambda: self._plans.write(name, text, saved), acts=False, done="saved"
+        name, text, text_before = self._name, self._text, self._saved
+        is_saved = await self._visit.act(
+            f"save plan {name}", lambda: self._plans.write(name, text, text_before), acts=False, done="saved"
         )
-        if done:
+        if is_saved:
             self._saved = text
             self._state(self._visit.now)
-        return bool(done)
+        return bool(is_saved)
 
     async def _enter_plan(self) -> None:
         if self._text != self._saved and not await self._save_plan():
@@ -173,15 +173,15 @@ class _Screen:
         for field in (self._distance, self._elevations, self._azimuths):
             field.set_enabled(not fields.own_views)
         self._every.set_enabled(not fields.own_lights)
-        said = [
+        remarks = [
             words
-            for own, words in (
+            for is_own, words in (
                 (fields.own_views, "the views are as the YAML has them"),
                 (fields.own_lights, "the lights are as the YAML has them"),
             )
-            if own
+            if is_own
         ]
-        self._form_says.set_text("; ".join(said))
+        self._form_says.set_text("; ".join(remarks))
         self._filling = False
 
     def _filled_fields(self) -> PlanFields:
@@ -270,13 +270,13 @@ class _Screen:
                 return
             self._verdict.set_content('<p class="hint">checking</p>')
             try:
-                found = await self._visit.service.desk.check(
+                verdict = await self._visit.service.desk.check(
                     Draft(self._plans.path(self._name), self._text), lambda: turn == self._turn
                 )
             except InputError as error:
-                found = Checked(problems=(Problem(self._name, 0, 0, "", str(error)),))
-            if found is not None and turn == self._turn:
-                self._show_checked(found)
+                verdict = Checked(problems=(Problem(self._name, 0, 0, "", str(error)),))
+            if verdict is not None and turn == self._turn:
+                self._show_checked(verdict)
 
         in_background(check)
 
@@ -287,28 +287,31 @@ class _Screen:
             self._views.set_content("")
             return
         report = found.report
-        said = "".join(f'<p class="bad">refused: {html.escape(words)}</p>' for words in report["refusals"])
-        said = (
-            said or '<p class="good">The plan can be run (paths and collisions are checked when it is drawn, and '
+        verdict_html = "".join(f'<p class="bad">refused: {html.escape(words)}</p>' for words in report["refusals"])
+        verdict_html = (
+            verdict_html
+            or '<p class="good">The plan can be run (paths and collisions are checked when it is drawn, and '
         )
-        said += "" if report["refusals"] else "before it begins).</p>"
-        said += "".join(f'<p class="warm">{html.escape(words)}</p>' for words in report["warnings"])
-        self._verdict.set_content(said + facts_html(figures_of(found)))
+        verdict_html += "" if report["refusals"] else "before it begins).</p>"
+        verdict_html += "".join(f'<p class="warm">{html.escape(words)}</p>' for words in report["warnings"])
+        self._verdict.set_content(verdict_html + facts_html(figures_of(found)))
         self._views.set_content(view_table(found))
 
     def _show_problems(self, problems: Sequence[Problem]) -> None:
         lines = self._text.splitlines()
-        own = str(self._plans.path(self._name)) if self._name else ""
+        plan_path = str(self._plans.path(self._name)) if self._name else ""
         rows = []
-        for one in problems:
-            here = one.file == own and 0 < one.line <= len(lines)
-            place = f"line {one.line}" if here else Path(one.file).name
-            said = f"{one.key}: {one.message}" if one.key else one.message
-            excerpt = f"<code>{html.escape(lines[one.line - 1].strip())}</code>" if here else ""
-            rows.append(f'<li><b class="bad">{html.escape(place)}</b> {html.escape(said)} {excerpt}</li>')
+        for problem in problems:
+            here = problem.file == plan_path and 0 < problem.line <= len(lines)
+            place = f"line {problem.line}" if here else Path(problem.file).name
+            message = f"{problem.key}: {problem.message}" if problem.key else problem.message
+            excerpt = f"<code>{html.escape(lines[problem.line - 1].strip())}</code>" if here else ""
+            rows.append(f'<li><b class="bad">{html.escape(place)}</b> {html.escape(message)} {excerpt}</li>')
         self._problems.set_content(f'<ul class="problems">{"".join(rows)}</ul>' if rows else "")
         self._editor.line_tooltips = {
-            one.line: one.message for one in problems if one.file == own and 0 < one.line <= len(lines)
+            problem.line: problem.message
+            for problem in problems
+            if problem.file == plan_path and 0 < problem.line <= len(lines)
         }
         self._editor.decorations = [
             {"kind": "line", "line": line, "class": "wrong-line"} for line in self._editor.line_tooltips
@@ -354,12 +357,12 @@ def _joined(values: Sequence[float]) -> str:
 def _numbers(text: str | None, what: str) -> list[float]:
     """Raises InputError."""
     try:
-        found = [float(word) for word in str(text or "").replace(",", " ").split()]
+        numbers = [float(word) for word in str(text or "").replace(",", " ").split()]
     except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
         raise InputError(f"{what}: expected numbers, with commas between; found {text!r}")
-    return found
+    return numbers
 
 
 def _tidy(value: float) -> float:

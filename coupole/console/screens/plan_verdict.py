@@ -27,22 +27,24 @@ def figures_of(found: Checked) -> dict[str, str]:
         )
         or "not known: press Meter in Focus",
     }
-    if (placed := report["object"]) is not None:
-        sides = zip(placed["low_mm"], placed["high_mm"], strict=True)
+    if (placement := report["object"]) is not None:
+        sides = zip(placement["low_mm"], placement["high_mm"], strict=True)
         figures["object"] = " x ".join(f"{high - low:.0f}" for low, high in sides) + " mm"
-        lowest = placed["lowest_over_disk_mm"]
+        lowest = placement["lowest_over_disk_mm"]
         figures["it stands"] = "beside the disk" if lowest is None else f"{lowest:.1f} mm above the disk"
     return figures
 
 
 def view_table(found: Checked) -> str:
     """A line for each view, in the order of the visits."""
-    framed = {one["view"]: one for one in (found.report["object"] or {}).get("views", [])}
+    framing_of_view = {
+        view_framing["view"]: view_framing for view_framing in (found.report["object"] or {}).get("views", [])
+    }
     rows = []
     for view in found.views:
-        seen = framed.get(view["name"])
-        field = "-" if seen is None else f"{seen['in_field']:.0%}"
-        sharp = "-" if seen is None or seen["in_focus"] is None else f"{seen['in_focus']:.0%}"
+        framing = framing_of_view.get(view["name"])
+        field = "-" if framing is None else f"{framing['in_field']:.0%}"
+        sharp = "-" if framing is None or framing["in_focus"] is None else f"{framing['in_focus']:.0%}"
         times = duration_text(view["duration_s"]), f"{view['dose_lux_h']:.3f}"
         rows.append((view["name"], *times, _judged(field), _judged(sharp)))
     return table_html(("view", "time", "lux h", "object in field", "of it sharp"), rows)

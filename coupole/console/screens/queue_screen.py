@@ -81,10 +81,10 @@ class _Screen:
         self._halted.set_visibility(bool(now.halted))
         self._checked.text = f"Preflight of {now.checking}"
         self._checking.set_visibility(bool(now.checking))
-        known = (now.halted, tuple(now.queue), self._visit.may_act)
-        if known == self._shown:
+        state = (now.halted, tuple(now.queue), self._visit.may_act)
+        if state == self._shown:
             return
-        self._shown = known
+        self._shown = state
         waiting = [entry for entry in now.queue if entry.state == "waiting"]
         self._rows.clear()
         with self._rows:
@@ -97,10 +97,10 @@ class _Screen:
         self._sum.text = _sum_of(waiting)
         self._ended.clear()
         with self._ended:
-            ended = [one for one in reversed(now.queue) if one.state in _KINDS]
-            for entry in ended[:_ENDED_SHOWN]:
+            ended_entries = [ended_entry for ended_entry in reversed(now.queue) if ended_entry.state in _KINDS]
+            for entry in ended_entries[:_ENDED_SHOWN]:
                 self._row(entry, entry.state)
-            if not ended:
+            if not ended_entries:
                 ui.label("None yet.").classes("hint").props("role=listitem")
 
     def _row(self, entry: EntryNow, state: str, waiting: list[EntryNow] | None = None, number: int = 0) -> None:
@@ -132,8 +132,8 @@ class _Screen:
             ("arrow_downward", "later", down, number + 1 < len(waiting)),
             ("delete_outline", "take out", lambda: self._take_out(entry), True),
         ):
-            made = button("", do, icon=icon, name=words.replace(" ", "-"), kind="flat")
-            labelled(made, f"{words}: {entry.words[:80]}").props("dense").set_enabled(possible)
+            move_button = button("", do, icon=icon, name=words.replace(" ", "-"), kind="flat")
+            labelled(move_button, f"{words}: {entry.words[:80]}").props("dense").set_enabled(possible)
 
 
 def _named(entry: EntryNow) -> str:
@@ -168,7 +168,7 @@ def _sum_of(waiting: list[EntryNow]) -> str:
     needs = [entry.needs for entry in waiting if entry.needs is not None]
     if not needs:
         return ""
-    seconds = sum(one.preparation_s + one.duration_s for one in needs)
-    light = sum(one.dose_lux_h for one in needs)
-    size = sum(one.bytes for one in needs)
+    seconds = sum(entry_needs.preparation_s + entry_needs.duration_s for entry_needs in needs)
+    light = sum(entry_needs.dose_lux_h for entry_needs in needs)
+    size = sum(entry_needs.bytes for entry_needs in needs)
     return f"all that waits: {duration_text(seconds)}, {bytes_text(size)}, {light:.3f} lux h"

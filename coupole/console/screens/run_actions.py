@@ -46,8 +46,8 @@ class RunActions:
                 ("Reflectance …", "lens_blur", self._reflectance),
                 ("Show", "3d_rotation", self._show),
             ):
-                made = button(words, do, name=words.split()[0].lower(), icon=icon)
-                made.set_enabled(visit.may_act)
+                action_button = button(words, do, name=words.split()[0].lower(), icon=icon)
+                action_button.set_enabled(visit.may_act)
         if not visit.may_act:
             ui.label("Operators at this machine may do these.").classes("hint")
         self._links = ui.row().classes("links")
@@ -64,12 +64,12 @@ class RunActions:
         self._there = there
         self._links.clear()
         with self._links:
-            for is_there, words, what in zip(
+            for is_there, words, page_name in zip(
                 there, ("Open the report", "README", "Open the page to look at"), ("report", "readme", "look"),
                 strict=True,
             ):  # fmt: skip
                 if is_there:
-                    link(words, f"/api/v1/runs/{self._name}/{what}", name=f"open-{what}")
+                    link(words, f"/api/v1/runs/{self._name}/{page_name}", name=f"open-{page_name}")
 
     async def _begin(
         self, what: str, command: Sequence[str | Path], then: Callable[[Task], object] = lambda _: None

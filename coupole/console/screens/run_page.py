@@ -61,13 +61,13 @@ def build(visit: Visit, name: str) -> None:
 
     async def fill() -> None:
         try:
-            known = await in_thread(_read, visit.service, name)
+            run_facts = await in_thread(_read, visit.service, name)
         except CoupoleError as error:
             waiting.set_text(str(error))
             return
         waiting.delete()
         with box:
-            page = _Page(visit, known)
+            page = _Page(visit, run_facts)
         await page.choose()
 
     ui.timer(0.01, fill, once=True)
@@ -75,9 +75,9 @@ def build(visit: Visit, name: str) -> None:
 
 def _read(service: Service, name: str) -> _Known:
     run = service.runs.run(name)
-    happened = [(event.t, words) for event in journal.read(run.journal_path) if (words := words_of(event))]
+    events = [(event.t, words) for event in journal.read(run.journal_path) if (words := words_of(event))]
     row = service.runs.row(name)
-    return _Known(run, row, service.runs.status(name), led_places(service.sheets, name), happened[::-1])
+    return _Known(run, row, service.runs.status(name), led_places(service.sheets, name), events[::-1])
 
 
 class _Page:
@@ -126,12 +126,13 @@ class _Page:
 
     def _told(self, row: RunRow) -> dict[str, str]:
         status = self._known.status
-        left, duration_s = row.frames - row.proven, sum(session.duration_s for session in status.sessions)
+        missing_count, duration_s = row.frames - row.proven, sum(session.duration_s for session in status.sessions)
         return {
             "object": row.object or "not named",
             "begun": f"{moment(row.created)} UTC by {row.operator or 'nobody named'}",
             "took": f"{duration_text(duration_s)} in {count(len(status.sessions), 'session')}",
-            "frames": f"{row.proven} of {row.frames} proven" + (f", {left} are missing" if left else ""),
+            "frames": f"{row.proven} of {row.frames} proven"
+            + (f", {missing_count} are missing" if missing_count else ""),
             "taken again": f"{status.reshot} shots",
             "light on the object": f"{status.dose_lux_h:.3f} lux h",
             "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
@@ -150,19 +151,19 @@ class _Page:
     async def _retake(self) -> None:
         """A new plan with this view alone, as it was; in the queue."""
         service, view, run = self._visit.service, self._view.value, self._known.run
-        made = await self._visit.act(
+        plan_name = await self._visit.act(
             f"plan for {view} again", lambda: service.plan_files.retake(run, view), acts=False
         )
-        if made is not None:
-            await enter(self._visit, NewEntry(plan=made), made)
+        if plan_name is not None:
+            await enter(self._visit, NewEntry(plan=plan_name), plan_name)
 
     def _foot(self) -> None:
-        run, status, happened = self._known.run, self._known.status, self._known.events
+        run, status, events = self._known.run, self._known.status, self._known.events
         with panel("What happened"):
-            lines = [(moment(t) + t[16:19], words) for t, words in happened[:_EVENTS_SHOWN]]
+            lines = [(moment(t) + t[16:19], words) for t, words in events[:_EVENTS_SHOWN]]
             named(ui.html(table_html(("UTC", "what"), lines), sanitize=False), "events").style("width:100%")
-            if len(happened) > _EVENTS_SHOWN:
-                ui.label(f"The newest {_EVENTS_SHOWN} of {len(happened)}; all are in the report.").classes("hint")
+            if len(events) > _EVENTS_SHOWN:
+                ui.label(f"The newest {_EVENTS_SHOWN} of {len(events)}; all are in the report.").classes("hint")
             with ui.expansion("Numbers").classes("printed"):
                 facts(_numbers(run.about, status, str(run.folder)))
 
@@ -187,11 +188,11 @@ class _Page:
         self._frames = [frame for frame in of_view if str(frame.exposure) == self._exposure.value]
         self._sheet.show(self._frames)
         lit = self._lit()
-        known = await in_thread(self._visit.service.sheets.known_means, self._name, lit)
-        self._dome.show(self._known.places, self._frames, known)
+        means = await in_thread(self._visit.service.sheets.known_means, self._name, lit)
+        self._dome.show(self._known.places, self._frames, means)
         if self._frames:
             await self._pick(self._frames[len(lit) // 2].shot)
-        unread = len(lit) - len(known)
+        unread = len(lit) - len(means)
         bytes_unread = unread * self._known.row.bytes / max(1, self._known.row.proven)
         asks = bytes_unread > _READ_UNASKED_BYTES
         self._read_means.set_visibility(asks)
@@ -204,16 +205,19 @@ class _Page:
 
     async def _fill_means(self) -> None:
         """Read what is not known yet, and colour the dome."""
-        lit, frames, done = self._lit(), self._frames, [0, 0]
+        lit, frames, progress = self._lit(), self._frames, [0, 0]
         self._read_means.set_visibility(False)
 
         def count() -> None:
-            self._means_words.set_text(f"reading: {done[0]} of {done[1]} frames" if done[1] else "")
+            self._means_words.set_text(f"reading: {progress[0]} of {progress[1]} frames" if progress[1] else "")
 
         counting = ui.timer(0.5, count)
         try:
             means = await in_long_thread(
-                self._visit.service.sheets.means, self._name, lit, lambda *now: done.__setitem__(slice(None), now)
+                self._visit.service.sheets.means,
+                self._name,
+                lit,
+                lambda *now: progress.__setitem__(slice(None), now),
             )
         except CoupoleError as error:
             counting.cancel()
@@ -247,8 +251,8 @@ class _Page:
 
 def _numbers(about: dict[str, Any], status: Status, folder: str) -> dict[str, str]:
     devices = {
-        kind: " ".join(str(one.get(key, "")) for key in ("vendor", "model", "serial", "firmware"))
-        for kind, one in about.get("devices", {}).items()
+        kind: " ".join(str(device.get(key, "")) for key in ("vendor", "model", "serial", "firmware"))
+        for kind, device in about.get("devices", {}).items()
     }
     records = about.get("calibrations")
     records = records if isinstance(records, dict) else {}

@@ -67,11 +67,15 @@ class _Screen:
             f"{waiting} plans wait in the queue."
         )
         self._fault.show(now.arm_fault)
-        ended = [one for one in now.queue if one.state in ("done", "failed", "stopped") and not one.hold]
-        last = ended[-1] if ended else None
-        known = last.model_dump_json() if last else ""
-        if known != self._said:
-            self._said = known
+        ended_entries = [
+            ended_entry
+            for ended_entry in now.queue
+            if ended_entry.state in ("done", "failed", "stopped") and not ended_entry.hold
+        ]
+        last = ended_entries[-1] if ended_entries else None
+        state_text = last.model_dump_json() if last else ""
+        if state_text != self._said:
+            self._said = state_text
             self._show_last(last)
 
     def _show_last(self, last: EntryNow | None) -> None:
@@ -82,16 +86,16 @@ class _Screen:
         run, visit = Path(last.run).name, self._visit
 
         async def resume() -> None:
-            halted = visit.now.halted
+            halt_reason = visit.now.halted
             resuming.set_enabled(False)
-            first = next((one.id for one in visit.now.queue if one.state == "waiting"), "")
+            first = next((entry.id for entry in visit.now.queue if entry.state == "waiting"), "")
             if await enter(visit, NewEntry(resume=run, before=first), f"the rest of {run}"):
-                await visit.act("go on with the queue", lambda: visit.service.queue.go_on(halted))
+                await visit.act("go on with the queue", lambda: visit.service.queue.go_on(halt_reason))
             resuming.set_enabled(True)
 
         with self._after:
-            ended = {"done": "is complete", "failed": "failed", "stopped": "was stopped"}[last.state]
-            ui.label(f"{run or last.words} {ended}" + (f": {last.said}" if last.said else "."))
+            outcome = {"done": "is complete", "failed": "failed", "stopped": "was stopped"}[last.state]
+            ui.label(f"{run or last.words} {outcome}" + (f": {last.said}" if last.said else "."))
             with ui.row().classes("bar"):
                 if last.state != "done" and run and visit.may_act:
                     resuming = button("Resume it", resume, icon="play_arrow", name="resume", kind="main")
@@ -104,10 +108,10 @@ class _Screen:
             return
         service, name = self._visit.service, now.run
         try:
-            watched = await in_thread(service.watch.of, name)
-            self._show(now, watched)
-            if watched.newest is not None and str(watched.newest.shot) != self._shown:
-                shot = str(watched.newest.shot)
+            watched_run = await in_thread(service.watch.of, name)
+            self._show(now, watched_run)
+            if watched_run.newest is not None and str(watched_run.newest.shot) != self._shown:
+                shot = str(watched_run.newest.shot)
                 frame = await in_thread(service.runs.frame, name, shot)
                 self._show_frame(name, frame)
                 self._shown = shot
@@ -153,12 +157,12 @@ class _Screen:
 
 def _bars(watched: Watched, current: str | None) -> str:
     rows = []
-    for view, proven, expected in watched.views:
-        share = proven / expected if expected else 1.0
+    for view, proven, frame_count in watched.views:
+        share = proven / frame_count if frame_count else 1.0
         mark = ' style="font-weight:650"' if view == current else ""
         rows.append(
             f'<tr><td{mark}>{html.escape(view)}</td><td style="width:60%"><progress max="1" value="{share:.4f}" '
             f'aria-label="{html.escape(view)}" style="width:100%"></progress></td>'
-            f"<td>{proven} of {expected}</td></tr>"
+            f"<td>{proven} of {frame_count}</td></tr>"
         )
     return f'<table class="plain"><tbody>{"".join(rows)}</tbody></table>'

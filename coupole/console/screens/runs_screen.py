@@ -56,10 +56,10 @@ class _Screen:
 
     def _show(self) -> None:
         words = (self._search.value or "").lower().split()
-        found = [row for row in self._rows if all(word in _searched(row) for word in words)]
-        self._count.text = f"{len(found)} of {len(self._rows)} runs" if words else f"{len(found)} runs"
-        self._more.set_visibility(len(found) > self._most)
-        text = _table(found[: self._most]) if found else '<p class="hint">No run is found.</p>'
+        rows = [row for row in self._rows if all(word in _searched(row) for word in words)]
+        self._count.text = f"{len(rows)} of {len(self._rows)} runs" if words else f"{len(rows)} runs"
+        self._more.set_visibility(len(rows) > self._most)
+        text = _table(rows[: self._most]) if rows else '<p class="hint">No run is found.</p>'
         if text != self._shown:
             self._shown = text
             self._table.set_content(text)
@@ -101,14 +101,15 @@ def _row(row: RunRow) -> str:
     )
     about = " · ".join(html.escape(words) for words in (row.object, moment(row.created), row.operator) if words)
     share = f"{row.proven} of {row.frames}" if row.proven != row.frames else str(row.frames)
-    verified = moment(row.verified) if row.verified else "no"
+    verified_at = moment(row.verified) if row.verified else "no"
     return (
         f'<tr><td class="thumbnail">{picture}</td><td class="run"><a href="{page}">{name}</a>'
         f'<div class="hint">{about}</div></td>'
         f'<td><span class="{STATE_KINDS.get(row.state, "")}">{html.escape(row.state)}</span>'
         f"{'' if not row.simulated else ' <span class=hint>simulated</span>'}</td>"
         f'<td data-head="frames">{share}</td><td data-head="size">{bytes_text(row.bytes)}</td>'
-        f'<td data-head="verified">{verified}</td><td data-head="archived">{"yes" if row.archived else "no"}</td>'
+        f'<td data-head="verified">{verified_at}</td>'
+        f'<td data-head="archived">{"yes" if row.archived else "no"}</td>'
         f'<td><button type="button" class="small-button" data-run="{name}" aria-label="actions of {name}">Actions'
         "</button></td></tr>"
     )

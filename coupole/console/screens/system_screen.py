@@ -51,8 +51,10 @@ def _disk(visit: Visit) -> None:
 
 
 def _show_disk(disk: Disk, folder: str) -> None:
-    used = 1 - disk.free / disk.total
-    ui.linear_progress(used, show_value=False).props(f'aria-label="disk, {used:.0%} full"').style("height:.6rem")
+    used_share = 1 - disk.free / disk.total
+    ui.linear_progress(used_share, show_value=False).props(f'aria-label="disk, {used_share:.0%} full"').style(
+        "height:.6rem"
+    )
     few = "; below the reserve" if disk.free < disk.reserve else ""
     facts(
         {
@@ -66,11 +68,11 @@ def _show_disk(disk: Disk, folder: str) -> None:
 
 
 def _versions() -> None:
-    found = versions()
+    version_of = versions()
     with panel("Versions"):
-        facts({name: found[name] for name in _MAIN_VERSIONS if name in found})
+        facts({name: version_of[name] for name in _MAIN_VERSIONS if name in version_of})
         with ui.expansion("All packages").classes("printed"):
-            facts({name: version for name, version in found.items() if name not in _MAIN_VERSIONS})
+            facts({name: version for name, version in version_of.items() if name not in _MAIN_VERSIONS})
 
 
 def _rig(visit: Visit) -> None:
@@ -93,7 +95,7 @@ def _rig(visit: Visit) -> None:
         ).classes("two-columns")
         if lines := to_measure(cell.document.path):
             ui.label(f"{len(lines)} lines of the rig are still to be measured:").classes("warm")
-            rows = [(str(one.line), one.key, one.why) for one in lines]
+            rows = [(str(line.line), line.key, line.why) for line in lines]
             named(ui.html(table_html(("line", "key", "what"), rows), sanitize=False), "measure").style(
                 "width:100%"
             )
@@ -134,16 +136,16 @@ class _Log:
 
 def _cells(line: dict[str, Any]) -> list[str]:
     status = int(line.get("status", 0))
-    asked = f"{line.get('asked', '')} {line.get('about', '')}".strip()
+    action = f"{line.get('asked', '')} {line.get('about', '')}".strip()
     t = str(line.get("t", ""))
     answer = f"good|{status}" if status < 400 else f"bad|{status}"
-    return [moment(t) + t[16:19], str(line.get("name", "")) or "nobody", asked, answer, str(line.get("from", ""))]
+    return [moment(t) + t[16:19], str(line.get("name", "")) or "nobody", action, answer, str(line.get("from", ""))]
 
 
 def _notifications(visit: Visit) -> None:
     with panel("Notifications"):
-        if found := notifications(visit.service.folder):
-            facts(found)
+        if receivers := notifications(visit.service.folder):
+            facts(receivers)
         else:
             ui.label(f"Nobody is told anything: there is no {visit.service.folder / NOTIFICATIONS}.").classes(
                 "hint"

@@ -34,8 +34,8 @@ class TaskList:
     def look(self) -> None:
         """Show what is so now."""
         tasks = [task for task in self._visit.service.tasks.listed if self._wanted(task)][: self._most]
-        for gone in set(self._rows) - {task.id for task in tasks}:
-            self._rows.pop(gone).box.delete()
+        for task_id in set(self._rows) - {task.id for task in tasks}:
+            self._rows.pop(task_id).box.delete()
         for task in reversed(tasks):
             if task.id not in self._rows:
                 with self._box:
@@ -69,10 +69,10 @@ class _Row:
         self._why.text = task.why or (f"in {task.found['out']}" if "out" in task.found else "")
         self._why.classes(add="bad" if task.why else "hint", remove="hint" if task.why else "bad")
         self._why.set_visibility(bool(self._why.text))
-        said = task.said
-        if said != self._shown:
-            self._shown = said
-            self._said.set_content(html.escape(said))
+        output = task.said
+        if output != self._shown:
+            self._shown = output
+            self._said.set_content(html.escape(output))
 
     async def _end(self) -> None:
         await self._visit.act(f"stop {self._task.words}", self._task.stop, role=Role.OPERATOR, acts=False)

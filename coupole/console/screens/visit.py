@@ -80,10 +80,10 @@ class Visit:
                 ui.navigate.to("/")
                 return
             now = self.now
-            known = now.model_dump_json(exclude={"t"})
-            if known == before:
+            state_text = now.model_dump_json(exclude={"t"})
+            if state_text == before:
                 return
-            before = known
+            before = state_text
             for show in self._followers:
                 try:
                     show(now)
@@ -116,7 +116,7 @@ class Visit:
         try:
             self.service.sessions.of(self._secret, script=False)
             self.require(action, role, acts=acts)
-            found = await _in(_URGENT if urgent else _ACTING, do)
+            answer = await _in(_URGENT if urgent else _ACTING, do)
         except NotAllowed as refusal:
             status = refusal.status
             self.say(str(refusal), bad=True)
@@ -134,15 +134,15 @@ class Visit:
             _LOGGING.submit(self.service.audit.note, *line)
         if done:
             self.say(done)
-        return found
+        return answer
 
     def require(self, action: str, role: Role = Role.OPERATOR, *, acts: bool = True) -> None:
         """Raise NotAllowed if this person may not do something at this moment."""
         account = self.account
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
-        if acts and (unwanted := self.service.loop_watch.refusal()):
-            raise NotAllowed(409, f"{action}: {unwanted}")
+        if acts and (refusal := self.service.loop_watch.refusal()):
+            raise NotAllowed(409, f"{action}: {refusal}")
         allow(self.service, account, role, action, acts=acts)
 
     @property

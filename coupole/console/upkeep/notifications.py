@@ -129,14 +129,14 @@ def read_settings(folder: Path) -> Settings | None:
 def ways(settings: Settings) -> Mapping[str, Callable[[Message], None]]:
     """Return the ways by which messages go out, by name; each raises OSError or ValueError if the message did not
     go out, with what the other side said."""
-    found: dict[str, Callable[[Message], None]] = {}
+    senders: dict[str, Callable[[Message], None]] = {}
     if settings.email is not None:
-        found[f"e-mail by {settings.email.server}"] = partial(_mail, settings.email)
+        senders[f"e-mail by {settings.email.server}"] = partial(_mail, settings.email)
     for number, hook in enumerate(settings.webhooks, 1):
-        found[f"webhook {number} at {urlsplit(hook.url).hostname}"] = partial(_post, hook)
+        senders[f"webhook {number} at {urlsplit(hook.url).hostname}"] = partial(_post, hook)
     if settings.desktop:
-        found["desktop"] = _show
-    return found
+        senders["desktop"] = _show
+    return senders
 
 
 def _mail(to: Email, message: Message) -> None:
@@ -155,8 +155,8 @@ def _mail(to: Email, message: Message) -> None:
             server.starttls(context=context)
         if to.user:
             server.login(to.user, to.password)
-        if refused := server.send_message(mail):
-            raise OSError(f"not accepted for {', '.join(refused)}")
+        if refused_addresses := server.send_message(mail):
+            raise OSError(f"not accepted for {', '.join(refused_addresses)}")
 
 
 class _NoRedirect(HTTPRedirectHandler):

@@ -39,11 +39,11 @@ class Occurrences:
             if entry.ended and entry.id not in self._ended:
                 self._ended.add(entry.id)
                 yield self._ending(entry)
-        if (halted := self._queue.halted) != self._halted:
-            self._halted = halted
-            ended = [entry.words for entry in self._queue.entries if entry.ended]
-            if halted and not halted.startswith(tuple(ended)):
-                yield self._message("fault", "the queue has stopped", halted)
+        if (halt_reason := self._queue.halted) != self._halted:
+            self._halted = halt_reason
+            ended_words = [entry.words for entry in self._queue.entries if entry.ended]
+            if halt_reason and not halt_reason.startswith(tuple(ended_words)):
+                yield self._message("fault", "the queue has stopped", halt_reason)
         if (fault := self._newest_fault()) != self._known_fault:
             self._known_fault = fault
             if fault:
@@ -123,20 +123,20 @@ class Notifier:
 
     def _sent(self, message: Message) -> dict[str, str]:
         assert self._settings is not None
-        found = {}
+        error_of_way = {}
         for way, send in ways(self._settings).items():
             for trial in range(_TRIALS):
                 try:
                     send(message)
                 except (OSError, ValueError) as error:
-                    found[way] = f"{way}: {error or type(error).__name__}"
+                    error_of_way[way] = f"{way}: {error or type(error).__name__}"
                     if trial + 1 == _TRIALS or self._ending.wait(_AGAIN_AFTER_S):
                         break
                 else:
-                    found[way] = ""
+                    error_of_way[way] = ""
                     break
-            self._note(message, way, found[way])
-        return found
+            self._note(message, way, error_of_way[way])
+        return error_of_way
 
     def _note(self, message: Message, way: str, trouble: str) -> None:
         line = {"t": utc_now(), "event": message.event, "subject": message.subject, "by": way, "trouble": trouble}
@@ -151,14 +151,14 @@ class Notifier:
 def send_test(settings: Settings, cell: str) -> dict[str, str]:
     """A message by each way, once; what each met, empty if it was sent."""
     message = Message.now(cell, "test", "a test of its notifications", "If you read this, they reach you.")
-    found = {}
+    error_of_way = {}
     for way, send in ways(settings).items():
         begun_s = time.monotonic()
         try:
             send(message)
-            found[way] = ""
+            error_of_way[way] = ""
         except (OSError, ValueError) as error:
-            found[way] = f"{error or type(error).__name__} (after {time.monotonic() - begun_s:.0f} s)"
-    if not found:
+            error_of_way[way] = f"{error or type(error).__name__} (after {time.monotonic() - begun_s:.0f} s)"
+    if not error_of_way:
         raise InputError("the settings name no way: expected `email`, `webhooks` or `desktop: true`")
-    return found
+    return error_of_way

@@ -67,15 +67,15 @@ def without_secrets(text: str) -> str:
         return text
     if (whole := _json_without(text)) is not None:
         return whole
-    kept: list[str] = []
+    safe_lines: list[str] = []
     below: tuple[int, bool] | None = None
     for line in text.splitlines(keepends=True):
         if below is not None and _is_below(line, *below):
             continue
         document = _json_without(line) if line.startswith(("{", "[")) else None
         safe, below = (document, None) if document is not None else _line_without(line)
-        kept.append(safe)
-    return "".join(kept)
+        safe_lines.append(safe)
+    return "".join(safe_lines)
 
 
 def _json_without(text: str) -> str | None:
@@ -84,10 +84,10 @@ def _json_without(text: str) -> str | None:
         document = json_of(text, "a text", allow_nan=True)
     except InputError:
         return None
-    found = _value_without(document)
-    if found == document:
+    safe_document = _value_without(document)
+    if safe_document == document:
         return text
-    return json.dumps(found, ensure_ascii=False, indent=2 if "\n" in text.strip() else None) + "\n"
+    return json.dumps(safe_document, ensure_ascii=False, indent=2 if "\n" in text.strip() else None) + "\n"
 
 
 def _value_without(value: Any) -> Any:
@@ -108,9 +108,9 @@ def _line_without(line: str) -> tuple[str, tuple[int, bool] | None]:
     if (entry := _ENTRY.search(words)) is None:
         return line, None
     value = entry[4] or ""
-    if (quoted := _QUOTED.match(value)) is not None:
+    if (quoted_match := _QUOTED.match(value)) is not None:
         quote = value[0]
-        rest, below = _line_without(value[quoted.end() :])
+        rest, below = _line_without(value[quoted_match.end() :])
         return f"{words[: entry.start()]}{entry[1]}{entry[3]}{quote}{LEFT_OUT}{quote}{rest}{end}", below
     begin = words[: entry.start()]
     lead = _LEAD.match(words)
@@ -153,10 +153,10 @@ class SupportBundles:
 
     def path(self, name: str) -> Path:
         """Raises InputError: there is none of this name."""
-        found = self._folder / name
-        if not re.fullmatch(r"coupole-support-\w+\.zip", name) or not found.is_file():
+        path = self._folder / name
+        if not re.fullmatch(r"coupole-support-\w+\.zip", name) or not path.is_file():
             raise InputError(f"{name!r}: no such support bundle")
-        return found
+        return path
 
     def _texts(self) -> Iterator[tuple[str, str]]:
         """Names inside, and their texts."""
@@ -178,9 +178,11 @@ class SupportBundles:
         for record in cell.rig.calibrations if cell.rig.calibrations != "none" else ():
             path = cell.document.resolve(record)
             yield f"rig/calibrations/{path.name}", path
-        others = (cell.storage_folder.resolve(), cell.state_folder.resolve())
+        other_folders = (cell.storage_folder.resolve(), cell.state_folder.resolve())
         plans = (
-            path for path in self._plans.rglob("*.yaml") if not any(map(path.resolve().is_relative_to, others))
+            path
+            for path in self._plans.rglob("*.yaml")
+            if not any(map(path.resolve().is_relative_to, other_folders))
         )
         yield from _below("plans", self._plans, plans)
         yield from _below("state", cell.state_folder, cell.state_folder.glob("*.jsonl"))
@@ -195,14 +197,14 @@ class SupportBundles:
 @functools.cache
 def versions() -> dict[str, str]:
     """Return the versions of Coupole, Python, the system, and the packages that Coupole wants."""
-    found = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}
-    for wanted in sorted(importlib.metadata.requires("coupole") or []):
-        name = re.split(r"[\s<>=!~;\[]", wanted, maxsplit=1)[0]
+    version_of = {"coupole": coupole.__version__, "python": sys.version.split()[0], "system": platform.platform()}
+    for requirement in sorted(importlib.metadata.requires("coupole") or []):
+        name = re.split(r"[\s<>=!~;\[]", requirement, maxsplit=1)[0]
         try:
-            found[name] = importlib.metadata.version(name)
+            version_of[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            version_of[name] = "not installed"
+    return version_of
 
 
 def _below(inside: str, folder: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:

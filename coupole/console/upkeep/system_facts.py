@@ -62,12 +62,12 @@ def disk_of(cell: Cell, rows: Sequence[RunRow]) -> Disk:
 def to_measure(rig: Path) -> list[ToMeasure]:
     """Find the keys of a rig's file that stand below comments `# Measure: ...`."""
     lines = rig.read_text(encoding="utf-8").splitlines()
-    found = []
+    keys = []
     for number, line in enumerate(lines, 1):
         if why := _MEASURE.fullmatch(line):
             key = next((text.split(":")[0].strip(" -{") for text in lines[number:] if _is_entry(text)), "")
-            found.append(ToMeasure(number, key, why[1]))
-    return found
+            keys.append(ToMeasure(number, key, why[1]))
+    return keys
 
 
 def _is_entry(line: str) -> bool:
@@ -82,13 +82,13 @@ def log_lines(path: Path) -> list[dict[str, Any]]:
             lines = file.read().split(b"\n")
     except OSError:
         return []
-    found = []
+    entries = []
     for line in reversed(lines):
         try:
-            found.append(dict(json_of(line, str(path), allow_nan=True)))
+            entries.append(dict(json_of(line, str(path), allow_nan=True)))
         except (InputError, ValueError, TypeError):
             continue
-    return found
+    return entries
 
 
 def notifications(folder: Path) -> dict[str, str]:

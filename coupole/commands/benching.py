@@ -26,10 +26,12 @@ def bench(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
     object_of: Annotated[
         Path | None,
-        typer.Option("--object", help="The plan whose object lies on the support; without it nothing does."),
+        typer.Option(
+            "--object", help="The plan whose object lies on the support; without this option the support is empty."
+        ),
     ] = None,
     leave_after_s: Annotated[
-        float, typer.Option("--leave-after-s", min=1, help="End when nobody has asked for so long.")
+        float, typer.Option("--leave-after-s", min=1, help="End after this time without a request.")
     ] = 600.0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell is held.")] = False,
     as_json: JsonOption = False,
@@ -57,9 +59,11 @@ def bench(
 
 def arm(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
-    to: Annotated[Literal["home", "park", "view"], typer.Argument(help="Where to.", show_default=False)],
-    plan: Annotated[Path | None, typer.Argument(help="With view: the plan.", show_default=False)] = None,
-    view: Annotated[str | None, typer.Argument(help="With view: its name.", show_default=False)] = None,
+    to: Annotated[
+        Literal["home", "park", "view"], typer.Argument(help="Target of the motion.", show_default=False)
+    ],
+    plan: Annotated[Path | None, typer.Argument(help="The plan, for a view.", show_default=False)] = None,
+    view: Annotated[str | None, typer.Argument(help="Name of the view.", show_default=False)] = None,
     object_of: Annotated[
         Path | None, typer.Option("--object", help="The plan whose object lies on the support (default: PLAN).")
     ] = None,

@@ -27,10 +27,10 @@ def bracket(
     out: Annotated[Path, typer.Option("--out", help="The merged picture, OpenEXR.", show_default=False)],
     exposure_s: Annotated[
         list[float] | None,
-        typer.Option(help="Time of each photograph, in their order; else that of EXIF."),
+        typer.Option(help="Exposure time of each photograph, in their order; by default the time in EXIF."),
     ] = None,
     linear: Annotated[
-        bool, typer.Option("--linear", help="Values are proportional to exposure, as those of raw files are.")
+        bool, typer.Option("--linear", help="Pixel values are proportional to exposure, as in raw files.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -23,16 +23,13 @@ def calibrate_all(
     ),
     scan: Annotated[
         Path | None,
-        typer.Option(
-            "--scan", help="Of the object with stickers, as `coupole scan` wrote it; no mesh without it."
-        ),
+        typer.Option("--scan", help="Mesh of the object with stickers, from `coupole scan`, to calibrate."),
     ] = None,
     repeatability_mm: RepeatabilityMm = 0.03,
     repeatability_deg: RepeatabilityDeg = 0.003,
-    only: Annotated[list[str] | None, typer.Option("--only", help="This step alone; again for more.")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="Do this step only; repeat for more.")] = None,
     valid_days: Annotated[
-        int | None,
-        typer.Option("--valid-days", min=1, max=3650, help="When the records expire; else as each kind has it."),
+        int | None, typer.Option("--valid-days", min=1, max=3650, help="Days until the records expire.")
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before each step of a real cell.")] = False,
     as_json: JsonOption = False,

@@ -30,8 +30,8 @@ CornersOption = Annotated[
     typer.Option(
         "--corners",
         metavar='"X,Y X,Y X,Y X,Y"',
-        help="Middles of the chart's top left, top right, bottom right and bottom left patch in the first view's "
-        "frames, px; without it the chart lies as its description says.",
+        help="Centres of the chart's top left, top right, bottom right and bottom left patch in the"
+        " first view's frames, px; by default the chart lies as its description says.",
         show_default=False,
     ),
 ]
@@ -39,7 +39,7 @@ WhiteOption = Annotated[
     Path | None,
     typer.Option(
         "--white",
-        help="A run of the same plan with a white sheet in the chart's place, in place of the LEDs' known light.",
+        help="A run of the same plan with a white sheet in the chart's place; it replaces the LEDs' known light.",
         show_default=False,
     ),
 ]

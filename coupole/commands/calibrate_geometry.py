@@ -43,12 +43,16 @@ class RobotRepeatability:
 class ScannedStickers:
     """Their size, where they stand, and how exactly the scanner placed them."""
 
-    diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Of a sticker's bright disk.")] = 6.0
-    nearest_mm: Annotated[float, typer.Option(min=50.0, help="Nearest that a sticker stands to the camera.")] = (
-        200.0
+    diameter_mm: Annotated[float, typer.Option(min=1.0, max=50.0, help="Diameter of a sticker's bright disk.")] = (
+        6.0
     )
-    farthest_mm: Annotated[float, typer.Option(min=60.0, help="Farthest that one stands.")] = 900.0
-    scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy of the scanner, as stated.")] = 0.03
+    nearest_mm: Annotated[
+        float, typer.Option(min=50.0, help="Smallest distance of a sticker from the camera.")
+    ] = 200.0
+    farthest_mm: Annotated[
+        float, typer.Option(min=60.0, help="Largest distance of a sticker from the camera.")
+    ] = 900.0
+    scanner_mm: Annotated[float, typer.Option(min=1e-4, help="Accuracy that the scanner's maker states.")] = 0.03
 
 
 @calibration("leds", limits=LEDS, lens=False)
@@ -61,10 +65,14 @@ def leds(
     ] = None,
     *,
     robot: RobotRepeatability,
-    tolerance_mm: Annotated[float, typer.Option(min=1e-4, help="Of LEDs on their boards, as stated.")] = 0.05,
+    tolerance_mm: Annotated[
+        float, typer.Option(min=1e-4, help="Tolerance of LEDs on their boards that the maker states.")
+    ] = 0.05,
     accept_faults: Annotated[
         bool,
-        typer.Option("--accept-faults", help="Accept dead, swapped, astray LEDs; the table has what was found."),
+        typer.Option(
+            "--accept-faults", help="Accept dead, swapped and misplaced LEDs; the table holds what was measured."
+        ),
     ] = False,
 ) -> Work:
     """Positions and normals of all LEDs, from views of the lit LEDs, each seen six times or more.
@@ -108,7 +116,8 @@ def mesh(
     hand_eye: HandEyeOption,
     camera: CameraOption = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="The rig, for the mesh's place on the support as plans want it.")
+        Path | None,
+        typer.Option("--rig", help="The rig, to print the mesh's place on the support as plans need it."),
     ] = None,
     *,
     stickers: ScannedStickers,

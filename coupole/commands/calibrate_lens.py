@@ -75,10 +75,18 @@ def chromatic(
 class StatedRobot:
     """Errors of the robot, as stated."""
 
-    repeatability_mm: Annotated[float, typer.Option(min=1e-4, help="Of the robot, as stated.")] = 0.03
-    repeatability_deg: Annotated[float, typer.Option(min=1e-5, help="Of the robot, as stated.")] = 0.003
-    absolute_mm: Annotated[float, typer.Option(min=0.0, help="The robot's absolute error, as stated.")] = 0.3
-    absolute_deg: Annotated[float, typer.Option(min=1e-5, help="Of orientation, or of each axis' zero.")] = 0.02
+    repeatability_mm: Annotated[
+        float, typer.Option(min=1e-4, help="Repeatability of position that the robot's maker states.")
+    ] = 0.03
+    repeatability_deg: Annotated[
+        float, typer.Option(min=1e-5, help="Repeatability of orientation that the robot's maker states.")
+    ] = 0.003
+    absolute_mm: Annotated[
+        float, typer.Option(min=0.0, help="Absolute error of the robot's position that its maker states.")
+    ] = 0.3
+    absolute_deg: Annotated[
+        float, typer.Option(min=1e-5, help="Absolute error of its orientation, or of the zero of each axis.")
+    ] = 0.02
 
 
 @calibration("hand-eye", limits=HAND_EYE)
@@ -93,7 +101,8 @@ def hand_eye(
         ),
     ] = None,
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="The rig, whose arm's axes may have zero errors (for runs).")
+        Path | None,
+        typer.Option("--rig", help="The rig of the arm: zero errors of its axes are estimated too (for runs)."),
     ] = None,
     *,
     robot: StatedRobot,

@@ -91,7 +91,7 @@ def response(
 def flat_field(
     runs: Runs,
     panel_mm: Annotated[
-        float, typer.Option("--panel-mm", min=50.0, help="From the camera to the panel that it looks at.")
+        float, typer.Option("--panel-mm", min=50.0, help="Distance from the camera to the panel.")
     ] = 600.0,
     dark_record: DarkOption = None,
     response_record: ResponseOption = None,

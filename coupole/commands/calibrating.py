@@ -43,10 +43,14 @@ Paths = Annotated[
     typer.Argument(help="Runs, or one folder of pictures.", show_default=False, metavar="RUN_OR_FOLDER..."),
 ]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the record, its page and its picture.")]
-NameOption = Annotated[str | None, typer.Option("--name", help="Of the record; kind and date if not given.")]
-LensOption = Annotated[str | None, typer.Option("--lens", help="Which lens it is, in words.")]
-EmissionOption = Annotated[str, typer.Option("--emission", help="lambertian, or paper (its cosine twice).")]
-DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="When the record expires.")]
+NameOption = Annotated[
+    str | None, typer.Option("--name", help="Name of the record; by default its kind and date.")
+]
+LensOption = Annotated[str | None, typer.Option("--lens", help="Description of the lens, in words.")]
+EmissionOption = Annotated[
+    str, typer.Option("--emission", help="Emission of LEDs: lambertian, or paper (squared cosine).")
+]
+DaysOption = Annotated[int, typer.Option("--valid-days", min=1, max=3650, help="Days until the record expires.")]
 
 
 def emission_of(name: str) -> Emission:

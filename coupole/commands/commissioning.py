@@ -19,8 +19,8 @@ _Only = Annotated[
     str | None,
     typer.Option(
         "--only",
-        help="Do this step, though it has passed: cycle, axes, stopping, geometry, lamps, trigger, watchdog, "
-        "presence or emergency-stop.",
+        help="Do this step even if it has passed: cycle, axes, stopping, geometry, lamps, trigger, "
+        "watchdog, presence or emergency-stop.",
     ),
 ]
 _Board = Annotated[
@@ -36,10 +36,10 @@ _Board = Annotated[
 
 def commission(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
-    name: Annotated[str, typer.Option("--name", help="Who stands at the cell.", show_default=False)],
+    name: Annotated[str, typer.Option("--name", help="Name of the person at the cell.", show_default=False)],
     only: _Only = None,
     board: _Board = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Simulated cells only: nobody is asked.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nobody; for simulated cells only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a cell's safety figures at reduced speed, step by step, with a person's word before each.

@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False, autocompletion=plans)]
-RigOption = Annotated[Path | None, typer.Option("--rig", help="Another rig than the plan names.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+RigOption = Annotated[Path | None, typer.Option("--rig", help="A rig other than the one that the plan names.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output.")]
 ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
 MeshOption = Annotated[
-    Path | None, typer.Option("--mesh", help="Mesh of the object; without it the one that the run names.")
+    Path | None, typer.Option("--mesh", help="Mesh of the object; by default the mesh that the run names.")
 ]
 RecordsOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--calibrations",
-        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift), or a folder of records; "
-        "again for more. Without it those that the run names.",
+        help="A record (hand-eye, leds, led-power; dark, response, flat-field, drift) or a folder "
+        "of records; repeat for more. By default the records that the run names.",
         show_default=False,
     ),
 ]

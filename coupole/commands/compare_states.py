@@ -20,16 +20,16 @@ def compare(
             show_default=False,
         ),
     ],
-    after: Annotated[Path, typer.Argument(help="Another one of the same object.", show_default=False)],
+    after: Annotated[Path, typer.Argument(help="Another state of the same object.", show_default=False)],
     out: Annotated[
         Path | None, typer.Option("--out", help="A new folder for report and maps.", show_default=False)
     ] = None,
-    unit: Annotated[str, typer.Option("--unit", help="Of both: mm, cm, m, um or in.")] = "mm",
+    unit: Annotated[str, typer.Option("--unit", help="Unit of both: mm, cm, m, um or in.")] = "mm",
     noise_mm: Annotated[
         float | None,
         typer.Option(
             "--noise-mm",
-            help="Standard deviation of a point of either state; by its scatter without it.",
+            help="Standard deviation of a point of either state; by default estimated from the scatter.",
             show_default=False,
         ),
     ] = None,

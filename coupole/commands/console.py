@@ -23,17 +23,19 @@ RigPath = Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=Fa
 
 def serve(
     rig: RigPath,
-    host: Annotated[str, typer.Option("--host", help="Address; of others than this machine only with TLS.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any.")] = 8640,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen on; an address that other machines reach needs TLS.")
+    ] = ("127.0.0.1"),
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0 for any free one.")] = 8640,
     name: Annotated[
         list[str] | None,
         typer.Option("--name", help="Another name under which browsers know this machine.", show_default=False),
     ] = None,
     plans: Annotated[
         Path | None,
-        typer.Option("--plans", help="Folder of plans; without it `plans` beside the rig's folder, or the rig's."),
+        typer.Option(
+            "--plans", help="Folder of plans; by default `plans` beside the rig's folder, or the rig's folder."
+        ),
     ] = None,
     tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM file.")] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file.")] = None,
@@ -113,23 +115,23 @@ def queue(
     ] = None,
     resume: Annotated[
         list[Path] | None,
-        typer.Option("--resume", help="Go on with this run after them; again for more.", autocompletion=runs),
+        typer.Option("--resume", help="Resume this run after the plans; repeat for more.", autocompletion=runs),
     ] = None,
     hold: Annotated[
-        str, typer.Option("--hold", help="After them wait for a person, who is to do this.", show_default=False)
+        str, typer.Option("--hold", help="Wait for a person after them, who is to do this.", show_default=False)
     ] = "",
     before: Annotated[
-        str, typer.Option("--before", help="Enter, or --move, before this entry.", show_default=False)
+        str, typer.Option("--before", help="Put the new or moved entry before this one.", show_default=False)
     ] = "",
     move: Annotated[
         str, typer.Option("--move", help="Move this entry to the end, or --before another.", show_default=False)
     ] = "",
-    take_out: Annotated[str, typer.Option("--take-out", help="Take out this entry.", show_default=False)] = "",
-    go_on: Annotated[bool, typer.Option("--go-on", help="Go on after a hold or a fault.")] = False,
+    take_out: Annotated[str, typer.Option("--take-out", help="Remove this entry.", show_default=False)] = "",
+    go_on: Annotated[bool, typer.Option("--go-on", help="Continue after a hold or a fault.")] = False,
     take_control: Annotated[
-        bool, typer.Option("--take-control", help="Take control from whoever has it, first of all.")
+        bool, typer.Option("--take-control", help="Take control first, from whoever has it.")
     ] = False,
-    give_control: Annotated[bool, typer.Option("--give-control", help="Give control up, last of all.")] = False,
+    give_control: Annotated[bool, typer.Option("--give-control", help="Give up control last.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Enter plans in the queue of a cell whose console is served on this machine; without plans show it.

@@ -18,9 +18,11 @@ SLOWER_MS = 12
 def doctor(
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", help="The rig (YAML); without it the simulated cell.", show_default=False),
+        typer.Option("--rig", help="The rig (YAML); by default the simulated cell.", show_default=False),
     ] = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=0.5, max=86400, help="How long to measure.")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.5, max=86400, help="Duration of the measurement.")
+    ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
     """Measure whether this machine answers the arm's controller in time, in each cycle of the rig.

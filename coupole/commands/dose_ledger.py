@@ -16,25 +16,30 @@ if TYPE_CHECKING:
 
 
 def dose(
-    object_id: Annotated[str, typer.Argument(metavar="OBJECT", help="Its id in plans.", show_default=False)],
+    object_id: Annotated[
+        str, typer.Argument(metavar="OBJECT", help="The object's id in plans.", show_default=False)
+    ],
     rig: Annotated[
-        Path | None, typer.Option("--rig", help="Where this rig keeps its ledgers; else the user's data folder.")
+        Path | None, typer.Option("--rig", help="Rig whose ledgers are used; by default the user's data folder.")
     ] = None,
     add: Annotated[
-        float | None, typer.Option("--add", min=0, help="Enter light given elsewhere, lux hours; needs --note.")
+        float | None,
+        typer.Option("--add", min=0, help="Enter light that was given elsewhere, in lux hours; needs --note."),
     ] = None,
-    note: Annotated[str, typer.Option("--note", help="What that light was.")] = "",
+    note: Annotated[str, typer.Option("--note", help="Description of that light.")] = "",
     warn_above: Annotated[
-        float | None, typer.Option("--warn-above", min=0, help="Warn when the total exceeds this, lux hours.")
+        float | None, typer.Option("--warn-above", min=0, help="Warn when the total exceeds this, in lux hours.")
     ] = None,
     budget: Annotated[
         float | None,
         typer.Option(
-            "--budget", min=0, help="All light that it may receive in its life, lux hours; needs --name."
+            "--budget",
+            min=0,
+            help="Total light that the object may receive in its life, in lux hours; needs --name.",
         ),
     ] = None,
-    name: Annotated[str, typer.Option("--name", help="Who says so.")] = "",
-    reason: Annotated[str, typer.Option("--reason", help="Why the budget is this.")] = "",
+    name: Annotated[str, typer.Option("--name", help="Name of the person who decides it.")] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Reason for this budget.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """All light that an object has received, run by run, and its budget; light given elsewhere is entered by hand.

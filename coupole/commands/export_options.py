@@ -29,18 +29,22 @@ ToOption = Annotated[
 ]
 ViewsOption = Annotated[
     list[str] | None,
-    typer.Option("--views", help="Of runs: names, with * and ?; again for more.", rich_help_panel=_PARTS),
+    typer.Option(
+        "--views", help="For runs: names of views, with * and ?; repeat for more.", rich_help_panel=_PARTS
+    ),
 ]
 ShotsOption = Annotated[
     list[str] | None,
-    typer.Option("--shots", help="Of runs: labels, as `led04*/e0`; again for more.", rich_help_panel=_PARTS),
+    typer.Option(
+        "--shots", help="For runs: labels of shots, such as `led04*/e0`; repeat for more.", rich_help_panel=_PARTS
+    ),
 ]
 FitOption = Annotated[
     str | None,
     typer.Option(
         "--fit",
         autocompletion=materials,
-        help="Of results: ggx or ggx_normal; without it what missed least.",
+        help="For results: ggx or ggx_normal; by default the fit with the smaller error in the check.",
         rich_help_panel=_PARTS,
     ),
 ]
@@ -58,8 +62,9 @@ AdaptiveOption = Annotated[
     typer.Option(
         "--adaptive",
         metavar="ERROR",
-        help="For bsdf: as small a table as misses the fit by at most this share (as 0.003) in 95 % of "
-        "directions, of all and of those in the lobe; without it 17 MB.",
+        help="For bsdf: the smallest table whose error against the fit is at most this share (such "
+        "as 0.003) in 95 % of directions, of all and of those in the lobe; by default a table "
+        "of 17 MB.",
         min=1e-5,
         max=0.5,
         show_default=False,
@@ -70,7 +75,7 @@ RefinedOption = Annotated[
     Path | None,
     typer.Option(
         "--refined",
-        help="For colmap: folder of `coupole reflectance refine`, whose poses, lens and mesh hold.",
+        help="For colmap: folder of `coupole reflectance refine`; its poses, lens and mesh are used.",
         rich_help_panel=_PARTS,
     ),
 ]
@@ -78,7 +83,7 @@ SensorOption = Annotated[
     Path | None,
     typer.Option(
         "--sensor-spectra",
-        help="Table of nm, red, green, blue: the sensor's sensitivities.",
+        help="Table of the sensor's spectral sensitivities: nm, red, green, blue.",
         rich_help_panel=_COLOUR,
     ),
 ]
@@ -86,7 +91,7 @@ LedsOption = Annotated[
     Path | None,
     typer.Option(
         "--led-spectrum",
-        help="Table of nm, power; without it the rig's dome.spectrum.",
+        help="Table of the LEDs' spectrum: nm, power; by default the rig's dome.spectrum.",
         rich_help_panel=_COLOUR,
     ),
 ]
@@ -94,31 +99,37 @@ EyeOption = Annotated[
     bool,
     typer.Option(
         "--for-the-eye",
-        help="TIFF of sRGB, 16 bit, in place of the camera's numbers; needs --sensor-spectra.",
+        help="Write TIFF in sRGB, 16 bit, instead of the camera's values; needs --sensor-spectra.",
         rich_help_panel=_COLOUR,
     ),
 ]
 LinearOption = Annotated[
     bool,
     typer.Option(
-        "--linear", help="With --for-the-eye: without sRGB's curve, as its profile says.", rich_help_panel=_COLOUR
+        "--linear",
+        help="With --for-the-eye: linear values, without sRGB's curve; the file's profile says so.",
+        rich_help_panel=_COLOUR,
     ),
 ]
 LicenceOption = Annotated[
     str | None,
-    typer.Option("--licence", help="Its URL, or words; without it the plan's.", rich_help_panel=_ABOUT),
+    typer.Option(
+        "--licence", help="URL of the licence, or words; by default the plan's licence.", rich_help_panel=_ABOUT
+    ),
 ]
 AuthorOption = Annotated[
     list[str] | None,
     typer.Option(
         "--author",
-        help="'NAME <https://orcid.org/...> at HOUSE'; again for more.",
+        help="'NAME <https://orcid.org/...> at HOUSE'; repeat for more.",
         rich_help_panel=_ABOUT,
     ),
 ]
-PublisherOption = Annotated[str | None, typer.Option("--publisher", help="Its name.", rich_help_panel=_ABOUT)]
+PublisherOption = Annotated[
+    str | None, typer.Option("--publisher", help="Name of the publisher.", rich_help_panel=_ABOUT)
+]
 NameOption = Annotated[
-    str | None, typer.Option("--name", help="Title; without it the folder's name.", rich_help_panel=_ABOUT)
+    str | None, typer.Option("--name", help="Title; by default the folder's name.", rich_help_panel=_ABOUT)
 ]
 IdentifierOption = Annotated[str | None, typer.Option("--identifier", help="A DOI.", rich_help_panel=_ABOUT)]
 InPlaceOption = Annotated[
@@ -133,7 +144,7 @@ BasisOption = Annotated[
     str | None,
     typer.Option(
         "--basis",
-        help="For relight: bilinear (without this option), rbf, ptm or hsh.",
+        help="For relight: bilinear (default), rbf, ptm or hsh.",
         rich_help_panel=_SHOWN,
     ),
 ]
@@ -141,7 +152,7 @@ PlanesOption = Annotated[
     int | None,
     typer.Option(
         "--planes",
-        help="For relight, bilinear and rbf: 27 (without this option) or 18.",
+        help="For relight with bilinear or rbf: 27 (default) or 18.",
         rich_help_panel=_SHOWN,
     ),
 ]
@@ -149,8 +160,9 @@ BaseUrlOption = Annotated[
     str | None,
     typer.Option(
         "--base-url",
-        help="For iiif: the address where the folder will be found; ids in the files begin with it. Without it "
-        "they begin with https://example.org/iiif, and no viewer finds the pictures.",
+        help="For iiif: the address at which the folder will be served; the ids in the files begin "
+        "with it. By default they begin with https://example.org/iiif, where no viewer finds "
+        "the pictures.",
         rich_help_panel=_SHOWN,
     ),
 ]

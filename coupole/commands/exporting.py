@@ -68,10 +68,12 @@ class Found:
 
 @flattened
 def export(
-    source: Annotated[Path, typer.Argument(help="A run's folder, or a result's.", show_default=False)],
+    source: Annotated[Path, typer.Argument(help="Folder of a run or of a result.", show_default=False)],
     to: ToOption,
     options: ExportOptions,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder; SOURCE/export if not given.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; by default SOURCE/export.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite existing files.")] = False,
     as_json: JsonOption = False,
 ) -> None:

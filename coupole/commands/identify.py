@@ -29,7 +29,7 @@ _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknow
 SpectraArgument = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="Spectra: an instrument's export, a table with one spectrum a row, or a folder of them.",
+        help="Spectra: an instrument's export, a table with one spectrum in each row, or a folder of such files.",
         metavar="SPECTRUM",
         show_default=False,
     ),
@@ -38,8 +38,8 @@ LibraryOption = Annotated[
     Path,
     typer.Option(
         "--library",
-        help="Spectra of known pigments: a table with one a row and its wavelengths in the first line or in "
-        "spectra.txt beside it, or a folder of exports.",
+        help="Spectra of known pigments: a table with one spectrum in each row and the wavelengths "
+        "in the first line or in spectra.txt beside it, or a folder of exports.",
         show_default=False,
     ),
 ]
@@ -47,23 +47,25 @@ ClassesOption = Annotated[
     Path | None,
     typer.Option(
         "--classes",
-        help="Table of name, class, Colour Index name. Without it the one that comes with Coupole for a "
-        "library of this name: KremerHistorical, GamblinConservationColors, GretagMacbethMini, oilpaint.",
+        help="Table of name, class and Colour Index name. By default the table that comes with "
+        "Coupole for a library of this name: KremerHistorical, GamblinConservationColors, "
+        "GretagMacbethMini, oilpaint.",
     ),
 ]
 UnitOption = Annotated[
     Literal["auto", "percent", "fraction"],
-    typer.Option("--unit", help="Of the spectra's reflectance, where their files leave it open."),
+    typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not tell it."),
 ]
 PageOption = Annotated[
-    Path | None, typer.Option("--report", help="Folder for a page with curves and what each band says.")
+    Path | None, typer.Option("--report", help="Folder for a page with the curves and the evidence in each band.")
 ]
 ResultOption = Annotated[
     Path | None,
-    typer.Option("--result", help="In place of spectra a fitted result of runs, with --at.", show_default=False),
+    typer.Option("--result", help="A fitted result of runs instead of spectra, with --at.", show_default=False),
 ]
 AtOption = Annotated[
-    str | None, typer.Option("--at", help="X,Y,Z in mm of its exported mesh.", show_default=False)
+    str | None,
+    typer.Option("--at", help="Place X,Y,Z in mm on the exported mesh of --result.", show_default=False),
 ]
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def status(
     run: RunningRun = None,
-    following: Annotated[bool, typer.Option("--follow", help="Show its progress until it ends.")] = False,
+    following: Annotated[bool, typer.Option("--follow", help="Show the progress until the run ends.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Progress of a run, also while it is running, and the command line that takes what is left.
@@ -44,7 +44,8 @@ def status(
 def report(
     run: RunPath,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Another file than RUN/report.html.", show_default=False)
+        Path | None,
+        typer.Option("--out", help="File for the report; by default RUN/report.html.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -63,7 +64,7 @@ def report(
 def verify(
     run: RunPath,
     with_manifest: Annotated[
-        bool, typer.Option("--manifest", help="Enter in manifest.sha256 what it does not list yet.")
+        bool, typer.Option("--manifest", help="Enter files in manifest.sha256 that it does not list yet.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -136,7 +137,7 @@ def archive(
     codec: Annotated[str, typer.Option("--codec", help="lz4 (fast) or zstd (a little smaller).")] = "lz4",
     keep: Annotated[bool, typer.Option("--keep", help="Keep the original files, in RUN/unarchived.")] = False,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Of a run that is not complete, archive the complete views.")
+        bool, typer.Option("--partial", help="Archive the complete views of a run that is not complete.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -182,7 +183,7 @@ def scan(
     targets: Annotated[Path | None, typer.Option("--targets", help="Table of the scanner's targets.")] = None,
     unit: Annotated[str, typer.Option("--unit", help="The mesh's unit: mm, cm, m, um or in.")] = "mm",
     targets_unit: Annotated[
-        str | None, typer.Option("--targets-unit", help="The table's, if it is another.")
+        str | None, typer.Option("--targets-unit", help="Unit of the table, if it is another.")
     ] = None,
     accept_defects: Annotated[
         bool, typer.Option("--accept-defects", help="Accept a mesh that is not a clean surface.")

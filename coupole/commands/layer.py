@@ -29,10 +29,10 @@ class FilmSpectra:
     black: Annotated[Path | None, typer.Option(help="Spectrum of the black ground.")] = None
     white: Annotated[Path | None, typer.Option(help="Spectrum of the white ground.")] = None
     opaque: Annotated[Path | None, typer.Option(help="Spectrum of an opaque film of the same paint.")] = None
-    thickness_um: Annotated[float | None, typer.Option(min=0.01, help="Of the film; K and S are then per mm.")] = (
-        None
-    )
-    u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Its standard uncertainty.")] = 0.0
+    thickness_um: Annotated[
+        float | None, typer.Option(min=0.01, help="Thickness of the film; K and S are then per mm.")
+    ] = None
+    u_thickness_um: Annotated[float, typer.Option(min=0.0, help="Standard uncertainty of the thickness.")] = 0.0
 
     def are_named(self) -> bool:
         """Tell whether any was given."""
@@ -65,10 +65,12 @@ class FilmSpectra:
 class Instrument:
     """Spectrometer, and what it sees of a paint."""
 
-    binder_index: Annotated[float, typer.Option(min=1.0, max=3.0, help="1: no glossy face.")] = 1.5
-    geometry: Annotated[str, typer.Option(help="Of the instrument: gloss excluded, gloss included, or 45:0.")] = (
-        "gloss excluded"
-    )
+    binder_index: Annotated[
+        float, typer.Option(min=1.0, max=3.0, help="Refractive index of the film; 1 means no glossy face.")
+    ] = 1.5
+    geometry: Annotated[
+        str, typer.Option(help="Geometry of the instrument: gloss excluded, gloss included, or 45:0.")
+    ] = "gloss excluded"
 
     def known_geometry(self) -> Geometry:
         """Raises InputError if there is none of that name."""
@@ -90,14 +92,19 @@ def layer(
     ] = None,
     *,
     films: FilmSpectra,
-    noise: Annotated[float, typer.Option(min=1e-5, max=0.1, help="Of a spectrum's value, standard.")] = 0.005,
+    noise: Annotated[
+        float, typer.Option(min=1e-5, max=0.1, help="Standard uncertainty of a spectrum's value.")
+    ] = 0.005,
     instrument: Instrument,
     bare_grounds: Annotated[
         bool, typer.Option("--bare-grounds", help="The grounds were measured without a glossy face.")
     ] = False,
-    name: Annotated[str | None, typer.Option(help="Of the paint.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the paint.")] = None,
     other_grinding: Annotated[
-        Path | None, typer.Option(help="Paint file of another grinding of the pigment: ratio of their grains.")
+        Path | None,
+        typer.Option(
+            help=("Paint file of another grinding of the pigment, to compute the ratio of their grain sizes.")
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for paint file and report.")] = None,
     as_json: JsonOption = False,

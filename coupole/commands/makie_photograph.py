@@ -29,24 +29,25 @@ def makie(
         Path, typer.Argument(help="PNG, TIFF or JPEG of 8 or 16 bits, in sRGB.", show_default=False)
     ],
     metal: Annotated[
-        str, typer.Option("--metal", metavar="X,Y", help="A pixel amid metal alone.", show_default=False)
+        str,
+        typer.Option("--metal", metavar="X,Y", help="A pixel in the middle of bare metal.", show_default=False),
     ],
     lacquer: Annotated[
         list[str],
         typer.Option(
             "--lacquer",
             metavar="X,Y",
-            help="A pixel amid bare lacquer; again for a second and third colour.",
+            help="A pixel in the middle of bare lacquer; repeat for more colours (up to three).",
             show_default=False,
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The drawing: PNG with alpha.", show_default=False)],
     linear: Annotated[
-        bool, typer.Option("--linear", help="Values are proportional to light, without sRGB's curve.")
+        bool, typer.Option("--linear", help="Pixel values are proportional to light, without sRGB's curve.")
     ] = False,
     inside: Annotated[
         bool,
-        typer.Option("--inside", help="Every pixel is metal and lacquer alone, without shadow: exact for three."),
+        typer.Option("--inside", help="Pixels hold metal and lacquer only, no shadow: exact for three colours."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

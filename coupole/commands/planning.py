@@ -27,13 +27,14 @@ def check(
     rig: RigOption = None,
     output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="What is left of this run.", autocompletion=runs)
+        Path | None, typer.Option("--resume", help="Check the rest of this run.", autocompletion=runs)
     ] = None,
     no_paths: Annotated[
         bool, typer.Option("--no-paths", help="Leave out path planning and swept collisions.")
     ] = False,
     no_disk_speed: Annotated[
-        bool, typer.Option("--no-disk-speed", help="Do not measure the disk's speed, as a run writes to it.")
+        bool,
+        typer.Option("--no-disk-speed", help="Do not measure the disk's write speed, because a run writes to it."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -96,10 +97,10 @@ def view(
 def simulate(
     plan: PlanPath,
     rig: RigOption = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="How many shots, over all views.")] = 12,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of shots, of all views together.")] = 12,
     out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("simulated"),
     width: Annotated[
-        int | None, typer.Option("--width", min=16, help="Of the frames, if less than the rig's.")
+        int | None, typer.Option("--width", min=16, help="Width of the frames, if smaller than the rig's.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -156,14 +157,16 @@ def plan_new(
     template: Annotated[
         str | None,
         typer.Option(
-            "--template", help="Which template; the one called NAME, else `views`.", autocompletion=templates
+            "--template",
+            help="Template; by default the one called NAME, otherwise `views`.",
+            autocompletion=templates,
         ),
     ] = None,
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", help="The rig; without it the simulated cell.", show_default=False),
+        typer.Option("--rig", help="The rig; by default the simulated cell.", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the views of `leds`, which are drawn.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random views of `leds`.")] = 1,
 ) -> None:
     """Write a plan to start from. The views of `leds` are chosen for the rig's dome: a minute or two.
 

@@ -34,18 +34,22 @@ def recipe(
         list[Path],
         typer.Option(
             "--palette",
-            help="Folder of paint files, a paint file, or a library of K and S; again for more.",
+            help="Folder of paint files, a paint file, or a library of K and S; repeat for more.",
             show_default=False,
         ),
     ],
-    light: Annotated[str, typer.Option("--light", help="Names, the first that of the match.")] = "D65,A",
-    at_most: Annotated[int, typer.Option("--at-most", min=1, max=8, help="Paints in a recipe.")] = 4,
+    light: Annotated[
+        str, typer.Option("--light", help="Names of illuminants; the match is made under the first.")
+    ] = "D65,A",
+    at_most: Annotated[
+        int, typer.Option("--at-most", min=1, max=8, help="Largest number of paints in a recipe.")
+    ] = 4,
     noise: Annotated[
-        float, typer.Option("--noise", min=1e-5, max=0.1, help="Of the target's values, standard.")
+        float, typer.Option("--noise", min=1e-5, max=0.1, help="Standard uncertainty of the target's values.")
     ] = 0.005,
     *,
     instrument: Instrument,
-    observer: Annotated[str, typer.Option(help="10 deg or 2 deg.")] = "10 deg",
+    observer: Annotated[str, typer.Option(help="Standard observer: 10 deg or 2 deg.")] = "10 deg",
     out: Annotated[Path | None, typer.Option("--out", help="Write this page (HTML).")] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -19,27 +19,38 @@ class StatedUncertainties:
     """Standard uncertainties that no record states, in mm and degrees."""
 
     arm_mm: Annotated[
-        float, typer.Option("--arm-mm", min=1e-4, help="Of the flange's position, from view to view.")
+        float,
+        typer.Option(
+            "--arm-mm", min=1e-4, help="Standard uncertainty of the flange's position, from view to view."
+        ),
     ] = 0.03
-    arm_deg: Annotated[float, typer.Option("--arm-deg", min=1e-5, help="Of its orientation.")] = 0.003
-    mesh_mm: Annotated[float, typer.Option("--mesh-mm", min=1e-4, help="Of the mesh's place in the cell.")] = 0.1
-    mesh_deg: Annotated[float, typer.Option("--mesh-deg", min=1e-5, help="Of its orientation.")] = 0.02
+    arm_deg: Annotated[
+        float, typer.Option("--arm-deg", min=1e-5, help="Standard uncertainty of the flange's orientation.")
+    ] = 0.003
+    mesh_mm: Annotated[
+        float, typer.Option("--mesh-mm", min=1e-4, help="Standard uncertainty of the mesh's position in the cell.")
+    ] = 0.1
+    mesh_deg: Annotated[
+        float, typer.Option("--mesh-deg", min=1e-5, help="Standard uncertainty of the mesh's orientation.")
+    ] = 0.02
     shape_mm: Annotated[
-        float, typer.Option("--shape-mm", min=1e-4, help="Of the mesh's surface along its normals.")
+        float,
+        typer.Option("--shape-mm", min=1e-4, help="Standard uncertainty of the mesh's surface along its normals."),
     ] = 0.03
     scale_mm: Annotated[
-        float, typer.Option("--scale-mm", min=1.0, help="Over which the surface is off alike.")
+        float, typer.Option("--scale-mm", min=1.0, help="Correlation length of the errors of the surface.")
     ] = 20.0
 
 
 @flattened
 def refine(
     runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", help="Folder for what is found.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the result.", show_default=False)],
     mesh: MeshOption = None,
     calibrations: RecordsOption = None,
     search_mm: Annotated[
-        float, typer.Option("--search-mm", min=0.1, max=20.0, help="The farthest that views may disagree.")
+        float,
+        typer.Option("--search-mm", min=0.1, max=20.0, help="Largest disagreement of views that is searched."),
     ] = 3.0,
     *,
     stated: StatedUncertainties,

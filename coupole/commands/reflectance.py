@@ -59,7 +59,7 @@ reflectance_app = typer.Typer(
 def from_runs_or_pictures(
     runs: Annotated[
         list[Path] | None,
-        typer.Argument(help="Runs of one object, or no run but --pictures.", show_default=False),
+        typer.Argument(help="Runs of one object; none with --pictures.", show_default=False),
     ] = None,
     out: OutOption = None,
     *,
@@ -233,13 +233,21 @@ def cluster(
     result: ResultArgument,
     clusters: Annotated[
         int | None,
-        typer.Option("--clusters", min=1, help="At most so many; without it one for 400 triangles, 16 to 1000."),
+        typer.Option(
+            "--clusters",
+            min=1,
+            help="Largest number of clusters; by default one for each 400 triangles, 16 to 1000.",
+        ),
     ] = None,
     degrees: Annotated[
-        int, typer.Option("--degrees", min=2, max=17, help="Of harmonics of pairs: 220 for 10, 969 for 17.")
+        int,
+        typer.Option(
+            "--degrees", min=2, max=17, help="Order of the harmonics of pairs: 220 functions for 10, 969 for 17."
+        ),
     ] = 10,
     without_view: Annotated[
-        str | None, typer.Option("--without-view", help="Take no samples of a view, and be judged by it.")
+        str | None,
+        typer.Option("--without-view", help="Leave the samples of this view out, and judge the fit by them."),
     ] = None,
     memory: MemoryOption = "2GB",
     as_json: JsonOption = False,

@@ -25,39 +25,43 @@ SupportOption = Annotated[
         "--support-reflectance",
         min=0.0,
         max=0.95,
-        help="Of the disk under the object, which lights it too.",
+        help="Albedo of the disk under the object, which reflects light to it.",
     ),
 ]
 KeepOption = Annotated[
-    bool, typer.Option("--keep-inter-reflection", help="Leave in the samples what comes by way of other surfaces.")
+    bool,
+    typer.Option("--keep-inter-reflection", help="Do not remove the light that comes by way of other surfaces."),
 ]
 MemoryOption = Annotated[
-    str, typer.Option("--memory", help="For the samples that are fitted together: 500MB, 4GB.")
+    str, typer.Option("--memory", help="Memory for the samples that are fitted together, such as 500MB or 4GB.")
 ]
 RefinedOption = Annotated[
     Path | None,
-    typer.Option("--refined", help="Folder of `coupole reflectance refine`: its poses, lens and mesh hold."),
+    typer.Option("--refined", help="Folder of `coupole reflectance refine`; its poses, lens and mesh are used."),
 ]
 PosesOption = Annotated[
     Path | None,
     typer.Option(
         "--poses",
-        help="Folder of COLMAP's, of one run, with images and camera of `coupole export RUN --to colmap`: its "
-        "poses hold, brought onto the records' by a similarity (three views or more) or as they are; their "
-        "uncertainty is the records', as COLMAP states none.",
+        help="Folder of COLMAP for one run, with images and camera of `coupole export RUN --to "
+        "colmap`. Its poses are used: aligned to the records' poses by a similarity (three "
+        "views or more), or as they are. Their uncertainty is that of the records, because "
+        "COLMAP states none.",
         show_default=False,
     ),
 ]
 SchedulerOption = Annotated[
     str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask cluster that does the job: tcp://HOST:8786."),
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="Address of a dask cluster that does the job: tcp://HOST:8786."
+    ),
 ]
 PicturesOption = Annotated[
     Path | None,
     typer.Option(
         "--pictures",
-        help="Folder of 8- or 16-bit pictures, linear (or see --srgb), in the order of its filenames.txt, else "
-        "sorted.",
+        help="Folder of 8- or 16-bit pictures, linear (or see --srgb), in the order of its "
+        "filenames.txt, otherwise sorted by name.",
         show_default=False,
     ),
 ]
@@ -65,8 +69,8 @@ LightsOption = Annotated[
     Path | None,
     typer.Option(
         "--lights",
-        help="Directions to the lights, one in each line (x right, y up, z to the camera), an .lp file, or "
-        "relight's .dome or .relight.",
+        help="Directions to the lights: a file with one in each line (x right, y up, z to the "
+        "camera), an .lp file, or relight's .dome or .relight.",
         show_default=False,
     ),
 ]
@@ -76,24 +80,29 @@ SrgbOption = Annotated[
 ]
 IntensitiesOption = Annotated[
     Path | None,
-    typer.Option("--intensities", help="One number or three (r g b) for each light; values are divided by them."),
+    typer.Option(
+        "--intensities",
+        help="Intensities of the lights, one number or three (r g b) for each; pixel values are divided by them.",
+    ),
 ]
 UncalibratedOption = Annotated[
     bool,
     typer.Option(
         "--uncalibrated",
-        help="Of a run without calibrations: one view as pictures under lights at their nominal places; relative "
-        "values of single pixels.",
+        help="For a run without calibrations: treat one view as pictures under lights at their "
+        "nominal places; the values of pixels are relative.",
     ),
 ]
-ViewOption = Annotated[str | None, typer.Option("--view", help="Of --uncalibrated; the first without it.")]
-MaskOption = Annotated[Path | None, typer.Option("--mask", help="Picture that is black where nothing is fitted.")]
+ViewOption = Annotated[str | None, typer.Option("--view", help="View for --uncalibrated; by default the first.")]
+MaskOption = Annotated[
+    Path | None, typer.Option("--mask", help="Mask: a picture that is black where nothing is fitted.")
+]
 LeaveOutOption = Annotated[
     str,
     typer.Option(
         "--leave-out",
-        help="Lights (of pictures, from 0) or LEDs (of runs; every twelfth without it) that are kept for the "
-        "check: 4,12,20.",
+        help="Lights (of pictures, counted from 0) or LEDs (of runs; by default every twelfth) that"
+        " are left out of the fit and kept for the check, such as 4,12,20.",
         show_default=False,
     ),
 ]

@@ -33,15 +33,15 @@ SeenFromOption = Annotated[
     str | None,
     _option(
         "--seen-from",
-        "Where the scanner stood in each scan's frame: origin, or far away along +x, -x, +y, -y, +z or -z, or "
-        "none; found by the scans themselves without it.",
+        "Place of the scanner in each scan's frame: origin, far away along +x, -x, +y, -y, +z or -z, or none; by "
+        "default found from the scans.",
     ),
 ]
 TrustOption = Annotated[
     bool,
     typer.Option(
         "--trust-poses",
-        help="Begin with the poses that PTX and E57 state; they are tested and adjusted all the same.",
+        help="Start from the poses that PTX and E57 state; they are still tested and adjusted.",
     ),
 ]
 
@@ -51,7 +51,7 @@ def register(
     out: Annotated[Path, _option("--out", "A new folder for poses, mesh and report.")],
     unit: Annotated[
         str | None,
-        _option("--unit", "Of scans and tables: mm, cm, m, um or in; mm without it. E57 is always in m."),
+        _option("--unit", "Unit of scans and tables: mm (default), cm, m, um or in. E57 is always in m."),
     ] = None,
     targets: Annotated[
         Path | None, _option("--targets", "Table of targets in the scans: scan, name, x, y, z, u_mm.")
@@ -62,10 +62,13 @@ def register(
     seen_from: SeenFromOption = None,
     trust_poses: TrustOption = False,
     mesh_mm: Annotated[
-        float | None, _option("--mesh-mm", "Cells of the merged mesh; 1.5 times the points' spacing without it.")
+        float | None,
+        _option("--mesh-mm", "Size of the merged mesh's cells; by default 1.5 times the spacing of the points."),
     ] = None,
-    no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Poses only.")] = False,
-    levels: Annotated[str, typer.Option("--levels", help="Pitches of thinner clouds, mm.")] = "5,10,50,250",
+    no_mesh: Annotated[bool, typer.Option("--no-mesh", help="Write poses only.")] = False,
+    levels: Annotated[
+        str, typer.Option("--levels", help="Point spacings of the thinned clouds, mm.")
+    ] = "5,10,50,250",
     as_json: JsonOption = False,
 ) -> None:
     """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""

@@ -70,29 +70,34 @@ EnvironmentOption = Annotated[
     ),
 ]
 LightsOption = Annotated[Path | None, _option("--lights", "A file (YAML) of lights with strengths.")]
-SamplesOption = Annotated[int, typer.Option("--samples", min=1, max=65536, help="Of each area and environment.")]
-ViewOption = Annotated[str | None, typer.Option("--view", help="Of a result of runs; the first without it.")]
-FromOption = Annotated[str | None, _option("--from", "X,Y,Z of a camera anywhere, mm, in place of --view.")]
-LookAtOption = Annotated[str | None, _option("--look-at", "X,Y,Z that it looks at; the object without it.")]
-SizeOption = Annotated[str | None, _option("--size", "Its WIDTHxHEIGHT; 1024x768 without it.")]
+SamplesOption = Annotated[
+    int, typer.Option("--samples", min=1, max=65536, help="Number of samples of each area light and environment.")
+]
+ViewOption = Annotated[str | None, typer.Option("--view", help="View of a result of runs; by default the first.")]
+FromOption = Annotated[str | None, _option("--from", "Place X,Y,Z of a camera, mm, instead of --view.")]
+LookAtOption = Annotated[str | None, _option("--look-at", "Place X,Y,Z that it looks at; by default the object.")]
+SizeOption = Annotated[str | None, _option("--size", "Size of its picture, WIDTHxHEIGHT; by default 1024x768.")]
 FieldOption = Annotated[
     float | None,
-    _option("--field-of-view", "Its degrees across; as the object needs without it.", min=0.01, max=170.0),
+    _option(
+        "--field-of-view", "Width of its field, degrees; by default as the object needs.", min=0.01, max=170.0
+    ),
 ]
 FitOption = Annotated[
     str | None,
     typer.Option(
         "--fit",
         autocompletion=fits,
-        help="Of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; without it the one "
-        "that missed least in the check (of the first two with --uncertainty).",
+        help="Fit of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; by"
+        " default the fit with the smallest error in the check (with --uncertainty: of ggx and"
+        " ggx_normal).",
     ),
 ]
 UncertaintyOption = Annotated[
     Path | None,
     _option(
         "--uncertainty",
-        "Of a result of runs: write the picture's standard uncertainty (68 %) too; .npy, .exr or .png, as --to.",
+        "For a result of runs: write the picture's standard uncertainty (68 %) too; .npy, .exr or .png, as --to.",
     ),
 ]
 TurnOption = Annotated[
@@ -102,7 +107,7 @@ WhiteOption = Annotated[
     float | None,
     _option(
         "--white",
-        "Of a video, or a picture for the eye: shown as white; its 99.9 % quantile without it.",
+        "Value that a video or a picture for the eye shows as white; by default its 99.9 % quantile.",
         min=1e-9,
     ),
 ]

@@ -25,21 +25,21 @@ EyeOption = Annotated[
     bool,
     typer.Option(
         "--for-the-eye",
-        help="sRGB in place of the camera's channels; needs --colour, or --sensor-spectra and --led-spectrum.",
+        help="Write sRGB instead of camera channels; needs --colour, or --sensor-spectra and --led-spectrum.",
     ),
 ]
 SensorOption = Annotated[
     Path | None,
-    typer.Option("--sensor-spectra", help="Table of nm, red, green, blue: the sensor's sensitivities."),
+    typer.Option("--sensor-spectra", help="Table of the sensor's spectral sensitivities: nm, red, green, blue."),
 ]
 SpectrumOption = Annotated[
     Path | None,
-    typer.Option("--led-spectrum", help="Table of nm, power: that of the dome's LEDs."),
+    typer.Option("--led-spectrum", help="Table of the spectrum of the dome's LEDs: nm, power."),
 ]
 
 RecordOption = Annotated[
     Path | None,
-    typer.Option("--colour", help="A record of `calibrate colour`, in place of tables of spectra."),
+    typer.Option("--colour", help="A record of `calibrate colour`, instead of tables of spectra."),
 ]
 
 

@@ -22,14 +22,20 @@ Progress = Callable[[str, int, int], None]
 def render(
     scene: Annotated[Path, typer.Argument(help="The scene (YAML).", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder for the pictures.")] = Path("rendered"),
-    samples: Annotated[int | None, typer.Option("--samples", min=1, help="Paths through each pixel.")] = None,
-    width: Annotated[
-        int | None, typer.Option("--width", min=4, help="Of the pictures, if less than the scene's.")
+    samples: Annotated[
+        int | None, typer.Option("--samples", min=1, help="Number of light paths through each pixel.")
     ] = None,
-    step: Annotated[int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20, 40.")] = None,
+    width: Annotated[
+        int | None, typer.Option("--width", min=4, help="Width of the pictures, if smaller than the scene's.")
+    ] = None,
+    step: Annotated[
+        int | None, typer.Option("--step", help="Step between spectral bands, nm: 5, 10, 20 or 40.")
+    ] = None,
     noise: Annotated[
         float | None,
-        typer.Option("--noise", min=1e-4, max=0.9, help="Stop at this noise: relative, in half of the pixels."),
+        typer.Option(
+            "--noise", min=1e-4, max=0.9, help="Stop when half of the pixels have at most this relative noise."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

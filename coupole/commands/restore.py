@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from coupole.heritage.restoration.restoring import Restoration, Say
 
 MeshArgument = Annotated[Path, typer.Argument(help="The mesh: PLY, OBJ, STL, GLB, glTF, OFF.", show_default=False)]
-UnitOption = Annotated[str, typer.Option("--unit", help="Of the mesh: mm, cm, m, um or in.")]
+UnitOption = Annotated[str, typer.Option("--unit", help="Unit of the mesh: mm, cm, m, um or in.")]
 _JOB = "from"
 
 
@@ -51,17 +51,19 @@ def restore(
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures and report.", show_default=False)],
     hypothesis: Annotated[
         list[str] | None,
-        typer.Option("--hypothesis", help="Only this one; again for more.", show_default=False),
+        typer.Option("--hypothesis", help="Only this hypothesis; repeat for more.", show_default=False),
     ] = None,
     unit: UnitOption = "mm",
     samples: Annotated[
-        int | None, typer.Option("--samples", min=1, help="Paths through each pixel.", show_default=False)
+        int | None,
+        typer.Option("--samples", min=1, help="Number of light paths through each pixel.", show_default=False),
     ] = None,
     width: Annotated[
-        int | None, typer.Option("--width", min=4, help="Of the pictures, if less.", show_default=False)
+        int | None, typer.Option("--width", min=4, help="Width of the pictures, if smaller.", show_default=False)
     ] = None,
     step: Annotated[
-        int | None, typer.Option("--step", help="Between bands, nm: 5, 10, 20, 40.", show_default=False)
+        int | None,
+        typer.Option("--step", help="Step between spectral bands, nm: 5, 10, 20 or 40.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

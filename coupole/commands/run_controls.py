@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 RunningRun = Annotated[
     Path | None,
     typer.Argument(
-        help="The run's folder; not needed while one run alone is acquired.",
+        help="The run's folder; not needed while only one run is being acquired.",
         show_default=False,
         autocompletion=runs,
     ),

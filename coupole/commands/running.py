@@ -32,7 +32,7 @@ def acquire(
     rig: RigOption = None,
     output: Annotated[Path | None, typer.Option("--output", help="Parent folder of the run.")] = None,
     resume: Annotated[Path | None, typer.Option("--resume", help="Resume this run.", autocompletion=runs)] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's twin.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Rehearse on the rig's simulated twin.")] = False,
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=1000, help="Pace of a dry run.")] = 20.0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before a real cell moves.")] = False,
     with_mesh: Annotated[
@@ -83,7 +83,7 @@ def acquire(
 def devices(
     rig: Annotated[
         Path | None,
-        typer.Option("--rig", help="The rig (YAML); without it the simulated cell.", show_default=False),
+        typer.Option("--rig", help="The rig (YAML); by default the simulated cell.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -119,7 +119,8 @@ def meter(
     plan: PlanPath,
     rig: RigOption = None,
     saturated: Annotated[
-        float, typer.Option("--saturated", min=0, max=0.5, help="Share of a picture's pixels that may saturate.")
+        float,
+        typer.Option("--saturated", min=0, max=0.5, help="Largest share of a picture's pixels that may saturate."),
     ] = 1e-3,
     snr: Annotated[float, typer.Option("--snr", min=1, help="Signal-to-noise ratio to reach.")] = 30.0,
     share: Annotated[
@@ -155,12 +156,16 @@ def meter(
 
 def live(
     what: Annotated[Path, typer.Argument(help="A run's folder, a plan, or a rig.", show_default=False)],
-    led: Annotated[int | None, typer.Option("--led", help="Id of the first LED; dark if not given.")] = None,
-    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="First exposure.")] = 8000,
+    led: Annotated[
+        int | None, typer.Option("--led", help="Id of the LED to begin with; dark if not given.")
+    ] = None,
+    exposure_us: Annotated[int, typer.Option("--exposure-us", min=10, help="Exposure to begin with.")] = 8000,
     frames_per_s: Annotated[
-        float, typer.Option("--fps", min=0.1, max=20, help="Pictures a second, at most.")
+        float, typer.Option("--fps", min=0.1, max=20, help="Largest number of pictures per second.")
     ] = 5.0,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0 for any free one.")
+    ] = 0,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before real LEDs are lit.")] = False,
 ) -> None:
     """Live view of the camera, or of a run in progress: figures here, pictures on a page for this machine.
@@ -188,8 +193,10 @@ def live(
 
 def confirm(
     rig: Annotated[Path, typer.Argument(help="The rig (YAML).", show_default=False)],
-    name: Annotated[str, typer.Option("--name", help="Who has been to the cell.", show_default=False)],
-    note: Annotated[str, typer.Option("--note", help="What the cause was.")] = "",
+    name: Annotated[
+        str, typer.Option("--name", help="Name of the person who has been to the cell.", show_default=False)
+    ],
+    note: Annotated[str, typer.Option("--note", help="Cause of the fault.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """A named person's word that, after a fault of the arm, its cause is found, the cell is clear and the arm may

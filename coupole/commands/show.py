@@ -25,16 +25,16 @@ SourceArgument = Annotated[
 OutOption = Annotated[Path, typer.Option("--out", help="The page, FILE.html.", show_default=False)]
 ViewOption = Annotated[
     list[str] | None,
-    typer.Option("--view", help="Of a run: views to show, NAME or a pattern; repeatable. All without it."),
+    typer.Option("--view", help="For a run: views to show, a name or a pattern; repeat for more. By default all."),
 ]
 SamplesOption = Annotated[
-    bool, typer.Option("--samples", help="Of a result of runs: put all samples beside the page, for its plots.")
+    bool, typer.Option("--samples", help="For a result of runs: put all samples beside the page, for its plots.")
 ]
 PlanesOption = Annotated[
     int | None,
     typer.Option(
         "--residual-planes",
-        help="Of a result of runs: planes for what GGX leaves of it, 0 for none; 9 without it.",
+        help=("For a result of runs: number of planes of the residual that GGX leaves, 0 for none; by default 9."),
         min=0,
         max=29,
         show_default=False,
@@ -42,7 +42,7 @@ PlanesOption = Annotated[
 ]
 EnvironmentOption = Annotated[
     Path | None,
-    typer.Option("--environment", help="Of a result: light from all around, .exr or .hdr, twice as wide as high."),
+    typer.Option("--environment", help="For a result: environment map, .exr or .hdr, twice as wide as high."),
 ]
 
 

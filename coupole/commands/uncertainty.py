@@ -28,7 +28,10 @@ _SAMPLES = 24
 CoverageOption = Annotated[
     list[float] | None,
     typer.Option(
-        "--coverage", help="Of an interval, again for more. 0.68 and 0.95 if not given.", min=0.01, max=0.99
+        "--coverage",
+        help="Coverage of an interval; repeat for more. By default 0.68 and 0.95.",
+        min=0.01,
+        max=0.99,
     ),
 ]
 
@@ -37,10 +40,18 @@ CoverageOption = Annotated[
 class SpotOfObject:
     """Measured spot: a triangle of the mesh, and the light on it."""
 
-    incidence_deg: Annotated[float, typer.Option("--incidence", min=0.0, max=75.0, help="Of the light.")] = 42.0
-    vertex_um: Annotated[float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error.")] = 30.0
-    edge_um: Annotated[float, typer.Option("--edge-um", min=1.0, help="Of the mesh's triangles.")] = 200.0
-    pixels: Annotated[int, typer.Option("--pixels", min=1, help="Of a triangle, per channel.")] = 5
+    incidence_deg: Annotated[
+        float, typer.Option("--incidence", min=0.0, max=75.0, help="Angle of incidence of the light.")
+    ] = 42.0
+    vertex_um: Annotated[
+        float, typer.Option("--vertex-um", min=0.0, help="Limit of the scanner's error at a vertex.")
+    ] = 30.0
+    edge_um: Annotated[float, typer.Option("--edge-um", min=1.0, help="Edge length of the mesh's triangles.")] = (
+        200.0
+    )
+    pixels: Annotated[
+        int, typer.Option("--pixels", min=1, help="Number of pixels of a triangle, per channel.")
+    ] = 5
     contrast: Annotated[
         float, typer.Option("--contrast", min=0.0, help="Relative change of albedo per mm of the object.")
     ] = 0.02
@@ -51,14 +62,15 @@ def budget(
     records: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, led-power, "
-            "drift. Without a record, seed 003's or assumed figures.",
+            help="Records, or folders of them: camera, hand-eye, leds, mesh, flat-field, response, "
+            "led-power, drift. Where there is no record, figures of seed 003 or assumed ones are "
+            "used.",
             metavar="RECORD_OR_FOLDER",
         ),
     ] = None,
     plan: Annotated[
         Path | None,
-        typer.Option("--plan", help="Add the records that this plan names, of other kinds."),
+        typer.Option("--plan", help="Add the records of other kinds that this plan names."),
     ] = None,
     beside: Annotated[
         list[Path] | None,

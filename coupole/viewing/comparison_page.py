@@ -17,7 +17,7 @@ from coupole.viewing.view_solids import Points, Solid
 
 REPORT, MAPS = "report.html", "maps.ply"
 _ENDS = (np.array([0.13, 0.33, 0.62]), np.array([0.93, 0.93, 0.91]), np.array([0.70, 0.35, 0.05]))
-"""Of distances: inwards, none, outwards; blue and orange differ to all eyes."""
+"""Colours of distances inwards, of none, and outwards; blue and orange differ to all eyes."""
 _UNKNOWN = np.array([0.55, 0.55, 0.58])
 _STRONG = np.array([0.35, 0.0, 0.35])
 _REGIONS_SHOWN = 20
@@ -42,7 +42,7 @@ def write(found: Comparison, folder: Path) -> None:
 
 
 def remarks(found: Comparison) -> Iterator[str]:
-    """What its reader must know, one sentence each."""
+    """Yield what the reader of the report must know, one sentence each."""
     known = np.isfinite(found.distance_mm)
     yield (
         f"shape: {int(found.moved.sum()):,} of {int(known.sum()):,} points changed significantly, in "

@@ -51,7 +51,7 @@ def show_dose(console: Console, ledger: Ledger, history: History, others: list[s
 
 
 def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, Any]:
-    """For `--json`."""
+    """Return the document for `--json`."""
     return {
         "object": ledger.object_id,
         "ledger": str(ledger.path),

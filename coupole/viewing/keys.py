@@ -68,7 +68,7 @@ def _read(terminal: int, ended: int, actions: Mapping[str, Callable[[], object]]
 
 
 def _is_ours() -> bool:
-    """Whether standard input is a terminal, and this process in its foreground."""
+    """Tell whether standard input is a terminal, and this process in its foreground."""
     try:
         terminal = sys.stdin.fileno()
         return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()

@@ -77,7 +77,7 @@ class Studio:
     def __init__(self, choice: Choice) -> None:
         self.closing = threading.Event()
         self.remark = ""
-        """What the source has to say; empty if nothing."""
+        """Remark of the source, for the viewer; empty if there is none."""
         self._asked_s = time.monotonic()
         self._lock = threading.Lock()
         self._shown: Shown | None = None

@@ -34,7 +34,7 @@ _WIDTH_PX = 960
 _REQUEST_S = 10.0
 """A connection is closed after this time, whatever it is doing."""
 MOST_CONNECTIONS = 16
-"""At once; one more closes the oldest. A page has two, for some milliseconds each."""
+"""Most connections at the same time; one more closes the oldest. A page has two, for some milliseconds each."""
 _MOST_POSTED = 4096
 _OURS = "X-Coupole-Live"
 """Browsers send this header only for pages of this server, so no other site can switch LEDs."""
@@ -211,7 +211,8 @@ class _Viewer(BaseHTTPRequestHandler):
         return self.rfile.read(size)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """In place of the base class's page: for requests that it cannot read, and for other methods."""
+        """Send plain text in place of the base class's page, for requests that it cannot read and for other
+        methods."""
         self._send(HTTPStatus(code), Answer("text/plain; charset=utf-8", HTTPStatus(code).phrase.encode()))
 
     def _send(self, status: HTTPStatus, answer: Answer) -> None:
@@ -256,7 +257,7 @@ def _policy(html: bytes) -> str:
 
 
 def _content(html: bytes, tag: str) -> bytes:
-    """Of the page's one element of this name."""
+    """Return the content of the page's only element of this name."""
     _, _, after = html.partition(f"<{tag}>".encode())
     return after.partition(f"</{tag}>".encode())[0]
 

@@ -45,7 +45,7 @@ def write_object_picture(job: Job, path: Path) -> None:
 
 
 def _lookout(low: Any, high: Any, *, above: bool) -> Lookout:
-    """Without perspective; with the support's centre in the picture."""
+    """Return a viewpoint without perspective, with the support's centre in the picture."""
     low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     across, along = (high - low)[[0, 1] if above else [0, 2]] + 20.0
     eye = look_at((low + high) / 2, 5000.0, -90.0, 90.0 if above else 0.0)

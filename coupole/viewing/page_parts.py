@@ -63,7 +63,7 @@ def moment(utc: str) -> str:
 
 
 def link(path: str, shown: str = "") -> str:
-    """To a file beside the page."""
+    """Return a link to a file beside the page."""
     return f'<a href="{text(path)}">{text(shown or path)}</a>'
 
 

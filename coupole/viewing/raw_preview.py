@@ -16,7 +16,7 @@ _SATURATED, _SHARP = (255, 0, 0), (0, 255, 60)
 _SHARP_GRADIENT = 0.25
 """Relative change of brightness from one cell to the next, above which an edge is in focus."""
 _BEYOND_NOISE = 5.0
-"""Of the standard error of a frame's mean product of gradients, below which noise may have made it."""
+"""Multiple of the standard error of a frame's mean product of gradients, below which noise may have made it."""
 _CLIPPED = 0.001
 """Share of a region's pixels at full scale, above which it says nothing about the white point."""
 _DARK = 0.02
@@ -38,9 +38,9 @@ class Figures:
     """Figures of a RAW frame."""
 
     histograms: dict[str, list[int]]
-    """By channel (R, G1, G2, B; Y for MONO): pixels in `BINS` equal steps from 0 to full scale."""
+    """Pixels by channel (R, G1, G2, B; Y for MONO), in `BINS` equal steps from 0 to full scale."""
     saturated: dict[str, float]
-    """By channel: share of pixels at full scale."""
+    """Share of pixels at full scale, by channel."""
     brightest: float
     """99.9 % quantile, share of the range above black."""
     sharpness: float
@@ -115,7 +115,8 @@ def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
 
 
 def _sharpness(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    """Of two planes [h, w] of the same scene with independent noise; 0 where there is no more than noise."""
+    """Return the sharpness of two planes [h, w] of the same scene with independent noise; 0 if there is only
+    noise."""
     products = np.diff(one, axis=0)[:, 1:] * np.diff(other, axis=0)[:, 1:]
     products += np.diff(one, axis=1)[1:] * np.diff(other, axis=1)[1:]
     energy, noise = float(products.mean()), float(products.std()) / math.sqrt(products.size)

@@ -21,7 +21,7 @@ from coupole.viewing.reflectance_page import STYLE
 
 REPORT = "report.html"
 LONGER = 10.0
-"""Of arrows, over the disagreement."""
+"""Length of arrows over the disagreement that they show."""
 SURPRISING = 3.0
 """Standard deviations of a sum of squares beyond which stated uncertainties are called too small."""
 _STYLE = STYLE + "svg{background:#000}line{stroke:#f40;stroke-width:1.5}circle{fill:#f40}"
@@ -42,7 +42,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """What its maker must know, one sentence each."""
+    """Yield what the maker of the refinement must know, one sentence each."""
     if about["simulated"]:
         yield "frames of a simulated cell"
     for when, told in (("before", "views disagree by"), ("after", "after refinement by")):
@@ -61,7 +61,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
 
 
 def surprising(about: dict[str, Any]) -> bool:
-    """Whether the steps are larger than what was stated explains."""
+    """Tell whether the steps are larger than the stated uncertainties explain."""
     expected = about["determined"]
     return bool(about["chi2_of_steps"] > expected + SURPRISING * np.sqrt(2 * expected))
 

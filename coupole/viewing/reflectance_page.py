@@ -23,7 +23,8 @@ from coupole.viewing.raw_preview import png
 WIDTH_PX = 480
 MOST_CHECKS = 6
 POOR_RESIDUAL = 0.05
-"""Of square roots of values, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
+"""Residual of square roots of values, as a share of the diffuse part's, beyond which the material model itself is
+in doubt."""
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.2em .8em .2em 0;text-align:left;vertical-align:top}
@@ -43,7 +44,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """What its maker must know, one sentence each."""
+    """Yield what the maker of the result must know, one sentence each."""
     if run := about.get("uncalibrated_run"):
         yield (
             f"of the run {run} without calibrations: values are relative, and lights stand where rig and LED "

@@ -108,7 +108,8 @@ def _exposure_in_words(run: Run, views: Sequence[SampledView]) -> str:
 
 
 def _plans_budget_lux_h(run: Run) -> float | None:
-    """For runs whose journal has none."""
+    """Read the dose budget from the plan, for runs whose journal has none; None if the plan has none or cannot be
+    read."""
     try:
         plan = yamlfile.read(run.plan_path).validate(Plan)
     except (InputError, OSError):

@@ -18,12 +18,12 @@ from coupole.viewing.run_sample import SampledView
 from coupole.viewing.terminal import bytes_text, duration_text
 
 _MOST_LINES = 30
-"""Of trouble, before the rest is only counted."""
+"""Most lines of trouble; the rest is only counted."""
 _STOPPED_IN_0_1 = "Interrupted"
 
 
 def light_in_words(found: Status, budget_lux_h: float | None) -> str:
-    """Of all sessions; a burst whose end was not recorded counts as planned."""
+    """Return the light of all sessions; a burst whose end was not recorded counts as planned."""
     light_s = sum(session.light_s for session in found.sessions)
     allowed = f" (the object may receive {budget_lux_h:g} in its life)" if budget_lux_h else ""
     return f"{found.dose_lux_h:.3f} lux h{allowed}, LEDs on for {light_s:.1f} s"
@@ -46,7 +46,7 @@ def light(events: Sequence[Event], views: Iterable[SampledView], found: Status) 
 
 
 def duration_in_words(found: Status) -> str:
-    """Of all sessions together."""
+    """Return the duration of all sessions together."""
     total_s = sum(session.duration_s for session in found.sessions)
     pauses = sum(session.pauses for session in found.sessions)
     paused_s = sum(session.paused_s for session in found.sessions)
@@ -57,7 +57,7 @@ def duration_in_words(found: Status) -> str:
 
 
 def sessions(found: Status) -> str:
-    """When each began, how long it took and was paused, and how it ended."""
+    """Return a table of sessions: when each began, how long it took and was paused, and how it ended."""
     rows = []
     for number, session in enumerate(found.sessions, 1):
         outcome, reason = _end_of(session, found, last=number == len(found.sessions))
@@ -111,7 +111,7 @@ def _records(run: Run) -> dict[str, tuple[Any, str]]:
 
 
 def troubles(events: Iterable[Event], views: Iterable[SampledView], found: Status) -> list[str]:
-    """What went wrong, a line of HTML each."""
+    """Return what went wrong, a line of HTML each."""
     lines = []
     for event in events:
         if isinstance(event, FaultNoted) and event.kind != _STOPPED_IN_0_1:

@@ -1,4 +1,4 @@
-"""What a run's pictures show, as sections of its report: exposure, coverage of the mesh, the pictures."""
+"""Sections of a run's report about what its pictures show: exposure, coverage of the mesh, the pictures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SPOKEN = {"R": "red", "G": "green", "B": "blue", "Y": "grey"}
 
 
 def exposure_in_words(views: Sequence[SampledView]) -> str:
-    """How many views are well exposed; empty without pictures."""
+    """Return how many views are well, over- and under-exposed; empty without pictures."""
     verdicts = [verdict for view in views if (verdict := view.verdict())]
     counts = {verdict: verdicts.count(verdict) for verdict in ("well exposed", "over-exposed", "under-exposed")}
     told = [f"{count} of {len(verdicts)} views {verdict}" for verdict, count in counts.items() if count]

@@ -1,4 +1,4 @@
-"""How much of an object's surface the views of a run show, by its mesh and the poses that were measured."""
+"""Coverage: how much of an object's surface the views of a run show, by its mesh and the measured poses."""
 
 from __future__ import annotations
 
@@ -41,23 +41,24 @@ _BACKGROUND = 255
 
 @dataclass(frozen=True)
 class Coverage:
-    """Of the part of the surface that can be seen from anywhere above the disk."""
+    """Coverage of the reachable part of the surface: what can be seen from anywhere above the disk."""
 
     placement: Placement
     sharp_mm: tuple[float, float]
     views: tuple[Framing, ...]
-    """Of the views that have proven shots."""
+    """Framings of the views that have proven shots."""
     shares: tuple[float, ...]
-    """[n]: share of that part which at least n + 1 views show, up to `MOST` views or as many as there are."""
+    """[n]: share of the reachable part that at least n + 1 views show, up to `MOST` views or as many as there
+    are."""
     reachable: float
-    """That part, as a share of the whole surface."""
+    """Reachable part, as a share of the whole surface."""
     drawings: dict[str, bytes]
-    """PNGs by whence the object is seen; the colour is `of_share(views / MOST)`."""
+    """PNGs by the direction from which the object is seen; the colour is `of_share(views / MOST)`."""
 
 
 def coverage_of(run: Run, views: Sequence[SampledView]) -> Coverage | None:
-    """None for an object without mesh, or if no view has a measured pose. Raises InputError if the run's plan,
-    rig or mesh cannot be read."""
+    """Return the coverage of a run; None for an object without mesh, or if no view has a measured pose. Raises
+    InputError if the run's plan, rig or mesh cannot be read."""
     files = read_plan(run.plan_path, run.rig_path)
     poses = {view.name: view.base_from_camera for view in views if view.base_from_camera is not None}
     if files.mesh_path is None or not poses:
@@ -67,8 +68,8 @@ def coverage_of(run: Run, views: Sequence[SampledView]) -> Coverage | None:
 
 
 def coverage(rig: Rig, corners_mm: NDArray[np.float64], poses: dict[str, Transform]) -> Coverage:
-    """Of an object [triangles, 3, 3] (support frame) by views with these `base_from_camera`. Raises InputError for
-    a mesh of which nothing can be seen."""
+    """Return the coverage of an object [triangles, 3, 3] (support frame) by views with these `base_from_camera`.
+    Raises InputError for a mesh of which nothing can be seen."""
     support_from_base = inverse(rig.support.base_from_support.matrix())
     sights = [sight_of(rig, support_from_base @ pose) for pose in poses.values()]
     mesh, points_mm = ray_mesh(corners_mm), surface_samples(corners_mm)

@@ -23,7 +23,8 @@ from coupole.storage.durable import write_synced
 from coupole.viewing.reflectance_page import STYLE, display, figure, grey
 
 POOR_RESIDUAL = 0.05
-"""Of square roots, as a share of the diffuse part's: beyond it the material model itself is in doubt."""
+"""Residual of square roots, as a share of the diffuse part's, beyond which the material model itself is in
+doubt."""
 WHITE_KS = 0.1
 LEAST_KS = 0.004
 """A tenth of a dielectric's: below it the roughness says nothing."""
@@ -46,7 +47,7 @@ def write(folder: Path) -> Path:
 
 
 def remarks(about: dict[str, Any]) -> Iterator[str]:
-    """What its maker must know, one sentence each."""
+    """Yield what the maker of the result must know, one sentence each."""
     if about["simulated"]:
         yield "frames of a simulated cell"
     views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"
@@ -241,7 +242,7 @@ def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]
 
 
 def _rgb(values: NDArray[Any]) -> NDArray[Any]:
-    """Of one channel three."""
+    """Repeat a single channel three times."""
     return values if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
 
 

@@ -1,4 +1,4 @@
-"""What a sample of a run's proven frames shows, view by view: exposure, histograms, small pictures."""
+"""Sample of a run's proven frames, and what it shows of each view: exposure, histograms, small pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coupole.viewing.raw_preview import BINS, Coding, channels, look
 
 PICTURES_PER_VIEW = 12
 _PICTURES_PER_EXPOSURE = 4
-"""At least, of a bracket."""
+"""Least number of pictures for each exposure time of a bracket."""
 _PICTURE_WIDTH_PX = 320
 
 
@@ -34,7 +34,7 @@ class SampledExposure:
     worst: str = ""
     """The sampled shot with the largest share of saturated pixels; empty if none has any."""
     histograms: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-    """By colour (R, G, B; Y for MONO): pixels of all sampled frames in `BINS` equal steps from 0 to full scale."""
+    """Pixels of all sampled frames by colour (R, G, B; Y for MONO), in `BINS` equal steps from 0 to full scale."""
     black_share: float = 0.0
     """The black level as a share of full scale."""
 
@@ -68,7 +68,7 @@ class SampledView:
     base_from_camera: Transform | None = None
     """Measured; None if the view has no frame, or its file no pose."""
     trouble: str = ""
-    """Why its file cannot be read; empty if it can."""
+    """Reason why the view's file cannot be read; empty if it can."""
 
     def verdict(self) -> str:
         """`over-exposed` if even the shortest exposure saturates, `under-exposed` if even the longest is dark,

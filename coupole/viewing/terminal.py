@@ -45,7 +45,7 @@ def make_console(*, quiet: bool) -> Console:
 
 
 class _Console(Console):
-    """As wide as the terminal that reads it, also where a queue lies between."""
+    """Console as wide as the terminal that reads it, also if a queue is between them."""
 
     @property
     def size(self) -> ConsoleDimensions:

@@ -21,11 +21,11 @@ import threading
 from coupole.viewing.text_queue import TextQueue, Unread
 
 PATIENCE_S = 1.0
-"""At its end a command waits so long for a reader who takes nothing."""
+"""Time for which a command waits at its end for a reader who takes nothing."""
 AT_MOST_S = 10.0
-"""And so long for one who is slow."""
+"""Time for which it waits at most for a reader who is slow."""
 DOCUMENT_PATIENCE_S = 10.0
-"""So long for a reader of standard output who takes nothing: half a document is worth nothing."""
+"""Time for which it waits for a reader of standard output who takes nothing: half a document is worth nothing."""
 _DOCUMENT_BYTES = 1 << 24
 _WRITE_BYTES = 4096
 _FIRST_KEPT_FD = 10
@@ -35,7 +35,8 @@ class Outlet:
     """The way of one of the standard streams from this process, its libraries and children to its reader."""
 
     def __init__(self, fd: int, queue: TextQueue) -> None:
-        """From now on descriptor `fd` leads into the queue, and only a thread of this to what it was."""
+        """Lead descriptor `fd` into the queue from now on; only a thread of this outlet writes to what it was
+        before."""
         self.fd, self.queue = fd, queue
         self.reader_fd = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
         ours, theirs = os.pipe()
@@ -49,13 +50,14 @@ class Outlet:
         threading.Thread(target=self._listen, name=f"text into {fd}", daemon=True).start()
 
     def put(self, text: bytes) -> None:
-        """After what libraries and children have written so far. Never waits."""
+        """Append text to what libraries and children have written so far. Never waits."""
         with self._order:
             self.collect()
             self.queue.put(text)
 
     def collect(self) -> bool:
-        """What libraries and children have written; whether any of them can write more."""
+        """Put what libraries and children have written into the queue. Return whether any of them can write
+        more."""
         with self._order, contextlib.suppress(BlockingIOError):
             while text := os.read(self._pipe, 65536):
                 self.queue.put(text)
@@ -87,7 +89,7 @@ class Outlet:
 
 
 class _Stream(io.RawIOBase):
-    """What `sys.stdout` and `sys.stderr` write to."""
+    """Stream to which `sys.stdout` and `sys.stderr` write."""
 
     def __init__(self, outlet: Outlet) -> None:
         self._outlet = outlet
@@ -123,8 +125,8 @@ def keep_standard_places() -> None:
 
 
 def install() -> None:
-    """From now on, to the end of this process, nothing that it prints waits for a reader. Streams that somebody
-    has replaced (tests) stay as they are."""
+    """Make nothing that this process prints wait for a reader, from now to its end. Streams that somebody has
+    replaced (tests) stay as they are."""
     keep_standard_places()
     for fd, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
@@ -146,8 +148,8 @@ def install() -> None:
 
 
 def full_stdout() -> str:
-    """Why standard output does not take what was written to it; empty if it does, or if its reader has gone. What
-    it did not take is dropped."""
+    """Return why standard output does not take what was written to it; empty if it does, or if its reader has
+    gone. What it did not take is dropped."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -161,14 +163,15 @@ def full_stdout() -> str:
 
 
 def unread() -> Unread | None:
-    """What was not taken of standard error so far; None if all was, or its reader is only a little late."""
+    """Return what of standard error was not taken so far; None if all was, or its reader is only a little late."""
     outlet = _installed.get("stderr")
     found = outlet.queue.unread() if outlet else None
     return found if found and (found.lost_bytes or found.stalled_s >= PATIENCE_S) else None
 
 
 def terminal_size() -> os.terminal_size | None:
-    """Of the terminal that reads standard error, if one does and text goes there by a queue."""
+    """Return the size of the terminal that reads standard error; None if none does, or text does not go there by a
+    queue."""
     outlet = _installed.get("stderr")
     with contextlib.suppress(OSError):
         return os.get_terminal_size(outlet.reader_fd) if outlet else None
@@ -176,7 +179,7 @@ def terminal_size() -> os.terminal_size | None:
 
 
 def say_now(text: str, patience_s: float) -> None:
-    """On standard error, whose reader has this time for it. Never waits longer."""
+    """Write text to standard error, and give its reader this time to take it. Never waits longer."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody is there
         if "stderr" in _installed:
             sys.stderr.write(text)
@@ -196,7 +199,7 @@ def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE
 
 
 def _is(stream: object, fd: int) -> bool:
-    """Whether a stream leads to a descriptor."""
+    """Tell whether a stream leads to a descriptor."""
     try:
         return bool(stream.fileno() == fd)  # type: ignore[attr-defined]
     except (AttributeError, OSError, ValueError):

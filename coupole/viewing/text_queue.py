@@ -12,13 +12,13 @@ MOST_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Unread:
-    """What a reader has not been given."""
+    """Text that a reader has not been given."""
 
     lost_lines: int
     lost_bytes: int
     waiting_bytes: int
     stalled_s: float
-    """How long the reader has taken nothing though something waits."""
+    """Time for which the reader has taken nothing though something waits."""
 
     def __bool__(self) -> bool:
         return bool(self.lost_bytes or self.waiting_bytes)
@@ -29,7 +29,7 @@ class TextQueue:
     many lines are gone. From any thread."""
 
     def __init__(self, most_bytes: int = MOST_BYTES, *, tells: bool = True) -> None:
-        """`tells`: of what was dropped, in its place; not in a document."""
+        """Make an empty queue. `tells`: it reports what was dropped, in its place; false for a document."""
         self._most_bytes, self._tells = most_bytes, tells
         self._pieces: deque[bytes] = deque()
         self._waiting_bytes = self._taken_bytes = 0  # taken: handed out, not yet with the reader
@@ -39,7 +39,7 @@ class TextQueue:
         self._changed = threading.Condition()
 
     def put(self, text: bytes) -> None:
-        """Never waits."""
+        """Append text. Never waits."""
         if not text:
             return
         with self._changed:

@@ -27,7 +27,7 @@ _OUTLINE = 0.55
 _LINE_BIAS, _LINE_BIAS_MM = 2e-3, 10.0
 """Depth tolerance for lines on surfaces: as a share of the depth (perspective), or in mm."""
 _NEARNESS_PER_MM = 1e-5
-"""Without perspective."""
+"""Nearness per mm of depth, without perspective."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 @numba.njit(cache=True, nogil=True)
 def _rasterise(pixels, near, nearest, face):  # type: ignore[no-untyped-def]
-    """For each pixel the nearest triangle (pixels [n, 3, 2], nearness [n, 3]), into `nearest` and `face`."""
+    """Write the nearest triangle of each pixel (pixels [n, 3, 2], nearness [n, 3]) into `nearest` and `face`."""
     height, width = nearest.shape
     for k in range(len(pixels)):
         ax, ay = pixels[k, 0]

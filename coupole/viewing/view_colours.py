@@ -22,7 +22,7 @@ UNUSED: Colour = (0.80, 0.80, 0.80)
 INK: Colour = (0.13, 0.15, 0.18)
 
 _SHARE = np.array([(0.16, 0.16, 0.32), (0.20, 0.42, 0.55), (0.35, 0.68, 0.55), (0.95, 0.85, 0.30)])
-"""From 0 to 1: from dark to light, without red, so that it is readable in grey too."""
+"""Colours of shares from 0 to 1: from dark to light, without red, so that they are readable in grey too."""
 
 
 def of_share(share: ArrayLike) -> NDArray[np.float64]:

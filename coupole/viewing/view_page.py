@@ -22,7 +22,7 @@ from coupole.viewing.view_solids import Points, Solid, disk, joined, with_fewer_
 _OBJECT_FACES = 30_000
 _ROUND = 12
 _MANY = 8
-"""With more views than this the arm is shown in one view at a time only."""
+"""Number of views beyond which the arm is shown in one view at a time only."""
 _SUPPORT_THICKNESS_MM = 15.0
 _OVERVIEW, _ALWAYS = 0, -1
 """Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""

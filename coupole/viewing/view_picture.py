@@ -60,7 +60,7 @@ def write_picture(scene: Scene, path: Path) -> None:
 
 
 def _cell_lookout(scene: Scene, width: int, height: int) -> Lookout:
-    """From outside, with a long focal length, so that the whole dome is in the picture."""
+    """Return a viewpoint outside the dome, with a long focal length, so that the whole dome is in the picture."""
     radius_mm = float(np.linalg.norm(scene.leds_mm, axis=1).max())
     distance_mm = 4.0 * radius_mm
     eye = look_at((0, 0, 0.45 * radius_mm), distance_mm, -60.0, 18.0)
@@ -69,7 +69,7 @@ def _cell_lookout(scene: Scene, width: int, height: int) -> Lookout:
 
 
 def _flat_lookout(scene: Scene, width: int, height: int, *, above: bool) -> Lookout:
-    """Without perspective, scaled to support and arm."""
+    """Return a viewpoint without perspective, scaled to support and arm."""
     standing = [stop.joints_deg for stop in scene.stops]
     standing += [stop.clash.joints_deg for stop in scene.stops if stop.clash is not None]
     arms = [scene.arm(joints, around=8) for joints in (scene.home_deg, *standing) if joints is not None]

@@ -59,7 +59,7 @@ class Stop:
 
     name: str
     number: int
-    """In the order of visiting, from 1; refused views come last."""
+    """Number in the order of visiting, from 1; refused views come last."""
     joints_deg: Joints | None
     """[6] joint angles at the view; None if the arm cannot reach it."""
     leg_s: float | None
@@ -74,7 +74,7 @@ class Stop:
     """[n, 3] closed line around the part of object and support that the picture shows."""
     shadow: Occlusion | None
     refusal: str
-    """Why this view makes the plan be refused; empty if it does not."""
+    """Reason why the plan is refused for this view; empty if it is not."""
     clash: Clash | None
 
 

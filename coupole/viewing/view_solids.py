@@ -65,7 +65,7 @@ def box(name: str, low_mm: ArrayLike, high_mm: ArrayLike) -> Solid:
 
 
 def disk(name: str, radius_mm: float, thickness_mm: float, around: int = 96) -> Solid:
-    """About the origin, its top at z = 0."""
+    """Return a disk around the origin, with its top at z = 0."""
     angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
     rim = radius_mm * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     low = np.array((0, 0, -thickness_mm))
@@ -83,7 +83,7 @@ def disk(name: str, radius_mm: float, thickness_mm: float, around: int = 96) -> 
 
 
 def with_fewer_faces(solid: Solid, faces_at_most: int) -> Solid:
-    """About the same shape with fewer faces, for drawing."""
+    """Return about the same shape with fewer faces, for drawing."""
     return Solid(solid.name, *simplified(solid.vertices_mm, solid.faces, faces_at_most))
 
 

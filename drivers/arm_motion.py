@@ -1,4 +1,5 @@
-"""What the arm drivers share: checks of targets, stopping times and angles, waiting, age of the last message.
+"""Parts that the arm drivers share: checks of targets, stopping times and angles, waiting, age of the last
+message.
 
 Angles are degrees of the arm's six axes; speeds, accelerations and jerks are of the same axes.
 """

@@ -77,12 +77,12 @@ FRAME_TRIGGER = (
     _line("TriggerDivider", 1),
     _line("TriggerMultiplier", 1),
 )
-"""Of the trigger that starts frames, once it is on: some cameras lock them before."""
+"""Features of the trigger that starts frames, set once it is on: some cameras lock them before."""
 TRIGGER_LINE = (
     Line(("LineMode",), ("Input",)),
     _line("LineInverter", False),
 )
-"""Of the line that the trigger comes on."""
+"""Features of the line on which the trigger comes."""
 _ONE_OF_SEVERAL = (
     ("RegionSelector", "RegionMode", "Region0"),
     ("ComponentSelector", "ComponentEnable", "Intensity"),
@@ -114,7 +114,7 @@ class State:
         self._features = features
         self._rigs = {*settings.features, *settings.leave}
         self.held: dict[str, str] = {}
-        """By feature, or feature[entry of its selector]: values as read back."""
+        """Values as read back, by feature or feature[entry of its selector]."""
 
     def apply(self, lines: Collection[Line]) -> None:
         """Set the features of these lines, in their order."""

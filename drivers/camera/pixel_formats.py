@@ -25,7 +25,7 @@ class PixelFormat:
     """PFNC value; bits 16 to 23 are the bits per pixel on the wire."""
     bit_depth: int
     bayer_pattern: str
-    """As in `coupole.devices.FrameFormat`."""
+    """Bayer pattern as in `coupole.devices.FrameFormat`."""
     packing: Packing
 
     @property
@@ -62,7 +62,7 @@ FORMATS = {
     for code, (suffix, depth, size, packing) in zip(codes, _COLUMNS, strict=True)
     if code
 }
-"""By name, as the feature `PixelFormat` holds it."""
+"""Formats by name, as the feature `PixelFormat` holds it."""
 
 
 @numba.njit(cache=True, nogil=True)

@@ -27,7 +27,7 @@ from drivers.ledbox.usbtmc import UsbtmcLink
 from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
 
 _BLOCK_TIMEOUT_S = 2.2
-"""After this silence the box has discarded an incomplete block (its own limit is 2 s)."""
+"""Silence after which the box has discarded an incomplete block (its own limit is 2 s)."""
 _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 """Duration of a poll during a burst, and its bytes on the line apart from records."""
 _MAX_RECORDS_PER_POLL = 512
@@ -279,7 +279,7 @@ class LedBox:
         return str(version)
 
     def _ask_enabling_switch(self) -> bool:
-        """Whether the box has an input for one: older firmware does not know the question."""
+        """Ask whether the box has an input for an enabling switch: older firmware does not know the question."""
         try:
             self._scpi.ask("INP:ENAB?", 1)
         except DeviceRefused as refused:
@@ -350,7 +350,7 @@ class LedBox:
         return int(self._scpi.number(crc))
 
     def _poll(self) -> tuple[bool, NDArray[np.void]]:
-        """Whether there are more records of finished steps to fetch, and the next ones."""
+        """Return whether there are more records of finished steps to fetch, and the next ones."""
         bytes_wanted = self._scpi.bytes_per_s * _POLL_S - _POLL_OVERHEAD_BYTES
         limit = max(1, min(_MAX_RECORDS_PER_POLL, int(bytes_wanted / RECORD_BYTES)))
         command = f"SEQ:STAT?;INDex?;LOG? {self._next_record},{limit}"

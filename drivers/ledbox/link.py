@@ -1,4 +1,4 @@
-"""What carries bytes to a box and back, with a device clear that waits for no exchange."""
+"""Links that carry bytes to a box and back, with a device clear that waits for no exchange."""
 
 from __future__ import annotations
 

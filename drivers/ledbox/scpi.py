@@ -42,7 +42,7 @@ class ScpiSession:
         """Device clears so far when both ends were last in step; None if an exchange has gone wrong since."""
         self._calls = threading.local()
         self._ends = 0
-        """How often all calls in progress were ended."""
+        """Number of times that all calls in progress were ended."""
 
     def ask(self, command: str | bytes, replies: int, reply_bytes: int = 0) -> tuple[Unit, ...]:
         """Send a message and return its `replies` response units, which may contain `reply_bytes` of blocks.

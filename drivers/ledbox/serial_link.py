@@ -69,7 +69,7 @@ class SerialLink:
                 raise TimeoutError(f"{len(rest)} of {len(data)} bytes could not be sent")
 
     def read(self, deadline: Deadline, clears: int) -> bytes:
-        """At least one byte, and all others that have arrived."""
+        """Read at least one byte, and all others that have arrived."""
         while True:
             self._refuse_closed(clears)
             late = deadline.expired  # read first: bytes that arrived in time are accepted even if read late
@@ -182,7 +182,7 @@ class SerialLink:
             raise ConnectionError("the port was closed")
 
     def _failure(self, error: Exception, clears: int) -> Exception:
-        """What to raise for an error of the port: a device clear may have closed it."""
+        """Return the exception to raise for an error of the port: a device clear may have closed it."""
         return Cleared() if self.clears != clears else ConnectionError(str(error))
 
 

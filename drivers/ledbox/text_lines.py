@@ -42,7 +42,7 @@ _FIELDS: dict[str, tuple[frozenset[str], frozenset[str]]] = {
     "all_off": (frozenset(), frozenset()),
     "identify": (frozenset(), frozenset()),
 }
-"""For each template: the fields that it must have, and those that it may have."""
+"""Fields of each template: those that it must have, and those that it may have."""
 
 
 class Settings(BaseModel):
@@ -70,7 +70,7 @@ class Settings(BaseModel):
     line_ending: Literal["lf", "crlf", "cr"] = "lf"
     """Ending of commands. A reply ends in LF, or in CR if commands do."""
     settle_ms: float = Field(default=2000, ge=0, le=60_000)
-    """From opening the port until the box accepts commands: many microcontrollers reset when it is opened."""
+    """Time from opening the port until the box accepts commands: many microcontrollers reset when it is opened."""
     name: str = "led box"
 
     def longest_light_s(self, on_us: int) -> float:
@@ -124,7 +124,7 @@ class _Flash:
     off_ns: int | None = None
     """Rig time at which the box confirmed that command; None until then."""
     failure: DeviceError | None = None
-    """Why the driver's thread could not end it."""
+    """Error because of which the driver's thread could not end the flash."""
 
 
 class TextLineBox:
@@ -142,7 +142,7 @@ class TextLineBox:
         self.led_count = settings.led_count
         self._lock = threading.RLock()
         self._ends = 0
-        """How often `lights_off` has ended the calls in progress."""
+        """Number of times that `lights_off` has ended the calls in progress."""
         self._flash: _Flash | None = None
         self._in_step = False
         """True if the next line from the box is the answer to the next command."""

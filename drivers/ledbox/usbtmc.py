@@ -161,7 +161,7 @@ class UsbtmcLink:
             raise Cleared
 
     def _failure(self, error: Exception, clears: int) -> Exception:
-        """What to raise for an error of a transfer: a device clear may have ended it."""
+        """Return the exception to raise for an error of a transfer: a device clear may have ended it."""
         return Cleared() if self.clears != clears else error
 
     def _class_request(self, request: int, length: int) -> tuple[int, ...]:

@@ -129,7 +129,7 @@ class UrRobot:
         self._motion_s = 0.0
         self._attention = Attention()
         self._lapses = 0
-        """Of the process, when the last motion began."""
+        """Lapses that the process had counted when the last motion began."""
         config = {field.name: getattr(settings, field.name) for field in fields(Config)}
         self._process = UrProcess(Config(**config))
         try:

@@ -14,9 +14,9 @@ from typing import Any, Literal
 DATAGRAM_BYTES = 65536
 
 EMERGENCY_STOP_BITS, PROTECTIVE_STOP_BIT, SAFEGUARD_STOP_BIT = 0x0E0, 0x004, 0x010
-"""Of RTDE's safety_status_bits."""
+"""Bits of RTDE's safety_status_bits."""
 BACKDRIVE, RUNNING = 6, 7
-"""Of RTDE's robot_mode: those in which the brakes are released."""
+"""Values of RTDE's robot_mode in which the brakes are released."""
 ROBOT_MODES = {
     -1: "no controller",
     0: "disconnected",
@@ -103,7 +103,7 @@ class State:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why the process could not begin."""
+    """Reason why the process could not begin."""
 
     kind: Literal["refused", "fault", "lost"]
     expected: str

@@ -28,7 +28,7 @@ class UrProcess:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._lost = ""
-        """Why no answer can come any more; empty while it can."""
+        """Reason why no answer can come any more; empty while it can."""
         self._began = self._rested = False
         self._errors_fd = os.memfd_create("coupole-ur")
         self._link, its_link = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

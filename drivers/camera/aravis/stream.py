@@ -30,8 +30,8 @@ default, the size of a frame, is too small for one, since the kernel counts the 
 _RECEIVERS = ("arv_gv_stream", "arv_uv_stream")
 _PRIORITY = 10
 _STRAYS_S = 0.02
-"""Until its filter is set, a packet socket receives all traffic of the interface, and libaravis takes it for
-parts of images. It is discarded by waiting this long before any buffer is queued."""
+"""Time to wait before any buffer is queued, which discards stray traffic: until its filter is set, a packet socket
+receives all traffic of the interface, and libaravis takes it for parts of images."""
 _SLICE_S = 0.05
 """Interval at which a waiting thread checks whether the stream was closed or the camera lost."""
 

@@ -34,7 +34,7 @@ _A_LOOK_S = 1e-4
 _NAP_S = 1e-3
 """Pause between polls for a frame: a blocking wait of genicam 1.6 would hold the GIL."""
 _SILENCE_S = 0.5
-"""After this time without frames the camera is queried: not every producer reports a lost camera."""
+"""Time without frames after which the camera is queried: not every producer reports a lost camera."""
 _IN_HAND = 16
 """Most frames in memory on their way to the disk."""
 

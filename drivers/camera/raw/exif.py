@@ -23,7 +23,7 @@ class Exif:
     make: str
     model: str
     serial: str
-    """Of the body; empty if the camera does not record it."""
+    """Serial number of the body; empty if the camera does not record it."""
     firmware: str
     taken_ns: int
     """Start of exposure, truncated to `resolution_us`."""

@@ -88,7 +88,8 @@ class Order:
         return steps
 
     def _before_first(self) -> int:
-        """If no number was known at the start of the burst: the number before the first file that has arrived.
+        """Return the number before the first file that has arrived, if no number was known at the start of the
+        burst.
 
         A file that arrives later with an earlier number is refused.
         """

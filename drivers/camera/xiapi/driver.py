@@ -325,7 +325,8 @@ class XiCamera:
         self._device.set("trigger_software", 1)
 
     def statistics(self) -> CameraStatistics:
-        """From xiAPI's counters, as described in xiApi.h. While disarmed: those of the last acquisition."""
+        """Return statistics from xiAPI's counters, as described in xiApi.h; while disarmed, those of the last
+        acquisition."""
         if self._armed.is_set():
             self._last = self._statistics()
         return self._last

@@ -28,7 +28,7 @@ class Settings(BaseModel):
     device: str = "camera"
     """The camera's name in messages."""
     serial: str = ""
-    """As printed on the camera; empty: the only one connected."""
+    """Serial number as printed on the camera; empty: the only camera connected."""
     library: str = LIBRARY
     """Name or path of libm3api."""
     region: Region | None = None

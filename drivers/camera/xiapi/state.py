@@ -65,7 +65,7 @@ FRAME_TRIGGER = (
     Line("trigger_delay", 0),
     Line("dbnc_en", 0),
 )
-"""Of the selected input, which starts frames."""
+"""Parameters of the selected input, which starts frames."""
 
 
 class State:
@@ -77,7 +77,7 @@ class State:
     def __init__(self, device: XiDevice, rigs: Collection[str]) -> None:
         self._device, self._rigs = device, frozenset(rigs)
         self.held: dict[str, str] = {}
-        """By parameter, or parameter[value of its selector]: values as read back."""
+        """Values as read back, by parameter or parameter[value of its selector]."""
 
     def apply(self, lines: Collection[Line]) -> None:
         """Set the parameters of these lines, in their order."""
@@ -100,7 +100,7 @@ class State:
         return False
 
     def set_if_present(self, parameter: str, value: int | float, entry: str = "") -> None:
-        """As `set`, for a parameter that only some models have."""
+        """Set a parameter as `set` does, if the model has it."""
         if self._device.has(parameter):
             self.set(parameter, value, entry)
 

@@ -40,7 +40,7 @@ _SAME_POSE_MM, _SAME_ROTATION = 1.0, 0.005
 """Largest allowed difference between the controller's flange pose and that computed from its axes."""
 _BEAT_EVERY_S = ATTENTION_S / 4.0
 _T1_SLOWER = 10.0
-"""In T1, motions take up to this factor longer (for time-outs)."""
+"""Largest factor by which motions take longer in T1 (for time-outs)."""
 
 
 class KukaEki:
@@ -227,7 +227,7 @@ class KukaEki:
             )
 
     def _percent(self, speed: float) -> int:
-        """Of the controller's own speeds. Raises DeviceRefused below its slowest."""
+        """Return a speed in percent of the controller's own speeds. Raises DeviceRefused below its slowest."""
         percent = int(round(speed * self.settings.velocity_percent(), 6))
         if percent < 1:
             raise refused(
@@ -354,7 +354,7 @@ def _slower(status: Status) -> float:
 
 
 def _condition(status: Status) -> ArmCondition:
-    """Of the one fault that the controller's program reports, the most serious."""
+    """Return the arm's condition, from the only fault that the controller's program reports: the most serious."""
     mode = "T1" if status.t1 else "automatic or T2"
     released = status.fault not in (wire.EMERGENCY_STOP, wire.DRIVES_OFF)
     return ArmCondition(mode, emergency_stop=status.fault == wire.EMERGENCY_STOP, brakes_released=released)

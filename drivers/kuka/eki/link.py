@@ -82,7 +82,7 @@ class Link:
         self._link, self._watch, self._timeout_s = link, watch, timeout_s
         self._link.settimeout(timeout_s)
         self.changed = threading.Condition()
-        """To be held while the watch is read or changed."""
+        """Condition to be held while the watch is read or changed."""
         self._closing = False
         self._thread = threading.Thread(target=self._read, name="kuka-eki", daemon=True)
         self._thread.start()

@@ -21,13 +21,14 @@ class Settings(BaseModel):
     address: str = Field(default="172.31.1.147:54600", pattern=r"^[^:]+:\d+$")
     """host:port of the controller, or of this machine where the controller is the client."""
     controller_is: Literal["server", "client"] = "server"
-    """Which side listens for the connection; EKI's own configuration (EXTERNAL/TYPE) names the opposite side."""
+    """Side of the controller: the server listens for the connection. EKI's own configuration (EXTERNAL/TYPE) names
+    the opposite side."""
     controller: Literal[""] | IPv4Address = ""
     """The controller's address, where it is the client: connections of any other are turned away and counted. (A
     controller that is the server is reached at `address`.) It may be left out only where no other machine can
     connect, or by a person's word."""
     any_controller_by: str = Field(default="", max_length=60)
-    """Who has decided that whoever connects first is taken for the controller."""
+    """Person who has decided that whoever connects first is taken for the controller."""
     status_ms: int = Field(default=20, ge=4)
     """Period of the controller's status messages, in controller time."""
     link_timeout_s: float = Field(default=2.0, gt=0)

@@ -15,7 +15,7 @@ from drivers.kuka.eki.wire import Six, Status
 
 @dataclass(frozen=True)
 class Fault:
-    """Why the session has ended; only the first fault is kept."""
+    """Fault that has ended the session; only the first one is kept."""
 
     kind: type[DeviceError]
     text: str
@@ -51,7 +51,7 @@ class Watch:
         self.speed_deg_s = 0.0
         self._tolerances = tolerances
         self._rest_deg: Six | None = None
-        """Where the arm must be when the order is done; None: wherever it comes to rest."""
+        """Axes at which the arm must be when the order is done; None: wherever it comes to rest."""
         self._asked = self._astray_cycles = 0
 
     @property

@@ -32,7 +32,8 @@ COMMAND_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Command/@Acceleration", "INT"),
     *_AXES,
 )
-"""From the host: path below the root, and type. Velocity and acceleration are percent of $VEL_AXIS, $ACC_AXIS."""
+"""Elements from the host: path below the root, and type. Velocity and acceleration are percent of $VEL_AXIS,
+$ACC_AXIS."""
 STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Status/@Session", "INT"),
     ("Status/@Taken", "INT"),
@@ -49,7 +50,7 @@ STATUS_ELEMENTS: tuple[tuple[str, str], ...] = (
     ("Pose/@Valid", "INT"),
     *((f"Pose/@{name}", "REAL") for name in "XYZABC"),
 )
-"""From the controller, at a steady rate; see `Status`."""
+"""Elements from the controller, which sends them at a steady rate; see `Status`."""
 
 NO_FAULT, EMERGENCY_STOP, DRIVES_OFF, STOP_MESSAGE, PROGRAM_ENDED, TARGET_REFUSED = range(6)
 FAULTS = {
@@ -93,7 +94,7 @@ class Status:
     """The controller's own clock ($ROB_TIMER)."""
     override_percent: int
     t1: bool
-    """In T1, where the controller slows every motion down."""
+    """True in T1, where the controller slows every motion down."""
     lapsed: int
     """Number of the last MOVE that was ended because no command came; 0 if none was."""
     model: str

@@ -21,7 +21,8 @@ _ROUNDING = 1e-5
 """Numbers on the wire have six decimals; a step and its change take up to four of them."""
 _SLACK = 1.001
 _POSE_SLACK = 2.0
-"""For the change of a pose's step: angles A, B, C of a turn differ from its rotation vector in second order."""
+"""Slack factor for the change of a pose's step: angles A, B, C of a turn differ from its rotation vector in second
+order."""
 
 
 class StepBounds:
@@ -46,7 +47,7 @@ class StepBounds:
         self._last = (0.0,) * 6
 
     def violation(self, step: Six, *, advances: bool) -> str:
-        """Why an answer that makes this step must not be sent, or ""."""
+        """Return why an answer that makes this step must not be sent, or ""."""
         for number, (length, farthest) in enumerate(zip(step, self.farthest, strict=True), start=1):
             if not abs(length) <= farthest:
                 return f"correction {number} would step by {length:.4f} in one cycle, {farthest:.4f} is the limit"
@@ -61,7 +62,7 @@ class StepBounds:
 
 
 def follow_bounds(corrects: str, follow_deg: float, geometry: Geometry) -> Six:
-    """How far a place may be from another, if each axis is within `follow_deg`."""
+    """Return how far a place may be from another, if each axis is within `follow_deg`."""
     return (follow_deg,) * 6 if corrects == "axes" else _pose_bounds(6.0 * radians(follow_deg), geometry)
 
 

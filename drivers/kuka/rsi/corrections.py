@@ -67,7 +67,8 @@ class Corrections:
         return self._last
 
     def step(self, values: Six) -> Six:
-        """From the place to which the answer before led to that of an answer with these corrections."""
+        """Return the step from the place to which the last answer led to that of an answer with these
+        corrections."""
         before, self.led_to = self.led_to, self._moved(self._from, values)
         return values if self._relative else self.between(before, self.led_to)
 

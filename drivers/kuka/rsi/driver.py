@@ -79,7 +79,7 @@ class KukaRsi:
         self._attention, self._silence = Attention(), Silence()
         self._hung = ""
         self._lapses = 0
-        """Of the loop, when the last motion began."""
+        """Lapses that the loop had counted when the last motion began."""
         self._process, self._block = _spawn(settings, self.arm)
         try:
             self._wait_for_session()

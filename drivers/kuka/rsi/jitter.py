@@ -1,4 +1,5 @@
-"""How soon this machine answers an RSI controller: the real process of the driver, a controller on loopback.
+"""Measurement of how soon this machine answers an RSI controller: real process of the driver, controller on
+loopback.
 
 This process acts as the controller: it sends a packet in every cycle and measures the time until the answer. The
 arm rests meanwhile, which costs the answering process a little less than a motion; what decides is when the
@@ -36,7 +37,7 @@ class Jitter(NamedTuple):
     cycle_ms: int
     answers: int
     realtime: bool
-    """Whether the answering process ran under SCHED_FIFO."""
+    """True if the answering process ran under SCHED_FIFO."""
     p50_us: float
     p99_us: float
     p99_99_us: float
@@ -54,7 +55,7 @@ class StandInController:
 
     def __init__(self, port: int, cycle_s: float) -> None:
         self.latencies_us: list[float] = []
-        """Of each packet; infinity where the answer was late."""
+        """Latency of each packet; infinity where the answer was late."""
         self._cycle_s = cycle_s
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._link.connect(("127.0.0.1", port))

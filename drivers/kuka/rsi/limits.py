@@ -17,7 +17,8 @@ _STARTS = 9
 def correction_violations(
     settings: Settings, arm: Arm, start_deg: ArrayLike, on_the_way_deg: ArrayLike, target_deg: ArrayLike
 ) -> str:
-    """Why a motion, straight in joint space, to `target_deg` [6] is not possible, as text for messages; else "".
+    """Return why a motion, straight in joint space, to `target_deg` [6] is not possible, as text for messages;
+    else "".
 
     `start_deg` [6]: axes where RSI was started. `on_the_way_deg` [1 or 2, 6]: where the motion starts: one point,
     or any point between two.

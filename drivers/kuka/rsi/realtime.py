@@ -7,7 +7,7 @@ import sys
 import threading
 
 PRIORITY = 20
-"""Under SCHED_FIFO, of 1 to 99; threads of the network in the kernel have 50."""
+"""Priority under SCHED_FIFO, of 1 to 99; threads of the network in the kernel have 50."""
 
 
 def become_realtime() -> bool:
@@ -20,7 +20,7 @@ def become_realtime() -> bool:
 
 
 def may_be_realtime() -> bool:
-    """Whether a process that this one starts may do so; tried in a thread that ends."""
+    """Tell whether a process that this one starts may run under SCHED_FIFO, by trying it in a thread that ends."""
     tried: list[bool] = []
     thread = threading.Thread(target=lambda: tried.append(become_realtime()))
     thread.start()
@@ -29,7 +29,7 @@ def may_be_realtime() -> bool:
 
 
 def how_to_give_the_right() -> str:
-    """For messages; in full: docs/how-to/kuka-controller.md."""
+    """Return how to give the right, for messages; the full text is in docs/how-to/kuka-controller.md."""
     return (
         f"Say `sudo setcap cap_sys_nice+ep {os.path.realpath(sys.executable)}`, or write "
         f"`@GROUP - rtprio {PRIORITY}` into /etc/security/limits.d/coupole.conf and log in again, or in a "

@@ -30,16 +30,16 @@ a new session, or after an outage long enough for one."""
 _LONGEST_STEP = 12
 """Largest step of the IPOC that is believed before it is known: the longest cycle in ms."""
 _ANOTHER_RUN = 2
-"""After this many packets in a row that continue one another, but not the session, the session is over."""
+"""Packets in a row that continue one another, but not the session, after which the session is over."""
 _REMEMBERED = 250
 """Packets that are known again when the network brings them a second time; more than are in a second."""
 _LAST_WORDS = 5
 """Packets that are still answered once the commanded axes are at rest after a fault."""
 _HALTED_PACKETS = 5
-"""After this many cycles in a row in which it was not led on, by late answers or since it is not where it was led,
-the arm has halted."""
+"""Cycles in a row without leading the arm on, after which the arm has halted: answers were late, or the arm is not
+where it was led."""
 _QUIET_NS = 500_000_000
-"""Without delay counter, a packet after a silence this long counts as the first of a session."""
+"""Silence after which a packet without delay counter counts as the first of a session."""
 
 _SESSION_ENDS = (shared_state.LINK_LOST, shared_state.RESTARTED, shared_state.OUT_OF_BOUNDS)
 """Faults after which nothing is answered, since the controller may have begun a new session, or no answer is
@@ -48,7 +48,8 @@ right."""
 
 @dataclass(frozen=True)
 class Config:
-    """What the driver passes to the loop; the fields are described in `drivers.kuka.rsi.settings.Settings`."""
+    """Settings that the driver passes to the loop; the fields are described in
+    `drivers.kuka.rsi.settings.Settings`."""
 
     cycle_s: float
     declared_cycle_s: float | None
@@ -107,7 +108,7 @@ class RsiSession:
         self._witness = self._new_witness(simulated=False)
         self._cycle = CycleMeter(config.cycle_s, None)
         self._counts_delay = False
-        """Whether the session's first packet had a delay counter."""
+        """True if the session's first packet had a delay counter."""
         self._controller = b""
         self._start_deg: tuple[float, ...] | None = None
         """The measured axes at the start of the session, to which corrections refer; None before it."""
@@ -123,7 +124,7 @@ class RsiSession:
         self._remembered: deque[int] = deque(maxlen=_REMEMBERED)
         """Hashes of the last packets of the session."""
         self.behind = False
-        """Whether the last packet came after a silence for which nothing accounts yet."""
+        """True if the last packet came after a silence that nothing explains yet."""
 
     def obey(self, command: shared_state.Command) -> None:
         """Take a command. After a fault, motion commands are ignored."""
@@ -200,7 +201,7 @@ class RsiSession:
         return self._last_answer
 
     def _proves(self, packet: Packet, now_ns: int) -> bool:
-        """Whether this packet's corrections still count from the session's start, as far as can be seen; else
+        """Tell whether this packet's corrections still count from the session's start, as far as can be seen; else
         nothing is answered."""
         self.behind = False
         if broken := self._witness.broken(packet, now_ns):
@@ -224,8 +225,9 @@ class RsiSession:
         return (self._stop_template if ends else self._template) % (*values, packet.ipoc)
 
     def _silent(self) -> bool:
-        """After a fault the driver ends the session by not answering, so that no old correction reaches a new
-        session: at once if a new one may have begun, else when the commanded axes, and so the arm, are at rest."""
+        """Tell whether the driver does not answer any more. After a fault it ends the session in this way, so that
+        no old correction reaches a new session: at once if a new one may have begun, else when the commanded axes,
+        and so the arm, are at rest."""
         if self.fault != shared_state.NO_FAULT and self.motion.phase == shared_state.STANDING:
             self._last_words -= 1
         return self._session_over or self._last_words < 0
@@ -285,7 +287,7 @@ class RsiSession:
         return packet.delay == 0 if packet.delay is not None else quiet_ns > _QUIET_NS
 
     def _begin_session(self, packet: Packet, controller: bytes) -> None:
-        """Once in the life of this object."""
+        """Begin the session; called once in the life of this object."""
         config = self._config
         self._controller, self._counts_delay = controller, packet.delay is not None
         # Only a simulated controller may say how long its cycle is.

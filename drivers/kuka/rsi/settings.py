@@ -32,10 +32,10 @@ class Settings(BaseModel):
     out only where no other machine can send (`listen` on loopback), or by a person's word: the first sender of an
     answerable packet then counts as the controller, until the driver is closed."""
     any_controller_by: str = Field(default="", max_length=60)
-    """Who has decided that whoever sends first is taken for the controller."""
+    """Person who has decided that whoever sends first is taken for the controller."""
     without_realtime_by: str = Field(default="", max_length=60)
-    """Who has decided that this machine may answer at normal priority; without that word, and the right to
-    real-time priority, a controller on the network is not answered."""
+    """Person who has decided that this machine may answer at normal priority. Without this entry, and without the
+    right to real-time priority, a controller on the network is not answered."""
     cycle_ms: Literal[4, 12] = 4
     """4 for #IPO_FAST, 12 for #IPO. It is compared with the arrival of the packets before the first motion."""
     declared_cycle_ms: float | None = Field(default=None, gt=0)
@@ -52,19 +52,19 @@ class Settings(BaseModel):
     """The element that ends the controller's program when the driver is closed; empty for none: the controller
     then ends it with an error when no more answers come."""
     corrects: Literal["axes", "pose"] = "axes"
-    """What the controller corrects: axes (AXISCORR) or the flange's pose (POSCORR). In both cases motions are
-    straight in joint space; those on which the pose does not determine the axes are refused."""
+    """Quantity that the controller corrects: axes (AXISCORR) or the flange's pose (POSCORR). In both cases motions
+    are straight in joint space; those on which the pose does not determine the axes are refused."""
     mode: Literal["absolute", "relative"] = "absolute"
-    """As in RSI_ON: corrections count from where RSI was started, or are summed from cycle to cycle."""
+    """Mode as in RSI_ON: corrections count from where RSI was started, or are summed from cycle to cycle."""
     axis_correction_deg: tuple[PositiveFloat, ...] | None = Field(default=None, min_length=6, max_length=6)
-    """How far each axis may be from where RSI was started: MaxA1 to MaxA6 of the context's AXISCORRMON. The
+    """Largest distance of each axis from where RSI was started: MaxA1 to MaxA6 of the context's AXISCORRMON. The
     controller stops RSI beyond it, so a target there is refused. Without it, each axis' whole range."""
     pose_correction_mm: float = Field(default=2300.0, gt=0)
     pose_correction_deg: float = Field(default=180.0, gt=0, le=180)
     """The same for corrections of the pose: MaxTrans and MaxRotAngle of POSCORRMON. The defaults allow the arm's
     whole reach, and any rotation."""
     singularity_margin_deg: float = Field(default=5.0, gt=0, lt=45)
-    """For corrections of the pose: least angle of wrist, elbow and shoulder from their singularities."""
+    """Least angle of wrist, elbow and shoulder from their singularities, for corrections of the pose."""
     link_timeout_s: float = Field(default=2.0, gt=0)
     """The link counts as lost after this silence (machine time); longer than any pause of the simulated world."""
     connect_timeout_s: float = Field(default=10.0, gt=0)
@@ -72,8 +72,8 @@ class Settings(BaseModel):
     delay_limit: int = Field(default=50, ge=1)
     """Delay counter at which motion ends in a fault; below the controller's own limit (100 as shipped)."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
-    """How the controller counts late answers: all of a session, so that a fall means that RSI was started anew; or
-    those in a row, from 0 again after one in time."""
+    """Way in which the controller counts late answers: all of a session, so that a fall means that RSI was started
+    anew; or those in a row, from 0 again after one in time."""
     unaccounted_s: float = Field(default=0.1, ge=0)
     """A silence of the controller of this length that its IPOC does not count ends the session; 0: none does."""
     speed_fraction: float = Field(default=0.5, gt=0, le=1)

@@ -75,7 +75,7 @@ class State(NamedTuple):
     """Motions that ended because nobody looked at them (`coupole.supervision`)."""
     measured_deg: Six = _ZEROS
     velocity_deg_s: Six = _ZEROS
-    """Of the measured axes, over the last cycle."""
+    """Velocity of the measured axes, over the last cycle."""
     commanded_deg: Six = _ZEROS
     start_deg: Six = _ZEROS
     """Axes at the start of the session, from which the correction limits count."""

@@ -32,7 +32,7 @@ class Motion:
         self._output: Any = ruckig.OutputParameter(1)
         self._start_deg: Six = (0.0,) * 6
         self._line_deg: Six = (0.0,) * 6
-        """From start to target; the profile's position goes from 0 to 1 of it."""
+        """Line from start to target; the profile's position goes from 0 to 1 of it."""
         self._next_target_deg: Six | None = None
         self._next_speed = 1.0
 

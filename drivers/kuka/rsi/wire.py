@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 class Packet(NamedTuple):
     ipoc: bytes
-    """As received, to be sent back unchanged."""
+    """IPOC as received, to be sent back unchanged."""
     joints_deg: tuple[float, ...]
     delay: int | None
     """The counter of late answers; None where the controller does not send it."""

@@ -64,7 +64,8 @@ class ArmWitness:
         self._last_ns = self._step = self._answered = self._waits = 0
 
     def broken(self, packet: Packet, now_ns: int) -> str:
-        """Why corrections may no longer count from where they did, by this packet; "" if that is proven."""
+        """Return why, by this packet, corrections may no longer count from where they did; "" if it proves that
+        they do."""
         last = self._last
         if last is None:
             return ""
@@ -114,7 +115,8 @@ class ArmWitness:
         return bool(self._led) and any(self._beyond(self._reported(joints_deg), self._led[-1], self._follow))
 
     def violation(self, packet: Packet, place: Any, now_ns: int) -> str:
-        """Why an answer to `packet` that leads to `place` must not be sent, or ""; it is then taken as sent."""
+        """Return why an answer to `packet` that leads to `place` must not be sent; else "", and the answer is
+        taken as sent."""
         if why := self.broken(packet, now_ns):
             return why
         arm = self._reported(packet.joints_deg)
@@ -135,7 +137,7 @@ class ArmWitness:
         return ""
 
     def _beyond(self, arm: Any, place: Any, within: Six) -> list[bool]:
-        """For each number of a place, whether the arm is neither there nor where it lags behind."""
+        """Tell, for each number of a place, whether the arm is neither there nor where it lags behind."""
         off = self._between(arm, place)
         behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
         return [

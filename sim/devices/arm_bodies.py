@@ -23,7 +23,7 @@ _UR_RADII_MM: dict[UrModel, dict[str, float]] = {
     "ur5e": {"column": 60.0, "shoulder": 65.0, "upper": 60.0, "forearm": 50.0, "wrist": 45.0},
     "ur10e": {"column": 78.0, "shoulder": 85.0, "upper": 75.0, "forearm": 60.0, "wrist": 48.0},
 }
-"""From the outlines in Universal Robots' data sheets; each link is widest at its joints' housings."""
+"""Radii from the outlines in Universal Robots' data sheets; each link is widest at its joints' housings."""
 _UR_ASIDE_MM: dict[UrModel, tuple[float, float]] = {"ur5e": (138.0, 7.0), "ur10e": (176.0, 39.0)}
 """Distance of upper arm and forearm from the plane of axis 1, along axis 2."""
 

@@ -61,7 +61,7 @@ class Settings(BaseModel):
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the true lens (Brown-Conrady, OpenCV's order), to be found by calibration."""
     blur: bool | None = None
-    """Whether defocus and diffraction blur pictures; None: where each pixel is shaded."""
+    """True if defocus and diffraction blur pictures; None: only if each pixel is shaded."""
     rim_radius: Annotated[float, Field(gt=0)] = 3.0
     rim_shift: Annotated[float, Field(ge=0)] = 4.0
     """Mechanical vignetting, as in `sim.optics.objective.Objective`."""
@@ -111,7 +111,7 @@ class Wire(Protocol):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the world provides to a camera: sensor timing, light, pose, scene."""
+    """Surroundings that the world provides to a camera: sensor timing, light, pose, scene."""
 
     readout_us: float
     exposure_gap_us: float
@@ -127,17 +127,17 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Triggering:
-    """How the camera is set to take triggers; the default is an exposure at each edge."""
+    """Settings by which the camera takes triggers; the default is an exposure at each edge."""
 
     delay_ns: int = 0
     divider: int = 1
-    """Only each n-th edge triggers."""
+    """Number n: only each n-th edge triggers."""
     latches: bool = False
     """An early edge is remembered, and exposes as soon as the sensor is ready."""
     least_period_ns: int = 0
-    """From one exposure's start to the next; 0: what the sensor needs."""
+    """Least time from one exposure's start to the next; 0: what the sensor needs."""
     most_frames: int = 0
-    """After so many exposures the acquisition is over; 0: never."""
+    """Number of exposures after which the acquisition is over; 0: never."""
     edges_to_start: int = 0
     """First edges of a session, which start the acquisition and expose nothing."""
 

@@ -1,4 +1,5 @@
-"""What a camera's own settings do to the picture on its way out: region, binning, mirroring, look-up table, ..."""
+"""Effects of a camera's own settings on the picture on its way out: region, binning, mirroring, look-up table,
+..."""
 
 from __future__ import annotations
 

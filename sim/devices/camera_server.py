@@ -62,7 +62,7 @@ class _Plain(_Command):
 _COMMAND: TypeAdapter[_Configure | _Arm | _Plain] = TypeAdapter(
     Annotated[_Configure | _Arm | _Plain, Field(discriminator="do")]
 )
-"""What a client may ask for."""
+"""Commands that a client may send."""
 
 
 def _received(client: socket.socket, size: int) -> bytes:

@@ -50,7 +50,7 @@ class CameraStandIn(Protocol):
 
 
 def impossible(fault: faults.Fault, settings: CameraSettings) -> str:
-    """Why this stand-in cannot simulate the fault; empty if it can."""
+    """Return why this stand-in cannot simulate the fault; empty if it can."""
     if isinstance(fault, faults.CameraControlLoss) and settings.kind != "gige":
         return f"`camera_control_loss` cannot happen to a camera of kind `{settings.kind}`: it has no such channel"
     return ""

@@ -199,7 +199,7 @@ class GigeCamera:
     # -- faults -------------------------------------------------------------------------------------------
 
     def lose_packets(self, ratio: float) -> None:
-        """From now on this fraction of stream packets is lost on the wire."""
+        """Lose this fraction of stream packets on the wire from now on."""
         self._tell(gige_server.LOSE_PACKETS.pack(gige_server.DOES_LOSE_PACKETS, ratio))
 
     def lose_control(self) -> None:
@@ -285,7 +285,7 @@ class GigeCamera:
         )
 
     def _run_free(self, session: int) -> None:
-        """With trigger mode off, the camera exposes at its frame rate."""
+        """Expose at the camera's frame rate, while trigger mode is off."""
         if self._link is None or session != self._session:
             return
         self._body.expose(self._reactor.now_ns)

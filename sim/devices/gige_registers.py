@@ -112,7 +112,8 @@ class Registers:
 
 @dataclass(frozen=True)
 class Writable:
-    """What a client may write to a register: `low` to `high`, from `low` in steps of `step` if that is not 0."""
+    """Values that a client may write to a register: `low` to `high`, from `low` in steps of `step` if that is not
+    0."""
 
     low: float
     high: float

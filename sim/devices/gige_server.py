@@ -28,7 +28,7 @@ from sim.devices.gige_registers import Registers
 PORT = 3956
 """Fixed by GigE Vision."""
 BROADCASTS = ("255.255.255.255", "127.255.255.255")
-"""Where clients look for cameras."""
+"""Addresses at which clients look for cameras."""
 SEND = struct.Struct("<BIIQQ6I")
 """Order of the world to send an image: what it does, slot, session, frame id, timestamp ns, width, height, left,
 top, pixel format, bytes."""
@@ -39,7 +39,7 @@ SENT = struct.Struct("<I")
 
 _KEY = 0x42
 _HEADER = struct.Struct(">BBHHH")
-"""Of a command: key, flags, command, size of the rest, request id. Of an acknowledgement: status (2 bytes),
+"""Header of a command: key, flags, command, size of the rest, request id; of an acknowledgement: status (2 bytes),
 command, size, id."""
 _ACKNOWLEDGE = 1
 _DISCOVERY, _READ_REGISTERS, _WRITE_REGISTERS, _READ_MEMORY, _WRITE_MEMORY = 0x02, 0x80, 0x82, 0x84, 0x86
@@ -53,7 +53,7 @@ _LISTEN_S = 0.1
 
 @dataclass(frozen=True)
 class Start:
-    """What the process is started with."""
+    """Data with which the process is started."""
 
     address: str
     link_fd: int
@@ -217,7 +217,7 @@ class GigeServer:
         return status
 
     def _act_on(self, address: int, client: tuple[str, int]) -> None:
-        """What a written register starts."""
+        """Start what a written register asks for."""
         registers = self._registers
         if address == reg.CONTROL_PRIVILEGE:
             if registers.integer(address):
@@ -255,7 +255,7 @@ class GigeServer:
             self._release()
 
     def _release(self) -> None:
-        """Without a client the camera stops; its settings stay."""
+        """Stop the camera when it has no client; its settings stay."""
         self._controller = None
         for address in (reg.CONTROL_PRIVILEGE, reg.ACQUISITION, reg.HOST_PORT):
             self._registers.set_integer(address, 0)

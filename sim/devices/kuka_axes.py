@@ -32,7 +32,7 @@ class Axes:
     def __init__(self, settings: Settings, now_ns: int) -> None:
         self.commanded_deg: Axes6 = settings.start_joints_deg
         self.stops = 0
-        """How often the axes have come to rest."""
+        """Number of times that the axes have come to rest."""
         self.came_from_deg: Axes6 = settings.start_joints_deg
         """The commanded axes at the stop before the last."""
         self._stood_at_deg: Axes6 = settings.start_joints_deg

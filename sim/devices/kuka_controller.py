@@ -57,7 +57,7 @@ class KukaController:
     ) -> None:
         """`tell` gets a line for everything that is refused."""
         self.fault = ""
-        """Why RSI stopped; empty while it runs or waits for a client."""
+        """Reason why RSI stopped; empty while it runs or waits for a client."""
         self.ended_programs = 0
         """Programs that a client has ended with the stop element."""
         self._refusals = Refusals("robot", tell)

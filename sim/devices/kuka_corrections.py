@@ -41,7 +41,7 @@ class Corrections:
 
     @property
     def clamped(self) -> str:
-        """What the last correction was clamped to; empty if it was applied as it came."""
+        """Values to which the last correction was clamped, as text; empty if it was applied as it came."""
         found: str = self._sum.clamped
         return found
 

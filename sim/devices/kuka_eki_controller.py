@@ -73,7 +73,7 @@ class KukaEkiController:
 
     def __init__(self, reactor: Reactor, settings: Settings, stranger: ArmStranger = NO_STRANGER) -> None:
         self.fault = ""
-        """Why the robot program does not run; empty while it does."""
+        """Reason why the robot program does not run; empty while it does."""
         self.settled_since_ns: int | None = reactor.now_ns
         """World time since which the axes are at rest; None while they move."""
         self.errors = PoseErrors(

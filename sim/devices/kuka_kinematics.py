@@ -24,7 +24,7 @@ _CHAIN = (
     ((515.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((80.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
 )
-"""For each joint: its origin in the frame of the previous link, and its axis of rotation."""
+"""Origin of each joint in the frame of the previous link, and its axis of rotation."""
 AXIS_LIMITS_DEG = (
     (-170.0, 170.0),
     (-190.0, 45.0),

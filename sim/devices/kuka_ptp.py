@@ -25,7 +25,7 @@ class Motion:
 
     start_deg: tuple[float, ...]
     line_deg: tuple[float, ...]
-    """From path parameter 0 to 1."""
+    """Turn of each axis from path parameter 0 to 1."""
     begin: State
     phases: tuple[tuple[float, float], ...]
     """Duration (s) and jerk (1/s3) of each stretch of constant jerk."""
@@ -60,9 +60,8 @@ def point_to_point(
     acceleration_deg_s2: float,
     jerk_deg_s3: float,
 ) -> Motion:
-    """From rest to rest. Profile of seven phases; e.g. Biagiotti, Melchiorri, "Trajectory Planning for
-    Automatic Machines and Robots" (2008), section 3.4.
-    """
+    """Return a motion from rest to rest. Profile of seven phases; e.g. Biagiotti, Melchiorri, "Trajectory Planning
+    for Automatic Machines and Robots" (2008), section 3.4."""
     line_deg = tuple(b - a for a, b in zip(start_deg, target_deg, strict=True))
     longest_deg = max(map(abs, line_deg))
     if longest_deg < _LEAST_MOTION_DEG:

@@ -26,7 +26,7 @@ class Answer(NamedTuple):
     stops: bool = False
     """The program is to end."""
     remark: str = ""
-    """What the client may not have meant; empty if all is as configured."""
+    """Remark about what the client may not have meant; empty if all is as configured."""
 
 
 class Unread(NamedTuple):

@@ -45,10 +45,10 @@ class Limits(_Model):
     axis_clamp_deg: Six = (341.0, 236.0, 277.0, 371.0, 241.0, 701.0)
     axis_monitor_deg: Six = (340.0, 235.0, 276.0, 370.0, 240.0, 700.0)
     pose_clamp_mm: float = Field(default=2301.0, gt=0)
-    """For each coordinate."""
+    """Clamp for each coordinate."""
     pose_clamp_deg: float = Field(default=180.0, gt=0)
     pose_monitor_mm: float = Field(default=2300.0, gt=0)
-    """For the distance."""
+    """Limit for the distance."""
     pose_monitor_deg: float = Field(default=180.0, gt=0)
 
 
@@ -85,7 +85,7 @@ class Settings(_Model):
     delay_limit: int = Field(default=100, ge=1)
     """Late answers at which RSI stops with KSS29002."""
     delay_counts: Literal["cumulative", "consecutive"] = "cumulative"
-    """Which of the two applies to real controllers is not known."""
+    """Way of counting late answers; which of the two applies to real controllers is not known."""
     packets_after_estop_s: float = Field(default=0.5, ge=0)
     restart_s: float = Field(default=1.0, gt=0)
     """World time from a lost link until the RSI program runs and sends again."""

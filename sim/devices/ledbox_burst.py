@@ -26,7 +26,7 @@ STATUS_LED_OPEN, STATUS_OVER_TEMPERATURE, STATUS_NO_EDGE, STATUS_WAITED = 1, 2, 
 """Bits of a log record's status: the LED drew no current; its board was too hot, and the burst ends; no edge was
 sent; the step was delayed until the camera was ready."""
 _START_LEAD_NS = 200_000
-"""From INITiate to the first t_on."""
+"""Time from INITiate to the first t_on."""
 _READY_SAMPLE_NS = 100_000
 """Period at which the box samples the ready line while a step is delayed."""
 

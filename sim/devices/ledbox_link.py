@@ -1,4 +1,4 @@
-"""What carries bytes to the simulated LED box and back."""
+"""Links that carry bytes to the simulated LED box and back."""
 
 from __future__ import annotations
 

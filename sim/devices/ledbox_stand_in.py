@@ -50,7 +50,7 @@ _EDGE_FAULTS = (faults.DropTrigger, faults.DoubleTrigger, faults.OverTemperature
 
 
 def impossible(fault: faults.Fault, settings: LedBoxSettings) -> str:
-    """Why this stand-in cannot simulate the fault; empty if it can."""
+    """Return why this stand-in cannot simulate the fault; empty if it can."""
     match settings:
         case ledbox_firmware.Settings():
             boards = -(-settings.led_count // settings.leds_per_board)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform
 
 Chain = Callable[[Sequence[float]], tuple[Transform, NDArray[np.float64], NDArray[np.float64]]]
-"""From six joint angles in degrees: `base_from_flange`, and in the base frame the joints' origins in mm and their
-axes, each [6, 3]."""
+"""Function of six joint angles in degrees, which returns `base_from_flange` and, in the base frame, the joints'
+origins in mm and their axes, each [6, 3]."""
 
 _STEPS = 30
 _REACH_MM = 1000.0

@@ -116,7 +116,8 @@ class PtyPort:
             self._received(piece)
 
     def _take_status(self, status: int) -> None:
-        """What a packet without bytes reports; on input that the client has discarded, a BREAK follows."""
+        """Act on the status that a packet without bytes reports: if the client has discarded input, a BREAK
+        follows."""
         if status & termios.TIOCPKT_FLUSHWRITE and self._on_break is not None:
             termios.tcflush(self._master, termios.TCIFLUSH)  # what the kernel had already passed on
             self._on_break()

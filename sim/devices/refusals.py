@@ -1,4 +1,4 @@
-"""What a stand-in refuses, told to a person: an outside client would otherwise see silence only.
+"""Refusals of a stand-in, told to a person: an outside client would otherwise see silence only.
 
 A client that is wrong is wrong in every cycle, so the same reason is told again only after a while, with its
 count.
@@ -14,7 +14,7 @@ _AGAIN_S = 2.0
 
 
 def untold(message: str) -> None:
-    """For stand-ins whose client is Coupole itself."""
+    """Drop the message: for stand-ins whose client is Coupole itself."""
 
 
 class Refusals:
@@ -23,7 +23,7 @@ class Refusals:
     def __init__(self, device: str, tell: Callable[[str], None]) -> None:
         self._device, self._tell = device, tell
         self._since: dict[str, tuple[float, int]] = {}
-        """For each reason, when it was last told, and how often it has occurred since."""
+        """Time at which each reason was last told, s, and number of times that it has occurred since."""
 
     def refused(self, reason: str, details: str = "") -> None:
         """`reason` is equal for equal mistakes; `details` are those of this occurrence."""

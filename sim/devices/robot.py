@@ -58,7 +58,7 @@ class RobotStandIn(Protocol):
 
 
 def impossible(fault: faults.Fault, settings: RobotSettings) -> str:
-    """Why this stand-in cannot simulate the fault; empty if it can."""
+    """Return why this stand-in cannot simulate the fault; empty if it can."""
     if isinstance(fault, faults.LateRsi) and settings.kind != "rsi":
         return f"`late_rsi` cannot happen to a robot of kind `{settings.kind}`: it has no RSI answers"
     return ""

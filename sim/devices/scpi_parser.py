@@ -91,7 +91,8 @@ class Interpreter:
         return b"".join(self.replies(data))
 
     def replies(self, data: bytes) -> Iterator[bytes]:
-        """As `receive`, one message after the other; the response of a message without query is empty."""
+        """Execute messages as `receive` does, one after the other; the response of a message without query is
+        empty."""
         return (self._execute(message) for message in self._splitter.feed(data))
 
     def clear(self) -> None:

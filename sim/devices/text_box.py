@@ -31,7 +31,7 @@ class Settings(BaseModel):
     first_led: int = Field(default=0, ge=0)
     """The box's number for LED 0."""
     answers: bool = True
-    """If false, it answers nothing but its identity."""
+    """True if the box answers; else it answers only the query for its identity."""
     serial_number: str = "SIM-0002"
     ambient_c: float = 22.0
     """Temperature of the LEDs, which are not heated."""
@@ -79,7 +79,7 @@ class TextBox:
         self._link.close()
 
     def stick_led(self, led: int) -> None:
-        """From now on the LED cannot be switched off once it is lit: its transistor has failed short."""
+        """Make an LED stick: once it is lit, it cannot be switched off. Its transistor has failed short."""
         self._stuck_leds.add(led)
 
     def temperature_of_led_c(self, led: int) -> float:

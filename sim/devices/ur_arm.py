@@ -36,7 +36,7 @@ _DH = {
         (0.0, 116.55, 0.0),
     ),
 }
-"""For each joint a and d in mm and alpha in rad, by Denavit and Hartenberg. Source: Universal Robots, "DH
+"""Values a and d in mm and alpha in rad of each joint, by Denavit and Hartenberg. Source: Universal Robots, "DH
 Parameters for calculations of kinematics and dynamics"."""
 
 
@@ -125,7 +125,8 @@ class Motion:
 
 
 def movej(start_deg: Six, end_deg: Six, speed_deg_s: float, acceleration_deg_s2: float, t_ns: int) -> Motion:
-    """From rest to rest, axes synchronised: trapezoidal speed of the leading axis, as URScript's movej."""
+    """Return a motion from rest to rest with synchronised axes: trapezoidal speed of the leading axis, as
+    URScript's movej."""
     turn_deg = max(abs(b - a) for a, b in zip(start_deg, end_deg, strict=True))
     return _trapezoid((start_deg, end_deg), turn_deg, speed_deg_s, acceleration_deg_s2, t_ns)
 
@@ -139,8 +140,8 @@ def movel(
     acceleration_m_s2: float,
     t_ns: int,
 ) -> Motion | None:
-    """From rest to rest, the tool on a straight line and turning at a constant rate about one axis, as URScript's
-    movel; None if the arm cannot follow. For a pure rotation, radians count as metres."""
+    """Return a motion from rest to rest, with the tool on a straight line and turning at a constant rate about one
+    axis, as URScript's movel; None if the arm cannot follow. For a pure rotation, radians count as metres."""
     start = flange_pose(model, start_deg) @ flange_from_tool
     line_mm = base_from_tool[:3, 3] - start[:3, 3]
     turned_rad = np.array(rotation_vector(start[:3, :3].T @ base_from_tool[:3, :3]))
@@ -162,7 +163,7 @@ def movel(
 
 
 def brake(start_deg: Six, velocity_deg_s: Six, deceleration_deg_s2: float, t_ns: int) -> Motion:
-    """To rest along the present direction in joint space, as URScript's stopj."""
+    """Return the motion to rest along the present direction in joint space, as URScript's stopj."""
     speed_deg_s = max(map(abs, velocity_deg_s))
     if speed_deg_s == 0.0:
         return Motion((start_deg, start_deg), 0.0, 0.0, (), t_ns)
@@ -173,7 +174,7 @@ def brake(start_deg: Six, velocity_deg_s: Six, deceleration_deg_s2: float, t_ns:
 
 
 def _trapezoid(places_deg: tuple[Six, ...], length: float, speed: float, acceleration: float, t_ns: int) -> Motion:
-    """From rest to rest along the corners."""
+    """Return a motion from rest to rest along the corners."""
     if length == 0.0:
         return Motion(places_deg, length, 0.0, (), t_ns)
     top = min(speed, math.sqrt(acceleration * length))

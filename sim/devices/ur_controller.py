@@ -77,7 +77,7 @@ class UrController:
                 f"a UR stand-in works in real time only: the world's speed is {reactor.clock.speed:g}, not 1"
             )
         self.fault = ""
-        """Why the controller ended the last program; empty if it did not."""
+        """Reason why the controller ended the last program; empty if it did not."""
         self.settled_since_ns: int | None = reactor.now_ns
         """World time since which the axes are at rest; None while they move."""
         self.remote_control = True

@@ -35,7 +35,7 @@ class ControlScript:
 
     def __init__(self, arm: Arm, tcp_offset_m_rad: Six) -> None:
         self.ended = ""
-        """Why the program ended by itself; empty while it runs."""
+        """Reason why the program ended by itself; empty while it runs."""
         self.watchdog_s: float | None = None
         """The controller ends the program after this time without a write to input_int_register_0; None: never."""
         self.outputs: dict[str, Value] = {}

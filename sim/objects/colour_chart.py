@@ -20,7 +20,7 @@ ROWS, COLUMNS = 4, 6
 PITCH_MM, PATCH_MM, MARGIN_MM = 22.0, 18.0, 6.0
 THICKNESS_MM = 2.0
 _CELL_MM = 2.0
-"""Of the face; edges of patches and plate lie on multiples of it."""
+"""Size of the cells of the face; edges of patches and plate lie on multiples of it."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ DRAWN = {
         0.032,
     ),
 }
-"""By name: rows A to D from the top, columns 1 to 6 from the left."""
+"""Patches by name: rows A to D from the top, columns 1 to 6 from the left."""
 
 
 def colour_chart() -> Surface:

@@ -24,9 +24,9 @@ from sim.scene.brdf_table import tabulate
 from sim.scene.surface import Material
 
 _TURNS = 16
-"""Of an anisotropic surface."""
+"""Number of turns over which an anisotropic surface is averaged."""
 _NODES = 24
-"""Of each integral over the hemisphere."""
+"""Nodes of each integral over the hemisphere."""
 
 
 @cache
@@ -61,7 +61,7 @@ def alta_material(paths: tuple[Path, ...]) -> Material:
 
 
 def _shown(name: str, made: Brdf) -> Material:
-    """As a material of the scene, its diffuse reflectance as in `specimens.specimen`."""
+    """Return a material of the scene, with its diffuse reflectance as in `specimens.specimen`."""
     red, green, blue = np.clip(albedo(made, np.array([np.sqrt(0.5)]), nodes=_NODES)[0], 1e-6, 1.0).tolist()
     return Material(name, (red, green, blue), table=tabulate(made, np.eye(3)))
 

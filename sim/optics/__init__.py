@@ -1,1 +1,1 @@
-"""From light on a scene to digital numbers: LEDs, lens, sensor."""
+"""Way from light on a scene to digital numbers: LEDs, lens, sensor."""

@@ -23,7 +23,7 @@ _OWN_FLUX, _OWN_PUMP, _FLASH, _LOOSE = 1, 2, 3, 4
 
 @dataclass(frozen=True)
 class LedModel:
-    """How a dome's LEDs differ from their table; all values are assumed, of the order of white power LEDs."""
+    """Deviations of a dome's LEDs from their table; all values are assumed, of the order of white power LEDs."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 

@@ -25,7 +25,7 @@ class Objective:
 
     focal_length_mm: float = 35.0
     focus_distance_mm: float = 334.0
-    """From the lens's principal plane to the plane in focus."""
+    """Distance from the lens's principal plane to the plane in focus."""
     f_number: float = 8.0
     rim_radius: float = 3.0
     """Radius of the front rim over that of the pupil: stopped down to f/8 the rim is far outside (assumed)."""

@@ -56,7 +56,7 @@ Radiance = NDArray[np.float32]
 
 @dataclass
 class Look:
-    """What one pose of camera and arm sees, and the radiances computed for it so far."""
+    """View from one pose of camera and arm, and the radiances computed for it so far."""
 
     base_from_camera: Transform
     arm_mm: Capsules
@@ -69,7 +69,7 @@ class Look:
     radiance: dict[int, Radiance] = field(default_factory=dict)
     """Radiance of the sites, by LED, or by minus the number of a panel."""
     around: Neighbourhood | None = None
-    """Where interreflection is interpolated, once it is needed."""
+    """Neighbourhood in which interreflection is interpolated, once it is needed."""
     disk_px: NDArray[np.float32] | None = None
     """Blur by defocus, once it is needed."""
     glows: dict[int, Glow | None] = field(default_factory=dict)

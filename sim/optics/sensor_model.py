@@ -58,7 +58,7 @@ class SensorModel:
 
     @property
     def electrons_per_dn(self) -> float:
-        """At gain 1; to be divided by the gain."""
+        """Electrons per DN at gain 1; to be divided by the gain."""
         return self.full_scale_e / (self.white_dn - self.black_dn)
 
     def dark_factor(self, temperature_c: float) -> float:

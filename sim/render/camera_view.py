@@ -35,7 +35,7 @@ class View:
     triangle: NDArray[np.int32]
     """[sites] row of the tables of triangles."""
     fine: Fine | None
-    """What the sites' surface has beyond its triangles; None: nothing."""
+    """Detail of the sites' surface beyond its triangles; None: there is none."""
     eye_mm: NDArray[np.float64]
     """[3] the projection centre."""
     sides: NDArray[np.int64]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 LED_SIDE_MM = 7.0
 FAR_SIDES = 36.0
-"""From this distance in sides, 2 x 2 Gauss points differ from the polygon by less than 1e-6 if all of the emitter
+"""Distance in sides from which 2 x 2 Gauss points differ from the polygon by less than 1e-6 if all of the emitter
 is above the horizon (measured in tests/sim/render/test_emitter.py)."""
 _GAUSS = 1.0 / np.sqrt(3.0)
 
@@ -29,9 +29,9 @@ class Emitter:
     normal: NDArray[np.float64]
     """Unit; light leaves on this side."""
     half_u_mm: NDArray[np.float64]
-    """From the centre to the middle of one side."""
+    """Vector from the centre to the middle of one side."""
     half_v_mm: NDArray[np.float64]
-    """From the centre to the middle of the next side: u x v points along the normal."""
+    """Vector from the centre to the middle of the next side: u x v points along the normal."""
     flux_lm: float
 
 

@@ -104,7 +104,8 @@ def exchange(scene: Scene, obstacles: Obstacles, rays: int) -> Exchange:
 def neighbourhood(
     between: Exchange, corners_mm: NDArray[np.float32], sides: NDArray[np.int64], normals: NDArray[np.float32]
 ) -> Neighbourhood:
-    """Where light from other surfaces is interpolated for sides [seen] of triangles, as in `View`."""
+    """Return the neighbourhood in which light from other surfaces is interpolated, for sides [seen] of triangles
+    as in `View`."""
     shape = (len(sides), _NEIGHBOURS)
     found = Neighbourhood(np.empty(shape, np.int32), np.empty(shape, np.float32))
     _weigh(

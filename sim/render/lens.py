@@ -67,7 +67,8 @@ class Lens:
 
     @property
     def terms(self) -> NDArray[np.float64]:
-        """Of `bend` and `distorted`: the distortion's, and for a lens with more than Brown's its centre too."""
+        """Terms for `bend` and `distorted`: those of the distortion, and for a lens with more than Brown's also
+        its centre."""
         if len(self.distortion) == 5 and not any(self.off_axis):
             return np.array(self.distortion)
         more = (0.0,) * (12 - len(self.distortion))

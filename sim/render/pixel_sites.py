@@ -1,4 +1,4 @@
-"""Where the rays of each pixel meet the surface: one site for each pixel and triangle that it sees.
+"""Sites at which the rays of each pixel meet the surface: one for each pixel and triangle that it sees.
 
 A pixel's k x k rays that meet one triangle share a site, the mean of their points on it: light on a triangle
 varies little within a pixel, while its edges are resolved by all rays.

@@ -127,7 +127,7 @@ def _shade(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux, out):  # type: ignore[no-untyped-def]
-    """Into `out` [3] what a material's table makes of `lux` from (tx, ty, tz)."""
+    """Write into `out` [3] what a material's table makes of `lux` from (tx, ty, tz)."""
     vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
     far, away = np.sqrt(tx * tx + ty * ty + tz * tz), np.sqrt(vx * vx + vy * vy + vz * vz)
     vx, vy, vz = vx / away, vy / away, vz / away

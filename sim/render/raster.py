@@ -26,9 +26,10 @@ _BAND_ROWS = 32
 _LAST = np.int64(0xFFFFFFFF)
 _CHUNK = 16384
 _WIDE = 32
-"""For more columns than this it is faster to find first which part of a row is between the edges."""
+"""Number of columns above which it is faster to find first which part of a row is between the edges."""
 _SMALL = 8
-"""With distortion, smaller triangles (columns and rows) have their corners moved, larger ones each pixel's ray."""
+"""Size limit of small triangles (columns and rows). With distortion their corners are moved; for larger ones, each
+pixel's ray is moved."""
 _STRIDE = 8
 """Bands are processed in this stride, so that every thread's part is spread over the image."""
 
@@ -36,7 +37,7 @@ _STRIDE = 8
 def visible_triangles(
     corners_mm: NDArray[np.float32], sight: Sight, base_from_camera: Transform
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """What each pixel's centre sees [h, w], a row of the second array or -1; and the triangles seen [seen].
+    """Return what each pixel's centre sees [h, w], a row of the second array or -1; and the triangles seen [seen].
 
     `corners_mm` [n, 3, 3] are in the base frame. The result is exact in float64 without distortion, and for large
     triangles with distortion; edges of small ones are right to 3e-4 pixel. Both sides are visible. Triangles are

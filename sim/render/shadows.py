@@ -29,7 +29,7 @@ class Shadows:
         self._place_of_side = np.full(2 * len(obstacles.corners_mm), -1, np.int32)
         self._side_of_place = np.empty(0, np.int64)
         self._kept: dict[int, tuple[int, _Bits]] = {}
-        """For each LED, the number of places traced, and their bits."""
+        """Number of places traced for each LED, and their bits."""
 
     def places(self, sides: NDArray[np.int64]) -> NDArray[np.int32]:
         """[n] places of the sides that a view shows (numbered as in `Obstacles.trace`), all different."""

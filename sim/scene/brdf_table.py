@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from coupole.appearance.matter.brdf import Brdf
 
 NODES = (80, 48, 12)
-"""Of theta_h, theta_d and phi_d."""
+"""Number of nodes of theta_h, theta_d and phi_d."""
 _LOWEST_Z = 2e-3
 """Nodes below the horizon take the value just above it, for interpolation."""
 _CHUNK = 8
@@ -57,7 +57,8 @@ def _lifted(way: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @numba.njit(cache=True, nogil=True)
 def look_up(table, nx, ny, nz, lx, ly, lz, vx, vy, vz, out):  # type: ignore[no-untyped-def]
-    """Into `out` [3] the value of a table under unit normal, light and view; both must be above the horizon."""
+    """Write into `out` [3] the value of a table for unit normal, light and view; light and view must be above the
+    horizon."""
     hx, hy, hz = lx + vx, ly + vy, lz + vz
     length = np.sqrt(hx * hx + hy * hy + hz * hz)
     hx, hy, hz = hx / length, hy / length, hz / length

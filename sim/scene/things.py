@@ -77,7 +77,7 @@ class Stickers(BaseModel):
     seed: int = 1
     diameter_mm: _Length = 6.0
     gap_mm: _Length = 0.8
-    """As in `sim.objects.standards.sticker_poses`, which gives their poses."""
+    """Gap as in `sim.objects.standards.sticker_poses`, which gives the stickers' poses."""
     new: Annotated[int, Field(ge=0)] = 0
     """Number of those that were attached after the scan and are not in its table."""
     fallen: Annotated[int, Field(ge=0)] = 0
@@ -100,7 +100,7 @@ class Stickers(BaseModel):
         return self._poses(surface)[self.new :]
 
     def _poses(self, surface: Surface) -> Poses:
-        """Of all stickers ever attached: first the new ones, last those that have come off."""
+        """Return poses of all stickers ever attached: first the new ones, last those that have come off."""
         from sim.objects.standards import sticker_poses
 
         total = self.count + self.fallen
@@ -127,7 +127,7 @@ class Sample(_Thing):
         return self.bare() if self.stickers is None else self.stickers.on(self.bare())
 
     def bare(self) -> Surface:
-        """Without its stickers."""
+        """Return the surface without its stickers."""
         from sim.objects import colour_chart, fabric, shapes, standards, urushi, wedges
 
         match self.kind:
@@ -157,7 +157,7 @@ Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 
 
 class Disturbance(Protocol):
-    """What changes a thing's surface behind the back of whoever described it."""
+    """Change of a thing's surface that its description does not know."""
 
     def disturbed(self, kind: str, surface: Surface) -> Surface: ...
 

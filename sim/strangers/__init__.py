@@ -1,4 +1,5 @@
-"""What no calibration has a term for: causes that disturb the simulated cell, in modules by what they disturb.
+"""Causes for which no calibration has a term: they disturb the simulated cell. Modules are named by what is
+disturbed.
 
 Each is off until the rig switches it on (`world.settings.strangers`). None of them is known to any calibration.
 """

@@ -30,7 +30,7 @@ class LensStranger(BaseModel):
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     """s1, s2, s3, s4 of OpenCV's thin-prism model."""
     stop_shift_mm: tuple[float, float] = (0.0, 0.0)
-    """Of the entrance pupil from the lens's axis, along the image's x and y."""
+    """Shift of the entrance pupil from the lens's axis, along the image's x and y."""
     breathing: Annotated[float, Field(gt=-0.5, lt=0.5)] = 0.0
     """Relative change of the image distance from a camera that looks straight down to one that looks sideways: the
     focus group slides by its weight, with the cosine of the angle."""

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class LightStranger(BaseModel):
-    """How the dome's LEDs radiate."""
+    """Deviations in how the dome's LEDs radiate."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 _TAILS, _DRIFT = 21, 22
 """Numbers of the seed's random streams."""
 _DEGREES = 2.5
-"""Of Student's distribution: of finite variance, without a fourth moment."""
+"""Degrees of freedom of Student's distribution, which then has a finite variance but no fourth moment."""
 
 
 class SensorStranger(BaseModel):

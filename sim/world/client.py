@@ -17,7 +17,8 @@ from sim.world.config import Config, Settings
 __all__ = ["Config", "Settings", "World"]
 
 _START_TIMEOUT_S = 900.0
-"""At its first start on a machine a world compiles its code: a minute or two, on a busy machine many."""
+"""Time-out for the start: at its first start on a machine a world compiles its code, which takes a minute or two,
+on a busy machine many."""
 _ANSWER_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 5.0
 

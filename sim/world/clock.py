@@ -26,7 +26,7 @@ _SEQUENCE, _WISH = struct.Struct("<Q"), struct.Struct("<q")
 BLOCK_BYTES = _BLOCK.size + _WISH.size
 _NAP_S = 0.02
 _LOOK_EVERY_NS = 20_000_000
-"""How often, by the machine's clock, a reader looks whether the world's process still runs."""
+"""Interval, by the machine's clock, at which a reader looks whether the world's process still runs."""
 FOREVER_NS = 2**62
 
 

@@ -48,7 +48,7 @@ class _Model(BaseModel):
 
 
 class MaterialConfig(_Model):
-    """As `sim.scene.surface.Material`: Lambert and GGX per channel."""
+    """Material as in `sim.scene.surface.Material`: Lambert and GGX per channel."""
 
     diffuse: tuple[Share, Share, Share]
     f0: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
@@ -113,7 +113,7 @@ class InterreflectionConfig(_Model):
     bounces: Annotated[int, Field(ge=2, le=16)] = 4
     """The most surfaces that light meets."""
     rays: Annotated[int, Field(ge=4, le=4096)] = 128
-    """From each side of a patch."""
+    """Number of rays from each side of a patch."""
 
 
 class CameraConfig(_Model):
@@ -179,15 +179,15 @@ class Settings(_Model):
     interreflection: InterreflectionConfig | bool | None = None
     """None: as `shading` has it."""
     arm_shadows: bool = True
-    """Whether arm and tool block light."""
+    """True if arm and tool block light."""
     cables: tuple[ToolBody, ...] = ()
     """Capsules in the support frame that hang in the cell and block light, of which no plan and no rig knows."""
     material: MaterialConfig | SpecimenConfig | MeasuredConfig | None = None
-    """Of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
+    """Material of the plan's object, multiplied by its mesh's own colours; None: these alone, or warm stone."""
     detail: tuple[Layer, ...] = ()
-    """Of the plan's object: texture, bumps and turned normals that its mesh does not have."""
+    """Detail of the plan's object: texture, bumps and turned normals that its mesh does not have."""
     stickers: Stickers | None = None
-    """On the plan's object."""
+    """Stickers on the plan's object."""
     leds: LedModel = STEADY
     """`{}`: realistic LEDs, each with its own flux and colour, temperature dependence and flicker."""
     dome: DomeErrors = DomeErrors()

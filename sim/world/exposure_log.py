@@ -19,7 +19,7 @@ class LitExposure(NamedTuple):
     """Counts exposures from power-on."""
     frame_id: int
     timestamp_ns: int
-    """On the camera's clock, as the frame has it."""
+    """Timestamp on the camera's clock, as the frame has it."""
     exposure_s: float
     lit: list[tuple[int, float]]
     """LED number, and seconds at its tabulated flux."""
@@ -45,5 +45,5 @@ class ExposureLog:
             self._last.append(LitExposure(number, frame_id, timestamp_ns, exposure_s, lit, panels))
 
     def since(self, first: int, count: int) -> list[LitExposure]:
-        """At most `count` exposures, from number `first` on."""
+        """Return at most `count` exposures, from number `first` on."""
         return [one for one in self._last if one.number >= first][:count]

@@ -13,7 +13,8 @@ from sim.world.config import SceneConfig
 
 
 class Ruler:
-    """What is measured: the tool over the disk, the tool itself, disk and dome, and where the first board lies."""
+    """Measurements with a ruler: the tool over the disk, the tool itself, disk and dome, and where the first board
+    lies."""
 
     def __init__(self, scene: SceneConfig, things: Sequence[Thing], leds_mm: NDArray[np.float64]) -> None:
         """`leds_mm` [n, 3]: where the LEDs really are, base frame."""
@@ -23,7 +24,7 @@ class Ruler:
         self._board = next((thing for thing in things if isinstance(thing, CharucoBoard)), None)
 
     def lengths_mm(self, base_from_flange: Transform) -> dict[str, float]:
-        """By name, with the flange where it is."""
+        """Return the lengths by name, for this pose of the flange."""
         tool = [(*end, body.radius_mm) for body in self._scene.tool for end in (body.from_mm, body.to_mm)]
         ends = np.array([(0.0, 0.0, 0.0, 0.0), *tool])
         pose = self._support_from_base @ base_from_flange

@@ -294,7 +294,7 @@ class OneFault(BaseModel):
 
 
 def _told(message: str) -> None:
-    """To the terminal of whoever serves this world; standard output is for the endpoints."""
+    """Print a message on the terminal of whoever serves this world; standard output is for the endpoints."""
     print(message, file=sys.stderr, flush=True)
 
 
@@ -317,7 +317,8 @@ def main() -> int:
 
 
 def _end_when_parent_is_gone() -> None:
-    """As a signal does it, so that a world in the making ends too: its code may be compiled for minutes."""
+    """End this process by a signal when the parent is gone, so that a world in the making ends too: its code may
+    be compiled for minutes."""
     with contextlib.suppress(OSError):
         while os.read(sys.stdin.fileno(), 4096):
             pass

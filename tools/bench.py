@@ -34,11 +34,11 @@ SMALL_DEMO = {"lights": {"kind": "every", "every": 40}}
 
 @dataclass(frozen=True)
 class Asked:
-    """How often and how much is measured."""
+    """Request: how often and how much is measured."""
 
     rounds: int
     frames: int | None
-    """Of `reflectance`."""
+    """Number of frames of `reflectance`."""
     smallest: bool
 
 

@@ -32,7 +32,7 @@ TILE_PX, TILE_AT = 256, (1900 / 4096, 1100 / 3072)
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
-    """For each codec: ratio, speed, and two readings; peers: plain h5py, and the file before."""
+    """Yield ratio, speed and two readings for each codec; peers are plain h5py, and the file before archiving."""
     import hdf5plugin  # noqa: F401  # registers the filter
 
     from coupole.storage.bitshuffle import CODECS

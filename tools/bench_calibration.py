@@ -28,17 +28,17 @@ PIXEL_PX, ROBOT_MM, ROBOT_DEG, TOLERANCE_MM = 0.05, 0.03, 0.003, 0.05
 
 @dataclass(frozen=True)
 class Size:
-    """How much is adjusted."""
+    """Size of what is adjusted."""
 
     scale: float = 1.0
-    """Of the image of a board, over 4096 x 3072 pixels."""
+    """Scale of the image of a board, over 4096 x 3072 pixels."""
     images: int = 45
     boards: int = 180
-    """Of six LEDs."""
+    """Number of boards of six LEDs."""
     views: int = 150
-    """Of the dome."""
+    """Number of views of the dome."""
     peers_steps: int | None = None
-    """At most; None: until it has converged."""
+    """Most steps of the peer; None: until it has converged."""
 
 
 SMALLEST = Size(scale=0.25, images=8, boards=12, views=40, peers_steps=3)

@@ -1,4 +1,4 @@
-"""What ten watchers at a console cost the acquisition: its efficiency with them over that without.
+"""Cost of ten watchers at a console: efficiency of the acquisition with them over that without.
 
 Watchers are clients of the Run screen that speak the screens' own protocol (socket.io over WebSocket) and fetch
 each new picture, as browsers do; they draw nothing, as browsers on other machines cost this one nothing. All is on
@@ -62,7 +62,7 @@ class Console:
 
 @dataclass
 class Seen:
-    """What a watcher got."""
+    """Counts of what a watcher got, and the addresses (`shots`) that it fetched."""
 
     connections: int = 0
     updates: int = 0

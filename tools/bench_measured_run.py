@@ -28,7 +28,7 @@ from bench_render import (
 
 @dataclass(frozen=True)
 class Size:
-    """Of frames, width and height, and of the relief, of which about nine tenths are seen."""
+    """Size of frames, width and height, and of the relief, of which about nine tenths are seen."""
 
     size_px: tuple[int, int] = FULL
     triangles: int = 1_150_000
@@ -39,7 +39,7 @@ LIFT_MM = 6.0
 VIEW, MESH, DARK_FRAMES = "top", "relief.ply", 2
 EXPOSURE_US = 8000
 POWER = 1.2e7
-"""Of every LED and channel, DN s^-1 m^2 sr."""
+"""Power of every LED and channel, DN s^-1 m^2 sr."""
 NOISE = (6.0, 0.4)
 """Variance in the dark, DN^2, and gain, DN/e."""
 

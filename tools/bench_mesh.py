@@ -31,7 +31,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 
 def _times(path: Path, millions: float, rounds: int) -> Iterator[dict[str, Any]]:
-    """Of reading one file in several ways, interleaved; it is removed."""
+    """Yield times of reading one file in several ways, interleaved; the file is then removed."""
     from coupole.scan.mesh_files import read_mesh
     from coupole.scan.scanner_export import read_scan
 
@@ -58,7 +58,7 @@ def _times(path: Path, millions: float, rounds: int) -> Iterator[dict[str, Any]]
 
 
 def _memory(path: Path, millions: float) -> dict[str, Any]:
-    """Of a process that reads a large file; it is removed."""
+    """Return the memory of a process that reads a large file; the file is then removed."""
     (_write_sheet if path.suffix == ".ply" else _write_stl)(path, round(1e6 * millions))
     took_s, peak_gb = _in_a_process(path)
     path.unlink()

@@ -37,19 +37,19 @@ PAPER_S = 150.0
 PAPER_BYTES = {"ggx_normal": 14e6, "sh": 600e6, "rbf": 600e6}
 PAPER_TRIANGLES = 500_000
 PAPER_TIMES = {"ggx_normal": 1.0, "sh": 2.0, "rbf": 6.0}
-"""Of making a picture, over GGX's."""
+"""Times of making a picture, over that of GGX."""
 _CHUNK = 16 << 20
 FULL_RUN = Size()
 
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured."""
+    """Scope of the measurement."""
 
     run: Size = FULL_RUN
     frames: int = FRAMES
     few_frames: int = 10
-    """Of the run whose memory is compared with that of all frames."""
+    """Frames of the run whose memory is compared with that of all frames."""
     fitted: int = 16_384
     """Triangles."""
     by_scipy: int = 256
@@ -190,7 +190,7 @@ def _forget(path: Path) -> None:
 
 
 def _read_direct(path: Path, size: int) -> None:
-    """As many bytes of a file, past the page cache."""
+    """Read this number of bytes of a file, past the page cache."""
     _forget(path)
     memory = mmap.mmap(-1, _CHUNK)
     fd = os.open(path, os.O_RDONLY | os.O_DIRECT)
@@ -214,7 +214,7 @@ def _result(folder: Path) -> Any:
 
 
 def _some_samples(folder: Path, count: int) -> Any:
-    """Of neighbouring triangles in the middle of the view."""
+    """Return samples of neighbouring triangles in the middle of the view."""
     result = _result(folder)
     view = result.views[0]
     first = len(view.triangles) // 2

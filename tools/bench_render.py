@@ -30,14 +30,14 @@ RAISED_MM = 10.0
 
 @dataclass(frozen=True)
 class Size:
-    """Of frames, width and height in pixels, and of reliefs, in millions of triangles."""
+    """Size of frames, width and height in pixels, and of reliefs, in millions of triangles."""
 
     full_px: tuple[int, int] = FULL
     small_px: tuple[int, int] = (1024, 768)
     medium: float = 1.4
     large: float = 10.0
     small: float = 0.1
-    """Of the small frame."""
+    """Size of the relief of the small frame."""
     least_rounds: int = 3
     leds_of_a_round: int = 12
     pixel_leds_of_a_round: int = 4

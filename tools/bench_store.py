@@ -34,7 +34,7 @@ Writer = Callable[[Path, NDArray[np.uint16], int], None]
 
 @dataclass(frozen=True)
 class Size:
-    """How much is written."""
+    """Size of what is written."""
 
     height_px: int = 3072
     width_px: int = 4096

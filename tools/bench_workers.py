@@ -28,7 +28,7 @@ SMALLEST = {"kind": "every", "every": 40}
 
 @dataclass(frozen=True)
 class Fitted:
-    """How long it took."""
+    """Time that the fit took."""
 
     seconds: float
     client_cpu_s: float

@@ -67,7 +67,7 @@ class Judged:
     error: float
     u: float
     half_width: float
-    """Of its 95 % interval."""
+    """Half width of the parameter's 95 % interval."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ class Proof:
     accuracy: dict[str, float]
     """Distances from the truth in mm and deg, by name; `_in_true_base`: including the arm's common error."""
     refused: str | None = None
-    """Why a calibration of this cell was refused or its record missed its limits; None: all were accepted."""
+    """Reason why a calibration of this cell was refused or its record missed its limits; None: all were
+    accepted."""
 
 
 def prove_cell(

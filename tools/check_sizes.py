@@ -14,7 +14,7 @@ from pathlib import Path
 FOLDERS = ("coupole", "drivers", "sim", "tools")
 MOST_MODULE_LINES = 400
 MOST_FUNCTION_LINES = 60
-"""From the first decorator or `def` to the last line, including the docstring."""
+"""Most lines of a function, from the first decorator or `def` to the last line, including the docstring."""
 MOST_ROOMS, MOST_TOP_FILES = 15, 9
 """Packages and top-level files in coupole/."""
 SHARED_NAMES = {"__init__", "records", "report", "settings"}

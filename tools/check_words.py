@@ -1,4 +1,4 @@
-"""How plain names and docstrings are, held by bounds that only go down: part of `tools/check`.
+"""Plainness of names and docstrings, held by bounds that only go down: part of `tools/check`.
 
     python tools/check_words.py [--show] [ROOM ...]
 
@@ -43,7 +43,7 @@ class Room:
     fragments: list[str] = field(default_factory=list)
 
     def shares(self) -> dict[str, float]:
-        """In per cent."""
+        """Return both shares, in per cent."""
         return {
             "names": 100.0 * len(self.bare) / max(1, self.names),
             "fragments": 100.0 * len(self.fragments) / max(1, self.docstrings),

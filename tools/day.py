@@ -28,10 +28,10 @@ from long_day import WORLD, Day, Watcher, cell_in, wrong_at_the_end  # noqa: E40
 
 WARM_UP_SHARE = 0.1
 GROWTH_BYTES, GROWTH_OTHER = 50e6, 3
-"""How much a process may grow after the warm-up; of handles, threads and sockets it may have a few more or less,
-since the moment of a sample is any."""
+"""Growth that a process may have after the warm-up; it may have a few handles, threads and sockets more or less,
+since samples are taken at any moment."""
 KEPT_BYTES = 400
-"""What the controller may keep of each frame besides: which shots are proven, and where."""
+"""Bytes that the controller may keep of each frame besides: which shots are proven, and where."""
 WRAP_S = 2**32 / 1e6
 MOST_SESSIONS = 20
 WHO = ("controller", "arm's process", "world")

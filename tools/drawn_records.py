@@ -42,17 +42,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scale:
-    """What differs from the shipped records, for cells that are known worse or better, or have another camera."""
+    """Differences from the shipped records, for cells that are known worse or better, or have another camera."""
 
     led_mm: float | None = None
     """Standard uncertainty of each coordinate of an LED; None: as the record has it."""
     led_normal_deg: float | None = None
     camera_mm: float | None = None
-    """Of each coordinate of the camera in the flange's frame."""
+    """Standard uncertainty of each coordinate of the camera in the flange's frame."""
     pitch_um: float = 44.0
-    """Of the pixels."""
+    """Pitch of the pixels."""
     size_px: tuple[int, int] | None = None
-    """Of another sensor: width and height; its pixels are alike."""
+    """Width and height of another sensor; its pixels are alike."""
     sensor: SensorModel = SHIPPED_SENSOR
 
 

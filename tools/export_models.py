@@ -84,7 +84,7 @@ def lab_differences(found: Array, wanted: Array) -> Array:
 
 
 def _cosines(of: Materials, lit: Lit) -> tuple[Array, Array, Array, Array]:
-    """Of light, camera and half vector to the normal, and of camera to half vector."""
+    """Return the cosines of light, camera and half vector to the normal, and of camera to half vector."""
     half = lit.lights + lit.cameras
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
@@ -106,7 +106,7 @@ def _v(nl: Array, nv: Array, alpha: Array) -> Array:
 
 
 def _fresnel(cosine: Array, f0: Array | float) -> Array:
-    """Of a dielectric that reflects `f0` at normal incidence."""
+    """Return Fresnel's reflectance of a dielectric that reflects `f0` at normal incidence."""
     root = np.sqrt(np.minimum(f0, 0.999))
     ior = (1.0 + root) / (1.0 - root)
     g = np.sqrt(ior**2 - 1.0 + cosine**2)

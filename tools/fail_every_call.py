@@ -58,7 +58,7 @@ def one(case: Case) -> dict[str, Any]:
 
 
 def case_of(line: dict[str, Any]) -> Case:
-    """Of a line that was kept."""
+    """Return the case of a line that was kept."""
     second = (Event(line["k2"], line["kind2"]),) if line.get("kind2") else ()
     return (Event(line["k"], line["kind"]), *second)
 

@@ -29,7 +29,7 @@ LOGS = ROOT / "runs" / "proofs"
 ENDED = LOGS / "ended.jsonl"
 _PYTEST = "-m pytest --full -q -n 2 --dist loadscope --timeout 3600"
 _APART = {"tests/faults": "tests/faults/test_injection.py", "tests/runs": "tests/runs/test_soak.py"}
-"""What is a proof of its own, by its folder."""
+"""Test files that are a proof of their own, by folder."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def keep(ended: Ended) -> None:
 
 
 def table(found: dict[str, Ended]) -> str:
-    """In Markdown: every proof, those that were not run too."""
+    """Return a table in Markdown of every proof, also of those that were not run."""
     lines = [
         "| proof | shows | date, commit | machine | minutes | ended | last line |",
         "|---|---|---|---|---|---|---|",

@@ -24,7 +24,8 @@ _STEP_X, _STEP_Y, _BOX_W, _BOX_H, _MARGIN = 74, 46, 132, 34, 16
 
 
 def rooms_in_order() -> list[str]:
-    """From the top layer down, the contracts merged, drivers and simulation between plan and appearance."""
+    """Return the rooms from the top layer down, with the contracts merged, and drivers and simulation between plan
+    and appearance."""
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = config["tool"]["importlinter"]["contracts"]
     layers = [name for name in contracts[0]["layers"] if name not in CONTRACTS]

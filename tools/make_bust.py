@@ -91,7 +91,7 @@ def _pedestal(x: Field, y: Field, z: Field) -> Field:
 
 
 def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
-    """Over the shoulders, open in front, in folds that deepen downwards."""
+    """Return a mantle over the shoulders, open in front, in folds that deepen downwards."""
     down = _ramp(z, 225, 60)
     folds = 6.5 * down * np.sin(13.0 * turn + 0.03 * z) + 3.0 * down * np.sin(29.0 * turn + 1.3 - 0.05 * z)
     side = np.stack([np.abs(x), y, z], axis=-1)
@@ -194,7 +194,7 @@ def _joined(a: Field, b: Field, round_mm: float) -> Field:
 
 
 def _cut(a: Field, b: Field, round_mm: float) -> Field:
-    """What of `a` is not in `b`, with a rounded edge."""
+    """Return the part of `a` that is not in `b`, with a rounded edge."""
     return -_joined(-a, b, round_mm)
 
 

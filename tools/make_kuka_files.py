@@ -35,7 +35,7 @@ STOP_NOTE = """\
   end, without an error. Whatever else silences the PC still ends in KSS29002. RSI_MOVECORR must be what runs:
   outside of it the same input is an error.
 """
-"""About the object that ends the program."""
+"""Note about the object that ends the program."""
 PING_S = 1
 """EKI's shortest interval for detecting that the PC is gone."""
 

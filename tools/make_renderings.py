@@ -38,7 +38,7 @@ QUICK = {
 }
 """Samples, width in pixels, nm between bands."""
 BUST, BUST_QUICK = "restored-bust", (18, 400, None)
-"""Of configs/restorations/, for docs/pictures/gallery."""
+"""Bust of configs/restorations/, for docs/pictures/gallery."""
 
 
 def main() -> None:

@@ -42,7 +42,7 @@ class Mutant:
 
     name: str
     path: str
-    """Of the file, from the root of the tree."""
+    """Path of the file, from the root of the tree."""
     old: str
     new: str
     harm: str
@@ -50,12 +50,12 @@ class Mutant:
     select: str = ""
     """Pytest's `-k`."""
     equivalent: str = ""
-    """Why no test can notice it; empty if one can."""
+    """Reason why no test can notice the mutant; empty if one can."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a mutant."""
+    """Outcome of a mutant."""
 
     name: str
     outcome: str
@@ -95,7 +95,7 @@ def mutated(mutant: Mutant, root: Path) -> str:
 
 
 def stale(mutants: Iterable[Mutant], root: Path) -> list[str]:
-    """What does not fit the tree: mutants without their text, tests that are not there."""
+    """Return what does not fit the tree: mutants without their text, tests that are not there."""
     found = []
     for mutant in mutants:
         try:

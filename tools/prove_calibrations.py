@@ -61,7 +61,7 @@ class Verdict:
     covered: float
     rms_over_u: float
     median_error: float
-    """Of its magnitude, in the name's unit."""
+    """Median of the error's magnitude, in the name's unit."""
     median_u: float
 
     @property

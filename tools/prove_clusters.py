@@ -46,9 +46,9 @@ CLUSTERS, TRIANGLES_FOR_EACH, MOST_RATIO = 1000, 417, 1.3
 SLOW, PATIENCE_S = 0.5, 60.0
 """Pace of a world that renders large frames, and how long it may be silent meanwhile."""
 PIXELS_FOR_EACH = 8.0
-"""Of a triangle, with `--triangles`."""
+"""Pixels for each triangle, with `--triangles`."""
 FLATTER = 0.2
-"""Its heights over those of the shipped relief: it stays in focus."""
+"""Heights of the finer relief over those of the shipped one: it stays in focus."""
 FINE_VIEWS = tuple(
     {**cells.TOP, "name": name, "target_mm": [0, 0, 5], "azimuth_deg": azimuth_deg}
     for name, azimuth_deg in (("front", -90), ("back", 90))
@@ -66,7 +66,7 @@ class Fine:
     """A finer relief, and a camera that sees it as finely; the field is the shipped camera's."""
 
     triangles: int
-    """That are seen, about."""
+    """Approximate number of triangles that are seen."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -110,7 +110,8 @@ def main() -> int:
 
 
 def _result(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
-    """Of a run of the coloured relief, or what of it is missing."""
+    """Make the result of a run of the coloured relief; the run and the records are made only if they are
+    missing."""
     about = folder / "run.txt"
     if not about.exists():
         about.write_text(str(_acquire(folder, fine, every, waves)))

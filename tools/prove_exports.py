@@ -1,4 +1,4 @@
-"""What exports of a result lose: pixels are lit anew from each file, and compared with the result it came from.
+"""Losses of exports of a result: pixels are lit anew from each file, and compared with the result it came from.
 
     python tools/prove_exports.py [RESULT] [--pixels 4000] [--write]
 
@@ -286,7 +286,7 @@ def _bsdf(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
 
 
 def _merl(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """By the database's own reader: the nearest value."""
+    """Return the nearest value, as the database's own reader does."""
     table = np.frombuffer(path.read_bytes(), "<f8", offset=12).reshape(3, *SIZE)
     half = unit(light + camera)
     theta_h, phi_h = np.arccos(half[:, 2]), np.arctan2(half[:, 1], half[:, 0])

@@ -44,7 +44,7 @@ from smallest import add_smallest  # noqa: E402
 
 PITCH_UM, SIZE_MM, TRIANGLES, DEPTH_MM = 5.5, 22.0, 8_600, 0.8
 EACH = 3.0**-0.5
-"""Of what is stated for all directions, in each."""
+"""Share, in each direction, of what is stated for all directions."""
 CAMERA_MM, LED_MM, LED_NORMAL_DEG, MESH_MM = 0.3 * EACH, 0.7 * EACH, 0.21 * 2**-0.5, 0.1 * EACH
 QUIET = SensorModel(full_well_e=135_000.0, read_noise_e=3.0)
 """Ten times the electrons, and a fourth of the noise in the dark."""

@@ -33,7 +33,7 @@ _SEED = 11
 
 
 def seen(shares: np.ndarray, chosen: list[Paint], under: Face) -> np.ndarray:
-    """What a mixture shows, NaN in bands that a paint does not know."""
+    """Return what a mixture shows, with NaN in bands that a paint does not know."""
     k, s = (
         np.asarray(sum(c * getattr(p, what) for c, p in zip(shares, chosen, strict=True)))
         for what in ("absorption", "scattering")

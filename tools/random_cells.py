@@ -182,7 +182,7 @@ class RandomCell:
 
     @property
     def true_lens(self) -> dict[str, float]:
-        """By the parameter names of records."""
+        """True values of the lens, by the parameter names of records."""
         focal_px = 1e3 / self.pitch_um / (1.0 / self.cell.rig.lens.focal_length_mm - 1.0 / self.lens["focus_mm"])
         bent = {name: self.lens[name] for name in ("k1", "p1", "p2")}
         middle = {"cx_px": 0.5 * (self.size_px[0] - 1), "cy_px": 0.5 * (self.size_px[1] - 1)}

@@ -36,7 +36,7 @@ Vector = tuple[str, float, float, float]
 
 
 def true_lens(cell: RandomCell, down: float) -> Lens:
-    """As rendered, where the camera looks with this cosine to straight down."""
+    """Return the lens as rendered, where the camera looks with this cosine to straight down."""
     width_px, height_px = cell.size_px
     strange = cell.strangers.lens
     focal_px = cell.true_lens["fx_px"]
@@ -53,7 +53,7 @@ def true_pixels(cell: RandomCell, in_camera_mm: Floats, down: float) -> Floats:
 
 
 def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: Floats) -> Iterator[Vector]:
-    """What both records say of rays. `joints_deg` [n, 6] are those of the calibration's views."""
+    """Yield what both records say of rays. `joints_deg` [n, 6] are those of the calibration's views."""
     down = _mean_down(cell, joints_deg)
     field = _field_mm(cell)
     seen = true_pixels(cell, field, down)
@@ -76,7 +76,7 @@ def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: 
 
 
 def has_truth(cell: RandomCell, parameter: str) -> bool:
-    """Whether a hand-eye record's parameter has a true value in a cell with a stranger.
+    """Tell whether a hand-eye record's parameter has a true value in a cell with a stranger.
 
     With another form of lens the camera's turn depends on what counts as its axis; an arm that errs by its posture
     has no one flange; a bent board has no one plane.

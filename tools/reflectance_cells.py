@@ -44,7 +44,7 @@ OLD_VIEWS = (cells.TOP, {**cells.TOP, "name": "side", "azimuth_deg": -60, "eleva
 NEW_VIEW = {**cells.TOP, "name": "third", "azimuth_deg": -130, "elevation_deg": 60}
 THIRDS_DEG = (0.0, 30.0, 60.0, 90.0)
 _SAMPLES = 20_000
-"""Of each view and channel, that are compared."""
+"""Samples of each view and channel that are compared."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale |
 
 @dataclass(frozen=True)
 class Truth:
-    """What the simulator knows, base frame."""
+    """Truth that the simulator knows, base frame."""
 
     table: NDArray[np.float32]
     corners_mm: Floats

@@ -35,7 +35,8 @@ class Figures:
     """Origins and axes of the joints with all angles 0, each in the frame of the one before."""
     flange_mm: tuple[float, float, float]
     flange_axis: tuple[int, int, int]
-    """From link 6 to the flange: its position, and the axis about which it is rotated by 90 deg."""
+    """Step from link 6 to the flange: its position (`flange_mm`), and the axis about which it is rotated by 90
+    deg."""
     top_deg_s: tuple[float, ...]
     """Highest axis speeds, before the rig's fraction."""
     has_jerk: bool = True
@@ -43,7 +44,7 @@ class Figures:
 
 
 def _of_ur(top_deg_s: float, d1: float, a2: float, a3: float, d4: float, d5: float, d6: float) -> Figures:
-    """From Universal Robots' table of Denavit-Hartenberg parameters, mm."""
+    """Return figures from Universal Robots' table of Denavit-Hartenberg parameters, mm."""
     joints = ((0, 0, d1), (0, 0, 0), (a2, 0, 0), (a3, 0, 0), (0, -d4, 0), (0, 0, -d5))
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1), (0, -1, 0))
     return Figures(joints, axes, (0, -d6, 0), (1, 0, 0), (top_deg_s,) * 6, has_jerk=False)
@@ -60,7 +61,7 @@ ARMS = {
     "UR5e": _of_ur(179.9, 162.5, -425.0, -392.2, 133.3, 99.7, 99.6),
     "UR10e": _of_ur(120.0, 180.7, -612.7, -571.55, 174.15, 119.85, 116.55),
 }
-"""By the names of the robot descriptions."""
+"""Figures of arms, by the names of the robot descriptions."""
 KR10 = ARMS["KR10 R1100 sixx"]
 _DISK_MM, _SHELL_MM = 50.0, 4
 FLANGE = 7

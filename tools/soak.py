@@ -31,7 +31,7 @@ from soaking import growths, soak  # noqa: E402
 from smallest import add_smallest  # noqa: E402
 
 GROWTH_BYTES, GROWTH_FILES = 50e6, 10
-"""How much a process may grow over the whole soak, after its warm-up."""
+"""Growth that a process may have over the whole soak, after its warm-up."""
 WRONG = ("mislabelled", "twice", "lost")
 
 

@@ -23,7 +23,7 @@ from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
 PHI_NODES = 25
-"""Of half a mesh, from 0 to pi."""
+"""Nodes of half a mesh in phi, from 0 to pi."""
 _LEAST_COSINE = 0.03
 """Nodes that the eye does not see, which its horizon is interpolated from, have the values of this cosine."""
 
@@ -43,7 +43,7 @@ class SphereMap:
 
     @property
     def vertices(self) -> int:
-        """That are shaded, of all meshes."""
+        """Number of vertices that are shaded, of all meshes."""
         return int(np.prod(self.radiance.shape[:3]))
 
     def at(self, normals: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Where the seconds of the tests go, by room (a folder of tests) and by kind.
+"""Account of where the seconds of the tests go, by room (a folder of tests) and by kind.
 
 `python tools/where_seconds_go.py [--workers N] [--show] [PATH ...]` runs the tests (all, or these paths) with
 pytest's `--account`. It prints two tables and the dearest tests. The counts stay in `runs/where_seconds_go`;
@@ -147,7 +147,7 @@ def lines() -> list[dict[str, Any]]:
 
 
 def processes(found: list[dict[str, Any]]) -> dict[int, Process]:
-    """Those of tests, by pid; a nursery is nobody's, whichever test was its first."""
+    """Return the processes of tests, by pid; a nursery belongs to no test, whichever test was its first."""
     nurseries = {line["pid"] for line in found if line["what"] == "nursery"}
     known = {
         line["pid"]: Process(line["name"], line["test"])
@@ -176,14 +176,14 @@ def columns(kinds: dict[str, float]) -> dict[str, float]:
 
 
 def add_cpu(spent: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
-    """What was counted inside, and under `rest` what is beyond it of all that a process used."""
+    """Add what was counted inside, and under `rest` the remainder of all that a process used."""
     counted = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
     add_up(spent.cpu_s, counted)
     spent.cpu_s[rest] += max(0.0, total_s - sum(counted.values()))
 
 
 def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
-    """By test, and what is nobody's."""
+    """Return seconds by test, and those that belong to no test."""
     by_test: dict[str, Spent] = defaultdict(Spent)
     nobody = Spent()
     owned: dict[str, list[Process]] = defaultdict(list)

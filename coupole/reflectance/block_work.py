@@ -96,14 +96,14 @@ class Cluster:
         return int(np.clip(-(-count // (_BLOCKS_EACH * self._all_threads)), _FEWEST_ROWS, _MOST_ROWS))
 
     def map(self, function: Callable[[Block], Done], blocks: Iterable[Block]) -> Iterator[Done]:
-        asked: deque[Any] = deque()
+        futures: deque[Any] = deque()
         ahead = _AHEAD * self._all_threads
         for block in blocks:
-            asked.append(self._client.submit(_done_alone, function, block, pure=False))
-            if len(asked) == ahead:
-                yield self._result(asked.popleft())
-        while asked:
-            yield self._result(asked.popleft())
+            futures.append(self._client.submit(_done_alone, function, block, pure=False))
+            if len(futures) == ahead:
+                yield self._result(futures.popleft())
+        while futures:
+            yield self._result(futures.popleft())
 
     @property
     def _all_threads(self) -> int:
@@ -133,11 +133,11 @@ class Cluster:
         return silent
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
-        mine = _seen_from_here(folder / witness)
-        for worker, seen in self._client.run(_seen_from_here, folder / witness).items():
-            if seen[1] != mine[1]:
-                raise InputError(f"--scheduler: the worker {worker} has Coupole {seen[1]}, here is {mine[1]}")
-            if seen != mine:
+        here = _seen_from_here(folder / witness)
+        for worker, there in self._client.run(_seen_from_here, folder / witness).items():
+            if there[1] != here[1]:
+                raise InputError(f"--scheduler: the worker {worker} has Coupole {there[1]}, here is {here[1]}")
+            if there != here:
                 raise InputError(
                     f"--scheduler: the worker {worker} does not see {folder} as it is here: put runs, records and "
                     "result on a file system that all machines have under the same path"

@@ -48,10 +48,10 @@ class Clusters:
     ) -> TriangleMaterials:
         """Return the materials of triangles by their places in `RunResult.triangles`. Normals are those of their
         `own` materials, or the mesh's where they borrow."""
-        number, borrowed = self.cluster[block], self.borrowed[block, None]
+        number, is_borrowed = self.cluster[block], self.borrowed[block, None]
         kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
         alpha[number < 0] = np.nan
-        normals = np.where(borrowed, mesh_normals, own.normals)
+        normals = np.where(is_borrowed, mesh_normals, own.normals)
         return TriangleMaterials(normals, kd, ks, alpha, residual)
 
 
@@ -72,7 +72,7 @@ def read_clusters(folder: Path) -> Clusters:
 def write_clusters(path: Path, clusters: Clusters, members: NDArray[np.int64]) -> None:
     """`members` [clusters] is how many triangles a cluster was found by."""
     with h5py.File(path, "w") as file:
-        for name, told in _TOLD.items():
+        for name, description in _TOLD.items():
             values = members if name == "members" else getattr(clusters, name)
-            kept = values.astype(np.float32) if name in Clusters.OF_CLUSTERS else values
-            file.create_dataset(name, data=kept, track_times=False).attrs["told"] = told
+            stored_values = values.astype(np.float32) if name in Clusters.OF_CLUSTERS else values
+            file.create_dataset(name, data=stored_values, track_times=False).attrs["told"] = description

@@ -58,9 +58,9 @@ def empty_pool(clusters: int, channels: int) -> Pool:
 
 def looks(materials: TriangleMaterials) -> Floats:
     """[b, channels * 6] square roots of reflectance about the mirror direction."""
-    found = np.empty((len(materials.alpha), materials.kd.shape[1], len(_OFF_DEG)))
-    _looks(materials.kd, materials.ks, materials.alpha, np.cos(np.radians(_OFF_DEG)), found)
-    return found.reshape(len(found), -1)
+    root_reflectances = np.empty((len(materials.alpha), materials.kd.shape[1], len(_OFF_DEG)))
+    _looks(materials.kd, materials.ks, materials.alpha, np.cos(np.radians(_OFF_DEG)), root_reflectances)
+    return root_reflectances.reshape(len(root_reflectances), -1)
 
 
 def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
@@ -89,31 +89,31 @@ def pool_samples(
 ) -> None:
     """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b], -1 for none; each
     of a cluster's `members` [k] gives an equal share."""
-    each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
+    most_each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
     order = random.permutation(np.flatnonzero(used))
     _pool(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, normals, cluster,
-        each, order, pool.values, pool.lights, pool.views, pool.counts,
+        most_each, order, pool.values, pool.lights, pool.views, pool.counts,
     )  # fmt: skip
 
 
 def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
     """[k] materials of clusters, from `starts` [k]; those whose pool is too small keep their start."""
     count, channels = len(pool.counts), pool.values.shape[2]
-    found = np.concatenate([starts.kd, starts.ks, starts.alpha[:, None], np.full((count, 1), np.nan)], axis=1)
+    parameters = np.concatenate([starts.kd, starts.ks, starts.alpha[:, None], np.full((count, 1), np.nan)], axis=1)
 
     def fit(number: int) -> None:
         n = pool.counts[number]
         if n >= FEWEST:
             _fit_one(
                 pool.values[number, :n].astype(np.float64), pool.lights[number, :n].astype(np.float64),
-                pool.views[number, :n].astype(np.float64), found[number],
+                pool.views[number, :n].astype(np.float64), parameters[number],
             )  # fmt: skip
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
         list(threads.map(fit, range(count)))
-    kd, ks = found[:, :channels], np.minimum(found[:, channels : 2 * channels], MOST_KS)
-    parts = np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, found[:, -2], found[:, -1]
+    kd, ks = parameters[:, :channels], np.minimum(parameters[:, channels : 2 * channels], MOST_KS)
+    parts = np.tile([0.0, 0.0, 1.0], (count, 1)), kd, ks, parameters[:, -2], parameters[:, -1]
     return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout
 
 
@@ -122,12 +122,12 @@ def nearest_cluster(
 ) -> NDArray[np.int64]:
     """[b] the cluster whose material explains a triangle's samples best, the mesh's normal taken; -1 for fewer
     than `fewest` samples."""
-    found = np.full(len(samples.values), -1, np.int64)
+    nearest = np.full(len(samples.values), -1, np.int64)
     _nearest(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, samples.normals,
-        np.flatnonzero(used), materials.kd, materials.ks, materials.alpha, fewest, found,
+        np.flatnonzero(used), materials.kd, materials.ks, materials.alpha, fewest, nearest,
     )  # fmt: skip
-    return found
+    return nearest
 
 
 @numba.njit(cache=True, nogil=True)
@@ -165,23 +165,23 @@ def _pool(  # type: ignore[no-untyped-def]
 ):
     axes = np.empty((3, 3))
     for triangle in range(len(values)):
-        number, taken = cluster[triangle], 0
+        number, count = cluster[triangle], 0
         if number < 0:
             continue
         axes_about(normals[triangle], axes)
         for sample in order:
             place = counts[number]
-            if taken == each[number] or place == pooled.shape[1]:
+            if count == each[number] or place == pooled.shape[1]:
                 break
-            known = True
+            all_positive = True
             for channel in range(values.shape[2]):
-                known &= values[triangle, sample, channel] > 0.0
-            if not known:
+                all_positive &= values[triangle, sample, channel] > 0.0
+            if not all_positive:
                 continue
             pooled[number, place] = values[triangle, sample]
             turned_to(axes, centres_mm[triangle], led_mm[sample], lights[number, place])
             turned_to(axes, centres_mm[triangle], cameras_mm[view_of[sample]], views[number, place])
-            taken += 1
+            count += 1
             counts[number] += 1
 
 
@@ -199,15 +199,15 @@ def _fit_one(values, lights, views, found):  # type: ignore[no-untyped-def]
     for channel in range(channels):
         grey[0] += found[channel] / channels
         grey[1] += found[channels + channel] / channels
-    z_axis, used = np.array([0.0, 0.0, 1.0]), np.arange(count)
+    z_axis, indices = np.array([0.0, 0.0, 1.0]), np.arange(count)
     unknowns = np.array([0.0, 0.0, 1.0, 0.0, 0.0, math.log(found[2 * channels])])
     unknowns[3], unknowns[4] = math.log(max(grey[0], 1e-9)), math.log(max(grey[1], 1e-6))
-    _, spread = fit_from(roots, used, lights, half, views, used, unknowns, z_axis, HELD, USUAL)
+    _, rms = fit_from(roots, indices, lights, half, views, indices, unknowns, z_axis, HELD, USUAL)
     colours_from(
-        values, used, z_axis, np.exp(unknowns[3:6]), lights, half, views, used, found[:channels],
+        values, indices, z_axis, np.exp(unknowns[3:6]), lights, half, views, indices, found[:channels],
         found[channels : 2 * channels],
     )  # fmt: skip
-    found[2 * channels], found[2 * channels + 1] = math.exp(unknowns[5]), spread
+    found[2 * channels], found[2 * channels + 1] = math.exp(unknowns[5]), rms
 
 
 @numba.njit(cache=True, nogil=True)
@@ -234,7 +234,7 @@ def _nearest(  # type: ignore[no-untyped-def]
                 shine = lobe(light[2], view[2], (light[2] + view[2]) / length, alpha[number])[0]
                 for channel in range(len(value)):
                     if not math.isnan(value[channel]):
-                        made = light[2] * (kd[number, channel] + ks[number, channel] * shine)
-                        misses[number] += (math.sqrt(made) - math.sqrt(max(value[channel], 0.0))) ** 2
+                        modelled_value = light[2] * (kd[number, channel] + ks[number, channel] * shine)
+                        misses[number] += (math.sqrt(modelled_value) - math.sqrt(max(value[channel], 0.0))) ** 2
         if count >= fewest:
             found[triangle] = np.argmin(misses)

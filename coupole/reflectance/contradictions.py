@@ -68,20 +68,20 @@ def contradicted(
         diffuse = materials.kd[:, None] * np.maximum(cosine, 0.0)[..., None] / whole
         ratio = samples.values / whole
     u_ratio = np.nan_to_num(u_noise.astype(np.float32), nan=np.inf)  # of unknown noise nothing contradicts
-    known = np.isfinite(ratio)
-    low = known & (ratio < _AGREE[0]) & (ratio + _SIGMA * u_ratio * ratio < 1.0) & (diffuse > _LEAST_DIFFUSE)
-    dark: NDArray[np.bool_] = known.any(axis=2) & (low | ~known).all(axis=2)
+    is_finite = np.isfinite(ratio)
+    low = is_finite & (ratio < _AGREE[0]) & (ratio + _SIGMA * u_ratio * ratio < 1.0) & (diffuse > _LEAST_DIFFUSE)
+    dark: NDArray[np.bool_] = is_finite.any(axis=2) & (low | ~is_finite).all(axis=2)
     if not dark.any():
         return dark
     row, led = np.nonzero(dark)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.nansum(ratio[row], axis=2) / known[row].sum(axis=2)
-    others = np.take_along_axis(mean, beside.places[led], axis=1)
-    enough = np.isfinite(others).sum(axis=1) >= _FEWEST_BESIDE
-    middle = np.full(len(others), np.nan)
-    middle[enough] = np.nanmedian(others[enough], axis=1)
-    mine = mean[np.arange(len(led)), led]
-    dark[row, led] = (middle > _AGREE[0]) & (middle < _AGREE[1]) & (mine < _MOST_LEFT * middle)
+        mean = np.nansum(ratio[row], axis=2) / is_finite[row].sum(axis=2)
+    neighbour_ratios = np.take_along_axis(mean, beside.places[led], axis=1)
+    enough = np.isfinite(neighbour_ratios).sum(axis=1) >= _FEWEST_BESIDE
+    middle = np.full(len(neighbour_ratios), np.nan)
+    middle[enough] = np.nanmedian(neighbour_ratios[enough], axis=1)
+    own_ratio = mean[np.arange(len(led)), led]
+    dark[row, led] = (middle > _AGREE[0]) & (middle < _AGREE[1]) & (own_ratio < _MOST_LEFT * middle)
     return dark
 
 
@@ -104,23 +104,23 @@ def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
     samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
     with h5py.File(view.path, "r") as file:
         dark = contradicted(samples, materials, file["u_own"][rows], beside)
-        known = np.isfinite(file["f"][rows])
-    return Found(rows, np.stack(np.nonzero(dark)), int(known[dark].sum()), int(known.sum()))
+        has_values = np.isfinite(file["f"][rows])
+    return Found(rows, np.stack(np.nonzero(dark)), int(has_values[dark].sum()), int(has_values.sum()))
 
 
 def leave_out(view: ViewSamples, found: Iterable[Found]) -> None:
     """Take what contradicts others out of a view's file, which is whole, before or after. Raises OSError."""
 
     def write(part: Path) -> None:
-        count = used = 0
+        count = total = 0
         shutil.copyfile(view.path, part)
         with h5py.File(part, "r+") as file:
-            for one in found:
-                count, used = count + one.values, used + one.all_values
-                if one.places.size:
-                    f, codes = file["f"][one.rows], file["codes"][one.rows]
-                    f[*one.places], codes[*one.places] = np.nan, BY_UNKNOWN
-                    file["f"][one.rows], file["codes"][one.rows] = f, codes
-            file.attrs[CONTRADICTED], file.attrs[SAMPLES] = count, used - count
+            for contradictions in found:
+                count, total = count + contradictions.values, total + contradictions.all_values
+                if contradictions.places.size:
+                    f, codes = file["f"][contradictions.rows], file["codes"][contradictions.rows]
+                    f[*contradictions.places], codes[*contradictions.places] = np.nan, BY_UNKNOWN
+                    file["f"][contradictions.rows], file["codes"][contradictions.rows] = f, codes
+            file.attrs[CONTRADICTED], file.attrs[SAMPLES] = count, total - count
 
     complete(view.path, write)

@@ -39,14 +39,18 @@ def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-u
     see `fit_from`."""
     count = (len(good) + LANES - 1) // LANES
     for number in range(count * LANES):
-        one = packs[number // LANES, :, number % LANES]
+        lane = packs[number // LANES, :, number % LANES]
         if number < len(good):
             sample = good[number]
-            one[0], one[10] = roots[number], 1.0
+            lane[0], lane[10] = roots[number], 1.0
             for k in range(3):
-                one[1 + k], one[4 + k], one[7 + k] = lights[sample, k], half[sample, k], views[view_of[sample], k]
+                lane[1 + k], lane[4 + k], lane[7 + k] = (
+                    lights[sample, k],
+                    half[sample, k],
+                    views[view_of[sample], k],
+                )
         else:
-            one[:] = 0.0  # its light comes from nowhere
+            lane[:] = 0.0  # its light comes from nowhere
     return count
 
 
@@ -58,36 +62,36 @@ def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled):  # type
     rows = np.empty((len(packs) * (UNKNOWNS + 1), LANES))
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     new_matrix, new_right, trial = np.empty_like(matrix), np.empty_like(right), np.empty(6)
-    cost, spread = _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right)
+    cost, rms = _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right)
     damping = 1e-2
     for _ in range(_MOST_STEPS):
         _move(unknowns, _solve(matrix, right, damping), trial)
-        moved, moved_spread = np.inf, 0.0
+        trial_cost, trial_rms = np.inf, 0.0
         if _least_cosine(trial, views) > 0.02:
-            moved, moved_spread = _equations(
+            trial_cost, trial_rms = _equations(
                 packs, trial, prior, stiffness, usual, scale, rows, new_matrix, new_right
             )
-        if moved < cost:
-            gain = cost - moved
+        if trial_cost < cost:
+            gain = cost - trial_cost
             assign(unknowns, trial)
             assign_rows(matrix, new_matrix)
             assign(right, new_right)
             damping = max(damping * 0.2, 1e-9)
-            cost, spread = moved, moved_spread
+            cost, rms = trial_cost, trial_rms
             if gain < settled * (cost + gain):
                 break
         else:
             damping *= 6.0
             if damping > 1e8:
                 break
-    return cost, spread / math.exp(0.5 * unknowns[3])
+    return cost, rms / math.exp(0.5 * unknowns[3])
 
 
 @numba.njit(cache=True, nogil=True)
 def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, right):  # type: ignore[no-untyped-def]
     """Normal equations of a step, into `matrix` and `right`; Cauchy's cost and the weighted rms."""
     t1, t2 = tangents(unknowns[0], unknowns[1], unknowns[2])
-    cost, spread = _residuals(packs, unknowns, t1, t2, scale, rows)
+    cost, rms = _residuals(packs, unknowns, t1, t2, scale, rows)
     count = len(packs)
     for i in range(UNKNOWNS):
         for j in range(i + 1):
@@ -104,15 +108,15 @@ def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, ri
     matrix[3, 3] += usual / SPREAD_KS**2
     matrix[4, 4] += usual
     cost += stiffness * (off0 * off0 + off1 * off1 + off2 * off2)
-    return cost + usual * (more_alpha * more_alpha + more_ks * more_ks), spread
+    return cost + usual * (more_alpha * more_alpha + more_ks * more_ks), rms
 
 
 @numba.njit(cache=True, nogil=True)
 def _product(rows, one, other, count):  # type: ignore[no-untyped-def]
-    found = lanes(0.0)
+    products = lanes(0.0)
     for n in range(count):
-        found += loaded(rows, one + n) * loaded(rows, other + n)
-    return total(found)
+        products += loaded(rows, one + n) * loaded(rows, other + n)
+    return total(products)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -135,8 +139,8 @@ def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped
     squares, weights, product, logarithms = lanes(0.0), lanes(0.0), lanes(1.0), 0.0
     eight = np.empty((1, LANES))
     for n in range(count):
-        one = packs[n]
-        cosine, nh, nv = _dot(normal, one, 1), _dot(normal, one, 4), _dot(normal, one, 7)
+        samples = packs[n]
+        cosine, nh, nv = _dot(normal, samples, 1), _dot(normal, samples, 4), _dot(normal, samples, 7)
         nl, nv = larger(cosine, 1e-9), larger(nv, 1e-9)
         t, a, b = 1.0 - nh * nh * rest, root(alpha2 + rest * nl * nl), root(alpha2 + rest * nv * nv)
         s, ab = nl * b + nv * a, a * b
@@ -144,11 +148,11 @@ def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped
         by_t, by_s, by_ab = inverse * s * ab, inverse * t * ab, inverse * t * s
         value = (0.5 / math.pi * alpha2) * by_t * by_t * by_s
         shine, value_by_s = ks * value, value * by_s
-        made = root(nl * (kd + shine))
-        off = (if_less(0.0, cosine, made, 0.0) - loaded(one, 0)) / scale
+        modelled_root = root(nl * (kd + shine))
+        off = (if_less(0.0, cosine, modelled_root, 0.0) - loaded(samples, 0)) / scale
         weight = 1.0 / (1.0 + off * off)
         share = root(weight)
-        factor = if_less(0.0, cosine, share * (0.5 / scale) / made, 0.0)
+        factor = if_less(0.0, cosine, share * (0.5 / scale) / modelled_root, 0.0)
         by_light = kd + shine - nl * ks * value_by_s * (b + nv * rest * nl * b * by_ab)
         by_view = -1.0 * nl * ks * value_by_s * (a + nl * rest * nv * a * by_ab)
         by_half = 4.0 * nl * nh * rest * by_t * shine
@@ -156,14 +160,18 @@ def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped
             nl * (1.0 - nv * nv) * a * by_ab + nv * (1.0 - nl * nl) * b * by_ab
         )
         for k, t12 in enumerate((t1, t2)):
-            tilt = by_light * _dot(t12, one, 1) + by_view * _dot(t12, one, 7) + by_half * _dot(t12, one, 4)
+            tilt = (
+                by_light * _dot(t12, samples, 1)
+                + by_view * _dot(t12, samples, 7)
+                + by_half * _dot(t12, samples, 4)
+            )
             store(factor * tilt, rows, k * count + n)
         store(factor * nl * kd, rows, 2 * count + n)
         store(factor * nl * shine, rows, 3 * count + n)
         store(factor * nl * ks * by_alpha, rows, 4 * count + n)
         store(off * share, rows, _OFF * count + n)
         squares += weight * off * off
-        weights += weight * loaded(one, 10)
+        weights += weight * loaded(samples, 10)
         product = product * (1.0 + off * off)
         if n % _TOGETHER == _TOGETHER - 1 or n == count - 1:
             store(product, eight, 0)

@@ -119,11 +119,11 @@ def seen_from(scene: Scene, triangles: NDArray[np.int64], seed: int) -> csr_arra
     strata = np.stack(np.divmod(np.arange(2 * across * across), 2 * across), axis=-1)
     step = max(1, _RAYS // len(strata))
     starts = range(0, len(triangles), step)
-    seeds = [int(one) for one in random.integers(0, 2**31, len(starts))]
+    seeds = [int(number) for number in random.integers(0, 2**31, len(starts))]
 
     def part(first: int, seed: int) -> csr_array:
-        mine = triangles[first : first + step]
-        return _gathered(scene, mine, strata, np.random.default_rng(seed))
+        part_triangles = triangles[first : first + step]
+        return _gathered(scene, part_triangles, strata, np.random.default_rng(seed))
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = list(pool.map(part, starts, seeds))
@@ -145,13 +145,13 @@ def _gathered(
     ways = x[..., None] * first[:, None] + y[..., None] * second[:, None] + z[..., None] * normals[:, None]
     shares = random.dirichlet((1.0, 1.0, 1.0), (count, rays))
     places = np.einsum("nrc,nck->nrk", shares, scene.corners_mm[mine]) + RAY_START_MM * normals[:, None]
-    met = scene.rays.run(
+    hits = scene.rays.run(
         np.ascontiguousarray(places.reshape(-1, 3), np.float32),
         np.ascontiguousarray(ways.reshape(-1, 3), np.float32),
         query="INTERSECT",
         output=1,
     )
-    hit = np.asarray(met["primID"], dtype=np.int64).reshape(count, rays)
+    hit = np.asarray(hits["primID"], dtype=np.int64).reshape(count, rays)
     front = (hit >= 0) & (np.einsum("nrk,nrk->nr", ways, scene.normals[hit]) < 0)
     row, ray = np.nonzero(front)
     data = np.full(len(row), 1.0 / rays, np.float32)
@@ -170,7 +170,7 @@ def points_of(scene: Scene) -> NDArray[np.int64]:
 def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, paper: bool) -> NDArray[np.float32]:
     """[patches, leds] E / Phi, m^-2, that reaches patches straight from LEDs: the mean of some of their
     triangles."""
-    found = np.zeros((scene.patches, len(led_mm)), np.float32)
+    irradiance = np.zeros((scene.patches, len(led_mm)), np.float32)
     for at in points_of(scene):
         centres, normals = scene.centres_mm[at], scene.normals[at]
         cosine = _cosines(centres, normals, led_mm)
@@ -180,8 +180,8 @@ def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, pape
         for part in range(0, len(patch), _RAYS):
             some = slice(part, part + _RAYS)
             light[patch[some], led[some]] *= ~blocked(scene.rays, starts[some], led_mm[led[some]])
-        found += (light / _POINTS).astype(np.float32)
-    return found
+        irradiance += (light / _POINTS).astype(np.float32)
+    return irradiance
 
 
 def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
@@ -196,20 +196,20 @@ def radiosity(
 ) -> NDArray[np.float32]:
     """[channels, patches, leds] exitance of patches for a power of 1. `shown` [patches, channels] is the
     reflectance that counts all light as direct; patches that no LED reaches keep it."""
-    found = []
-    for one in shown.T:
-        reflectance = one.copy()
+    exitances = []
+    for channel_reflectance in shown.T:
+        reflectance = channel_reflectance.copy()
         for _ in range(passes):
             exitance = reflectance[:, None].astype(np.float32) * direct
             for _ in range(_MOST_BOUNCES):
                 indirect = seen @ exitance
                 exitance = reflectance[:, None].astype(np.float32) * (direct + indirect)
-            reached = direct.sum(axis=1)
+            direct_power = direct.sum(axis=1)
             beside = np.where(direct > 0, indirect, 0.0).sum(axis=1)  # of the LEDs that samples are of
-            share = np.where(reached > 0, reached / np.maximum(reached + beside, 1e-30), 1.0)
-            reflectance = one * share
-        found.append(exitance)
-    return np.stack(found)
+            share = np.where(direct_power > 0, direct_power / np.maximum(direct_power + beside, 1e-30), 1.0)
+            reflectance = channel_reflectance * share
+        exitances.append(exitance)
+    return np.stack(exitances)
 
 
 def subtract(
@@ -228,13 +228,13 @@ def subtract(
     pose = result.base_from_support
     support = (pose[:3, 3], pose[:3, 2]) if support_reflectance > 0 else None
     scene = scene_of(corners, support_z=support)
-    shown, diffuse = _as_measured(result, scene, len(corners), support_reflectance)
+    patch_reflectance, diffuse = _as_measured(result, scene, len(corners), support_reflectance)
     say("inter-reflection", 1, 2 + len(missing))
     points = points_of(scene)
-    seen = sum(seen_from(scene, at, seed) for seed, at in enumerate(points)) * (1.0 / len(points))
+    form_factors = sum(seen_from(scene, at, seed) for seed, at in enumerate(points)) * (1.0 / len(points))
     say("inter-reflection", 2, 2 + len(missing))
     for number, view in enumerate(missing):
-        _subtract_view(view, scene, seen, shown, diffuse[view.path.stem], paper)
+        _subtract_view(view, scene, form_factors, patch_reflectance, diffuse[view.path.stem], paper)
         say("inter-reflection", 3 + number, 2 + len(missing))
 
 
@@ -246,11 +246,11 @@ def _as_measured(
     path = result.folder / AS_MEASURED
     if not path.exists():
         diffuse = {view.path.stem: _diffuse(result, view) for view in result.views}
-        shown = _shown(result, diffuse, scene, count, support_reflectance)
+        patch_reflectance = _shown(result, diffuse, scene, count, support_reflectance)
 
         def write(part: Path) -> None:
             with h5py.File(part, "w") as file:
-                file["shown"] = shown
+                file["shown"] = patch_reflectance
                 for name, values in diffuse.items():
                     file[f"diffuse/{name}"] = values
 
@@ -269,17 +269,17 @@ def _shown(
     every = []
     for view in result.views:
         values = diffuse[view.path.stem]
-        known = np.isfinite(values).all(axis=1)
-        mine, areas = scene.patch[view.triangles[known]], scene.areas_mm2[view.triangles[known]]
-        np.add.at(sums, mine, areas[:, None] * values[known])
-        np.add.at(weights, mine, areas)
-        every.append(values[known])
+        is_finite = np.isfinite(values).all(axis=1)
+        patches, areas = scene.patch[view.triangles[is_finite]], scene.areas_mm2[view.triangles[is_finite]]
+        np.add.at(sums, patches, areas[:, None] * values[is_finite])
+        np.add.at(weights, patches, areas)
+        every.append(values[is_finite])
     usual = np.median(np.concatenate(every), axis=0)
     with np.errstate(invalid="ignore"):
-        shown = np.where(weights[:, None] > 0, sums / weights[:, None], usual)
-    shown = np.clip(np.pi * shown, 0.0, _MOST_REFLECTED)
-    shown[np.unique(scene.patch[count:])] = support_reflectance
-    return shown
+        reflectance = np.where(weights[:, None] > 0, sums / weights[:, None], usual)
+    reflectance = np.clip(np.pi * reflectance, 0.0, _MOST_REFLECTED)
+    reflectance[np.unique(scene.patch[count:])] = support_reflectance
+    return reflectance
 
 
 def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
@@ -287,13 +287,13 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
     those reach it not."""
     some_leds = np.zeros(len(view.leds), np.bool_)
     some_leds[:: max(1, len(view.leds) // most)] = True
-    found = np.full((len(view.triangles), result.channels), np.nan)
-    for first in range(0, len(found), 8192):
-        rows = slice(first, min(first + 8192, len(found)))
+    medians = np.full((len(view.triangles), result.channels), np.nan)
+    for first in range(0, len(medians), 8192):
+        rows = slice(first, min(first + 8192, len(medians)))
         for columns in (some_leds, ~some_leds):
-            if np.isnan(found[rows]).any():
-                _fill_medians(found[rows], result.view_samples(view, rows, columns))
-    return found
+            if np.isnan(medians[rows]).any():
+                _fill_medians(medians[rows], result.view_samples(view, rows, columns))
+    return medians
 
 
 def _fill_medians(found: Floats, samples: TriangleSamples) -> None:
@@ -315,13 +315,13 @@ def _subtract_view(
 
     def write(part: Path) -> None:
         shutil.copyfile(view.path, part)
-        shares, used = [], 0
+        shares, sample_count = [], 0
         with h5py.File(part, "r+") as file:
-            told = "share of f that was inter-reflection, and was taken off"
-            kept = file.create_dataset(
+            description = "share of f that was inter-reflection, and was taken off"
+            share_dataset = file.create_dataset(
                 INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
             )
-            kept.attrs["told"] = told
+            share_dataset.attrs["told"] = description
             for first in range(0, len(view.triangles), 4096):
                 rows = slice(first, min(first + 4096, len(view.triangles)))
                 f = file["f"][rows]
@@ -331,10 +331,10 @@ def _subtract_view(
                 some = share[:: 1 + len(f) // 512]
                 shares.append(some[np.isfinite(some)])
                 file["f"][rows], file["u_own"][rows] = f * (1 - share), file["u_own"][rows] / (1 - share)
-                kept[rows] = share.astype(np.float16)
-                used += int(np.count_nonzero(np.isfinite(share)))
+                share_dataset[rows] = share.astype(np.float16)
+                sample_count += int(np.count_nonzero(np.isfinite(share)))
             every = np.concatenate(shares)
-            file.attrs[SAMPLES] = used
+            file.attrs[SAMPLES] = sample_count
             file.attrs[INTER_REFLECTION] = np.quantile(every, [0.5, 0.95]) if len(every) else [0.0, 0.0]
 
     complete(view.path, write)
@@ -351,13 +351,13 @@ def _off(
 ) -> NDArray[np.float32]:
     """[n, leds, channels] what to take off f of triangles: their diffuse reflectance times indirect over
     direct."""
-    mine = view.triangles[rows]
-    centres, normals = scene.centres_mm[mine], scene.normals[mine]
+    triangles = view.triangles[rows]
+    centres, normals = scene.centres_mm[triangles], scene.normals[triangles]
     arriving = lit_on(centres, view.led_mm, view.led_normals, paper) * _cosines(centres, normals, view.led_mm)
-    indirect = np.stack([gathers @ one for one in exitance], axis=-1)
-    reached = arriving > 0
-    total = np.where(reached, arriving, 0.0).sum(axis=1)[:, None]
-    of_direct = total / np.maximum(total + np.where(reached[..., None], indirect, 0.0).sum(axis=1), 1e-30)
+    indirect = np.stack([gathers @ channel_exitance for channel_exitance in exitance], axis=-1)
+    is_lit = arriving > 0
+    total = np.where(is_lit, arriving, 0.0).sum(axis=1)[:, None]
+    of_direct = total / np.maximum(total + np.where(is_lit[..., None], indirect, 0.0).sum(axis=1), 1e-30)
     with np.errstate(divide="ignore", invalid="ignore"):
         off = (np.nan_to_num(diffuse) * of_direct)[:, None] * indirect / arriving[..., None]
-    return np.where(reached[..., None], off, 0.0).astype(np.float32)
+    return np.where(is_lit[..., None], off, 0.0).astype(np.float32)

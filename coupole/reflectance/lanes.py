@@ -56,17 +56,17 @@ def _spread(context: Any, builder: Any, number: Any, kind: Any, value: Any) -> A
     """A number in all lanes; lanes as they are."""
     if isinstance(kind, _Lanes):
         return value
-    undefined = ir.Constant(_vector(number), ir.Undefined)
-    first = builder.insert_element(undefined, context.cast(builder, value, kind, number), _INT(0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+    no_vector = ir.Constant(_vector(number), ir.Undefined)
+    first = builder.insert_element(no_vector, context.cast(builder, value, kind, number), _INT(0))
+    return builder.shuffle_vector(first, no_vector, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
 
 
 def _made_of(build: Any) -> Any:
     """A function of lanes and numbers, by what `build` makes of their vectors."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
-        number, given = signature.return_type.number, zip(signature.args, values, strict=True)
-        return build(builder, *(_spread(context, builder, number, kind, value) for kind, value in given))
+        number, typed_values = signature.return_type.number, zip(signature.args, values, strict=True)
+        return build(builder, *(_spread(context, builder, number, kind, value) for kind, value in typed_values))
 
     return generate
 
@@ -130,8 +130,8 @@ def _math(name: str) -> Any:
         def build(builder, value):  # type: ignore[no-untyped-def]
             kind = ir.FunctionType(value.type, [value.type])
             whole = f"llvm.{name}.v{LANES}f{number.number.bitwidth}"
-            known = builder.module.globals.get(whole)
-            return builder.call(known or ir.Function(builder.module, kind, whole), [value])
+            declaration = builder.module.globals.get(whole)
+            return builder.call(declaration or ir.Function(builder.module, kind, whole), [value])
 
         return number(number), _made_of(build)
 
@@ -143,10 +143,10 @@ root, absolute = _math("sqrt"), _math("fabs")
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) -> Any:
     """Return the address of an element of an array of any strides."""
-    made = context.make_array(kind)(context, builder, array)
-    address = builder.ptrtoint(made.data, ir.IntType(64))
+    array_struct = context.make_array(kind)(context, builder, array)
+    address = builder.ptrtoint(array_struct.data, ir.IntType(64))
     for number, place in enumerate(places):
-        stride = builder.extract_value(made.strides, number)
+        stride = builder.extract_value(array_struct.strides, number)
         address = builder.add(address, builder.mul(stride, place))
     return address
 
@@ -156,17 +156,17 @@ def loaded(_context, array, row):  # type: ignore[no-untyped-def]
     """The first eight numbers of a row of an array [n, 8 or more] in C order; integers in single precision."""
     if array.layout != "C":
         raise errors.TypingError(f"expected an array in C order, got the order {array.layout}")
-    found = _KINDS.get(array.dtype, _KINDS[types.float32])
+    vector_kind = _KINDS.get(array.dtype, _KINDS[types.float32])
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         kind = signature.args[0].dtype
-        own = ir.VectorType(context.get_value_type(kind), LANES)
+        vector_type = ir.VectorType(context.get_value_type(kind), LANES)
         address = _address(context, builder, signature.args[0], *values)
-        vector = builder.load(builder.inttoptr(address, own.as_pointer()))
+        vector = builder.load(builder.inttoptr(address, vector_type.as_pointer()))
         vector.align = kind.bitwidth // 8
         return builder.uitofp(vector, _vector(types.float32)) if isinstance(kind, types.Integer) else vector
 
-    return found(array, types.intp), generate
+    return vector_kind(array, types.intp), generate
 
 
 @_compiled
@@ -178,8 +178,8 @@ def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         address = _address(context, builder, signature.args[1], *values[1:])
-        made = builder.store(values[0], builder.inttoptr(address, values[0].type.as_pointer()))
-        made.align = numbers.number.bitwidth // 8
+        instruction = builder.store(values[0], builder.inttoptr(address, values[0].type.as_pointer()))
+        instruction.align = numbers.number.bitwidth // 8
         return context.get_dummy_value()
 
     return types.void(numbers, array, types.intp), generate
@@ -196,8 +196,8 @@ def total(_context, numbers):  # type: ignore[no-untyped-def]
             low, high = (
                 ir.Constant(ir.VectorType(_INT, count), [at + n for n in range(count)]) for at in (0, count)
             )
-            undefined = ir.Constant(vector.type, ir.Undefined)
-            halves = (builder.shuffle_vector(vector, undefined, half) for half in (low, high))
+            no_vector = ir.Constant(vector.type, ir.Undefined)
+            halves = (builder.shuffle_vector(vector, no_vector, half) for half in (low, high))
             vector = builder.fadd(*halves)
         return builder.extract_element(vector, _INT(0))
 
@@ -210,15 +210,15 @@ def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
     precision."""
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
-        frames, chosen, place = values
+        frames, row_number, place = values
         of_arrays, of_rows = signature.args[:2]
-        own = context.get_value_type(of_arrays.dtype)
-        vector = ir.Constant(ir.VectorType(own, LANES), ir.Undefined)
+        element_type = context.get_value_type(of_arrays.dtype)
+        vector = ir.Constant(ir.VectorType(element_type, LANES), ir.Undefined)
         for lane in range(LANES):
-            where = _address(context, builder, of_rows, chosen, ir.IntType(64)(lane))
+            where = _address(context, builder, of_rows, row_number, ir.IntType(64)(lane))
             row = builder.load(builder.inttoptr(where, ir.IntType(64).as_pointer()))
             address = _address(context, builder, of_arrays, frames, row, place)
-            number = builder.load(builder.inttoptr(address, own.as_pointer()))
+            number = builder.load(builder.inttoptr(address, element_type.as_pointer()))
             vector = builder.insert_element(vector, number, _INT(lane))
         if isinstance(of_arrays.dtype, types.Integer):
             return builder.uitofp(vector, _vector(types.float32))
@@ -258,8 +258,8 @@ def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def
         rows = [_mixed(builder, fours[n], fours[n + 4], list(range(8))) for n in range(4)]
         low, high = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
         pairs = [_mixed(builder, rows[n], rows[n + 2], half) for half in (low, high) for n in (0, 1)]
-        made = [_mixed(builder, pairs[n], pairs[n + 1], half) for n in (0, 2) for half in (low, high)]
-        return context.make_tuple(builder, signature.return_type, made)
+        vectors = [_mixed(builder, pairs[n], pairs[n + 1], half) for n in (0, 2) for half in (low, high)]
+        return context.make_tuple(builder, signature.return_type, vectors)
 
     return _several(4)(arrays, rows, types.intp), generate
 
@@ -273,13 +273,13 @@ def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
         address = _address(context, builder, signature.args[0], *values)
         places = _vectors_at(builder, address, _vector(types.float32), 3)
         first, second, third = (builder.load(place, align=4) for place in places)
-        made = []
+        vectors = []
         for lane in range(3):
-            wanted = [3 * n + lane for n in range(LANES)]
-            early = _mixed(builder, first, second, [min(n, 15) for n in wanted])
-            late = [k if n < 16 else n - 8 for k, n in enumerate(wanted)]
-            made.append(_mixed(builder, early, third, late))
-        return context.make_tuple(builder, signature.return_type, made)
+            sources = [3 * n + lane for n in range(LANES)]
+            early = _mixed(builder, first, second, [min(n, 15) for n in sources])
+            late = [k if n < 16 else n - 8 for k, n in enumerate(sources)]
+            vectors.append(_mixed(builder, early, third, late))
+        return context.make_tuple(builder, signature.return_type, vectors)
 
     return _several(3)(array, types.intp), generate
 
@@ -292,11 +292,11 @@ def add_in_turns(_context, one, two, three, array, row):  # type: ignore[no-unty
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         address = _address(context, builder, signature.args[3], *values[3:])
         for number, place in enumerate(_vectors_at(builder, address, _vector(types.float32), 3)):
-            wanted = [divmod(8 * number + n, 3) for n in range(LANES)]
-            early = _mixed(builder, values[0], values[1], [lane + 8 * (of % 2) for lane, of in wanted])
-            late = [8 + lane if of == 2 else n for n, (lane, of) in enumerate(wanted)]
-            summed = builder.fadd(builder.load(place, align=4), _mixed(builder, early, values[2], late))
-            builder.store(summed, place, align=4)
+            sources = [divmod(8 * number + n, 3) for n in range(LANES)]
+            early = _mixed(builder, values[0], values[1], [lane + 8 * (of % 2) for lane, of in sources])
+            late = [8 + lane if of == 2 else n for n, (lane, of) in enumerate(sources)]
+            total_vector = builder.fadd(builder.load(place, align=4), _mixed(builder, early, values[2], late))
+            builder.store(total_vector, place, align=4)
         return context.get_dummy_value()
 
     return types.void(one, two, three, array, types.intp), generate

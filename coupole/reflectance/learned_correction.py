@@ -84,20 +84,28 @@ def look(
     count = len(strip.level)
     flat = strip.values.reshape(len(directions), -1)
     sums = (weights.astype(np.float32) @ flat).reshape(len(kernels), count, 3) / strip.level[:, None]
-    summed: Floats = sums[0]
+    first_sum: Floats = sums[0]
     near = nearest(directions, direction, NEAR)
-    shown = strip.values[near] / strip.level[:, None]
-    least, most = shown.min(axis=0), shown.max(axis=0)
-    parts = [summed, *(other - summed for other in sums[1:]), *(one - summed for one in shown)]
-    parts += [least - summed, most - summed, np.broadcast_to(summed.mean(axis=1, keepdims=True), summed.shape)]
-    parts += [_mean_around(strip.mask, summed, width) - summed for width in SURROUNDINGS_PX[:2]]
+    near_pictures = strip.values[near] / strip.level[:, None]
+    least, most = near_pictures.min(axis=0), near_pictures.max(axis=0)
+    parts = [
+        first_sum,
+        *(other_sum - first_sum for other_sum in sums[1:]),
+        *(light_picture - first_sum for light_picture in near_pictures),
+    ]
+    parts += [
+        least - first_sum,
+        most - first_sum,
+        np.broadcast_to(first_sum.mean(axis=1, keepdims=True), first_sum.shape),
+    ]
+    parts += [_mean_around(strip.mask, first_sum, width) - first_sum for width in SURROUNDINGS_PX[:2]]
     for place in near[:AROUND]:
-        one = strip.values[place] / strip.level[:, None]
-        parts.append(_mean_around(strip.mask, one, SURROUNDINGS_PX[2]) - one)
+        light_picture = strip.values[place] / strip.level[:, None]
+        parts.append(_mean_around(strip.mask, light_picture, SURROUNDINGS_PX[2]) - light_picture)
         distance = np.float32(_DISTANCE_SCALE * np.linalg.norm(directions[place] - direction))
-        parts.append(np.broadcast_to(distance, summed.shape))
+        parts.append(np.broadcast_to(distance, first_sum.shape))
     features = np.stack(parts, axis=-1).astype(np.float32).reshape(count * 3, -1)
-    return Sight(summed, features, np.minimum(least, sums.min(axis=0)), np.maximum(most, sums.max(axis=0)))
+    return Sight(first_sum, features, np.minimum(least, sums.min(axis=0)), np.maximum(most, sums.max(axis=0)))
 
 
 def _mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
@@ -132,13 +140,13 @@ class Network:
     def gradients(self, outputs: list[Floats], slope: Floats) -> list[tuple[Floats, Floats]]:
         """Return the gradients of a cost whose derivative by the last output [n, 1] is `slope`, by matrices and
         offsets."""
-        found = []
+        gradients = []
         for number in range(len(self.layers) - 1, -1, -1):
-            found.append((outputs[number].T @ slope, slope.sum(axis=0)))
+            gradients.append((outputs[number].T @ slope, slope.sum(axis=0)))
             if number:
                 ramp = np.where(outputs[number] > 0, np.float32(1.0), np.float32(_LEAK))
                 slope = (slope @ self.layers[number][0].T) * ramp
-        return found[::-1]
+        return gradients[::-1]
 
 
 def begun(features: int, generator: np.random.Generator) -> Network:
@@ -146,9 +154,9 @@ def begun(features: int, generator: np.random.Generator) -> Network:
     sizes = (features, *HIDDEN, 1)
     layers = []
     for number, (rows, columns) in enumerate(pairwise(sizes)):
-        spread = np.sqrt(2.0 / rows) * (0.01 if number == len(HIDDEN) else 1.0)
+        deviation = np.sqrt(2.0 / rows) * (0.01 if number == len(HIDDEN) else 1.0)
         layers.append(
-            (generator.normal(0.0, spread, (rows, columns)).astype(np.float32), np.zeros(columns, np.float32))
+            (generator.normal(0.0, deviation, (rows, columns)).astype(np.float32), np.zeros(columns, np.float32))
         )
     return Network(layers)
 
@@ -194,13 +202,16 @@ def lessons(
 ) -> Iterator[Lesson]:
     """Yield the lesson of each of these lights, with a share of the pixels drawn at random."""
     for light in lights:
-        left = left_without(directions, light, LEFT_OUT_WITH)
+        other_lights = left_without(directions, light, LEFT_OUT_WITH)
         sight = look(
-            Strip(strip.mask, strip.values[left], strip.level), directions[left], directions[light], kernels
+            Strip(strip.mask, strip.values[other_lights], strip.level),
+            directions[other_lights],
+            directions[light],
+            kernels,
         )
-        wanted = (strip.values[light] / strip.level[:, None] - sight.summed).ravel()
-        drawn = np.flatnonzero(generator.random(len(wanted)) < share)
-        yield Lesson(sight.features[drawn], wanted[drawn], np.repeat(strip.level**2, 3)[drawn])
+        targets = (strip.values[light] / strip.level[:, None] - sight.summed).ravel()
+        pixels = np.flatnonzero(generator.random(len(targets)) < share)
+        yield Lesson(sight.features[pixels], targets[pixels], np.repeat(strip.level**2, 3)[pixels])
 
 
 def train(
@@ -208,7 +219,7 @@ def train(
 ) -> Network:
     """A network from lessons of all lights. Every light counts alike, however hard it is."""
     features = np.concatenate([lesson.features for lesson in given])
-    wanted = np.concatenate([lesson.wanted for lesson in given])
+    targets = np.concatenate([lesson.wanted for lesson in given])
     errors = [float(np.mean(lesson.importance * lesson.wanted**2)) for lesson in given]
     common = float(np.median(errors)) + 1e-20
     roots = np.concatenate(
@@ -216,23 +227,23 @@ def train(
     ).astype(np.float32)
     roots /= np.sqrt(np.mean(roots**2))
     np.minimum(roots, np.float32(np.sqrt(20.0)), out=roots)
-    middle, spread = features.mean(axis=0), features.std(axis=0) + np.float32(1e-6)
+    middle, deviation = features.mean(axis=0), features.std(axis=0) + np.float32(1e-6)
     generator = np.random.default_rng(seed)
     network = begun(features.shape[1], generator)
     adam = _Adam(network)
-    steps = min(_MOST_STEPS, 1 + _LOOKS * len(wanted) // _BATCH)
+    steps = min(_MOST_STEPS, 1 + _LOOKS * len(targets) // _BATCH)
     for number in range(steps):
-        drawn = generator.integers(0, len(wanted), _BATCH)
-        outputs = network.forward((features[drawn] - middle) / spread)
-        root = roots[drawn][:, None]
-        off = np.clip(root * (outputs[-1] - wanted[drawn][:, None]), -_CLIPPED, _CLIPPED)
+        batch = generator.integers(0, len(targets), _BATCH)
+        outputs = network.forward((features[batch] - middle) / deviation)
+        root = roots[batch][:, None]
+        off = np.clip(root * (outputs[-1] - targets[batch][:, None]), -_CLIPPED, _CLIPPED)
         rate = 0.5 * _RATE * (1.0 + np.cos(np.pi * number / steps))
         adam.step(network.gradients(outputs, 2.0 / _BATCH * root * off), rate)
         if number % 50 == 0:
             say(number, steps)
     first, offset = network.layers[0]
-    scaled = (first / spread[:, None], offset - (middle / spread) @ first)
-    return Network([scaled, *network.layers[1:]])
+    first_layer = (first / deviation[:, None], offset - (middle / deviation) @ first)
+    return Network([first_layer, *network.layers[1:]])
 
 
 def corrected(strip: Strip, sight: Sight, network: Network | None) -> Floats:

@@ -51,24 +51,25 @@ def _libraries() -> ThreadpoolController:
 @numba.njit(cache=True, nogil=True)
 def gram(rows, product):  # type: ignore[no-untyped-def]
     """Fill `product` [n, n] with rows rows^T of `rows` [n, samples]: the half that `factorise` reads."""
-    upper, turned = np.array([85], np.uint8), np.array([84], np.uint8)  # U and T
+    upper, transpose = np.array([85], np.uint8), np.array([84], np.uint8)  # U and T
     sizes = np.array([rows.shape[0], rows.shape[1]], np.intc)
     factors = np.array([1.0, 0.0])
     _dsyrk(
-        upper.ctypes, turned.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes, sizes[1:].ctypes,
-        factors[1:].ctypes, product.ctypes, sizes.ctypes,
+        upper.ctypes, transpose.ctypes, sizes.ctypes, sizes[1:].ctypes, factors.ctypes, rows.ctypes,
+        sizes[1:].ctypes, factors[1:].ctypes, product.ctypes, sizes.ctypes,
     )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def sums(rows, values, right):  # type: ignore[no-untyped-def]
     """Fill `right` [m, n] with values rows^T of `values` [m, samples] and `rows` [n, samples]."""
-    turned, plain = np.array([84], np.uint8), np.array([78], np.uint8)  # T and N
+    transpose, plain = np.array([84], np.uint8), np.array([78], np.uint8)  # T and N
     sizes = np.array([len(rows), len(values), rows.shape[1]], np.intc)
     factors = np.array([1.0, 0.0])
     _dgemm(
-        turned.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, sizes[2:].ctypes, factors.ctypes, rows.ctypes,
-        sizes[2:].ctypes, values.ctypes, sizes[2:].ctypes, factors[1:].ctypes, right.ctypes, sizes.ctypes,
+        transpose.ctypes, plain.ctypes, sizes.ctypes, sizes[1:].ctypes, sizes[2:].ctypes, factors.ctypes,
+        rows.ctypes, sizes[2:].ctypes, values.ctypes, sizes[2:].ctypes, factors[1:].ctypes,
+        right.ctypes, sizes.ctypes,
     )  # fmt: skip
 
 
@@ -106,20 +107,20 @@ def solve_by_samples(rows, penalty, values, memory, factor, right):  # type: ign
     times y in `values`. `memory` has room for 2 n^2.
     """
     count, samples = rows.shape
-    scaled = memory[: samples * count].reshape(samples, count)
+    weighted_rows = memory[: samples * count].reshape(samples, count)
     for k in range(count):
         weight = 1.0 / np.sqrt(penalty[k])
         for sample in range(samples):
-            scaled[sample, k] = weight * rows[k, sample]
+            weighted_rows[sample, k] = weight * rows[k, sample]
     product = memory[count * count : count * count + samples * samples].reshape(samples, samples)
-    gram(scaled, product)
+    gram(weighted_rows, product)
     if not factorise(product, np.ones(samples), factor):
         return False
     solve(factor, values)
     sums(rows, values, right)
     for k in range(count):
-        for one in range(len(right)):
-            right[one, k] /= penalty[k]
+        for number in range(len(right)):
+            right[number, k] /= penalty[k]
     return True
 
 
@@ -160,8 +161,8 @@ def _half_solve(factor, right):  # type: ignore[no-untyped-def]
     """Replace each row of `right` [m, n] by L^-1 times it, with L L^T what was factorised."""
     letters = np.array([76, 85, 84, 78], np.uint8)  # from the left, upper, transposed, not of diagonal 1
     sizes = np.array([len(factor), len(right)], np.intc)
-    one = np.array([1.0])
+    unity = np.array([1.0])
     _dtrsm(
         letters.ctypes, letters[1:].ctypes, letters[2:].ctypes, letters[3:].ctypes, sizes.ctypes, sizes[1:].ctypes,
-        one.ctypes, factor.ctypes, sizes.ctypes, right.ctypes, sizes.ctypes,
+        unity.ctypes, factor.ctypes, sizes.ctypes, right.ctypes, sizes.ctypes,
     )  # fmt: skip

@@ -66,19 +66,19 @@ def _read_project(path: Path) -> LightFile:
         refuse(path, "expected a project of relight, with `images` and `dome`")
     if not all(isinstance(image, dict) and isinstance(image.get("filename"), str) for image in images):
         refuse(path, "images: expected a `filename` in each")
-    used = [number for number, image in enumerate(images) if not image.get("skip", False)]
+    picture_numbers = [number for number, image in enumerate(images) if not image.get("skip", False)]
     lights = _read_dome(path, dome)
     count = len(lights.directions)
-    if count not in (len(used), len(images)):
-        refuse(path, f"dome: {count} lights; {len(used)} pictures are used of {len(images)}")
-    rows = used if count == len(images) else list(range(count))
-    names = tuple(_last_part(images[number]["filename"]) for number in used)
+    if count not in (len(picture_numbers), len(images)):
+        refuse(path, f"dome: {count} lights; {len(picture_numbers)} pictures are used of {len(images)}")
+    rows = picture_numbers if count == len(images) else list(range(count))
+    names = tuple(_last_part(images[number]["filename"]) for number in picture_numbers)
     for place, name in enumerate(names):
         if name in names[:place]:
             refuse(path, f"images: {_twice(name)}")
     intensities = None if lights.intensities is None else lights.intensities[rows]
-    forced = project.get("forcedInputColorspace")
-    srgb = forced == "srgb" or (forced is None and project.get("iccProfileIsSRGB") is True)
+    forced_colorspace = project.get("forcedInputColorspace")
+    srgb = forced_colorspace == "srgb" or (forced_colorspace is None and project.get("iccProfileIsSRGB") is True)
     return LightFile(lights.directions[rows], names, intensities, srgb)
 
 
@@ -99,13 +99,13 @@ def _vectors(path: Path, dome: dict[str, Any], key: str, axes: str) -> Floats:
     rows = dome.get(key, [])
     if not isinstance(rows, list):
         refuse(path, f"{key}: expected a list")
-    found = np.zeros((len(rows), 3))
+    vectors = np.zeros((len(rows), 3))
     for number, row in enumerate(rows):
         values = [row.get(axis) for axis in axes] if isinstance(row, dict) else row
         if not isinstance(values, list) or len(values) != 3 or not all(map(_is_number, values)):
             refuse(path, f"{key}, number {number}: expected {', '.join(axes)}; found {json.dumps(row)}")
-        found[number] = values
-    return found
+        vectors[number] = values
+    return vectors
 
 
 def _is_number(value: object) -> bool:

@@ -25,24 +25,24 @@ def gains(
     grey: NDArray[np.float64], materials: PointMaterials, lights: NDArray[np.float64], view: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """[lights] of values [pixels, lights] under unit vectors [lights, 3]."""
-    chosen = np.flatnonzero(np.isfinite(materials.kd))
+    pixels = np.flatnonzero(np.isfinite(materials.kd))
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    modelled = modelled_values(
-        materials.normals[chosen],
-        materials.kd[chosen],
-        materials.ks[chosen],
-        materials.alpha[chosen],
+    model = modelled_values(
+        materials.normals[pixels],
+        materials.kd[pixels],
+        materials.ks[pixels],
+        materials.alpha[pixels],
         lights,
         half,
         view,
     )
-    lit = materials.normals[chosen] @ lights.T > _LIT
-    ratio = np.where(lit, grey[chosen] / np.maximum(modelled, 1e-12), np.nan)
-    found = np.ones(len(lights))
+    lit = materials.normals[pixels] @ lights.T > _LIT
+    ratio = np.where(lit, grey[pixels] / np.maximum(model, 1e-12), np.nan)
+    light_gains = np.ones(len(lights))
     enough = np.count_nonzero(lit, axis=0) > 0
-    found[enough] = np.nanmedian(ratio[:, enough], axis=0)
-    return found
+    light_gains[enough] = np.nanmedian(ratio[:, enough], axis=0)
+    return light_gains
 
 
 def gain_between(

@@ -60,5 +60,5 @@ def nearest(measured: Floats, direction: Floats, count: int) -> NDArray[np.int64
 
 def left_without(measured: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
     """Indices of the lights that are left when one goes with so many of its nearest neighbours."""
-    gone = nearest(measured, measured[number], neighbours + 1)
-    return np.setdiff1d(np.arange(len(measured)), np.append(gone, number))
+    near_lights = nearest(measured, measured[number], neighbours + 1)
+    return np.setdiff1d(np.arange(len(measured)), np.append(near_lights, number))

@@ -66,12 +66,14 @@ def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     group = np.empty(len(ways), np.int64)
     for view in np.unique(samples.view_of):
-        mine = np.flatnonzero(samples.view_of == view)
-        chosen, nearest = [0], np.full(len(mine), -np.inf)
-        for _ in range(min(GROUPS, len(mine))):
-            nearest = np.maximum(nearest, ways[mine] @ ways[mine[chosen[-1]]])
-            chosen.append(int(np.argmin(nearest)))
-        group[mine] = np.argmax(ways[mine] @ ways[mine[chosen[:-1]]].T, axis=1) + GROUPS * view
+        view_samples = np.flatnonzero(samples.view_of == view)
+        centres, nearest = [0], np.full(len(view_samples), -np.inf)
+        for _ in range(min(GROUPS, len(view_samples))):
+            nearest = np.maximum(nearest, ways[view_samples] @ ways[view_samples[centres[-1]]])
+            centres.append(int(np.argmin(nearest)))
+        group[view_samples] = (
+            np.argmax(ways[view_samples] @ ways[view_samples[centres[:-1]]].T, axis=1) + GROUPS * view
+        )
     return group
 
 
@@ -88,27 +90,27 @@ def covariances(
     """Return the covariances of materials that were fitted to the samples `used` [samples]; `noise_um` is that of
     the mesh's vertices, `middle_mm` the middle of the object."""
     prior = prior_stiffness(samples.areas_mm2, noise_um)
-    held = prior if fitted_normals else np.full(len(prior), HELD)
+    stiffness = prior if fitted_normals else np.full(len(prior), HELD)
     group = groups_of(samples, middle_mm)
     order = np.flatnonzero(used)
     order = order[np.argsort(group[order], kind="stable")]
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
     grey[:, 0] = np.maximum(grey[:, 0], LEAST_KD)
     grey[:, 1] = np.maximum(grey[:, 1], _LEAST_KS * grey[:, 0])
-    found = np.full((len(prior), UNKNOWNS, UNKNOWNS), np.nan)
+    material_covariances = np.full((len(prior), UNKNOWNS, UNKNOWNS), np.nan)
     u_kd, u_ks = np.full(materials.kd.shape, np.nan), np.full(materials.kd.shape, np.nan)
 
     def fill(first: int) -> None:
         part = slice(first, first + _PART)
         _fill(
             samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
-            materials.normals[part], grey[part], materials.kd[part], materials.ks[part], held[part], prior[part],
-            order, group, found[part], u_kd[part], u_ks[part],
+            materials.normals[part], grey[part], materials.kd[part], materials.ks[part], stiffness[part],
+            prior[part], order, group, material_covariances[part], u_kd[part], u_ks[part],
         )  # fmt: skip
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fill, range(0, len(prior), _PART)))
-    return MaterialUncertainty(found, u_kd, u_ks)
+    return MaterialUncertainty(material_covariances, u_kd, u_ks)
 
 
 def relative_uncertainty(
@@ -116,13 +118,13 @@ def relative_uncertainty(
 ) -> NDArray[np.float32]:
     """[b, samples] relative standard uncertainty of what materials give where samples were measured, without what
     all LEDs share; NaN where they give nothing."""
-    found = np.full(samples.values.shape[:2], np.nan, np.float32)
+    u_relative = np.full(samples.values.shape[:2], np.nan, np.float32)
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
     _relative(
         samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, materials.normals, grey,
-        covariance, found,
+        covariance, u_relative,
     )  # fmt: skip
-    return found
+    return u_relative
 
 
 @numba.njit(cache=True, nogil=True)
@@ -132,13 +134,13 @@ def _fill(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     samples = values.shape[1]
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
-    views, own = np.empty((len(cameras_mm), 3)), np.empty((samples, values.shape[2]))
+    views, colours = np.empty((len(cameras_mm), 3)), np.empty((samples, values.shape[2]))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
     for triangle in range(len(values)):
         if not grey[triangle, 2] > 0.0:
             continue
         n = gather(
-            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normals[triangle], order, own,
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normals[triangle], order, colours,
             good, roots, lights, half, views,
         )  # fmt: skip
         bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
@@ -167,8 +169,8 @@ def _fill(  # type: ignore[no-untyped-def]
         inverse = np.linalg.inv(bread)
         assign_rows(found[triangle], inverse @ meat @ inverse.T)
         _colours(
-            own, good[:n], lights, half, views, view_of, group, normals[triangle], grey[triangle], kd[triangle],
-            ks[triangle], found[triangle], u_kd[triangle], u_ks[triangle],
+            colours, good[:n], lights, half, views, view_of, group, normals[triangle], grey[triangle],
+            kd[triangle], ks[triangle], found[triangle], u_kd[triangle], u_ks[triangle],
         )  # fmt: skip
 
 

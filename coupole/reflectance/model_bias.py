@@ -38,33 +38,36 @@ def unbiased_normals(
     """[n, 3] fitted normals without what they have in common against those of the mesh [n, 3]; as they are for too
     few triangles. `noise_um` is that of the mesh's vertices."""
     normals = materials.normals.copy()
-    known = np.flatnonzero(np.isfinite(materials.alpha))
-    if len(known) < FEWEST:
+    fitted_triangles = np.flatnonzero(np.isfinite(materials.alpha))
+    if len(fitted_triangles) < FEWEST:
         return normals
     with one_thread():
-        faces = _facing(mesh_normals[known], centres_mm[known], areas_mm2[known])
-        group = clusters_of(looks(materials.at(known)), int(np.clip(len(known) // _TOGETHER, 1, _MOST_GROUPS)))
-        spread2 = 2.0 / prior_stiffness(areas_mm2[known], noise_um) + _USUAL_TILT**2
-        off = normals[known] - mesh_normals[known]
+        faces = _facing(mesh_normals[fitted_triangles], centres_mm[fitted_triangles], areas_mm2[fitted_triangles])
+        group = clusters_of(
+            looks(materials.at(fitted_triangles)),
+            int(np.clip(len(fitted_triangles) // _TOGETHER, 1, _MOST_GROUPS)),
+        )
+        spread2 = 2.0 / prior_stiffness(areas_mm2[fitted_triangles], noise_um) + _USUAL_TILT**2
+        off = normals[fitted_triangles] - mesh_normals[fitted_triangles]
         lean = np.zeros_like(off)
         for number in np.unique(group):
-            mine = group == number
-            if np.count_nonzero(mine) >= FEWEST:
-                lean[mine] = _smooth(faces[mine], off[mine], 1.0 / spread2[mine])
-    lean -= np.sum(lean * normals[known], axis=1, keepdims=True) * normals[known]
-    normals[known] = _unit(normals[known] - lean)
+            in_group = group == number
+            if np.count_nonzero(in_group) >= FEWEST:
+                lean[in_group] = _smooth(faces[in_group], off[in_group], 1.0 / spread2[in_group])
+    lean -= np.sum(lean * normals[fitted_triangles], axis=1, keepdims=True) * normals[fitted_triangles]
+    normals[fitted_triangles] = _unit(normals[fitted_triangles] - lean)
     return normals
 
 
 def _facing(normals: Floats, centres_mm: Floats, areas_mm2: Floats) -> Floats:
     """[n, 3] mean normals of the nearest triangles: of one by itself the scanner's noise would be taken as the
     direction that it depends on, and hence as the fit's error."""
-    tree, found = cKDTree(centres_mm), np.empty_like(normals)
+    tree, mean_normals = cKDTree(centres_mm), np.empty_like(normals)
     for first in range(0, len(normals), _CHUNK):
         part = slice(first, first + _CHUNK)
         near = tree.query(centres_mm[part], k=min(_NEAREST, len(normals)))[1]
-        found[part] = np.einsum("nk,nki->ni", areas_mm2[near], normals[near])
-    return _unit(found)
+        mean_normals[part] = np.einsum("nk,nki->ni", areas_mm2[near], normals[near])
+    return _unit(mean_normals)
 
 
 def _smooth(faces: Floats, off: Floats, weights: Floats) -> Floats:
@@ -72,10 +75,10 @@ def _smooth(faces: Floats, off: Floats, weights: Floats) -> Floats:
     x, y, z = faces.T
     terms = np.stack([np.ones_like(x), x, y, z, x * y, x * z, y * z, x * x - y * y, 3.0 * z * z - 1.0], axis=1)
     root = np.sqrt(weights / weights.mean())[:, None]
-    found: Floats = terms @ np.linalg.lstsq(root * terms, root * off, rcond=None)[0]
-    return found
+    polynomial: Floats = terms @ np.linalg.lstsq(root * terms, root * off, rcond=None)[0]
+    return polynomial
 
 
 def _unit(vectors: Floats) -> Floats:
-    found: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return found
+    unit_vectors: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return unit_vectors

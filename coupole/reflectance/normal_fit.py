@@ -62,12 +62,12 @@ def rank_normals(values: Floats, lights: Floats, ranks: tuple[float, float] = RA
     count = values.shape[1]
     first, last = round(ranks[0] * count), max(round(ranks[1] * count), round(ranks[0] * count) + 3)
     order = np.argsort(values, axis=1)[:, first:last]
-    chosen = lights[order]
-    normal = np.einsum("nki,nkj->nij", chosen, chosen) + 1e-9 * np.eye(3)
-    right = np.einsum("nki,nk->ni", chosen, np.take_along_axis(values, order, axis=1))
-    found = np.linalg.solve(normal, right[..., None])[..., 0]
-    length = np.linalg.norm(found, axis=1)
-    return found / np.maximum(length, 1e-300)[:, None], length
+    rank_lights = lights[order]
+    normal = np.einsum("nki,nkj->nij", rank_lights, rank_lights) + 1e-9 * np.eye(3)
+    right = np.einsum("nki,nk->ni", rank_lights, np.take_along_axis(values, order, axis=1))
+    scaled_normals = np.linalg.solve(normal, right[..., None])[..., 0]
+    length = np.linalg.norm(scaled_normals, axis=1)
+    return scaled_normals / np.maximum(length, 1e-300)[:, None], length
 
 
 def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int | None = None) -> PointMaterials:
@@ -76,20 +76,22 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
     normals, albedo = rank_normals(values, lights)
     half = lights + view
     half /= np.linalg.norm(half, axis=1, keepdims=True)
-    found = np.full((len(values), 7), np.nan)
-    scaled = np.ascontiguousarray(values, dtype=np.float64)
+    parameters = np.full((len(values), 7), np.nan)
+    ordered_values = np.ascontiguousarray(values, dtype=np.float64)
 
     only_view = np.zeros(len(lights), np.int64)
 
     def fit(begin: int) -> None:
         part = slice(begin, begin + _BLOCK)
-        least = _LEAST_SHARE * np.quantile(scaled[part], _OF_QUANTILE, axis=1)
-        of_part = normals[part], albedo[part], least, found[part]
-        _fit_all(scaled[part], lights, half, view[None], only_view, *of_part)
+        least = _LEAST_SHARE * np.quantile(ordered_values[part], _OF_QUANTILE, axis=1)
+        of_part = normals[part], albedo[part], least, parameters[part]
+        _fit_all(ordered_values[part], lights, half, view[None], only_view, *of_part)
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, len(values), _BLOCK)))
-    return PointMaterials(found[:, :3], found[:, 3], found[:, 4], found[:, 5], found[:, 6])
+    return PointMaterials(
+        parameters[:, :3], parameters[:, 3], parameters[:, 4], parameters[:, 5], parameters[:, 6]
+    )
 
 
 def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Floats) -> tuple[Floats, Floats]:
@@ -105,13 +107,13 @@ def colours(values: Floats, materials: PointMaterials, lights: Floats, view: Flo
 
 @numba.njit(cache=True, nogil=True)
 def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, kd, ks):  # type: ignore[no-untyped-def]
-    views, only_view, used = view.reshape(1, 3), np.zeros(len(lights), np.int64), np.arange(len(lights))
+    views, only_view, indices = view.reshape(1, 3), np.zeros(len(lights), np.int64), np.arange(len(lights))
     grey = np.empty(3)
     for pixel in range(len(values)):
         if grey_kd[pixel] > 0.0:
             grey[0], grey[1], grey[2] = grey_kd[pixel], grey_ks[pixel], alphas[pixel]
             colours_from(
-                values[pixel], used, normals[pixel], grey, lights, half, views, only_view, kd[pixel], ks[pixel]
+                values[pixel], indices, normals[pixel], grey, lights, half, views, only_view, kd[pixel], ks[pixel]
             )
 
 
@@ -163,10 +165,10 @@ def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
 def _fit_all(values, lights, half, views, view_of, normals, albedo, least, found):  # type: ignore[no-untyped-def]
     for pixel in range(len(values)):
         sample = values[pixel]
-        used = np.flatnonzero(sample > max(least[pixel], 0.0))
-        if len(used) < _FEWEST or albedo[pixel] <= 0.0:
+        indices = np.flatnonzero(sample > max(least[pixel], 0.0))
+        if len(indices) < _FEWEST or albedo[pixel] <= 0.0:
             continue
-        roots = np.sqrt(sample[used])
+        roots = np.sqrt(sample[indices])
         best = np.inf
         for alpha in _STARTS:
             unknowns = np.empty(6)
@@ -178,12 +180,12 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, least, found
             )
             if _least_cosine(unknowns, views) < 0.05:
                 assign(unknowns[:3], views[0])
-            cost, spread = fit_from(roots, used, lights, half, views, view_of, unknowns, views[0], 0.0, 0.0)
+            cost, rms = fit_from(roots, indices, lights, half, views, view_of, unknowns, views[0], 0.0, 0.0)
             if cost < best:
                 best = cost
                 assign(found[pixel, :3], unknowns[:3])
                 found[pixel, 3], found[pixel, 4] = math.exp(unknowns[3]), math.exp(unknowns[4])
-                found[pixel, 5], found[pixel, 6] = math.exp(unknowns[5]), spread
+                found[pixel, 5], found[pixel, 6] = math.exp(unknowns[5]), rms
 
 
 @numba.njit(cache=True, nogil=True)
@@ -197,7 +199,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     trial = np.empty(6)
-    cost, spread = _equations(
+    cost, rms = _equations(
         roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
     )
     damping = 1e-2
@@ -205,26 +207,26 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
         step = _solve(matrix, right, damping)
         _move(unknowns, step, trial)
         if _least_cosine(trial, views) > 0.02:
-            moved, moved_spread = _cost(
+            trial_cost, trial_rms = _cost(
                 roots, used, lights, half, views, view_of, trial, prior, stiffness, usual, scale
             )
         else:
-            moved, moved_spread = np.inf, 0.0
-        if moved < cost:
-            gain = cost - moved
+            trial_cost, trial_rms = np.inf, 0.0
+        if trial_cost < cost:
+            gain = cost - trial_cost
             assign(unknowns, trial)
             damping = max(damping * 0.2, 1e-9)
             if gain < _SETTLED * cost:
-                cost, spread = moved, moved_spread
+                cost, rms = trial_cost, trial_rms
                 break
-            cost, spread = _equations(
+            cost, rms = _equations(
                 roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
             )
         else:
             damping *= 6.0
             if damping > 1e8:
                 break
-    return cost, spread / math.exp(0.5 * unknowns[3])
+    return cost, rms / math.exp(0.5 * unknowns[3])
 
 
 @numba.njit(cache=True, nogil=True)

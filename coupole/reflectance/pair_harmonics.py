@@ -36,25 +36,25 @@ def count_of(degrees: int) -> int:
 def pair_functions(lights: Floats, views: Floats, degrees: int) -> Floats:
     """[n, count_of(degrees)] of pairs of unit vectors [n, 3], z the normal: in the order of l, of l' from l on, of
     m from 0 to l."""
-    found = np.empty((len(lights), count_of(degrees)))
-    _functions(lights, views, degrees, *_TABLES, found)
-    return found
+    functions = np.empty((len(lights), count_of(degrees)))
+    _functions(lights, views, degrees, *_TABLES, functions)
+    return functions
 
 
 def fit_pairs(pool: Pool, degrees: int) -> NDArray[np.float32]:
     """[clusters, count_of(degrees), channels] coefficients of reflectance, 1/sr, by least squares of f cos_i with
     Tikhonov's ridge, which grows with the degrees; NaN where a pool has too few samples."""
-    found = np.full((len(pool.counts), count_of(degrees), pool.values.shape[2]), np.nan, np.float32)
+    coefficients = np.full((len(pool.counts), count_of(degrees), pool.values.shape[2]), np.nan, np.float32)
     ridge = TIKHONOV * (_LEAST + _roll_off(degrees))
     for number, count in enumerate(pool.counts):
         if count < FEWEST:
             continue
-        lights, views = (one[number, :count].astype(np.float64) for one in (pool.lights, pool.views))
+        lights, views = (directions[number, :count].astype(np.float64) for directions in (pool.lights, pool.views))
         rows = pair_functions(lights, views, degrees) * lights[:, 2:]
         normal = rows.T @ rows
         normal[np.diag_indices_from(normal)] += ridge * np.trace(normal) / len(normal)
-        found[number] = cho_solve(cho_factor(normal), rows.T @ pool.values[number, :count])
-    return found
+        coefficients[number] = cho_solve(cho_factor(normal), rows.T @ pool.values[number, :count])
+    return coefficients
 
 
 def pair_values(
@@ -62,25 +62,30 @@ def pair_values(
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i where samples were measured, by the `cluster` [b] of each triangle, not below
     0; NaN without one."""
-    made = np.full(samples.values.shape, np.nan, np.float32)
+    modelled_values = np.full(samples.values.shape, np.nan, np.float32)
     degrees = next(d for d in range(MOST_DEGREES + 1) if count_of(d) == coefficients.shape[1])
     _values(
         samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, normals, cluster,
-        coefficients.astype(np.float64), degrees, *_TABLES, made,
+        coefficients.astype(np.float64), degrees, *_TABLES, modelled_values,
     )  # fmt: skip
-    return made
+    return modelled_values
 
 
 def _roll_off(degrees: int) -> Floats:
     """[count] 0 for the constant, 1 for the highest pair: as bending, squared."""
-    each = [first * (first + 1) + second * (second + 1) for first, second, _ in _orders(degrees)]
-    return np.asarray((np.array(each, float) / (2 * degrees * (degrees - 1))) ** 2)
+    bending = [first * (first + 1) + second * (second + 1) for first, second, _ in _orders(degrees)]
+    return np.asarray((np.array(bending, float) / (2 * degrees * (degrees - 1))) ** 2)
 
 
 def _orders(degrees: int) -> list[tuple[int, int, int]]:
     """l, l' and m of each function."""
     every = range(degrees)
-    return [(one, other, m) for one in every for other in every[one:] for m in range(one + 1)]
+    return [
+        (low_order, high_order, m)
+        for low_order in every
+        for high_order in every[low_order:]
+        for m in range(low_order + 1)
+    ]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -106,12 +111,12 @@ def _pair(light, view, degrees, a, b, first, of_light, of_view, cosines, row):  
         cosines[m] = cosine * (math.sqrt(2.0) if m else 1.0)
         cosine, sine = cosine * real - sine * imaginary, cosine * imaginary + sine * real
     place = 0
-    for one in range(degrees):
-        for other in range(one, degrees):
-            for m in range(one + 1):
-                value = of_light[one, m] * of_view[other, m]
-                if one != other:
-                    value = math.sqrt(0.5) * (value + of_light[other, m] * of_view[one, m])
+    for low_order in range(degrees):
+        for high_order in range(low_order, degrees):
+            for m in range(low_order + 1):
+                value = of_light[low_order, m] * of_view[high_order, m]
+                if low_order != high_order:
+                    value = math.sqrt(0.5) * (value + of_light[high_order, m] * of_view[low_order, m])
                 row[place] = value * cosines[m]
                 place += 1
 

@@ -100,9 +100,9 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
         complete(out / INTERPOLATION, interpolation.write)
     interpolation = read_interpolation(out)
     peak = peak_of(result)
-    checked = [check(result, interpolation, light, peak) for light in settings["left_out"]]
-    told = {**settings, "simulated": pictures.simulated}
-    about = _about(result, told, interpolation, materials, checked, time.monotonic() - begun_s)
+    checks = [check(result, interpolation, light, peak) for light in settings["left_out"]]
+    about_settings = {**settings, "simulated": pictures.simulated}
+    about = _about(result, about_settings, interpolation, materials, checks, time.monotonic() - begun_s)
     complete(out / ABOUT, lambda path: path.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8"))
     return about
 
@@ -123,7 +123,7 @@ def _store(pictures: PictureSet, path: Path, say: Said) -> None:
             file.attrs.update(full_scale=pictures.full_scale, axes=AXES)
             file["mask"], file["directions"] = pictures.mask, pictures.directions
             file["intensities"] = pictures.intensities
-            file["names"] = [one.name for one in pictures.files]
+            file["names"] = [path.name for path in pictures.files]
             values = file.create_dataset("values", (len(pictures), pictures.pixels, 3), pictures.dtype)
             values.attrs["shape"] = "lights, pixels of the mask in the order of rows, rgb; linear"
             for number in range(len(pictures)):
@@ -164,10 +164,10 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
             block = slice(begin, min(begin + BLOCK, pixels))
             say(step, begin, pixels)
             values = result.values(lights, block).transpose(1, 0, 2).astype(np.float64)
-            found = fit_materials(values.mean(axis=2), directions, VIEW)
-            kd, ks = colours(values, found, directions, VIEW)
-            made = (found.normals, kd, ks, found.alpha, found.residual, found.kd, found.ks)
-            for name, content in zip(_FIELDS, made, strict=True):
+            materials = fit_materials(values.mean(axis=2), directions, VIEW)
+            kd, ks = colours(values, materials, directions, VIEW)
+            contents = (materials.normals, kd, ks, materials.alpha, materials.residual, materials.kd, materials.ks)
+            for name, content in zip(_FIELDS, contents, strict=True):
                 file[name][block] = content
             file.attrs["fitted"] = block.stop
             file.flush()
@@ -195,9 +195,9 @@ def peak_of(result: PictureResult) -> float:
 
 def check(result: PictureResult, interpolation: Interpolation, light: int, peak: float) -> Checked:
     """One left-out light, made and compared, inside the mask."""
-    made = relit(result, interpolation, result.directions[light])
-    measured = result.values(np.array([light]))[0]
-    off = (made[result.mask] - measured).astype(np.float64)
+    relit_picture = relit(result, interpolation, result.directions[light])
+    measured_values = result.values(np.array([light]))[0]
+    off = (relit_picture[result.mask] - measured_values).astype(np.float64)
     psnr_db = 10.0 * np.log10(peak**2 / max(float(np.mean(off**2)), 1e-30))
     return Checked(light, psnr_db, float(np.mean(np.abs(off))))
 
@@ -206,7 +206,7 @@ def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:
     """Return the PSNR of all left-out lights together; None without any."""
     if not checked:
         return None
-    return float(-10.0 * np.log10(np.mean([10.0 ** (-one.psnr_db / 10.0) for one in checked])))
+    return float(-10.0 * np.log10(np.mean([10.0 ** (-light_check.psnr_db / 10.0) for light_check in checked])))
 
 
 def _about(
@@ -219,8 +219,8 @@ def _about(
 ) -> dict[str, Any]:
     with opened(result.folder / SAMPLES) as file:
         names = [name.decode() for name in file["names"][:]]
-    gained = zip(interpolation.lights.tolist(), interpolation.gains.tolist(), strict=True)
-    suspects = {names[light]: round(gain, 3) for light, gain in gained if abs(gain - 1.0) > SUSPECT}
+    gains_of_lights = zip(interpolation.lights.tolist(), interpolation.gains.tolist(), strict=True)
+    suspects = {names[light]: round(gain, 3) for light, gain in gains_of_lights if abs(gain - 1.0) > SUSPECT}
     peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     return {
         "schema": SCHEMA,
@@ -234,7 +234,10 @@ def _about(
         "kernel": interpolation.kernel,
         "left_out_rms": interpolation.left_out_rms,
         "suspect_pictures": suspects,
-        "held_out": [{"light": one.light, "psnr_db": round(one.psnr_db, 3), "mae": one.mae} for one in checked],
+        "held_out": [
+            {"light": light_check.light, "psnr_db": round(light_check.psnr_db, 3), "mae": light_check.mae}
+            for light_check in checked
+        ],
         "held_out_psnr_db": pooled_psnr_db(checked),
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_bytes,

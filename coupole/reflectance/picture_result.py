@@ -52,8 +52,8 @@ class PictureResult:
         try:
             about = read_json(path, allow_nan=True)
         except (OSError, InputError) as error:
-            what = "expected the result of `coupole reflectance --pictures`"
-            problem = Problem(str(path), 0, 0, "", f"{what}; {reason(error)}")
+            expectation = "expected the result of `coupole reflectance --pictures`"
+            problem = Problem(str(path), 0, 0, "", f"{expectation}; {reason(error)}")
             raise InputError([problem]) from error
         if not isinstance(about, dict) or about.get("schema") != SCHEMA:
             raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])

@@ -83,9 +83,9 @@ def read_pictures(
     """
     if not folder.is_dir():
         refuse(folder, "is no folder of pictures")
-    said = read_lights(lights)
-    directions = said.directions
-    names = said.names or _names_in(folder, {path.resolve() for path in (mask,) if path is not None})
+    light_file = read_lights(lights)
+    directions = light_file.directions
+    names = light_file.names or _names_in(folder, {path.resolve() for path in (mask,) if path is not None})
     if len(names) != len(directions):
         refuse(lights, f"has {len(directions)} lights, {folder} has {len(names)} pictures; expected as many")
     if len(names) < FEWEST_LIGHTS:
@@ -93,15 +93,15 @@ def read_pictures(
     files = tuple(folder / name for name in names)
     for path in files:
         if not path.is_file():
-            refuse(lights if said.names else folder / ORDER_FILE, f"names {path}: no such file")
+            refuse(lights if light_file.names else folder / ORDER_FILE, f"names {path}: no such file")
     lengths = np.linalg.norm(directions, axis=1)
     for number, length in enumerate(lengths):
         if length < 1e-6:
-            line = said.lines[number] if said.lines else 0
+            line = light_file.lines[number] if light_file.lines else 0
             refuse(lights, f"the direction of light number {number} (from 0), of {names[number]}, is 0 0 0", line)
     first = read_picture(files[0])
-    srgb = srgb or said.srgb
-    factors = said.intensities if said.intensities is not None else np.ones((len(files), 3))
+    srgb = srgb or light_file.srgb
+    factors = light_file.intensities if light_file.intensities is not None else np.ones((len(files), 3))
     if intensities is not None:
         factors = read_rows(intensities, (1, 3))
     if len(factors) != len(files) or not np.all(factors > 0):
@@ -130,8 +130,8 @@ def _names_in(folder: Path, others: set[Path]) -> tuple[str, ...]:
     order = folder / ORDER_FILE
     if order.is_file():
         return tuple(" ".join(read_lines(order)).split())
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return tuple(path.name for path in found if path.resolve() not in others and path.stem != "mask")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    return tuple(path.name for path in paths if path.resolve() not in others and path.stem != "mask")
 
 
 def read_picture(path: Path) -> NDArray[Any]:

@@ -96,14 +96,14 @@ def learn(
     ):  # a lesson would have fewer near pictures than are asked
         return Interpolation(lights, gains, kernel, rms, peak, None)
     share, generator = learned.MOST_SAMPLES / (every.size + 1), np.random.default_rng(0)
-    given = []
+    lessons_of_strips = []
     for mask, values in taught:
         strip = learned.strip_of(mask, values, LEAST_LEVEL * peak)
         kernels = learned.all_kernels(kernel)
-        given.append(
+        lessons_of_strips.append(
             list(learned.lessons(strip, directions, sound.tolist(), kernels, share=share, generator=generator))
         )
-    by_light = [_joined(parts) for parts in zip(*given, strict=True)]
+    by_light = [_joined(parts) for parts in zip(*lessons_of_strips, strict=True)]
     network = learned.train(by_light, say=say) if by_light else None
     return Interpolation(lights, gains, kernel, rms, peak, network)
 
@@ -122,10 +122,10 @@ def left_out_rms(values: Floats, directions: NDArray[np.float64]) -> dict[str, f
     flat = values.reshape(len(values), -1)
     squares = dict.fromkeys(KERNELS, 0.0)
     for light in range(len(values)):
-        left = left_without(directions, light, learned.LEFT_OUT_WITH)
+        other_lights = left_without(directions, light, learned.LEFT_OUT_WITH)
         for kernel in KERNELS:
-            row = light_interpolation.weights(directions[left], directions[light][None], kernel)[0]
-            squares[kernel] += float(np.mean((row.astype(np.float32) @ flat[left] - flat[light]) ** 2))
+            row = light_interpolation.weights(directions[other_lights], directions[light][None], kernel)[0]
+            squares[kernel] += float(np.mean((row.astype(np.float32) @ flat[other_lights] - flat[light]) ** 2))
     return {kernel: float(np.sqrt(square / len(values))) for kernel, square in squares.items()}
 
 
@@ -142,9 +142,9 @@ def relit(result: PictureResult, interpolation: Interpolation, direction: NDArra
         above, below = max(0, top - MARGIN_PX), min(len(result.mask), bottom + MARGIN_PX)
         strip = strip_between(result, interpolation, above, below)
         sight = learned.look(strip, directions, unit, kernels)
-        made = np.zeros((below - above, result.mask.shape[1], 3), np.float32)
-        made[strip.mask] = gain * learned.corrected(strip, sight, interpolation.network)
-        picture[top:bottom] = made[top - above : bottom - above]
+        strip_picture = np.zeros((below - above, result.mask.shape[1], 3), np.float32)
+        strip_picture[strip.mask] = gain * learned.corrected(strip, sight, interpolation.network)
+        picture[top:bottom] = strip_picture[top - above : bottom - above]
     return picture
 
 

@@ -46,25 +46,28 @@ def uncertainty_of_picture(
     count = 2 * UNKNOWNS + 1
 
     def picture(reflecting: TriangleMaterials, number: int, into: Picture | None = None) -> Picture:
-        made = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(lights, samples, into=into)
+        scene_picture = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(
+            lights, samples, into=into
+        )
         say(number + 1, count)
-        return made
+        return scene_picture
 
     straight = picture(materials, 0)
-    moved = np.empty_like(straight), np.empty_like(straight)
-    seen = scene.surface.seen
-    square = (straight * np.append(common, 0.0)[seen][..., None]) ** 2  # -1, for nothing, takes the last
+    step_pictures = np.empty_like(straight), np.empty_like(straight)
+    triangle_of_pixel = scene.surface.seen
+    # -1, for nothing, takes the last
+    square = (straight * np.append(common, 0.0)[triangle_of_pixel][..., None]) ** 2
     for part in range(UNKNOWNS):
         deviation = roots[:, :, part]
         shorter = _LONGEST_STEP / np.maximum(np.abs(deviation[:, _NOT_LINEAR]).max(axis=1), _LONGEST_STEP)
         up, down = (
             picture(_moved(materials, wider, sign * shorter[:, None] * deviation), 1 + 2 * part + (sign > 0), into)
-            for sign, into in zip((-1.0, 1.0), moved, strict=True)
+            for sign, into in zip((-1.0, 1.0), step_pictures, strict=True)
         )
-        square += ((up - down) / (2.0 * np.append(shorter, 1.0)[seen][..., None])) ** 2
-    known = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[seen]
-    found = np.where(known[..., None] | (straight == 0.0), np.sqrt(square), np.nan)
-    return found.astype(np.float32)
+        square += ((up - down) / (2.0 * np.append(shorter, 1.0)[triangle_of_pixel][..., None])) ** 2
+    has_covariance = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[triangle_of_pixel]
+    u_picture = np.where(has_covariance[..., None] | (straight == 0.0), np.sqrt(square), np.nan)
+    return u_picture.astype(np.float32)
 
 
 def refuse_uncertain(result: RunResult, fit: str) -> None:
@@ -104,12 +107,12 @@ def _moved(materials: TriangleMaterials, wider: Floats, step: Floats) -> Triangl
 
 @numba.njit(cache=True, nogil=True)
 def _turned(normals, tilts):  # type: ignore[no-untyped-def]
-    found = np.empty_like(normals)
+    turned_normals = np.empty_like(normals)
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
         square = 0.0
         for k in range(3):
-            found[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
-            square += found[n, k] ** 2
-        found[n] /= np.sqrt(square)
-    return found
+            turned_normals[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
+            square += turned_normals[n, k] ** 2
+        turned_normals[n] /= np.sqrt(square)
+    return turned_normals

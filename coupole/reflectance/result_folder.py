@@ -26,7 +26,7 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
             raise InputError(
                 f"{out} holds the result of other input, settings or version: name another folder with --out"
             )
-    elif out.exists() and any(one.suffix != ".part" for one in out.iterdir()):
+    elif out.exists() and any(content.suffix != ".part" for content in out.iterdir()):
         raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
     else:
         make_folder(out)

@@ -71,21 +71,21 @@ def ablate_result(out: Path, *, say: Said = lambda step, done, of: None) -> dict
         return {variant: _errors(case, variant, settings["scan_noise_um"]) for variant in variants}
 
     with one_thread(), ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        for done, found in enumerate(pool.map(of_block, blocks), start=1):
-            for variant, of_fits in found.items():
+        for count, errors_of_variants in enumerate(pool.map(of_block, blocks), start=1):
+            for variant, of_fits in errors_of_variants.items():
                 for name, off in of_fits.items():
                     errors[variant].setdefault(name, []).append(off)
-            say("ablate", done, len(blocks))
+            say("ablate", count, len(blocks))
     mae = {
         setting: [[value, {name: _mean(off) for name, off in errors[variant].items()}] for value, variant in steps]
         for setting, steps in VARIANTS.items()
     }
-    told = {"triangles": sum(block.stop - block.start for block in blocks), "mae": mae}
+    report = {"triangles": sum(block.stop - block.start for block in blocks), "mae": mae}
     try:
-        write_synced(out / ABLATION, json.dumps(told, indent=1) + "\n")
+        write_synced(out / ABLATION, json.dumps(report, indent=1) + "\n")
     except OSError as error:
         raise disk_error(out, error) from error
-    return told
+    return report
 
 
 def _mean(off: list[Floats]) -> float | None:
@@ -137,30 +137,31 @@ def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
 def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
     """Return the errors of each fit, under the LEDs that were left out, where every fit has something."""
     of_leds = np.unique(case.leds[~case.held])[:: variant.led_step]
-    used = np.isin(case.leds, of_leds)
+    is_fitted = np.isin(case.leds, of_leds)
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)
-    given = replace(case.samples, values=values.astype(np.float32))
+    samples = replace(case.samples, values=values.astype(np.float32))
     models = {
-        name: fit.values(given, fit.fit(given, used, noise_um, threads=1)) for name, fit in MATERIALS.items()
+        name: fit.values(samples, fit.fit(samples, is_fitted, noise_um, threads=1))
+        for name, fit in MATERIALS.items()
     }
-    made = {name: np.full(values.shape, np.nan, np.float32) for name in SLICES} | models
-    for view in range(len(given.cameras_mm)):
-        mine = given.view_of == view
-        seen = replace(
-            given,
-            values=given.values[:, mine],
-            led_mm=given.led_mm[mine],
-            view_of=given.view_of[mine] * 0,
-            cameras_mm=given.cameras_mm[view][None],
+    values_of_fits = {name: np.full(values.shape, np.nan, np.float32) for name in SLICES} | models
+    for view in range(len(samples.cameras_mm)):
+        in_view = samples.view_of == view
+        view_samples = replace(
+            samples,
+            values=samples.values[:, in_view],
+            led_mm=samples.led_mm[in_view],
+            view_of=samples.view_of[in_view] * 0,
+            cameras_mm=samples.cameras_mm[view][None],
         )
         for name, fit in SLICES.items():
-            model = None if fit.over is None else models[fit.over.name][:, mine]
+            model = None if fit.over is None else models[fit.over.name][:, in_view]
             basis = fewer(fit.basis, variant.coefficients)
-            coefficients = fit_slices(seen, used[mine], (basis, model), threads=1)[0]
-            made[name][:, mine] = slice_values(seen, coefficients, basis, model)
-    wanted = case.samples.values[:, case.held]
-    known = np.isfinite(wanted)
-    for found in made.values():
-        known &= np.isfinite(found[:, case.held])
+            coefficients = fit_slices(view_samples, is_fitted[in_view], (basis, model), threads=1)[0]
+            values_of_fits[name][:, in_view] = slice_values(view_samples, coefficients, basis, model)
+    held_out_values = case.samples.values[:, case.held]
+    is_finite = np.isfinite(held_out_values)
+    for fit_values in values_of_fits.values():
+        is_finite &= np.isfinite(fit_values[:, case.held])
     share = case.share[:, case.held]
-    return {name: ((made[name][:, case.held] - wanted) * share)[known] for name in FITS}
+    return {name: ((values_of_fits[name][:, case.held] - held_out_values) * share)[is_finite] for name in FITS}

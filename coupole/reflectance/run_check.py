@@ -117,19 +117,19 @@ def _check_view(
     check.noise += list(read_check_frames(result, view).noise)
     for part in held_out(result, view, settings, memory_bytes):
         some = part.samples
-        made = _made(result, view, part.rows, some, part.share)
-        _compare(made, some.values * part.share, check.triangles)
+        values_of_fits = _made(result, view, part.rows, some, part.share)
+        _compare(values_of_fits, some.values * part.share, check.triangles)
         noise = result.view_noise(view, part.rows, np.isin(view.leds, settings["left_out"]))
         for name, inside in check.inside.items():
             covariance = result.material_covariances(name, part.places)
             relative = relative_uncertainty(some, result.materials(name, part.places), covariance)
-            found = _inside(made[name] / part.share, relative, some.values, noise)
-            inside[0] += int(np.count_nonzero(found))
-            inside[1] += found.size
-        for channel, (_, measured) in enumerate(part.blocks):
-            pixels = {name: part.pixels(values, channel) for name, values in made.items()}
-            compared = _compare(pixels, measured, check.pictures)
-            level = np.clip(compared * _LEVELS_OF_RANGE, 0, _LEVELS - 1).astype(np.int64)
+            in_interval = _inside(values_of_fits[name] / part.share, relative, some.values, noise)
+            inside[0] += int(np.count_nonzero(in_interval))
+            inside[1] += in_interval.size
+        for channel, (_, measured_values) in enumerate(part.blocks):
+            pixels = {name: part.pixels(values, channel) for name, values in values_of_fits.items()}
+            compared_values = _compare(pixels, measured_values, check.pictures)
+            level = np.clip(compared_values * _LEVELS_OF_RANGE, 0, _LEVELS - 1).astype(np.int64)
             check.levels += np.bincount(level, minlength=_LEVELS)
         say(f"check of {view.view}", part.rows.stop, len(view.triangles))
 
@@ -157,22 +157,22 @@ def _inside(
     middle = made.mean(axis=2)
     variance = (relative * middle) ** 2 + np.sum((noise * measured) ** 2, axis=2) / measured.shape[2] ** 2
     off = np.abs(measured.mean(axis=2) - middle)
-    known = np.isfinite(off) & np.isfinite(variance)
-    found: NDArray[np.bool_] = off[known] < QUANTILE * np.sqrt(variance[known])
-    return found
+    is_finite = np.isfinite(off) & np.isfinite(variance)
+    in_interval: NDArray[np.bool_] = off[is_finite] < QUANTILE * np.sqrt(variance[is_finite])
+    return in_interval
 
 
 def _compare(
     made: Mapping[str, NDArray[np.floating]], measured: NDArray[np.floating], missed: dict[str, _Missed]
 ) -> NDArray[np.floating]:
     """Add what fits miss where all have something; the measured values there."""
-    known = np.isfinite(measured)
+    is_finite = np.isfinite(measured)
     for values in made.values():
-        known &= np.isfinite(values)
+        is_finite &= np.isfinite(values)
     for name, values in made.items():
-        missed[name].add(values[known] - measured[known])
-    found: NDArray[np.floating] = measured[known]
-    return found
+        missed[name].add(values[is_finite] - measured[is_finite])
+    compared_values: NDArray[np.floating] = measured[is_finite]
+    return compared_values
 
 
 def _interval_percent(uncertainty: dict[str, Any] | None) -> dict[str, float] | None:
@@ -188,10 +188,10 @@ def _typical(result: RunResult, name: str) -> dict[str, float | None]:
     triangles, share. None for those that are not known."""
     variances = np.einsum("nii->ni", result.material_covariances(name)).copy()
     variances[:, 2:4] += (result.u_triangles(slice(None)) ** 2 + result.u_shared**2)[:, None]
-    known = np.sqrt(variances)
-    tilt = np.degrees(np.hypot(known[:, 0], known[:, 1]))
+    deviations = np.sqrt(variances)
+    tilt = np.degrees(np.hypot(deviations[:, 0], deviations[:, 1]))
     columns = {"normal_deg": tilt} | {
-        f"{key}_percent": 100 * known[:, 2 + n] for n, key in enumerate(("kd", "ks", "alpha"))
+        f"{key}_percent": 100 * deviations[:, 2 + n] for n, key in enumerate(("kd", "ks", "alpha"))
     }
     return {key: _median(values[np.isfinite(values)]) for key, values in columns.items()}
 
@@ -208,7 +208,7 @@ def _about(
     seconds: float,
 ) -> dict[str, Any]:
     peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    left = {name: result.materials(name).residual for name in MATERIALS}
+    residuals = {name: result.materials(name).residual for name in MATERIALS}
     views = result.summaries
     return {
         "schema": SCHEMA,
@@ -218,10 +218,10 @@ def _about(
         "triangles": len(result.triangles),
         "not_fitted": int(np.count_nonzero(~np.isfinite(result.materials(GGX.name).alpha))),
         "samples": sum(view["samples"] for view in views),
-        "residual": {name: _median(values[np.isfinite(values)]) for name, values in left.items()},
-        "mae": {name: missed.mae for name, missed in check.pictures.items()},
-        "held_out_psnr_db": {name: missed.psnr_db(check.peak) for name, missed in check.pictures.items()},
-        "mae_of_triangles": {name: missed.mae for name, missed in check.triangles.items()},
+        "residual": {name: _median(values[np.isfinite(values)]) for name, values in residuals.items()},
+        "mae": {name: fit_errors.mae for name, fit_errors in check.pictures.items()},
+        "held_out_psnr_db": {name: fit_errors.psnr_db(check.peak) for name, fit_errors in check.pictures.items()},
+        "mae_of_triangles": {name: fit_errors.mae for name, fit_errors in check.triangles.items()},
         "held_out_inside": {name: n / of if of else None for name, (n, of) in check.inside.items()},
         "material_uncertainty": {name: _typical(result, name) for name in MATERIALS},
         "mae_of_noise": float(np.nanmean(check.noise)) if np.isfinite(check.noise).any() else None,

@@ -65,48 +65,48 @@ def cluster_result(
             f"--without-view: expected one of {', '.join(settings['view_names'])}; got {without_view}"
         )
     materials = result.materials(_FROM)
-    fitted = np.isfinite(materials.alpha)
-    known = int(np.count_nonzero(fitted))
-    count = count or int(np.clip(known // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
-    if known < count:
-        raise InputError(f"--clusters: expected at most {known}, the triangles with a material; got {count}")
-    cluster = np.full(len(fitted), -1, np.int64)
-    cluster[fitted] = clusters_of(looks(materials.at(np.flatnonzero(fitted))), count)
-    members = np.bincount(cluster[fitted])
+    is_fitted = np.isfinite(materials.alpha)
+    most = int(np.count_nonzero(is_fitted))
+    count = count or int(np.clip(most // USUAL_MEMBERS, FEWEST_CLUSTERS, MOST_CLUSTERS))
+    if most < count:
+        raise InputError(f"--clusters: expected at most {most}, the triangles with a material; got {count}")
+    cluster = np.full(len(is_fitted), -1, np.int64)
+    cluster[is_fitted] = clusters_of(looks(materials.at(np.flatnonzero(is_fitted))), count)
+    members = np.bincount(cluster[is_fitted])
     pool = empty_pool(len(members), materials.kd.shape[1])
     random = np.random.default_rng(0)
     for block in result.blocks(memory_bytes):
-        used = _used(result, block, settings["left_out"], without_view)
+        sample_mask = _used(result, block, settings["left_out"], without_view)
         samples, normals = result.samples(block), materials.normals[block]
-        pool_samples(pool, samples, used, normals, cluster[block], members, random)
-        say("pool samples", block.stop, len(fitted))
-    pooled = fit_pool(pool, _medians(materials, cluster, len(members)))
+        pool_samples(pool, samples, sample_mask, normals, cluster[block], members, random)
+        say("pool samples", block.stop, len(is_fitted))
+    fits = fit_pool(pool, _medians(materials, cluster, len(members)))
     harmonics = fit_pairs(pool, degrees)
-    borrowed = _borrow(result, pooled, cluster, settings["left_out"], without_view, memory_bytes, say)
-    found = Clusters(
-        cluster.astype(np.int32), borrowed, pooled.kd, pooled.ks, pooled.alpha, pooled.residual, harmonics
+    is_borrowed = _borrow(result, fits, cluster, settings["left_out"], without_view, memory_bytes, say)
+    clusters = Clusters(
+        cluster.astype(np.int32), is_borrowed, fits.kd, fits.ks, fits.alpha, fits.residual, harmonics
     )
     try:
-        complete(out / CLUSTERS, lambda path: write_clusters(path, found, members))
-        told = {
+        complete(out / CLUSTERS, lambda path: write_clusters(path, clusters, members))
+        report = {
             "clusters": len(members),
             "triangles": int(np.count_nonzero(cluster >= 0)),
-            "borrowed": int(np.count_nonzero(borrowed)),
+            "borrowed": int(np.count_nonzero(is_borrowed)),
             "without": int(np.count_nonzero(cluster < 0)),
             "harmonics": harmonics.shape[1],
             "without_view": without_view,
             **_missed(result, settings, without_view, memory_bytes, say),
         }
-        write_synced(out / ABOUT_CLUSTERS, json.dumps(told, indent=1) + "\n")
+        write_synced(out / ABOUT_CLUSTERS, json.dumps(report, indent=1) + "\n")
     except OSError as error:
         raise disk_error(out, error) from error
-    return told
+    return report
 
 
 def _used(result: RunResult, block: slice, left_out: list[int], without_view: str | None) -> NDArray[np.bool_]:
     """[samples] of a block: those of neither the LEDs nor the view that are left out."""
-    used = ~np.isin(result.along_samples(block, "leds"), left_out)
-    return np.asarray(used & (result.along_samples(block, "names") != without_view))
+    led_in_use = ~np.isin(result.along_samples(block, "leds"), left_out)
+    return np.asarray(led_in_use & (result.along_samples(block, "names") != without_view))
 
 
 def _medians(materials: TriangleMaterials, cluster: NDArray[np.int64], count: int) -> TriangleMaterials:
@@ -131,17 +131,17 @@ def _borrow(
     say: Said,
 ) -> NDArray[np.bool_]:
     """Give triangles without material the cluster that explains their few samples best; which ones got one."""
-    borrowed = np.zeros(len(cluster), np.bool_)
+    is_borrowed = np.zeros(len(cluster), np.bool_)
     for block in result.blocks(memory_bytes):
         lacking = np.flatnonzero(cluster[block] < 0)
         if len(lacking):
-            used = _used(result, block, left_out, without_view)
+            sample_mask = _used(result, block, left_out, without_view)
             some = result.samples(block).of_triangles(lacking)
-            found = nearest_cluster(some, used, pooled, FEWEST_TO_BORROW)
-            cluster[block.start + lacking] = found
-            borrowed[block.start + lacking] = found >= 0
+            nearest = nearest_cluster(some, sample_mask, pooled, FEWEST_TO_BORROW)
+            cluster[block.start + lacking] = nearest
+            is_borrowed[block.start + lacking] = nearest >= 0
         say("borrow", block.stop, len(cluster))
-    return borrowed
+    return is_borrowed
 
 
 def _missed(
@@ -149,12 +149,12 @@ def _missed(
 ) -> dict[str, Any]:
     """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of all views, and of
     the view that was left out too."""
-    found: dict[str, Any] = _mae(result, settings, result.views, memory_bytes, say)
+    report: dict[str, Any] = _mae(result, settings, result.views, memory_bytes, say)
     if without_view is not None:
         alone = [view for view in result.views if view.view == without_view]
-        found["mae_of_view"] = _mae(result, settings, alone, memory_bytes, say)["mae"]
-    own, clustered = found["mae"]["own"], found["mae"]["clustered"]
-    return {**found, "mae_ratio": clustered / own if own and clustered else None}
+        report["mae_of_view"] = _mae(result, settings, alone, memory_bytes, say)["mae"]
+    own_mae, clustered_mae = report["mae"]["own"], report["mae"]["clustered"]
+    return {**report, "mae_ratio": clustered_mae / own_mae if own_mae and clustered_mae else None}
 
 
 def _mae(
@@ -167,16 +167,24 @@ def _mae(
     pictures, triangles = ({name: [0.0, 0] for name in _WAYS} for _ in range(2))
     for view in views:
         for part in held_out(result, view, settings, memory_bytes):
-            own, borrowed = result.materials(_FROM, part.places), clusters.borrowed[part.places][:, None, None]
-            shared = model_values(part.samples, clusters.at(own, part.samples.normals, part.places)) * part.share
-            number = np.where(borrowed[:, 0, 0], -1, clusters.cluster[part.places])
-            by_pairs = pair_values(part.samples, own.normals, number, clusters.harmonics)
-            made = _alike(model_values(part.samples, own) * part.share, shared, by_pairs * part.share)
-            made["borrowed"] = np.where(borrowed, shared, np.nan)
-            for name, values in made.items():
+            own_materials, is_borrowed = (
+                result.materials(_FROM, part.places),
+                clusters.borrowed[part.places][:, None, None],
+            )
+            cluster_values = (
+                model_values(part.samples, clusters.at(own_materials, part.samples.normals, part.places))
+                * part.share
+            )
+            number = np.where(is_borrowed[:, 0, 0], -1, clusters.cluster[part.places])
+            by_pairs = pair_values(part.samples, own_materials.normals, number, clusters.harmonics)
+            values_of_ways = _alike(
+                model_values(part.samples, own_materials) * part.share, cluster_values, by_pairs * part.share
+            )
+            values_of_ways["borrowed"] = np.where(is_borrowed, cluster_values, np.nan)
+            for name, values in values_of_ways.items():
                 _add(triangles[name], values - part.samples.values * part.share)
-                for channel, (_, measured) in enumerate(part.blocks):
-                    _add(pictures[name], part.pixels(values, channel) - measured)
+                for channel, (_, measured_values) in enumerate(part.blocks):
+                    _add(pictures[name], part.pixels(values, channel) - measured_values)
             say(f"check of clusters in {view.view}", part.rows.stop, len(view.triangles))
     mae, of_triangles = (
         {name: total / count if count else None for name, (total, count) in sums.items()}
@@ -188,12 +196,14 @@ def _mae(
 def _alike(*values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
     """Return what all ways but the last give, where all of them give a value: harmonics have no value below the
     horizon of the fitted normal, where GGX has one."""
-    all_do = np.logical_and.reduce([np.isfinite(one) for one in values])
-    return {name: np.where(all_do, one, np.nan) for name, one in zip(_WAYS[:-1], values, strict=True)}
+    all_do = np.logical_and.reduce([np.isfinite(way_values) for way_values in values])
+    return {
+        name: np.where(all_do, way_values, np.nan) for name, way_values in zip(_WAYS[:-1], values, strict=True)
+    }
 
 
 def _add(sums: list[float], off: NDArray[np.floating]) -> None:
     """Add to the sum of magnitudes, and to their number."""
-    known = np.isfinite(off)
-    sums[0] += float(np.abs(off[known]).sum())
-    sums[1] += int(np.count_nonzero(known))
+    is_finite = np.isfinite(off)
+    sums[0] += float(np.abs(off[is_finite]).sum())
+    sums[1] += int(np.count_nonzero(is_finite))

@@ -86,8 +86,8 @@ def predicted(
     their lights are; NaN where the fit has nothing, the material alone where what it leaves was not fitted."""
     places = np.searchsorted(result.triangles, view.triangles[rows])
     if name == CLUSTERED:
-        own = result.materials(GGX_NORMAL.name, places)
-        return model_values(samples, result.clusters.at(own, samples.normals, places))
+        own_materials = result.materials(GGX_NORMAL.name, places)
+        return model_values(samples, result.clusters.at(own_materials, samples.normals, places))
     fit = FITS[name]
     if isinstance(fit, MaterialFit):
         return fit.values(samples, result.materials(name, places))
@@ -99,8 +99,8 @@ def _fit_materials(result: RunResult, job: _Job, made: MaterialFit, shop: Worksh
     uncertain: list[MaterialUncertainty] = []
     blocks = list(result.blocks(job.memory_bytes, shop.most_rows(len(result.triangles))))
     fit = partial(_materials_block, job, made, shop.threads)
-    for block, found in zip(blocks, shop.map(fit, blocks), strict=True):
-        parts.append(found)
+    for block, materials_part in zip(blocks, shop.map(fit, blocks), strict=True):
+        parts.append(materials_part)
         say(f"fit {made.name}", block.stop, len(result.triangles))
     if made.fits_normals:
         whole = joined(parts)
@@ -108,9 +108,9 @@ def _fit_materials(result: RunResult, job: _Job, made: MaterialFit, shop: Worksh
         parts = [replace(part, normals=normals[block]) for part, block in zip(parts, blocks, strict=True)]
     tasks = list(zip(blocks, parts, strict=True))
     finish = partial(_uncertain_block, job, made, shop.threads)
-    for number, (block, (materials, one)) in enumerate(zip(blocks, shop.map(finish, tasks), strict=True)):
+    for number, (block, (materials, uncertainty)) in enumerate(zip(blocks, shop.map(finish, tasks), strict=True)):
         parts[number] = materials
-        uncertain.append(one)
+        uncertain.append(uncertainty)
         say(f"uncertainty of {made.name}", block.stop, len(result.triangles))
     u_triangle = np.concatenate([result.u_triangles(block) for block in blocks])
 
@@ -130,8 +130,8 @@ def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
 
 def _materials_block(job: _Job, made: MaterialFit, threads: int | None, block: slice) -> TriangleMaterials:
     result = _opened(job.folder, job.token)
-    used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
-    return made.fit(result.samples(block), used, job.noise_um, threads)
+    sample_mask = ~np.isin(result.along_samples(block, "leds"), job.left_out)
+    return made.fit(result.samples(block), sample_mask, job.noise_um, threads)
 
 
 def _uncertain_block(
@@ -140,20 +140,20 @@ def _uncertain_block(
     """Materials of a block with the normals that they shall have: fitted ones without what they have in common."""
     block, materials = task
     result = _opened(job.folder, job.token)
-    used = ~np.isin(result.along_samples(block, "leds"), job.left_out)
+    sample_mask = ~np.isin(result.along_samples(block, "leds"), job.left_out)
     samples = result.samples(block)
     if made.fits_normals:
-        materials = recoloured(samples, used, materials, materials.normals, threads=threads)
-    return materials, made.uncertainty(samples, used, materials, job.noise_um, result.middle_mm, threads)
+        materials = recoloured(samples, sample_mask, materials, materials.normals, threads=threads)
+    return materials, made.uncertainty(samples, sample_mask, materials, job.noise_um, result.middle_mm, threads)
 
 
 def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
-    left = [number for number, view in enumerate(result.views) if view.contradicted is None]
-    tasks = _blocks_of_views(result, left, job.memory_bytes // 4, shop)
-    done = zip(tasks, shop.map(partial(_contradictions_block, job), tasks), strict=True)
-    for count, (number, blocks) in enumerate(groupby(done, key=lambda one: one[0][0]), start=1):
-        leave_out(result.views[number], (found for _, found in blocks))
-        say("contradictions", count, len(left))
+    view_numbers = [number for number, view in enumerate(result.views) if view.contradicted is None]
+    tasks = _blocks_of_views(result, view_numbers, job.memory_bytes // 4, shop)
+    task_outcomes = zip(tasks, shop.map(partial(_contradictions_block, job), tasks), strict=True)
+    for count, (number, blocks) in enumerate(groupby(task_outcomes, key=lambda one: one[0][0]), start=1):
+        leave_out(result.views[number], (contradictions for _, contradictions in blocks))
+        say("contradictions", count, len(view_numbers))
 
 
 def _contradictions_block(job: _Job, task: tuple[int, slice]) -> Found:
@@ -178,16 +178,16 @@ def _fit_slices(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None
     """All views in one go: no worker waits for the last block of each."""
     tasks = []
     for together in fitted_together():
-        left = [
+        view_numbers = [
             number
             for number, view in enumerate(result.views)
             if not all(result.slices_path(fit.name, view).exists() for fit in together)
         ]
-        tasks += [(together, *block) for block in _blocks_of_views(result, left, job.memory_bytes, shop)]
-    done = zip(tasks, shop.map(partial(_slices_block, job, shop.threads), tasks), strict=True)
-    for (together, number), blocks in groupby(done, key=lambda one: one[0][:2]):
-        found = ((rows, coefficients) for (_, _, rows), coefficients in blocks)
-        _write_slices(result, together, result.views[number], found, say)
+        tasks += [(together, *block) for block in _blocks_of_views(result, view_numbers, job.memory_bytes, shop)]
+    task_outcomes = zip(tasks, shop.map(partial(_slices_block, job, shop.threads), tasks), strict=True)
+    for (together, number), blocks in groupby(task_outcomes, key=lambda one: one[0][:2]):
+        rows_and_coefficients = ((rows, coefficients) for (_, _, rows), coefficients in blocks)
+        _write_slices(result, together, result.views[number], rows_and_coefficients, say)
 
 
 def _write_slices(
@@ -206,8 +206,8 @@ def _write_slices(
             file = files.enter_context(h5py.File(part, "w"))
             coefficients.append(begin_slices(file, fit, view, result.channels))
         for rows, of_rows in of_fits:
-            for data, found in zip(coefficients, of_rows, strict=True):
-                data[rows] = found
+            for data, block_coefficients in zip(coefficients, of_rows, strict=True):
+                data[rows] = block_coefficients
             say(f"fit {', '.join(fit.name for fit in fits)} of {view.view}", rows.stop, len(view.triangles))
 
 

@@ -66,8 +66,8 @@ class RunRequest:
     @property
     def sources(self) -> _Sources:
         """Sources of the runs' geometry, by whole paths."""
-        mesh, refined, poses = (path and path.resolve() for path in (self.mesh, self.refined, self.poses))
-        return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined, poses)
+        mesh, refined_path, poses = (path and path.resolve() for path in (self.mesh, self.refined, self.poses))
+        return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined_path, poses)
 
 
 @dataclass(frozen=True)
@@ -164,24 +164,28 @@ def _extract(
 ) -> None:
     """Samples of all views, and what the report says of each."""
     left_out = tuple(read_settings(out)["left_out"])
-    left = [
-        _View(run.resolve(), view.name, out / "samples" / f"{_name(measured_runs, measured, view)}.h5", left_out)
-        for run, measured in zip(request.runs, measured_runs, strict=True)
-        for view in measured.views
+    remaining_views = [
+        _View(
+            run.resolve(), view.name, out / "samples" / f"{_name(measured_runs, measured_run, view)}.h5", left_out
+        )
+        for run, measured_run in zip(request.runs, measured_runs, strict=True)
+        for view in measured_run.views
     ]
-    left = [one for one in left if not one.path.with_suffix(".json").exists()]
+    remaining_views = [run_view for run_view in remaining_views if not run_view.path.with_suffix(".json").exists()]
     sources = request.sources
-    for one in left:
-        shop.refuse_blind(one.run, RUN_JSON)
+    for run_view in remaining_views:
+        shop.refuse_blind(run_view.run, RUN_JSON)
     if sources.refined is not None:
         shop.refuse_blind(sources.refined, ABOUT)
     if sources.poses is not None:
         path = read_model(sources.poses).path
         shop.refuse_blind(path.parent, path.name)
     extract = partial(_extract_one, token, sources, shop.threads, shop.heard(say))
-    for number, (one, found) in enumerate(zip(left, shop.map(extract, left), strict=True), start=1):
-        write_synced(one.path.with_suffix(".json"), json.dumps(found))
-        say("views", number, len(left))
+    for number, (run_view, summary) in enumerate(
+        zip(remaining_views, shop.map(extract, remaining_views), strict=True), start=1
+    ):
+        write_synced(run_view.path.with_suffix(".json"), json.dumps(summary))
+        say("views", number, len(remaining_views))
     shop.everywhere(_forget)
 
 
@@ -193,27 +197,27 @@ def _extract_one(
     one: _View,
 ) -> dict[str, Any]:
     """Write the files of a view's samples and frames for the check; what the report says of them."""
-    measured, geometry, radiometry = _prepared(token, one.run, sources)
-    view = next(view for view in measured.views if view.name == one.view)
-    found = extract_view(measured, geometry, radiometry, view, one.path, say, threads=threads)
+    measured_run, geometry, radiometry = _prepared(token, one.run, sources)
+    view = next(view for view in measured_run.views if view.name == one.view)
+    summary = extract_view(measured_run, geometry, radiometry, view, one.path, say, threads=threads)
     frames = one.path.parents[1] / FRAMES / one.path.name
     complete(frames, partial(write_frames, radiometry, view, one.path, one.left_out, threads))
-    return found
+    return summary
 
 
 @lru_cache(maxsize=1)
 def _prepared(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
     """Return what all views of a run share, made once in each process and job (`token`)."""
-    measured = _measured(token, run, sources)
-    return measured, geometry_of(measured), Radiometry(measured)
+    measured_run = _measured(token, run, sources)
+    return measured_run, geometry_of(measured_run), Radiometry(measured_run)
 
 
 @lru_cache(maxsize=16)
 def _measured(token: str, run: Path, sources: _Sources) -> MeasuredRun:
-    measured = _recorded(token, run, sources)
+    measured_run = _recorded(token, run, sources)
     if sources.poses is not None:
-        return read_poses(sources.poses, measured).of(measured)
-    return measured if sources.refined is None else read_refined(sources.refined).of(measured)
+        return read_poses(sources.poses, measured_run).of(measured_run)
+    return measured_run if sources.refined is None else read_refined(sources.refined).of(measured_run)
 
 
 @lru_cache(maxsize=16)

@@ -45,11 +45,11 @@ class CheckFrames:
     @cached_property
     def _sorted(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Blocks of each channel in the order of what they see, and what they see."""
-        found = []
+        channels = []
         for places in self.triangle.reshape(len(self.triangle), -1):
             order = np.argsort(places, kind="stable")
-            found.append((order, places[order].astype(np.int64)))
-        return found
+            channels.append((order, places[order].astype(np.int64)))
+        return channels
 
 
 def read_check_frames(result: RunResult, view: ViewSamples) -> CheckFrames:
@@ -57,9 +57,9 @@ def read_check_frames(result: RunResult, view: ViewSamples) -> CheckFrames:
     with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
         share, leds, noise, offsets = (file[name][()] for name in ("share", "leds", "noise", "offsets"))
     with h5py.File(view.path, "r") as file:
-        seen = file["seen"][()]
+        triangle_of_pixel = file["seen"][()]
     height, width = share.shape[1:3]
-    triangle = np.stack([seen[row::2, column::2][:height, :width] for row, column in offsets])
+    triangle = np.stack([triangle_of_pixel[row::2, column::2][:height, :width] for row, column in offsets])
     return CheckFrames(share, leds, noise, triangle)
 
 
@@ -81,8 +81,8 @@ class HeldOut:
 
     def pixels(self, values: NDArray[np.floating], channel: int) -> NDArray[np.floating]:
         """[blocks, pictures] of values [n, leds, channels]."""
-        found: NDArray[np.floating] = values[:, self.columns, channel][self.blocks[channel][0]]
-        return found
+        block_values: NDArray[np.floating] = values[:, self.columns, channel][self.blocks[channel][0]]
+        return block_values
 
 
 def held_out(
@@ -90,17 +90,17 @@ def held_out(
 ) -> Iterator[HeldOut]:
     """A view's triangles, block by block. Light from surface to surface is taken off the pictures, as off the
     samples."""
-    held = np.isin(view.leds, settings["left_out"])
-    frames, column = read_check_frames(result, view), {int(led): n for n, led in enumerate(view.leds[held])}
+    is_held_out = np.isin(view.leds, settings["left_out"])
+    frames, column = read_check_frames(result, view), {int(led): n for n, led in enumerate(view.leds[is_held_out])}
     columns = [column[int(led)] for led in frames.leds]
     for rows in result.view_blocks(view, memory_bytes):
-        some = result.view_samples(view, rows, held)
-        lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[held], settings["emission"] == "paper")
-        direct = result.direct_shares(view, rows, held)[:, columns]
+        some = result.view_samples(view, rows, is_held_out)
+        lit = lit_on(some.centres_mm, some.led_mm, view.led_normals[is_held_out], settings["emission"] == "paper")
+        direct = result.direct_shares(view, rows, is_held_out)[:, columns]
         blocks = []
         for channel in range(result.channels):
-            place, measured = frames.pairs(rows, channel)
-            blocks.append((place, measured * direct[place, :, channel]))
+            place, measured_values = frames.pairs(rows, channel)
+            blocks.append((place, measured_values * direct[place, :, channel]))
         places = np.searchsorted(result.triangles, view.triangles[rows])
-        share = lit[..., None] * view.full_scales[held]
+        share = lit[..., None] * view.full_scales[is_held_out]
         yield HeldOut(rows, places, some, share, columns, tuple(blocks))

@@ -58,9 +58,9 @@ _TRIANGLES = 1 << 13
 
 def best_fit(result: RunResult, among: Collection[str] = FITS) -> str:
     """The one that missed least under the LEDs kept for the check; GGX with its normal if none were."""
-    known = read_about(result.folder)["mae"].items()
-    missed = {name: mae for name, mae in known if mae is not None and name in among}
-    return min(missed, key=missed.__getitem__, default=GGX_NORMAL.name)
+    mae_of_fits = read_about(result.folder)["mae"].items()
+    known_mae = {name: mae for name, mae in mae_of_fits if mae is not None and name in among}
+    return min(known_mae, key=known_mae.__getitem__, default=GGX_NORMAL.name)
 
 
 @dataclass(frozen=True)
@@ -125,13 +125,13 @@ class RelitScene:
     def _by_materials(self, picture: Picture, lighting: Lighting, coats: Coats, lobe_rays: int, say: Say) -> None:
         work = len(lighting.beams) + len(lighting.emitters)
         codes = np.zeros((LANES, *self.surface.seen.shape), np.uint8)
-        done = 0
+        count = 0
         for beams in alike(lighting.beams):
             alone = len(beams) == 1 and beams[0].density == 0.0
             for lane, beam in enumerate(beams):
                 reached(self.mesh, self.surface, beam, codes[lane])
-                done += 1
-                say(done, work)
+                count += 1
+                say(count, work)
             if alone:
                 add_beam(picture, self.surface, coats, codes[0], beams[0])
             else:
@@ -185,22 +185,24 @@ def _values_of(reflecting: Slices | Pairs, light: TriangleSamples, part: slice) 
 def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = None) -> RelitScene:
     """A measured view: the first one unless it is named; the fit that missed least under the LEDs that were kept
     for the check unless it is named. Raises InputError for a view or a fit that is not there."""
-    names = [one.view for one in result.views]
+    names = [run_view.view for run_view in result.views]
     if view is not None and view not in names:
         raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
     _refuse_unknown(fit)
-    mine = result.views[0 if view is None else names.index(view)]
+    pictured_view = result.views[0 if view is None else names.index(view)]
     name = fit or best_fit(result)
-    surface = surface_of_view(result, mine)
-    order = (mine, *(one for one in result.views if one is not mine))
+    surface = surface_of_view(result, pictured_view)
+    order = (pictured_view, *(run_view for run_view in result.views if run_view is not pictured_view))
     mesh = PacketMesh(result.corners_mm, compact=False)
-    made = FITS.get(name)
-    if not isinstance(made, ViewFit):
+    known_fit = FITS.get(name)
+    if not isinstance(known_fit, ViewFit):
         return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, mesh)
-    if not result.slices_path(name, mine).exists():
+    if not result.slices_path(name, pictured_view).exists():
         raise InputError(f"{result.folder}: has no fit {name}; `coupole reflectance fit {result.folder}` makes it")
-    under = None if made.over is None else materials_of(result, made.over.name, surface)
-    return RelitScene(result, name, surface, Slices(made, result.slices(name, mine), under), order, mesh)
+    under = None if known_fit.over is None else materials_of(result, known_fit.over.name, surface)
+    return RelitScene(
+        result, name, surface, Slices(known_fit, result.slices(name, pictured_view), under), order, mesh
+    )
 
 
 def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) -> RelitScene:
@@ -233,10 +235,12 @@ def _from_anywhere(result: RunResult, name: str, surface: Surface) -> Coats | Pa
 def materials_of(result: RunResult, name: str, surface: Surface) -> TriangleMaterials:
     """Return the materials of the surface's triangles. Raises InputError if there are none."""
     places = np.searchsorted(result.triangles, surface.triangles)
-    own = GGX_NORMAL.name if name == CLUSTERED else name
-    if not result.materials_path(own).exists():
-        raise InputError(f"{result.folder}: has no fit {own}; `coupole reflectance fit {result.folder}` makes it")
-    materials = result.materials(own, places)
+    fit_name = GGX_NORMAL.name if name == CLUSTERED else name
+    if not result.materials_path(fit_name).exists():
+        raise InputError(
+            f"{result.folder}: has no fit {fit_name}; `coupole reflectance fit {result.folder}` makes it"
+        )
+    materials = result.materials(fit_name, places)
     if name == CLUSTERED:
         materials = result.clusters.at(materials, surface.normals, places)
     return materials

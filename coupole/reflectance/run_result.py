@@ -137,7 +137,7 @@ class RunResult:
     def summaries(self) -> list[dict[str, Any]]:
         """Summaries that extraction gave of each view."""
         files = sorted((self.folder / "samples").glob("*.json"))
-        told = [read_json(path, allow_nan=True) for path in files]
+        summaries = [read_json(path, allow_nan=True) for path in files]
         return [
             {
                 **summary,
@@ -145,7 +145,7 @@ class RunResult:
                 CONTRADICTED: view.contradicted,
                 SAMPLES: summary[SAMPLES] if view.samples_left is None else view.samples_left,
             }
-            for summary, view in zip(told, self.views, strict=True)
+            for summary, view in zip(summaries, self.views, strict=True)
         ]
 
     def refuse_unfinished(self, settings: dict[str, Any], *, fits: bool = False) -> None:
@@ -181,17 +181,17 @@ class RunResult:
 
     def samples(self, block: slice) -> TriangleSamples:
         """Return the samples of the triangles of a block, in all views that see one of them."""
-        wanted = self.triangles[block]
+        triangles = self.triangles[block]
         values: list[NDArray[np.float32]] = []
-        seeing = [view for view in self.views if _rows(view, wanted)]
-        centres, normals = np.zeros((len(wanted), 3)), np.zeros((len(wanted), 3))
+        seeing = [view for view in self.views if _rows(view, triangles)]
+        centres, normals = np.zeros((len(triangles), 3)), np.zeros((len(triangles), 3))
         for view in seeing:
-            rows = _rows(view, wanted)
-            at = np.searchsorted(wanted, view.triangles[rows.start : rows.stop])
-            mine = self.view_samples(view, slice(rows.start, rows.stop))
-            centres[at], normals[at] = mine.centres_mm, mine.normals
-            all_of_them = np.full((len(wanted), *mine.values.shape[1:]), np.nan, np.float32)
-            all_of_them[at] = mine.values
+            rows = _rows(view, triangles)
+            at = np.searchsorted(triangles, view.triangles[rows.start : rows.stop])
+            view_samples = self.view_samples(view, slice(rows.start, rows.stop))
+            centres[at], normals[at] = view_samples.centres_mm, view_samples.normals
+            all_of_them = np.full((len(triangles), *view_samples.values.shape[1:]), np.nan, np.float32)
+            all_of_them[at] = view_samples.values
             values.append(all_of_them)
         return TriangleSamples(
             np.concatenate(values, axis=1),
@@ -200,7 +200,7 @@ class RunResult:
             np.stack([view.camera_mm for view in seeing]),
             centres,
             normals,
-            self.areas_mm2[wanted],
+            self.areas_mm2[triangles],
         )
 
     def view_samples(
@@ -245,14 +245,16 @@ class RunResult:
     def u_triangles(self, block: slice) -> NDArray[np.float32]:
         """[n] relative standard uncertainty, mean of channels, that samples of a triangle share by the responses
         of its pixels, which are others in each view. NaN without a record of the response."""
-        wanted = self.triangles[block]
-        squares, views = np.zeros(len(wanted)), np.zeros(len(wanted))
+        triangles = self.triangles[block]
+        squares, views = np.zeros(len(triangles)), np.zeros(len(triangles))
         for view in self.views:
-            if rows := _rows(view, wanted):
-                at = np.searchsorted(wanted, view.triangles[rows.start : rows.stop])
+            if rows := _rows(view, triangles):
+                at = np.searchsorted(triangles, view.triangles[rows.start : rows.stop])
                 with h5py.File(view.path, "r") as file:
-                    each = file["u_response"][rows.start : rows.stop]
-                squares[at] += np.sum(np.where(np.isinf(each), 0.0, each) ** 2, axis=1) / each.shape[1] ** 2
+                    u_response = file["u_response"][rows.start : rows.stop]
+                squares[at] += (
+                    np.sum(np.where(np.isinf(u_response), 0.0, u_response) ** 2, axis=1) / u_response.shape[1] ** 2
+                )
                 views[at] += 1
         return np.sqrt(squares / views**2).astype(np.float32)
 
@@ -265,8 +267,8 @@ class RunResult:
     def along_samples(self, block: slice, name: str) -> NDArray[Any]:
         """[samples, ...] what each sample of `samples(block)` has by its LED: `leds`, `led_normals`,
         `full_scales`, and its view: `names`."""
-        wanted = self.triangles[block]
-        return np.concatenate([getattr(view, name) for view in self.views if _rows(view, wanted)])
+        triangles = self.triangles[block]
+        return np.concatenate([getattr(view, name) for view in self.views if _rows(view, triangles)])
 
     def materials_path(self, name: str) -> Path:
         return self.folder / "fits" / f"{name}.h5"
@@ -283,10 +285,10 @@ class RunResult:
         """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
         with h5py.File(self.materials_path(name), "r") as file:
             lower = _read(file["covariance"], block)
-        found = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
-        found[:, *LOWER] = lower
-        found[:, *LOWER[::-1]] = lower
-        return found
+        covariances = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
+        covariances[:, *LOWER] = lower
+        covariances[:, *LOWER[::-1]] = lower
+        return covariances
 
     @cached_property
     def clusters(self) -> Clusters:
@@ -315,8 +317,8 @@ def _read(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
 
 def u_inter_reflection(share: NDArray[np.float16]) -> NDArray[np.float64]:
     """Relative standard uncertainty of samples from which inter-reflection was taken off, by its share."""
-    known = share.astype(np.float64)
-    return np.asarray(U_OF_INTER_REFLECTION * known / (1.0 - known))
+    fraction = share.astype(np.float64)
+    return np.asarray(U_OF_INTER_REFLECTION * fraction / (1.0 - fraction))
 
 
 def read_view_samples(path: Path) -> ViewSamples:
@@ -354,8 +356,8 @@ def read_about(folder: Path) -> dict[str, Any]:
 
 
 def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[slice]:
-    each = 64 * samples  # values, a model's, and what is copied between
-    step = int(np.clip(budget_bytes // max(1, each), 64, most))
+    triangle_bytes = 64 * samples  # values, a model's, and what is copied between
+    step = int(np.clip(budget_bytes // max(1, triangle_bytes), 64, most))
     step = -(-count // -(-count // step)) if count else step  # all alike
     for first in range(0, count, step):
         yield slice(first, min(first + step, count))

@@ -37,14 +37,14 @@ def write_materials(
     uncertainties of kd and ks, of a triangle and of all."""
     with h5py.File(path, "w") as file:
         file.create_dataset("triangles", data=triangles, track_times=False).attrs["told"] = "numbers in the mesh"
-        for field, told in FIELDS.items():
+        for field, description in FIELDS.items():
             values = np.concatenate([getattr(part, field) for part in parts]).astype(np.float32)
-            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
-        for field, told in UNCERTAIN.items():
+            file.create_dataset(field, data=values, track_times=False).attrs["told"] = description
+        for field, description in UNCERTAIN.items():
             values = np.concatenate([getattr(part, field) for part in uncertain]).astype(np.float32)
             if field == "covariance":
                 values = values[:, *LOWER]
-            file.create_dataset(field, data=values, track_times=False).attrs["told"] = told
+            file.create_dataset(field, data=values, track_times=False).attrs["told"] = description
         file.create_dataset("u_triangle", data=u_triangle, track_times=False).attrs["told"] = (
             "relative standard uncertainty of kd and ks, that of the responses of the triangle's pixels"
         )

@@ -34,12 +34,12 @@ def uncertainty_of(
     """Return what `result.json` says of the uncertainty; None without a record of the response, by which noise is
     known."""
     most = _TYPICAL // len(result.views)
-    known = [
+    channel_parts = [
         known_samples(result, view, result.channels // 2, scan_noise_um, most=most, of_triangles=_TRIANGLES)
         for view in result.views
     ]
-    places = Places(*_joined([one.places for one in known]))
-    sources = Sources(*_joined([one.sources for one in known]))
+    places = Places(*_joined([part.places for part in channel_parts]))
+    sources = Sources(*_joined([part.sources for part in channel_parts]))
     if not len(sources.u_noise):
         return None
     random = np.random.default_rng(0)
@@ -53,9 +53,9 @@ def uncertainty_of(
 
     whole = table(sources_drawn)
     without = {}
-    for number, (source, told) in enumerate(SOURCES.items(), start=1):
+    for number, (source, description) in enumerate(SOURCES.items(), start=1):
         say("uncertainty", number, len(SOURCES))
-        without[told] = table(sources_drawn.without(source))
+        without[description] = table(sources_drawn.without(source))
     return {
         "interval": percentiles(*bounds(places, sources, QUANTILE)) | {"coverage": COVERAGE},
         "closed_form": percentiles(*bounds(places_drawn, sources_drawn, TABLE_QUANTILE)),
@@ -66,14 +66,14 @@ def uncertainty_of(
 
 def percentiles(low: Floats, high: Floats) -> dict[str, Any]:
     """Median and 95th percentile of bounds, percent; infinite ones are left out and counted; None if all are."""
-    known = np.isfinite(high)
-    if not known.any():
+    is_finite = np.isfinite(high)
+    if not is_finite.any():
         return {"median": None, "percentile_95": None, "unbounded_share": 1.0}
-    below, above = 100.0 * (low[known] - 1.0), 100.0 * (high[known] - 1.0)
+    below, above = 100.0 * (low[is_finite] - 1.0), 100.0 * (high[is_finite] - 1.0)
     return {
         "median": [float(np.median(below)), float(np.median(above))],
         "percentile_95": [float(np.quantile(below, 0.05)), float(np.quantile(above, 0.95))],
-        "unbounded_share": float(1.0 - known.mean()),
+        "unbounded_share": float(1.0 - is_finite.mean()),
     }
 
 
@@ -85,10 +85,10 @@ def known_samples(
     rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
     leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))
     some = channel_samples(result, view, rows, leds, channel, scan_noise_um)
-    known = some.known
-    if len(known) > most:
-        known = np.sort(np.random.default_rng(2).choice(known, most, replace=False))
-    return some.at(known)
+    places = some.known
+    if len(places) > most:
+        places = np.sort(np.random.default_rng(2).choice(places, most, replace=False))
+    return some.at(places)
 
 
 def _joined(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:

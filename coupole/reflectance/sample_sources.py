@@ -63,36 +63,38 @@ def channel_samples(
     beside = beside or triangles_beside(result, view, rows)
     with h5py.File(view.path, "r") as file:
         lateral_u_mm, led_u_mm = float(file.attrs["lateral_u_mm"]), float(file.attrs["led_u_mm"])
-        used = np.unique(np.append(rows, beside.rows))
+        file_rows = np.unique(np.append(rows, beside.rows))
         channels = range(result.channels) if channel is None else (channel,)
 
         def tables(name: str) -> Floats:
-            return np.stack([_table(file[name], used, leds, one) for one in channels])
+            return np.stack([_table(file[name], file_rows, leds, channel_number) for channel_number in channels])
 
-        each_f, own = tables("f"), np.searchsorted(used, rows)
+        each_f, row_places = tables("f"), np.searchsorted(file_rows, rows)
         f, shares = each_f.mean(axis=0), np.abs(each_f) / np.maximum(np.abs(each_f).sum(axis=0), 1e-30)
         u_noise = np.sum(shares * tables("u_own"), axis=0)
-        dark = _table(file["codes"], used, leds, None) != REACHED
+        dark = _table(file["codes"], file_rows, leds, None) != REACHED
         indirect = np.zeros(f.shape)
         if view.inter_reflection is not None:
-            taken = u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16))
-            indirect = np.sum(shares * taken, axis=0)
+            u_indirect = u_inter_reflection(tables(INTER_REFLECTION).astype(np.float16))
+            indirect = np.sum(shares * u_indirect, axis=0)
         u_response = file["u_response"][()][rows][:, channels].mean(axis=1)
         u_own, u_shared = (
             file[name][()][leds][:, channels].mean(axis=1) for name in ("led_u_own", "led_u_shared")
         )
-        incidence = _cosines(file["centres_mm"][:][used], file["normals"][:][used], view.led_mm[leds])
+        incidence = _cosines(file["centres_mm"][:][file_rows], file["normals"][:][file_rows], view.led_mm[leds])
     signal, u_signal = np.where(dark, 0.0, f * incidence), np.where(dark, 0.0, u_noise)
-    u_place = beside.uncertainty(signal, u_signal, own, np.searchsorted(used, beside.rows), lateral_u_mm)
+    u_place = beside.uncertainty(
+        signal, u_signal, row_places, np.searchsorted(file_rows, beside.rows), lateral_u_mm
+    )
     grid = (len(rows), len(leds))
 
     def along(values: Floats, shape: tuple[int, ...]) -> Floats:
         return np.broadcast_to(values.reshape(shape), grid).ravel().astype(np.float64)
 
     sources = Sources(
-        u_noise[own].ravel(),
+        u_noise[row_places].ravel(),
         along(u_response, (-1, 1)),
-        indirect[own].ravel(),
+        indirect[row_places].ravel(),
         u_place.ravel(),
         along(u_own, (1, -1)),
         along(u_shared, (1, -1)),
@@ -102,7 +104,7 @@ def channel_samples(
     row, led = (places.ravel() for places in np.meshgrid(rows, leds, indexing="ij"))
     corners = result.corners_mm[view.triangles[row]].astype(np.float64)
     return ChannelSamples(
-        row, led, f[own].ravel(), Places(corners, view.led_mm[led], view.led_normals[led]), sources
+        row, led, f[row_places].ravel(), Places(corners, view.led_mm[led], view.led_normals[led]), sources
     )
 
 
@@ -122,18 +124,20 @@ class Beside:
         `own` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them differ by,
         as the square of the shift over that of the distance, at most as far as they are away. 1 where nothing
         beside is known."""
-        mine, noise = signal[own], (signal[own] * u_noise[own]) ** 2
+        own_signal, noise = signal[own], (signal[own] * u_noise[own]) ** 2
         share = np.minimum(2.0 * lateral_u_mm**2 / np.maximum(self.square_mm2, 1e-12), 1.0)
-        total, count = np.zeros(mine.shape), np.zeros(mine.shape)
+        total, count = np.zeros(own_signal.shape), np.zeros(own_signal.shape)
         for side in range(beside.shape[1]):
-            other = signal[beside[:, side]]
-            apart = (other - mine) ** 2 - noise - (other * u_noise[beside[:, side]]) ** 2
-            known = np.isfinite(apart) & (self.square_mm2[:, side] > 0.0)[:, None]
-            total += np.where(known, share[:, side, None] * apart, 0.0)
-            count += known
+            neighbour_signal = signal[beside[:, side]]
+            apart = (
+                (neighbour_signal - own_signal) ** 2 - noise - (neighbour_signal * u_noise[beside[:, side]]) ** 2
+            )
+            is_known = np.isfinite(apart) & (self.square_mm2[:, side] > 0.0)[:, None]
+            total += np.where(is_known, share[:, side, None] * apart, 0.0)
+            count += is_known
         with np.errstate(divide="ignore", invalid="ignore"):
-            found: Floats = np.sqrt(np.maximum(total / np.maximum(count, 1), 0.0)) / np.abs(mine)
-        return np.where(count > 0, found, 1.0)
+            u_relative: Floats = np.sqrt(np.maximum(total / np.maximum(count, 1), 0.0)) / np.abs(own_signal)
+        return np.where(count > 0, u_relative, 1.0)
 
 
 @lru_cache(maxsize=4)
@@ -153,38 +157,40 @@ def triangles_beside(result: RunResult, view: ViewSamples, rows: Integers) -> Be
         lateral_u_mm = float(file.attrs["lateral_u_mm"])
     areas_mm2 = result.areas_mm2[view.triangles]
     centres_mm, camera_mm, tree = _centres(view.path)
-    mine = centres_mm[rows]
-    towards = camera_mm - mine
+    own_centres_mm = centres_mm[rows]
+    towards = camera_mm - own_centres_mm
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     right = np.cross(towards, np.where(np.abs(towards[:, [2]]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
     right /= np.linalg.norm(right, axis=1, keepdims=True)
     up = np.cross(right, towards)
     far_mm = np.maximum(np.sqrt(2.0) * lateral_u_mm, _BESIDE * np.sqrt(areas_mm2[rows]))
-    found = np.empty((len(rows), _SIDES), np.int64)
-    square_mm2 = np.zeros(found.shape)
+    neighbours = np.empty((len(rows), _SIDES), np.int64)
+    square_mm2 = np.zeros(neighbours.shape)
     for side in range(_SIDES):
         angle = 2.0 * np.pi * side / _SIDES
         shift = far_mm[:, None] * (np.cos(angle) * right + np.sin(angle) * up)
-        away_mm, found[:, side] = tree.query(mine + shift)
-        apart = centres_mm[found[:, side]] - mine
+        away_mm, neighbours[:, side] = tree.query(own_centres_mm + shift)
+        apart = centres_mm[neighbours[:, side]] - own_centres_mm
         across = apart - np.sum(apart * towards, axis=1)[:, None] * towards
         there = away_mm < far_mm  # past the edge of what the view sees there is nothing
         square_mm2[:, side] = np.where(there, np.sum(across**2, axis=1), 0.0)
-    return Beside(found, square_mm2)
+    return Beside(neighbours, square_mm2)
 
 
 def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
     """[n, leds] of incidence."""
     ways = led_mm - centres_mm[:, None]
-    found: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
-    return found
+    cosines: Floats = np.einsum("nlk,nk->nl", ways, normals) / np.linalg.norm(ways, axis=2)
+    return cosines
 
 
 def _table(data: h5py.Dataset, rows: Integers, leds: Integers, channel: int | None) -> Floats:
     """[rows, leds] of a channel, if there are channels, by rows or by LEDs, whichever reads less of the file."""
-    own = () if channel is None else (channel,)
+    channel_index = () if channel is None else (channel,)
     if len(rows) * data.shape[1] < len(leds) * data.shape[0]:
-        return np.stack([data[(int(row), slice(None), *own)][leds] for row in rows]).astype(np.float64)
+        return np.stack([data[(int(row), slice(None), *channel_index)][leds] for row in rows]).astype(np.float64)
     first = int(rows[0])
     some = slice(first, int(rows[-1]) + 1)
-    return np.stack([data[(some, int(led), *own)][rows - first] for led in leds], axis=1).astype(np.float64)
+    return np.stack([data[(some, int(led), *channel_index)][rows - first] for led in leds], axis=1).astype(
+        np.float64
+    )

@@ -57,8 +57,8 @@ class Sources:
     def u_signal(self) -> Floats:
         """[n] relative."""
         parts = (self.u_noise, self.u_response, self.u_indirect, self.u_place)
-        found: Floats = np.sqrt(np.sum(np.square(parts), axis=0))
-        return found
+        u_relative: Floats = np.sqrt(np.sum(np.square(parts), axis=0))
+        return u_relative
 
     def without(self, source: str) -> Sources:
         """The same with one of `SOURCES` at 0."""
@@ -132,7 +132,7 @@ def drawn(
     def of_each(values: Floats, dimensions: int) -> Floats:
         return values.reshape(count, 1, *[1] * dimensions)
 
-    measured = _geometry(places.corners_mm, places.led_mm, places.led_normals, paper)
+    measured_geometry = _geometry(places.corners_mm, places.led_mm, places.led_normals, paper)
     corners = places.corners_mm[:, None] + of_each(sources.vertex_um * 1e-3, 2) * normal(3, 3)
     leds = places.led_mm[:, None] + of_each(sources.led_mm, 1) * normal(3)
     axes = np.broadcast_to(places.led_normals[:, None], leds.shape)
@@ -141,9 +141,9 @@ def drawn(
     signal = 1.0 + sources.u_signal[:, None] * normal()
     power = (1.0 + sources.u_own[:, None] * normal()) * (1.0 + sources.u_shared[:, None] * normal())
     with np.errstate(divide="ignore"):
-        found: Floats = signal * measured[:, None] / (power * geometry)
-    found[geometry <= 0.0] = np.nan
-    return found
+        ratios: Floats = signal * measured_geometry[:, None] / (power * geometry)
+    ratios[geometry <= 0.0] = np.nan
+    return ratios
 
 
 def _geometry(corners_mm: Floats, led_mm: Floats, led_normals: Floats, paper: bool) -> Floats:

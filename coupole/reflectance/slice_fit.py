@@ -51,25 +51,28 @@ def fit_slices(
     samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
-    found = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
-    left = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
+    coefficients = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
+    residuals = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
     penalties = np.stack([basis.penalty for basis, _ in fits])
     over = np.array([model is not None for _, model in fits])
-    camera_mm, which = samples.cameras_mm[0], np.flatnonzero(used)
+    camera_mm, indices = samples.cameras_mm[0], np.flatnonzero(used)
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
-        mine = ordered(found[:, part])
+        part_coefficients = ordered(coefficients[:, part])
         _fit_part(
-            ordered(samples.values[part]), ordered(left[:, part]), ordered(samples.led_mm), ordered(camera_mm),
-            ordered(samples.centres_mm[part]), ordered(samples.normals[part]), which, fits[0][0].harmonic,
-            penalties, over, mine,
+            ordered(samples.values[part]), ordered(residuals[:, part]), ordered(samples.led_mm),
+            ordered(camera_mm), ordered(samples.centres_mm[part]), ordered(samples.normals[part]), indices,
+            fits[0][0].harmonic, penalties, over, part_coefficients,
         )  # fmt: skip
-        found[:, part] = mine
+        coefficients[:, part] = part_coefficients
 
     with one_thread(), ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
-    return [one if model is not None else one[..., :COUNT] for one, (_, model) in zip(found, fits, strict=True)]
+    return [
+        fit_coefficients if model is not None else fit_coefficients[..., :COUNT]
+        for fit_coefficients, (_, model) in zip(coefficients, fits, strict=True)
+    ]
 
 
 def slice_values(
@@ -80,16 +83,16 @@ def slice_values(
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i, 1/sr, that slices, on top of their share of a `model` if they were fitted
     with one, give where the samples of one view are. Without slice: the model, or NaN."""
-    made = np.zeros(samples.values.shape, np.float32)
+    values = np.zeros(samples.values.shape, np.float32)
     if model is not None:
         share = coefficients[..., COUNT]
-        made = ordered(np.nan_to_num(share, nan=1.0)[:, None] * model)
+        values = ordered(np.nan_to_num(share, nan=1.0)[:, None] * model)
         coefficients = np.nan_to_num(coefficients[..., :COUNT])
     _add_part(
         ordered(coefficients), ordered(samples.led_mm), ordered(samples.cameras_mm[0]),
-        ordered(samples.centres_mm), ordered(samples.normals), basis.harmonic, made,
+        ordered(samples.centres_mm), ordered(samples.normals), basis.harmonic, values,
     )  # fmt: skip
-    return np.maximum(made, 0.0)
+    return np.maximum(values, 0.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -131,7 +134,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
 ):
     """Channels with the same samples share their matrix."""
     count, _, channels = values.shape
-    memory, which = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
+    memory, indices = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
     xyz, product, frame = np.empty((3, len(used))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
     memories = (
         np.empty(COUNT), np.empty(COUNT * COUNT), np.empty(2 * COUNT * COUNT), np.empty(channels * len(used)),
@@ -144,9 +147,9 @@ def _fit_part(  # type: ignore[no-untyped-def]
             first, end = end, end + 1
             while end < channels and _same(values[triangle], used, end):
                 end += 1
-            n = _known(values[triangle, :, first], used, which)
+            n = _known(values[triangle, :, first], used, indices)
             x, y, z = xyz[0, :n], xyz[1, :n], xyz[2, :n]
-            if n < FEWEST or _directions(frame, centres_mm[triangle], led_mm, which[:n], x, y, z) < FEWEST:
+            if n < FEWEST or _directions(frame, centres_mm[triangle], led_mm, indices[:n], x, y, z) < FEWEST:
                 continue
             rows = memory[: COUNT * n].reshape(COUNT, n)
             functions(harmonic, x, y, z, rows)
@@ -157,7 +160,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
                 gram(rows, product)
             for fit in range(len(left)):
                 _fit_one(
-                    rows, product, values[triangle], left[fit, triangle], which[:n], first, penalties[fit],
+                    rows, product, values[triangle], left[fit, triangle], indices[:n], first, penalties[fit],
                     over[fit], memories, found[fit, triangle, first:end],
                 )  # fmt: skip
 
@@ -169,26 +172,26 @@ def _fit_one(  # type: ignore[no-untyped-def]
     """Fill `found` [channels, COUNT + 1] with a fit to `left` of the samples `which` [n] in channels from
     `first`."""
     channels, n, size = len(found), len(which), min(len(which), COUNT)
-    held, matrix, room, wanted, solution = memories
-    mine, right = wanted[: channels * n].reshape(channels, n), solution[:channels]
+    ridge, matrix, room, target_memory, solution = memories
+    targets, right = target_memory[: channels * n].reshape(channels, n), solution[:channels]
     factor = matrix[: size * size].reshape(size, size)
-    _wanted(left, which, first, mine)
-    share = _held_by(mine, values, which, first) if over else 1.0
+    _wanted(left, which, first, targets)
+    share = _held_by(targets, values, which, first) if over else 1.0
     for k in range(COUNT):
-        held[k] = share * penalty[k]
-    if not _solve(rows, product, held, mine, room, factor, right):
+        ridge[k] = share * penalty[k]
+    if not _solve(rows, product, ridge, targets, room, factor, right):
         return
     assign_rows(found[:, :COUNT], right)
     found[:, COUNT] = 1.0
     if over:
         step = max(1, n // _LEFT_OUT)
         off = np.empty((2, channels, (n + step - 1) // step))
-        left_out(rows, mine, right, factor, step, off[0])
-        _wanted(values, which, first, mine)
+        left_out(rows, targets, right, factor, step, off[0])
+        _wanted(values, which, first, targets)
         for k in range(COUNT):
-            held[k] = LEAST_RESIDUAL * penalty[k]
-        if _solve(rows, product, held, mine, room, factor, right):
-            left_out(rows, mine, right, factor, step, off[1])
+            ridge[k] = LEAST_RESIDUAL * penalty[k]
+        if _solve(rows, product, ridge, targets, room, factor, right):
+            left_out(rows, targets, right, factor, step, off[1])
             _stack(off, right, found)
 
 
@@ -204,13 +207,13 @@ def _wanted(values, which, first, wanted):  # type: ignore[no-untyped-def]
 def _stack(off, plain, found):  # type: ignore[no-untyped-def]
     """Make of `found` [channels, COUNT + 1], a model and what it leaves, and of `plain` [channels, COUNT] the mean
     that misses least what both miss, `off` [2, channels, samples]."""
-    gained, apart = 0.0, 0.0
+    covariance, apart = 0.0, 0.0
     for channel in range(off.shape[1]):
         for number in range(off.shape[2]):
             between = off[1, channel, number] - off[0, channel, number]
-            gained += between * off[1, channel, number]
+            covariance += between * off[1, channel, number]
             apart += between * between
-    share = min(1.0, max(0.0, gained / max(apart, 1e-30)))
+    share = min(1.0, max(0.0, covariance / max(apart, 1e-30)))
     for channel in range(len(found)):
         found[channel, COUNT] = share
         for k in range(COUNT):
@@ -265,11 +268,11 @@ def _same(values, used, channel):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True)
 def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, made):  # type: ignore[no-untyped-def]
     count, samples, channels = made.shape
-    frame, which, total = np.empty((3, 3)), np.arange(samples), np.empty(samples)
+    frame, indices, total = np.empty((3, 3)), np.arange(samples), np.empty(samples)
     x, y, z, rows = np.empty(samples), np.empty(samples), np.empty(samples), np.empty((COUNT, samples))
     for triangle in range(count):
         _frame(normals[triangle], centres_mm[triangle], camera_mm, frame)
-        _directions(frame, centres_mm[triangle], led_mm, which, x, y, z)
+        _directions(frame, centres_mm[triangle], led_mm, indices, x, y, z)
         functions(harmonic, x, y, z, rows)
         for channel in range(channels):
             total[:] = 0.0

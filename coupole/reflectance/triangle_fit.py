@@ -107,18 +107,24 @@ def fit_triangles(
     """Materials from the samples `used` [samples]; normals are fitted if `noise_um` is given."""
     count, _, channels = samples.values.shape
     stiffness = np.full(count, HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
-    found = np.full((count, 5 + 2 * channels), np.nan)
+    parameters = np.full((count, 5 + 2 * channels), np.nan)
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
         _fit_part(
             samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
-            samples.normals[part], stiffness[part], noise_um is not None, np.flatnonzero(used), found[part],
+            samples.normals[part], stiffness[part], noise_um is not None, np.flatnonzero(used), parameters[part],
         )  # fmt: skip
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         list(pool.map(fit, range(0, count, _PART)))
-    parts = found[:, :3], found[:, 5 : 5 + channels], found[:, 5 + channels :], found[:, 3], found[:, 4]
+    parts = (
+        parameters[:, :3],
+        parameters[:, 5 : 5 + channels],
+        parameters[:, 5 + channels :],
+        parameters[:, 3],
+        parameters[:, 4],
+    )
     return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout
 
 
@@ -149,12 +155,12 @@ def recoloured(
 
 def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDArray[np.float32]:
     """[b, samples, channels] what the materials give where the samples were measured; NaN without material."""
-    made = np.full(samples.values.shape, np.nan, np.float32)
+    modelled_values = np.full(samples.values.shape, np.nan, np.float32)
     _model(
         samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, materials.normals, materials.kd,
-        materials.ks, materials.alpha, made,
+        materials.ks, materials.alpha, modelled_values,
     )  # fmt: skip
-    return made
+    return modelled_values
 
 
 @numba.njit(cache=True, nogil=True)
@@ -163,25 +169,25 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
     views = np.empty((len(cameras_mm), 3))
     good, roots = np.empty(samples, np.int64), np.empty(samples)
-    own, packs = np.empty((samples, channels)), np.empty((samples // LANES + 1, ROWS, LANES))
+    colours, packs = np.empty((samples, channels)), np.empty((samples // LANES + 1, ROWS, LANES))
     grey = np.empty(3)
     for triangle in range(count):
-        normal, held = normals[triangle], stiffness[triangle]
+        normal, normal_stiffness = normals[triangle], stiffness[triangle]
         n = gather(
-            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, own, good, roots,
-            lights, half, views,
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, colours, good,
+            roots, lights, half, views,
         )  # fmt: skip
         if n < FEWEST:
             continue
-        chosen = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, held, packs)
+        start = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, normal_stiffness, packs)
         count = pack(roots[:n], good[:n], lights, half, views, view_of, packs)
-        _, spread = fit_packs(packs[:count], views, chosen, normal, held, USUAL, _SETTLED)
-        assign(found[triangle, :3], chosen[:3] if free else normal)
-        found[triangle, 3], found[triangle, 4] = math.exp(chosen[5]), spread
+        _, rms = fit_packs(packs[:count], views, start, normal, normal_stiffness, USUAL, _SETTLED)
+        assign(found[triangle, :3], start[:3] if free else normal)
+        found[triangle, 3], found[triangle, 4] = math.exp(start[5]), rms
         kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
         for k in range(3):
-            grey[k] = math.exp(chosen[3 + k])
-        colours_from(own, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
+            grey[k] = math.exp(start[3 + k])
+        colours_from(colours, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
         for channel in range(channels):
             ks[channel] = min(ks[channel], MOST_KS)
 
@@ -190,17 +196,17 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
 def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, used, kd, ks):  # type: ignore[no-untyped-def]
     count, samples, channels = values.shape
     lights, half, views = np.empty((samples, 3)), np.empty((samples, 3)), np.empty((len(cameras_mm), 3))
-    good, roots, own = np.empty(samples, np.int64), np.empty(samples), np.empty((samples, channels))
+    good, roots, colours = np.empty(samples, np.int64), np.empty(samples), np.empty((samples, channels))
     for triangle in range(count):
         if not grey[triangle, 2] > 0.0:
             continue
         normal = normals[triangle]
         n = gather(
-            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, own, good, roots,
-            lights, half, views,
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, colours, good,
+            roots, lights, half, views,
         )  # fmt: skip
         colours_from(
-            own, good[:n], normal, grey[triangle], lights, half, views, view_of, kd[triangle], ks[triangle]
+            colours, good[:n], normal, grey[triangle], lights, half, views, view_of, kd[triangle], ks[triangle]
         )
         for channel in range(channels):
             ks[triangle, channel] = min(ks[triangle, channel], MOST_KS)
@@ -241,15 +247,15 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, pa
     kd = _first_kd(roots, good, lights, normal)
     step = max(1, len(good) // _TO_CHOOSE)
     count = pack(roots[::step], good[::step], lights, half, views, view_of, packs)
-    unknowns, chosen, best = np.empty(6), np.empty(6), np.inf
+    unknowns, best_unknowns, best = np.empty(6), np.empty(6), np.inf
     for alpha in _STARTS:
         assign(unknowns[:3], normal)
         unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
         cost, _ = fit_packs(packs[:count], views, unknowns, normal, stiffness, USUAL, _CHOSEN)
         if cost < best:
             best = cost
-            assign(chosen, unknowns)
-    return chosen
+            assign(best_unknowns, unknowns)
+    return best_unknowns
 
 
 @numba.njit(cache=True, nogil=True)

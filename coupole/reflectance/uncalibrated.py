@@ -58,41 +58,47 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
     run = Run(folder)
     files = read_plan(run.plan_path, run.rig_path)
     frames = open_light_frames([folder])
-    chosen = frames_of_leds(folder, frames, view)
+    frame_of_led = frames_of_leds(folder, frames, view)
     out.mkdir(parents=True, exist_ok=True)
-    leds = sorted(chosen)
-    shortest_us = min(frame.exposure_us for frame in chosen.values())
-    about = {"view": chosen[leds[0]].view, "frames": [str(chosen[led].shot) for led in leds], "run": frames.inputs}
+    leds = sorted(frame_of_led)
+    shortest_us = min(frame.exposure_us for frame in frame_of_led.values())
+    about = {
+        "view": frame_of_led[leds[0]].view,
+        "frames": [str(frame_of_led[led].shot) for led in leds],
+        "run": frames.inputs,
+    }
     _refuse_others(out / ABOUT, json.dumps(about) + "\n")
     dark = dark_signal(frames, None)
     brightest = np.zeros((frames.size_px[1] // 2, frames.size_px[0] // 2), np.uint16)
     for number, led in enumerate(leds):
         path = out / f"led{led:04d}.png"
         if not path.exists():
-            picture = _picture(frames, chosen[led], dark(chosen[led]), shortest_us)
+            picture = _picture(frames, frame_of_led[led], dark(frame_of_led[led]), shortest_us)
             complete(path, partial(_write_png, picture))
-        read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        assert read is not None
-        brightest = np.maximum(brightest, read.reshape(*brightest.shape, -1).max(axis=2))
+        stored_picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert stored_picture is not None
+        brightest = np.maximum(brightest, stored_picture.reshape(*brightest.shape, -1).max(axis=2))
         say("pictures", number + 1, len(leds))
-    seen = _nominal(files, chosen, run.simulated)
+    pictured_view = _nominal(files, frame_of_led, run.simulated)
     rows = files.cell.leds.rows(leds)
-    target_mm = _target_mm(files, chosen[leds[0]].base_from_camera)
+    target_mm = _target_mm(files, frame_of_led[leds[0]].base_from_camera)
     light = files.cell.leds.illuminance_lux(target_mm[None])[0, rows]
-    _write_rows(out / LIGHTS, seen.lights_mm / np.linalg.norm(seen.lights_mm, axis=1, keepdims=True))
+    _write_rows(
+        out / LIGHTS, pictured_view.lights_mm / np.linalg.norm(pictured_view.lights_mm, axis=1, keepdims=True)
+    )
     _write_rows(out / INTENSITIES, np.repeat(light[:, None] / light.max(), 3, axis=1))
     write_synced(out / ORDER_FILE, "".join(f"led{led:04d}.png\n" for led in leds))
     mask = np.where(brightest > _LEAST_SHARE * 65535, np.uint8(255), np.uint8(0))
     complete(out / MASK, partial(_write_png, mask))
-    return replace(seen, files=tuple(out / f"led{led:04d}.png" for led in leds))
+    return replace(pictured_view, files=tuple(out / f"led{led:04d}.png" for led in leds))
 
 
 def lights_of_view(folder: Path, view: str | None) -> PicturedView:
     """Return what the pictures of a view of a run are taken with, without writing them. Raises as
     `write_pictures`."""
     run = Run(folder)
-    chosen = frames_of_leds(folder, open_light_frames([folder]), view)
-    return _nominal(read_plan(run.plan_path, run.rig_path), chosen, run.simulated)
+    frame_of_led = frames_of_leds(folder, open_light_frames([folder]), view)
+    return _nominal(read_plan(run.plan_path, run.rig_path), frame_of_led, run.simulated)
 
 
 def _nominal(files: PlanFiles, chosen: dict[int, LightFrame], simulated: bool) -> PicturedView:
@@ -127,16 +133,18 @@ def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[
     name = views[0] if view is None else view
     if name not in views:
         raise InputError(f"--view: expected one of {', '.join(views)}, got {name!r}")
-    found: dict[int, LightFrame] = {}
+    frame_of_led: dict[int, LightFrame] = {}
     for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
         if frame.view != name or frame.led is None:
             continue
-        kept = found.get(frame.led)
-        if kept is None or _clipped(kept, frames.white_dn) > _MOST_CLIPPED:
-            found[frame.led] = frame
-    if len(found) < FEWEST_LIGHTS:
-        raise InputError(f"{folder}: {len(found)} LEDs lit the view {name}; at least {FEWEST_LIGHTS} are needed")
-    return found
+        earlier_frame = frame_of_led.get(frame.led)
+        if earlier_frame is None or _clipped(earlier_frame, frames.white_dn) > _MOST_CLIPPED:
+            frame_of_led[frame.led] = frame
+    if len(frame_of_led) < FEWEST_LIGHTS:
+        raise InputError(
+            f"{folder}: {len(frame_of_led)} LEDs lit the view {name}; at least {FEWEST_LIGHTS} are needed"
+        )
+    return frame_of_led
 
 
 def _clipped(frame: LightFrame, white_dn: int) -> float:

@@ -71,8 +71,8 @@ def read_model(folder: Path) -> ColmapModel:
         ):
             paths = [folder / place / f"{name}{suffix}" for name in ("cameras", "images")]
             if all(path.is_file() for path in paths):
-                found = dict(cameras(paths[0]))
-                return ColmapModel(paths[1], found, tuple(images(paths[1])))
+                cameras_by_number = dict(cameras(paths[0]))
+                return ColmapModel(paths[1], cameras_by_number, tuple(images(paths[1])))
     raise InputError(
         f"{folder}: expected a model of COLMAP, cameras and images as .txt or .bin, there or in sparse/0; found "
         "none. Name the folder that `coupole export RUN --to colmap` made, or COLMAP's output"
@@ -156,8 +156,8 @@ def _records(path: Path, read: Callable[[bytes, int], tuple[Record, int]]) -> It
         data = path.read_bytes()
         (count,), at = struct.unpack_from("<Q", data), 8
         for _ in range(count):
-            one, at = read(data, at)
-            yield one
+            record, at = read(data, at)
+            yield record
     except (OSError, OverflowError, struct.error, ValueError) as error:
         raise InputError(f"{path}: expected COLMAP's binary; it is damaged or cut short: {error}") from error
 

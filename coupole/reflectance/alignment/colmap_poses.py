@@ -74,19 +74,19 @@ def read_poses(folder: Path, measured: MeasuredRun) -> ColmapPoses:
     view that it lacks or has twice, another lens, centres on a line, poses that the records do not allow."""
     model = read_model(folder)
     camera_from_world = _of_views(model, measured)
-    recorded = np.stack([view.base_from_camera for view in measured.views])
+    recorded_poses = np.stack([view.base_from_camera for view in measured.views])
     world_from_camera = inverses(camera_from_world)
-    if len(recorded) >= LEAST_FITTED:
-        _refuse_a_line(model.path, recorded[:, :3, 3], _uncertainties(measured)[:, 0])
-        scale, base_from_world = similarity(world_from_camera[:, :3, 3], recorded[:, :3, 3])
+    if len(recorded_poses) >= LEAST_FITTED:
+        _refuse_a_line(model.path, recorded_poses[:, :3, 3], _uncertainties(measured)[:, 0])
+        scale, base_from_world = similarity(world_from_camera[:, :3, 3], recorded_poses[:, :3, 3])
     else:
         scale, base_from_world = 1.0, measured.base_from_support
-    scaled = world_from_camera.copy()
-    scaled[:, :3, 3] *= scale
-    found = base_from_world @ scaled
-    moved = between(recorded, found)
-    lengths = np.stack([np.linalg.norm(moved[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
-    poses = ColmapPoses(model.path, found, scale, moved, lengths / _uncertainties(measured))
+    scaled_poses = world_from_camera.copy()
+    scaled_poses[:, :3, 3] *= scale
+    base_from_camera = base_from_world @ scaled_poses
+    steps = between(recorded_poses, base_from_camera)
+    lengths = np.stack([np.linalg.norm(steps[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
+    poses = ColmapPoses(model.path, base_from_camera, scale, steps, lengths / _uncertainties(measured))
     _refuse_far(poses, measured)
     return poses
 
@@ -97,8 +97,8 @@ def similarity(of_points: Floats, to_points: Floats) -> tuple[float, Floats]:
     of, to = of_points - middle_of, to_points - middle_to
     covariance = to.T @ of
     turn = nearest_rotation(covariance)
-    spread = float(np.sum(of**2))
-    scale = float(np.trace(turn.T @ covariance)) / max(spread, np.finfo(float).tiny)
+    square_sum = float(np.sum(of**2))
+    scale = float(np.trace(turn.T @ covariance)) / max(square_sum, np.finfo(float).tiny)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, middle_to - scale * turn @ middle_of
     return scale, motion
@@ -108,7 +108,7 @@ def _of_views(model: ColmapModel, measured: MeasuredRun) -> Floats:
     """[v, 4, 4] camera_from_world of the run's views. Raises InputError for one without, or of another lens."""
     stems = [Path(image.name).stem for image in model.images]
     by_name = dict(zip(stems, model.images, strict=True))
-    found = []
+    camera_from_world = []
     for view in measured.views:
         if (count := stems.count(view.name)) != 1:
             names = ", ".join(sorted(image.name for image in model.images)[:5]) or "none"
@@ -120,8 +120,8 @@ def _of_views(model: ColmapModel, measured: MeasuredRun) -> Floats:
         if image.camera not in model.cameras:
             raise InputError(f"{model.path}: image {image.name}: its camera {image.camera} is not in the model")
         _refuse_other_lens(model.path, image.camera, model.cameras[image.camera], measured)
-        found.append(image.camera_from_world)
-    return np.stack(found)
+        camera_from_world.append(image.camera_from_world)
+    return np.stack(camera_from_world)
 
 
 def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured: MeasuredRun) -> None:
@@ -129,33 +129,36 @@ def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured: 
     where = f"{path.with_stem('cameras')}: camera {number}"
     if camera.size_px != measured.frames.size_px:
         raise InputError(f"{where}: expected pictures of {measured.frames.size_px} px; found {camera.size_px}")
-    given = dict(camera.parameters)
-    if "f" in given:
-        given["fx"] = given["fy"] = given.pop("f")
+    parameters = dict(camera.parameters)
+    if "f" in parameters:
+        parameters["fx"] = parameters["fy"] = parameters.pop("f")
     prior = measured.camera
     u = dict(zip(prior.free, np.sqrt(np.diag(prior.covariance)), strict=False))
-    for name in (*NAMES, *(name for name in given if name not in NAMES)):
-        ours = getattr(measured.lens, name, 0.0) + (_TO_CENTRE_PX if name in ("cx", "cy") else 0.0)
-        apart, allowed = (
-            abs(given.get(name, 0.0) - ours),
-            max(MOST_APART * u.get(name, 0.0), _SAME * max(1.0, abs(ours))),
+    for name in (*NAMES, *(name for name in parameters if name not in NAMES)):
+        lens_parameter = getattr(measured.lens, name, 0.0) + (_TO_CENTRE_PX if name in ("cx", "cy") else 0.0)
+        apart, most_apart = (
+            abs(parameters.get(name, 0.0) - lens_parameter),
+            max(MOST_APART * u.get(name, 0.0), _SAME * max(1.0, abs(lens_parameter))),
         )
-        if apart > allowed:
+        if apart > most_apart:
             raise InputError(
-                f"{where}: another lens than the record's: {name} is {given.get(name, 0.0):.6g} there, {ours:.6g} "
-                f"by the record, which allows {allowed:.2g}. Keep the camera as it was exported (COLMAP's "
-                "bundle adjuster: refine_focal_length, refine_principal_point and refine_extra_params 0)"
+                f"{where}: another lens than the record's: {name} is {parameters.get(name, 0.0):.6g} there, "
+                f"{lens_parameter:.6g} by the record, which allows {most_apart:.2g}. Keep the camera "
+                "as it was exported (COLMAP's bundle adjuster: refine_focal_length, refine_principal_point and "
+                "refine_extra_params 0)"
             )
 
 
 def _uncertainties(measured: MeasuredRun) -> Floats:
     """[v, 2] standard uncertainty of the records' poses in their worst direction: mm, rad."""
-    found = []
+    u_poses = []
     for view in measured.views:
         first = len(view.pointing.free)
-        own = view.pointing.covariance[first : first + 6, first : first + 6]
-        found.append([np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (own[:3, :3], own[3:, 3:])])
-    return np.array(found)
+        pose_covariance = view.pointing.covariance[first : first + 6, first : first + 6]
+        u_poses.append(
+            [np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (pose_covariance[:3, :3], pose_covariance[3:, 3:])]
+        )
+    return np.array(u_poses)
 
 
 def _refuse_a_line(path: Path, centres_mm: Floats, u_mm: Floats) -> None:
@@ -173,13 +176,13 @@ def _refuse_far(poses: ColmapPoses, measured: MeasuredRun) -> None:
         return
     length = float(np.linalg.norm(poses.moved[view, 3 * kind : 3 * kind + 3]))
     how_far = f"{np.degrees(length):.3g} degrees" if kind else f"{length:.3g} mm"
-    taken = (
+    conditions = (
         f"after a similarity to the {len(poses.moved)} cameras of the records"
         if len(poses.moved) >= LEAST_FITTED
         else "in the support's frame, in mm, as with one or two views the model must be"
     )
     raise InputError(
         f"{poses.path}: the camera of {measured.views[view].name} is {how_far} from where the records have it, "
-        f"{taken}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} at "
-        "most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
+        f"{conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} "
+        "at most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
     )

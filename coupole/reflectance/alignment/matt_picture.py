@@ -72,12 +72,12 @@ def _green_blocks(raw, dark, flat, green, top_dn, exposure_us, means):  # type: 
         for column in range(means.shape[1]):
             if not np.isinf(means[row, column]):
                 continue
-            total, count, clipped = 0.0, 0, False
+            total, count, any_clipped = 0.0, 0, False
             for pixel in range(4):
                 y, x = 2 * row + pixel // 2, 2 * column + pixel % 2
                 if green[y, x]:
                     total += (float(raw[y, x]) - dark[y, x]) / flat[y, x]
                     count += 1
-                    clipped |= raw[y, x] >= top_dn
-            if not clipped:
+                    any_clipped |= raw[y, x] >= top_dn
+            if not any_clipped:
                 means[row, column] = total / (count * exposure_us)

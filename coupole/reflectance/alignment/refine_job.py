@@ -62,26 +62,28 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
     runs = [read_measured_run(run, request.mesh, request.calibrations) for run in request.runs]
     refuse_different(runs)
     _refuse_other_cameras(runs)
-    views = [(measured, view) for measured in runs for view in measured.views]
+    views = [(measured_run, view) for measured_run in runs for view in measured_run.views]
     if len(views) < 2:
         raise InputError(f"{request.runs[0]}: has one view; what views disagree about needs two or more")
     leds = common_leds([view for _, view in views])
-    radiometry = {measured.run.folder: Radiometry(measured) for measured in runs}
+    radiometry = {measured_run.run.folder: Radiometry(measured_run) for measured_run in runs}
     pictures = [
-        matt_picture(measured, radiometry[measured.run.folder], view, leds, say) for measured, view in views
+        matt_picture(measured_run, radiometry[measured_run.run.folder], view, leds, say)
+        for measured_run, view in views
     ]
-    given = given_by(runs, request.doubts)
+    geometry = given_by(runs, request.doubts)
     threads = len(os.sched_getaffinity(0))
-    refined = refine(given, pictures, request.doubts, request.search_mm, threads, say)
-    names = [(measured.run.folder.name, view.name) for measured, view in views]
-    about = {**_about(refined, runs, names, leds, request), "seconds": round(time.monotonic() - begun_s, 3)}
+    refinement = refine(geometry, pictures, request.doubts, request.search_mm, threads, say)
+    names = [(measured_run.run.folder.name, view.name) for measured_run, view in views]
+    about = {**_about(refinement, runs, names, leds, request), "seconds": round(time.monotonic() - begun_s, 3)}
     try:
         make_folder(out)
-        simulated = any(measured.run.simulated for measured in runs)
+        any_simulated = any(measured_run.run.simulated for measured_run in runs)
         digest = sha256(runs[0].mesh_path)
-        complete(out / MESH, partial(_write_mesh, refined, runs[0]))
+        complete(out / MESH, partial(_write_mesh, refinement, runs[0]))
         complete(
-            out / REFINED, lambda path: write_refined(path, refined, names, pictures, digest, simulated=simulated)
+            out / REFINED,
+            lambda path: write_refined(path, refinement, names, pictures, digest, simulated=any_simulated),
         )
         write_synced(out / ABOUT, json.dumps(about, indent=1) + "\n")
     except OSError as error:
@@ -93,9 +95,14 @@ def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
     """Geometry of the runs of one camera and object, as records and scan have it."""
     first, prior = runs[0], runs[0].camera
     if prior.axis_sensitivity is not None:
-        each = [measured.camera.axis_sensitivity for measured in runs]
-        prior = replace(prior, axis_sensitivity=np.concatenate([one for one in each if one is not None]))
-    cameras = np.stack([view.base_from_camera for measured in runs for view in measured.views])
+        sensitivities = [measured_run.camera.axis_sensitivity for measured_run in runs]
+        prior = replace(
+            prior,
+            axis_sensitivity=np.concatenate(
+                [sensitivity for sensitivity in sensitivities if sensitivity is not None]
+            ),
+        )
+    cameras = np.stack([view.base_from_camera for measured_run in runs for view in measured_run.views])
     covariance = camera_covariance(prior, cameras, doubts)
     triangles = renumbered(first.triangles)
     return Given(first.lens, prior.free, cameras, covariance, welded(first.corners_mm, triangles), triangles)
@@ -104,10 +111,10 @@ def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
 def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
     """Raises InputError for runs with different records of the camera."""
     first = measured_runs[0]
-    for other in measured_runs[1:]:
-        if sha256(first.records["hand-eye"]) != sha256(other.records["hand-eye"]):
+    for other_run in measured_runs[1:]:
+        if sha256(first.records["hand-eye"]) != sha256(other_run.records["hand-eye"]):
             raise InputError(
-                f"{other.run.folder} and {first.run.folder} name different hand-eye records; one camera is "
+                f"{other_run.run.folder} and {first.run.folder} name different hand-eye records; one camera is "
                 "refined: name its record with --calibrations"
             )
 
@@ -132,18 +139,20 @@ def _about(
     request: RefineRequest,
 ) -> dict[str, Any]:
     unknowns, u = refined.unknowns, refined.uncertainties
-    stated = np.sqrt(np.diag(unknowns.covariance))
+    stated_u = np.sqrt(np.diag(unknowns.covariance))
     edge_mm = _mean_edge_mm(unknowns.given)
     shape = refined.steps[unknowns.shape]
     cameras = []
     for number, name in enumerate(names):
-        mine = unknowns.camera(number)
-        moved = {"moved": refined.steps[mine], "u": u[mine], "stated_u": stated[mine]}
-        cameras.append({"run": name[0], "view": name[1]} | {key: _mm_deg(six) for key, six in moved.items()})
+        columns = unknowns.camera(number)
+        camera_steps = {"moved": refined.steps[columns], "u": u[columns], "stated_u": stated_u[columns]}
+        cameras.append(
+            {"run": name[0], "view": name[1]} | {key: _mm_deg(six) for key, six in camera_steps.items()}
+        )
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "scipy")},
-        "simulated": any(measured.run.simulated for measured in runs),
+        "simulated": any(measured_run.run.simulated for measured_run in runs),
         "inputs": {m.run.folder.name: dict(m.frames.inputs) for m in runs},
         "mesh_sha256": sha256(runs[0].mesh_path),
         "leds": list(leds),
@@ -153,14 +162,14 @@ def _about(
             "after": _disagreement(refined.after, edge_mm),
         },
         "lens": {
-            name: {"moved": float(refined.steps[i]), "u": float(u[i]), "stated_u": float(stated[i])}
+            name: {"moved": float(refined.steps[i]), "u": float(u[i]), "stated_u": float(stated_u[i])}
             for i, name in enumerate(unknowns.names[unknowns.lens])
         },
         "cameras": cameras,
         "mesh": {
             "moved": _mm_deg(refined.steps[unknowns.mesh]),
             "u": _mm_deg(u[unknowns.mesh]),
-            "stated_u": _mm_deg(stated[unknowns.mesh]),
+            "stated_u": _mm_deg(stated_u[unknowns.mesh]),
             "shape_rms_mm": float(np.sqrt(np.mean(shape**2))),
             "shape_median_u_mm": float(np.median(u[unknowns.shape])),
             "shape_stated_u_mm": request.doubts.shape_mm,

@@ -150,9 +150,9 @@ def write_refined(
         for name in ("views", "names"):
             file[name].attrs["told"] = TOLD[name]
         for when, matches in (("before", refined.before), ("after", refined.after)):
-            for name, told in MATCH_FIELDS.items():
+            for name, description in MATCH_FIELDS.items():
                 data = file.create_dataset(f"{when}/{name}", data=getattr(matches, name), track_times=False)
-                data.attrs["told"] = told
+                data.attrs["told"] = description
         for number, picture in enumerate(pictures):
             data = file.create_dataset(f"pictures/{number}", data=_preview(picture), track_times=False)
             data.attrs["blocks"] = picture.shape
@@ -166,12 +166,12 @@ def _pointings(
     of_lens = [place for place, name in enumerate(names) if name.removesuffix("_px") in NAMES]
     of_mesh = [place for place, name in enumerate(names) if name.startswith("mesh.")]
     free = tuple(names[place].removesuffix("_px") for place in of_lens)
-    found = {}
+    pointings = {}
     for number, view in enumerate(views):
         of_camera = [place for place, name in enumerate(names) if name.startswith(f"camera{number}.")]
-        own = [*of_lens, *of_camera, *of_mesh]
-        found[view] = Pointing(free, covariance[np.ix_(own, own)], middle_mm)
-    return found
+        indices = [*of_lens, *of_camera, *of_mesh]
+        pointings[view] = Pointing(free, covariance[np.ix_(indices, indices)], middle_mm)
+    return pointings
 
 
 def _told(folder: Path, name: str) -> Any:
@@ -187,5 +187,5 @@ def _preview(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
     every = -(-picture.shape[1] // PREVIEW_PX)
     small = picture[::every, ::every]
     share = np.nan_to_num(small / np.nanpercentile(small, 99.5), nan=1.0)  # what is clipped is white
-    shown: NDArray[np.uint8] = (255 * np.clip(share, 0, 1) ** 0.5).astype(np.uint8)
-    return shown
+    preview: NDArray[np.uint8] = (255 * np.clip(share, 0, 1) ** 0.5).astype(np.uint8)
+    return preview

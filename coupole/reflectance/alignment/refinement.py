@@ -76,12 +76,12 @@ class Refined:
         unknowns, surface = self.unknowns, slice(self.unknowns.mesh.start, self.unknowns.count)
         vertices = unknowns.given.vertices_mm[chosen]
         normals, covariance = unknowns.normals[chosen], self.covariance[surface, surface]
-        found = np.empty(len(vertices))
+        u_mm = np.empty(len(vertices))
         for first in range(0, len(vertices), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
             by = unknowns.by_surface(vertices[rows], normals[rows])
-            found[rows] = np.sqrt(np.sum((by @ covariance) * by, axis=1))
-        return found
+            u_mm[rows] = np.sqrt(np.sum((by @ covariance) * by, axis=1))
+        return u_mm
 
     @property
     def determined(self) -> float:
@@ -106,17 +106,17 @@ def refine(
     steps = np.zeros(unknowns.count)
     matches = before = _matched(unknowns, steps, pictures, search_mm, threads, say)
     for number in range(ROUNDS):
-        adjusted = _adjusted(unknowns, steps, matches)
+        adjustment = _adjusted(unknowns, steps, matches)
         say("rounds of refinement", number + 1, ROUNDS)
-        settled = float(np.median(matches.apart_mm))
+        apart_before_mm = float(np.median(matches.apart_mm))
         search_mm = min(search_mm, max(search_mm / SEARCH_SHRINKS, LEAST_SEARCH_MM))
-        steps = adjusted.state
+        steps = adjustment.state
         matches = _matched(unknowns, steps, pictures, search_mm, threads, say)
-        if number and settled - float(np.median(matches.apart_mm)) < SETTLED_MM:
+        if number and apart_before_mm - float(np.median(matches.apart_mm)) < SETTLED_MM:
             break
     say("rounds of refinement", ROUNDS, ROUNDS)
-    component = adjusted.components[0]
-    return Refined(unknowns, steps, adjusted.covariance, before, matches, component.factor, component.rejected)
+    component = adjustment.components[0]
+    return Refined(unknowns, steps, adjustment.covariance, before, matches, component.factor, component.rejected)
 
 
 def surfaces_of(
@@ -142,14 +142,14 @@ def _matched(
     threads: int,
     say: Said,
 ) -> Matches:
-    found = match_views(surfaces_of(unknowns, steps, pictures, threads), search_mm, threads, say)
-    if len(found.blocks) < FEWEST_MATCHES:
+    matches = match_views(surfaces_of(unknowns, steps, pictures, threads), search_mm, threads, say)
+    if len(matches.blocks) < FEWEST_MATCHES:
         raise InputError(
             f"views are matched by what they show of the surface: expected {FEWEST_MATCHES} matches or more, "
-            f"found {len(found.blocks)}. Do views overlap, has the object texture, and is --search-mm as far as "
+            f"found {len(matches.blocks)}. Do views overlap, has the object texture, and is --search-mm as far as "
             "they disagree?"
         )
-    return found
+    return matches
 
 
 def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
@@ -160,10 +160,11 @@ def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[F
     everything = np.arange(unknowns.count)
 
     def evaluate(state: Floats) -> list[Block]:
-        moved = [
-            replace(one, residuals=one.residuals - one.jacobian @ (state - steps)[one.columns]) for one in lines
+        blocks = [
+            replace(block, residuals=block.residuals - block.jacobian @ (state - steps)[block.columns])
+            for block in lines
         ]
-        return [*moved, Block(-inverse @ state, inverse, everything, 1)]
+        return [*blocks, Block(-inverse @ state, inverse, everything, 1)]
 
     return adjust(
         steps,
@@ -182,20 +183,20 @@ def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Blo
     surface = np.arange(unknowns.mesh.start, unknowns.count)
     blocks = []
     for a, b in product(views, repeat=2):
-        mine = matches.some((matches.reference == a) & (matches.other == b))
-        if not len(mine.blocks):
+        pair_matches = matches.some((matches.reference == a) & (matches.other == b))
+        if not len(pair_matches.blocks):
             continue
-        first = _seen(cameras[a], lens, unknowns, mine.points_mm)
-        second = _seen(cameras[b], lens, unknowns, mine.points_mm)
+        first = _seen(cameras[a], lens, unknowns, pair_matches.points_mm)
+        second = _seen(cameras[b], lens, unknowns, pair_matches.points_mm)
         # [n, 3, 3]: rows of the first view's derivatives by the place, and the normal
-        across = np.linalg.inv(np.concatenate([first.by_place, mine.normals[:, None]], axis=1))
-        along = across[:, :, 2:] @ unknowns.by_surface(mine.points_mm, mine.normals)[:, None]
+        across = np.linalg.inv(np.concatenate([first.by_place, pair_matches.normals[:, None]], axis=1))
+        along = across[:, :, 2:] @ unknowns.by_surface(pair_matches.points_mm, pair_matches.normals)[:, None]
         by_place = second.by_place
-        carried = -by_place @ across[:, :, :2]
+        second_by_first = -by_place @ across[:, :, :2]
         derivatives = np.concatenate(
             [
-                second.by_lens + carried @ first.by_lens,
-                carried @ first.by_camera,
+                second.by_lens + second_by_first @ first.by_lens,
+                second_by_first @ first.by_camera,
                 second.by_camera,
                 by_place @ along,
             ],
@@ -204,8 +205,8 @@ def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Blo
         columns = np.concatenate(
             [np.r_[unknowns.lens], np.r_[unknowns.camera(a)], np.r_[unknowns.camera(b)], surface]
         )
-        whitening = np.linalg.inv(np.linalg.cholesky(mine.covariance))
-        residuals = whitening @ (mine.found - mine.computed)[..., None]
+        whitening = np.linalg.inv(np.linalg.cholesky(pair_matches.covariance))
+        residuals = whitening @ (pair_matches.found - pair_matches.computed)[..., None]
         blocks.append(
             Block(residuals.reshape(-1), (whitening @ derivatives).reshape(-1, len(columns)), columns, 0)
         )
@@ -228,9 +229,9 @@ def _seen(camera: Floats, lens: optics.Intrinsics, unknowns: Unknowns, points_mm
     """`lens` is of pixels; a block is two of them."""
     turn, place = camera[:3, :3], camera[:3, 3]
     inside = (points_mm - place) @ turn
-    seen = optics.project(inside, lens.vector())
-    by_point = seen.by_point / 2
+    projection = optics.project(inside, lens.vector())
+    by_point = projection.by_point / 2
     by_place = by_point @ turn.T
     free = [optics.NAMES.index(name) for name in unknowns.given.free]
     by_camera = np.concatenate([-by_place, by_point @ skew(inside)], axis=2)
-    return _Seen(by_place, seen.by_intrinsics[:, :, free] / 2, by_camera)
+    return _Seen(by_place, projection.by_intrinsics[:, :, free] / 2, by_camera)

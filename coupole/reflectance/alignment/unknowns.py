@@ -112,15 +112,15 @@ class Unknowns:
 
     def vertices_at(self, steps: Floats) -> Floats:
         """[n, 3] base frame."""
-        given, mesh = self.given, steps[self.mesh]
+        geometry, mesh = self.given, steps[self.mesh]
         along = cho_solve(cho_factor(self._shape_covariance), steps[self.shape])
-        shaped = given.vertices_mm.copy()
-        for first in range(0, len(shaped), _TOGETHER):
+        vertices_mm = geometry.vertices_mm.copy()
+        for first in range(0, len(vertices_mm), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
-            displaced_mm = self._kernel(given.vertices_mm[rows], self.controls_mm) @ along
-            shaped[rows] += displaced_mm[:, None] * self.normals[rows]
-        turned: Floats = (shaped - self.middle_mm) @ rotation(mesh[3:]).T + self.middle_mm + mesh[:3]
-        return turned
+            displaced_mm = self._kernel(geometry.vertices_mm[rows], self.controls_mm) @ along
+            vertices_mm[rows] += displaced_mm[:, None] * self.normals[rows]
+        turned_mm: Floats = (vertices_mm - self.middle_mm) @ rotation(mesh[3:]).T + self.middle_mm + mesh[:3]
+        return turned_mm
 
     def by_surface(self, points_mm: Floats, normals: Floats) -> Floats:
         """[n, 6 + controls] how far the surface moves along its normal at places, by steps of mesh and shape."""
@@ -130,8 +130,8 @@ class Unknowns:
     def weights(self, points_mm: Floats) -> Floats:
         """[n, controls] of the control points' displacements in that of a place."""
         near = self._kernel(points_mm, self.controls_mm)
-        found: Floats = cho_solve(cho_factor(self._shape_covariance), near.T).T
-        return found
+        weights: Floats = cho_solve(cho_factor(self._shape_covariance), near.T).T
+        return weights
 
     @cached_property
     def normals(self) -> Floats:
@@ -140,22 +140,26 @@ class Unknowns:
 
     @cached_property
     def _shape_covariance(self) -> Floats:
-        each = self.doubts.shape_mm**2
-        return self._kernel(self.controls_mm, self.controls_mm) + _NUGGET * each * np.eye(len(self.controls_mm))
+        variance_mm2 = self.doubts.shape_mm**2
+        return self._kernel(self.controls_mm, self.controls_mm) + _NUGGET * variance_mm2 * np.eye(
+            len(self.controls_mm)
+        )
 
     def _kernel(self, one_mm: Floats, other_mm: Floats) -> Floats:
         square = np.sum(one_mm**2, axis=1)[:, None] + np.sum(other_mm**2, axis=1) - 2 * one_mm @ other_mm.T
-        found: Floats = self.doubts.shape_mm**2 * np.exp(-np.maximum(square, 0.0) / (2 * self.doubts.scale_mm**2))
-        return found
+        covariance_mm2: Floats = self.doubts.shape_mm**2 * np.exp(
+            -np.maximum(square, 0.0) / (2 * self.doubts.scale_mm**2)
+        )
+        return covariance_mm2
 
 
 def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
     """[n, 3] unit; means of the triangles', weighted by their areas."""
     corners = vertices_mm[triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    each = np.repeat(across, 3, axis=0)
+    corner_normals = np.repeat(across, 3, axis=0)
     count, corner = len(vertices_mm), triangles.reshape(-1)
-    total = np.stack([np.bincount(corner, each[:, k], count) for k in range(3)], axis=1)
+    total = np.stack([np.bincount(corner, corner_normals[:, k], count) for k in range(3)], axis=1)
     result: Floats = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
     return result
 
@@ -163,24 +167,24 @@ def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats
 def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
     """Some of points [n, 3], each the farthest from those before it, until all others are within `spacing_mm` of
     one. Raises InputError if that takes more than `MOST_CONTROLS`."""
-    chosen = [int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))]
-    far = np.linalg.norm(points_mm - points_mm[chosen[0]], axis=1)
-    while far.max() > spacing_mm and len(chosen) < MOST_CONTROLS:
-        chosen.append(int(far.argmax()))
-        far = np.minimum(far, np.linalg.norm(points_mm - points_mm[chosen[-1]], axis=1))
+    indices = [int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))]
+    far = np.linalg.norm(points_mm - points_mm[indices[0]], axis=1)
+    while far.max() > spacing_mm and len(indices) < MOST_CONTROLS:
+        indices.append(int(far.argmax()))
+        far = np.minimum(far, np.linalg.norm(points_mm - points_mm[indices[-1]], axis=1))
     if far.max() > spacing_mm:
         raise InputError(
             f"--scale-mm: expected {np.ceil(far.max()):g} or more for an object of this size, got {spacing_mm:g}; "
             f"the surface is refined at {MOST_CONTROLS} points at most"
         )
-    return points_mm[chosen]
+    return points_mm[indices]
 
 
 def renumbered(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """[m, 3] places of triangles' corners among the vertices that triangles use, which keep their order."""
-    used = np.zeros(int(triangles.max()) + 1, np.bool_)
-    used[triangles] = True
-    return (np.cumsum(used) - 1)[triangles].astype(np.uint32)
+    in_use = np.zeros(int(triangles.max()) + 1, np.bool_)
+    in_use[triangles] = True
+    return (np.cumsum(in_use) - 1)[triangles].astype(np.uint32)
 
 
 def welded(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:

@@ -66,11 +66,11 @@ class Matches:
     @property
     def apart_mm(self) -> Floats:
         """[n]"""
-        found: Floats = np.linalg.norm(self.shifts_mm, axis=1)
-        return found
+        lengths_mm: Floats = np.linalg.norm(self.shifts_mm, axis=1)
+        return lengths_mm
 
     def some(self, chosen: NDArray[np.bool_]) -> Matches:
-        return Matches(*(getattr(self, one.name)[chosen] for one in fields(self)))
+        return Matches(*(getattr(self, attribute.name)[chosen] for attribute in fields(self)))
 
 
 def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, say: Said) -> Matches:
@@ -78,16 +78,16 @@ def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, sa
     to `search_mm`. Windows of a view do not overlap."""
     half = int(np.clip(views[0].picture.shape[1] / WINDOWS_ACROSS, SMALLEST_HALF, LARGEST_HALF))
     places = [_places(number, views, half) for number in range(len(views))]
-    total = sum(len(one.blocks) for one in places)
+    total = sum(len(part.blocks) for part in places)
     every = max(1, -(-total // MOST_PLACES))
-    some = [one.thinned(every) for one in places]
+    some = [part.thinned(every) for part in places]
     jobs = [(a, b) for a, b in product(range(len(views)), repeat=2) if a != b]
-    found: list[Matches] = []
+    pair_matches: list[Matches] = []
     with ThreadPoolExecutor(threads) as pool:
-        for one in pool.map(lambda pair: _match_pair(views, some[pair[0]], pair, half, search_mm), jobs):
-            found.append(one)
-            say("pairs of views", len(found), len(jobs))
-    return Matches(*(np.concatenate([getattr(one, f.name) for one in found]) for f in fields(Matches)))
+        for part in pool.map(lambda pair: _match_pair(views, some[pair[0]], pair, half, search_mm), jobs):
+            pair_matches.append(part)
+            say("pairs of views", len(pair_matches), len(jobs))
+    return Matches(*(np.concatenate([getattr(part, f.name) for part in pair_matches]) for f in fields(Matches)))
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _places(number: int, views: Sequence[ViewSurface], half: int) -> _Places:
     at, planes = np.array(blocks, np.int64).reshape(-1, 2), np.array(normals).reshape(-1, 3)
     points_mm = _on_planes(view, at.astype(float), np.array(middles).reshape(-1, 3), planes)
     nearest = view.points_mm[at[:, 1], at[:, 0]].astype(np.float64)
-    detail = np.stack([one.detail(nearest, planes) for one in views], axis=1)
+    detail = np.stack([surface.detail(nearest, planes) for surface in views], axis=1)
     best = (detail[:, number] > 0) & (detail.argmax(axis=1) == number)
     return _Places(at[best], points_mm[best], planes[best], detail[best])
 
@@ -133,31 +133,33 @@ def _on_planes(view: ViewSurface, blocks: Floats, points_mm: Floats, normals: Fl
     """[n, 3] where rays of blocks meet planes through points."""
     ways, eye = view.rays(blocks), view.base_from_camera[:3, 3]
     far = np.sum((points_mm - eye) * normals, axis=1) / np.sum(ways * normals, axis=1)
-    found: Floats = eye + far[:, None] * ways
-    return found
+    places_mm: Floats = eye + far[:, None] * ways
+    return places_mm
 
 
 def _match_pair(
     views: Sequence[ViewSurface], places: _Places, pair: tuple[int, int], half: int, search_mm: float
 ) -> Matches:
     first, second = views[pair[0]], views[pair[1]]
-    asked = np.flatnonzero(places.detail[:, pair[1]] > 0)
-    reach = np.ceil(search_mm * np.sqrt(places.detail[asked, pair[0]]))
-    made = [
+    candidates = np.flatnonzero(places.detail[:, pair[1]] > 0)
+    reach = np.ceil(search_mm * np.sqrt(places.detail[candidates, pair[0]]))
+    shifts = [
         _shift(first, second, places.blocks[place], half, min(max(int(blocks), 2), MOST_REACH))
-        for place, blocks in zip(asked, reach, strict=True)
+        for place, blocks in zip(candidates, reach, strict=True)
     ]
-    at = asked[[one is not None for one in made]]
-    shift = np.array([one[0] for one in made if one is not None]).reshape(-1, 2)
-    covariance = np.array([one[1] for one in made if one is not None]).reshape(-1, 2, 2)
+    at = candidates[[estimate is not None for estimate in shifts]]
+    shift = np.array([estimate[0] for estimate in shifts if estimate is not None]).reshape(-1, 2)
+    covariance = np.array([estimate[1] for estimate in shifts if estimate is not None]).reshape(-1, 2, 2)
     points, normals, blocks = places.points_mm[at], places.normals[at], places.blocks[at].astype(float)
-    moved = _on_planes(first, blocks + shift, points, normals)
-    found, computed = second.project(moved), second.project(points)
+    matched_mm = _on_planes(first, blocks + shift, points, normals)
+    matched_px, computed_px = second.project(matched_mm), second.project(points)
     steps = [_on_planes(first, blocks + step, points, normals) for step in np.eye(2)]
-    by_shift = np.stack([second.project(step) - computed for step in steps], axis=-1)
+    by_shift = np.stack([second.project(step) - computed_px for step in steps], axis=-1)
     covariance = by_shift @ covariance @ np.swapaxes(by_shift, 1, 2)
-    reference, other = (np.full(len(at), number, np.int64) for number in pair)
-    return Matches(reference, other, blocks, points, normals, found, computed, covariance, moved - points)
+    reference, other_view = (np.full(len(at), number, np.int64) for number in pair)
+    return Matches(
+        reference, other_view, blocks, points, normals, matched_px, computed_px, covariance, matched_mm - points
+    )
 
 
 def _shift(
@@ -167,17 +169,17 @@ def _shift(
     if they are too unlike, or too plain."""
     column, row = map(int, middle)
     window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
-    template, shown = first.picture[window], first.points_mm[(*window, 0)]
+    template, points_mm = first.picture[window], first.points_mm[(*window, 0)]
     lens = second.lens.vector()
-    warped = _warped(
+    second_picture = _warped(
         first.points_mm, row, column, half + reach + _MARGIN, second.picture, second.points_mm,
         second.base_from_camera, lens,
     )  # fmt: skip
-    best, right, down = _best_shift(template, shown, warped, reach)
+    best, right, down = _best_shift(template, points_mm, second_picture, reach)
     at_border = max(abs(right), abs(down)) >= reach  # the true one may lie beyond
     if best < LEAST_CORRELATION or at_border:
         return None
-    good, x, y, covariance = _finer(template, shown, warped, reach, right, down)
+    good, x, y, covariance = _finer(template, points_mm, second_picture, reach, right, down)
     if not good or np.linalg.eigvalsh(covariance)[1] > _WORST_U**2:
         return None
     return np.array([x, y]), covariance
@@ -218,12 +220,12 @@ def _warped(points, row, column, half, other, other_points, pose, lens):  # type
 @numba.njit(cache=True, nogil=True)
 def _cubic(values, x, y):  # type: ignore[no-untyped-def]
     """Interpolated by Keys' kernel (IEEE Trans. ASSP 29, 1981; a = -1/2) from 4 x 4 values."""
-    left, top = int(np.floor(x)) - 1, int(np.floor(y)) - 1
+    left_column, top = int(np.floor(x)) - 1, int(np.floor(y)) - 1
     total = 0.0
     for j in range(4):
         line = 0.0
         for i in range(4):
-            line += _keys(x - (left + i)) * values[top + j, left + i]
+            line += _keys(x - (left_column + i)) * values[top + j, left_column + i]
         total += _keys(y - (top + j)) * line
     return total
 
@@ -256,9 +258,9 @@ def _best_shift(template, shown, warped, reach):  # type: ignore[no-untyped-def]
                         ab += p * q
             if n < _LEAST_SHARE * side * side:
                 continue
-            spread = (aa - a * a / n) * (bb - b * b / n)
-            if spread > 0.0 and (ab - a * b / n) > best * np.sqrt(spread):
-                best, right, down = (ab - a * b / n) / np.sqrt(spread), dx, dy
+            variance_product = (aa - a * a / n) * (bb - b * b / n)
+            if variance_product > 0.0 and (ab - a * b / n) > best * np.sqrt(variance_product):
+                best, right, down = (ab - a * b / n) / np.sqrt(variance_product), dx, dy
     return best, right, down
 
 
@@ -267,9 +269,9 @@ def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-unty
     """Refine a whole shift; return whether the steps converged, the shift, and its covariance [2, 2]."""
     side, first = len(template), _MARGIN + reach
     x, y, gain, offset = float(right), float(down), 1.0, 0.0
-    settled, change = False, np.zeros(4)
+    is_converged, change = False, np.zeros(4)
     for step in range(_STEPS):
-        normal, rhs, left, count = np.zeros((4, 4)), np.zeros(4), 0.0, 0
+        normal, rhs, square_sum, count = np.zeros((4, 4)), np.zeros(4), 0.0, 0
         for j in range(side):
             for i in range(side):
                 at_x, at_y = first + x + i, first + y + j
@@ -284,12 +286,12 @@ def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-unty
                     rhs[k] += row[k] * off
                     for m in range(4):
                         normal[k, m] += row[k] * row[m]
-                left += off * off
+                square_sum += off * off
                 count += 1
         if count < _LEAST_SHARE * side * side or not _invert(normal):
             break
-        if settled:
-            return True, x, y, normal[:2, :2] * (left / (count - 4))
+        if is_converged:
+            return True, x, y, normal[:2, :2] * (square_sum / (count - 4))
         for k in range(4):
             change[k] = 0.0
             for m in range(4):
@@ -297,7 +299,7 @@ def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-unty
         x, y, gain, offset = x + change[0], y + change[1], gain + change[2], offset + change[3]
         if max(abs(x - right), abs(y - down)) > _MOST_FINER:
             break
-        settled = step > 0 and max(abs(change[0]), abs(change[1])) < _SETTLED
+        is_converged = step > 0 and max(abs(change[0]), abs(change[1])) < _SETTLED
     return False, x, y, np.zeros((2, 2))
 
 

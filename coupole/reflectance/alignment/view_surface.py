@@ -40,13 +40,13 @@ class ViewSurface:
     def project(self, points_mm: Floats) -> Floats:
         """[n, 2] blocks of places [n, 3]."""
         inside = apply(inverse(self.base_from_camera), points_mm)
-        found: Floats = optics.project(inside, self.lens.vector()).pixels
-        return found
+        blocks: Floats = optics.project(inside, self.lens.vector()).pixels
+        return blocks
 
     def rays(self, blocks: Floats) -> Floats:
         """[n, 3] unit directions in the base frame of blocks [n, 2]."""
-        found: Floats = unproject(blocks, self.lens) @ self.base_from_camera[:3, :3].T
-        return found
+        directions: Floats = unproject(blocks, self.lens) @ self.base_from_camera[:3, :3].T
+        return directions
 
     def detail(self, points_mm: Floats, normals: Floats) -> Floats:
         """[n] blocks per square millimetre of the surface at places; 0 where the view does not see them."""
@@ -62,8 +62,8 @@ class ViewSurface:
         inside = ahead & (place >= 0).all(axis=1) & (place < (width, height)).all(axis=1)
         column, row = np.where(inside[:, None], place, 0).T
         off = np.linalg.norm(self.points_mm[row, column] - points_mm, axis=1)
-        seen = inside & (off < _SAME_PLACE / np.sqrt(np.maximum(density, 1e-12)))  # also if off is NaN
-        return np.asarray(np.where(seen, density, 0.0))
+        in_view = inside & (off < _SAME_PLACE / np.sqrt(np.maximum(density, 1e-12)))  # also if off is NaN
+        return np.asarray(np.where(in_view, density, 0.0))
 
 
 def view_surface(
@@ -79,12 +79,12 @@ def view_surface(
     height, width = picture.shape
     blocks = block_lens(lens)
     surface = seen_surface(mesh, normals, blocks, base_from_camera, (width, height), threads=threads)
-    used = (surface.places >= 0) & np.isfinite(picture)
-    triangle = surface.triangles[surface.places[used]]
-    ways = directions_of_rows(blocks, width, 0, height)[used] @ base_from_camera[:3, :3].T
+    in_use = (surface.places >= 0) & np.isfinite(picture)
+    triangle = surface.triangles[surface.places[in_use]]
+    ways = directions_of_rows(blocks, width, 0, height)[in_use] @ base_from_camera[:3, :3].T
     eye = base_from_camera[:3, 3]
     corners = np.asarray(mesh.corners_mm)[triangle, 0]
     far = np.sum((corners - eye) * normals[triangle], axis=1) / np.sum(ways * normals[triangle], axis=1)
     points = np.full((height, width, 3), np.nan, np.float32)
-    points[used] = eye + far[:, None] * ways
+    points[in_use] = eye + far[:, None] * ways
     return ViewSurface(picture, points, base_from_camera, blocks)

@@ -73,23 +73,23 @@ def extract_view(
     threads = threads or len(os.sched_getaffinity(0))
     work, surface = view_pass(measured, geometry, radiometry, view, threads)
     codes_of = shadows_of(work, geometry)
-    used, of_code = 0, np.zeros(len(CODES), np.int64)
+    sample_count, of_code = 0, np.zeros(len(CODES), np.int64)
 
     def write(part: Path) -> None:
-        nonlocal used
+        nonlocal sample_count
         with h5py.File(part, "w") as file:
             _write_head(file, work, surface)
             file.attrs["view"] = path.stem
             data = _begin_samples(file, work)
-            done = 0
+            frame_count = 0
             for some in work.samples(codes_of, threads):
                 for name, values in (("codes", some.codes), ("f", some.f), ("u_own", some.u_own)):
                     _write_chunk(data[name], some, values)
-                used += int(np.count_nonzero(np.isfinite(some.f)))
+                sample_count += int(np.count_nonzero(np.isfinite(some.f)))
                 of_code[:] += np.bincount(some.codes.ravel(), minlength=len(CODES))
                 if some.rows.stop == len(surface.triangles):
-                    done += sum(len(view.by_led[int(led)]) for led in work.leds[some.leds])
-                    say(f"samples of {view.name}", done, len(view.frames))
+                    frame_count += sum(len(view.by_led[int(led)]) for led in work.leds[some.leds])
+                    say(f"samples of {view.name}", frame_count, len(view.frames))
 
     complete(path, write, unless=path.with_suffix(".json"))
     return {
@@ -97,7 +97,7 @@ def extract_view(
         "pixels": surface.pixels,
         "triangles": len(surface.triangles),
         "leds": len(work.leds),
-        "samples": used,
+        "samples": sample_count,
         "share_by_code": {name: float(of_code[code] / of_code.sum()) for name, code in CODES.items()},
     }
 
@@ -128,13 +128,13 @@ def view_pass(
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:
     """A function that gives the codes [leds, triangles] of some of the view's LEDs: what object and cell hide."""
-    hidden = _hidden_by_cell(work)
+    hidden_by_cell = _hidden_by_cell(work)
 
     def codes_of(part: slice, pool: Executor) -> NDArray[np.uint8]:
         leds = work.leds[part]
         codes = lamp_codes(geometry.mesh, work.facets, Positions(leds, *work.measured.leds.of(leds)), pool)
-        if hidden is not None:
-            codes[(codes == REACHED) & hidden(leds)] = BY_CELL
+        if hidden_by_cell is not None:
+            codes[(codes == REACHED) & hidden_by_cell(leds)] = BY_CELL
         return codes
 
     return codes_of
@@ -143,12 +143,12 @@ def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor]
 def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None:
     """A function of some LEDs, [leds, triangles] what the run says that arm or tool hide from the nearest patch of
     the object or one beside it, since edges of their shadows lie between patches; None if it says nothing."""
-    measured = work.measured
-    with h5py.File(measured.run.view_path(work.view.name), "r") as file:
+    measured_run = work.measured
+    with h5py.File(measured_run.run.view_path(work.view.name), "r") as file:
         if "entry/shadow/codes" not in file:
             return None
         shadow = {name: file[f"entry/shadow/{name}"][()] for name in ("codes", "leds", "points_mm")}
-    points_mm = apply(measured.base_from_support, shadow["points_mm"])
+    points_mm = apply(measured_run.base_from_support, shadow["points_mm"])
     patches = cKDTree(points_mm)
     patch = patches.query(work.facets.centres_mm)[1]
     column = {int(led): n for n, led in enumerate(shadow["leds"])}
@@ -157,40 +157,40 @@ def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.
     by_cell = by_cell[beside].any(axis=1)
 
     def hidden(leds: NDArray[np.int64]) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = by_cell.T[[column[int(led)] for led in leds]][:, patch]
-        return found
+        is_hidden: NDArray[np.bool_] = by_cell.T[[column[int(led)] for led in leds]][:, patch]
+        return is_hidden
 
     return hidden
 
 
 def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
-    measured, view, leds = work.measured, work.view, work.leds
-    file.attrs["channels"] = "".join(measured.channels)
-    file.attrs["simulated"] = measured.run.simulated
+    measured_run, view, leds = work.measured, work.view, work.leds
+    file.attrs["channels"] = "".join(measured_run.channels)
+    file.attrs["simulated"] = measured_run.run.simulated
     file.attrs["frame"] = "base of the robot"
-    file.attrs["led_u_mm"] = measured.led_u_mm  # of each coordinate of an LED's place
-    u_lateral_mm = view.pointing.u_lateral_mm(measured.lens, view.base_from_camera, work.facets.centres_mm)
+    file.attrs["led_u_mm"] = measured_run.led_u_mm  # of each coordinate of an LED's place
+    u_lateral_mm = view.pointing.u_lateral_mm(measured_run.lens, view.base_from_camera, work.facets.centres_mm)
     file.attrs["lateral_u_mm"] = u_lateral_mm  # of where pixels look, across the line of sight
     file.create_dataset("seen", data=surface.places, compression="gzip", compression_opts=1, track_times=False)
     file["seen"].attrs["told"] = "[h, w] place in `triangles` of what a pixel sees, -1 where it is not used"
     _dataset(file, "triangles", surface.triangles, "numbers of the mesh's triangles, from 0")
     _dataset(file, "pixels", work.reader.pixels, "pixels of each channel on each triangle")
-    told = "relative standard uncertainty that a triangle's samples share, of pixels' own responses"
-    _dataset(file, "u_response", work.reader.u_response, told)
+    description = "relative standard uncertainty that a triangle's samples share, of pixels' own responses"
+    _dataset(file, "u_response", work.reader.u_response, description)
     _dataset(file, "centres_mm", work.facets.centres_mm, "of the triangles, mm, base frame")
     _dataset(file, "normals", work.facets.normals, "of the triangles, unit, base frame")
     _dataset(file, "camera_mm", view.base_from_camera[:3, 3], "projection centre, mm, base frame")
     _dataset(file, "leds", leds, "numbers of the LEDs")
-    centres_mm, normals = measured.leds.of(leds)
+    centres_mm, normals = measured_run.leds.of(leds)
     _dataset(file, "led_positions_mm", centres_mm, "mm, base frame")
     _dataset(file, "led_normals", normals, "unit, base frame")
-    powers = measured.powers.of(leds)
+    powers = measured_run.powers.of(leds)
     _dataset(file, "led_u_own", powers.u_own, "relative standard uncertainty of an LED's power, its own")
-    shared = np.hypot(powers.u_shared, measured.u_signal)
+    u_shared = np.hypot(powers.u_shared, measured_run.u_signal)
     _dataset(
-        file, "led_u_shared", shared, "relative, of what all samples share: powers, response, fall-off, drift"
+        file, "led_u_shared", u_shared, "relative, of what all samples share: powers, response, fall-off, drift"
     )
-    scales = np.stack([_dn_share(measured, view, int(led)) for led in leds])
+    scales = np.stack([_dn_share(measured_run, view, int(led)) for led in leds])
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
 
 
@@ -216,10 +216,10 @@ def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:
         "codes": (np.uint8, (count, leds), f"of a triangle and an LED: {codes}"),
     }
     data = {}
-    for name, (kind, shape, told) in kinds.items():
+    for name, (kind, shape, description) in kinds.items():
         chunks = (min(BLOCK, count), min(work.together, leds), channels)[: len(shape)]
         data[name] = file.create_dataset(name, shape, kind, chunks=chunks, track_times=False)
-        data[name].attrs["told"] = told
+        data[name].attrs["told"] = description
     return data
 
 

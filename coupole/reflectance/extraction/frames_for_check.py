@@ -40,22 +40,22 @@ def write_frames(
     leds = leds[:: -(-len(leds) // MOST_FRAMES)] if leds else []
     with h5py.File(samples, "r") as file:
         of_led = list(file["leds"][()])
-        seen, codes = file["seen"][()], file["codes"][:, np.isin(of_led, leds)]
+        place_of_pixel, codes = file["seen"][()], file["codes"][:, np.isin(of_led, leds)]
     offsets = block_offsets(radiometry.channel, radiometry.channels)
-    height, width = seen.shape
+    height, width = place_of_pixel.shape
 
     def picture(led: int) -> tuple[NDArray[np.float16], float]:
         frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
-        reached = np.append(codes[:, leds.index(led)] == REACHED, False)  # the last one: what is not seen
-        return _picture(radiometry, frame, seen, reached, offsets)
+        is_lit = np.append(codes[:, leds.index(led)] == REACHED, False)  # the last one: what is not seen
+        return _picture(radiometry, frame, place_of_pixel, is_lit, offsets)
 
     with h5py.File(to, "w") as file, ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
         shape = (len(leds), height // 2, width // 2, radiometry.channels)
         data = file.create_dataset("share", shape, np.float16, track_times=False)
         data.attrs["told"] = "[leds, h / 2, w / 2, channels] of the camera's range; NaN where there is none"
         noise = np.full(len(leds), np.nan)
-        for number, (values, expected) in enumerate(pool.map(picture, leds)):
-            data[number], noise[number] = values, expected
+        for number, (values, noise_picture) in enumerate(pool.map(picture, leds)):
+            data[number], noise[number] = values, noise_picture
         file.create_dataset("leds", data=np.array(leds, np.int64), track_times=False)
         file.create_dataset("noise", data=noise, track_times=False)
         file["noise"].attrs["told"] = (

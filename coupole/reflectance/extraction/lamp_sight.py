@@ -57,17 +57,17 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
     codes = np.empty(len(facets.centres_mm), np.uint8)
     _away(facets.centres_mm, facets.normals, centre_mm, normal, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
     starts_mm, lit = facets.ray_starts_mm, np.flatnonzero(codes == REACHED)
-    shaded = lit[mesh.blocked(starts_mm, lit, centre_mm)]
-    codes[shaded] = SHADED
-    edge = _darken_beside(shaded, facets.neighbours, codes)
+    shaded_triangles = lit[mesh.blocked(starts_mm, lit, centre_mm)]
+    codes[shaded_triangles] = SHADED
+    edge = _darken_beside(shaded_triangles, facets.neighbours, codes)
     corners_mm = led_corners_mm(centre_mm[None], normal[None], LED_SIDE_MM)[0]
     for _ in range(_MOST_RINGS):
-        asked = _darken_beside(edge, facets.neighbours, codes)
-        partly = np.zeros(len(asked), np.bool_)
+        candidates = _darken_beside(edge, facets.neighbours, codes)
+        partly = np.zeros(len(candidates), np.bool_)
         for corner_mm in corners_mm:
-            partly |= mesh.blocked(starts_mm, asked, corner_mm)
-        codes[asked[~partly]] = REACHED
-        edge = asked[partly]
+            partly |= mesh.blocked(starts_mm, candidates, corner_mm)
+        codes[candidates[~partly]] = REACHED
+        edge = candidates[partly]
         if not len(edge):
             break
     return codes
@@ -76,15 +76,15 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
 @numba.njit(cache=True, nogil=True)
 def _darken_beside(triangles, neighbours, codes):  # type: ignore[no-untyped-def]
     """Give the lit neighbours of some triangles the code of a penumbra; which they are."""
-    found = np.empty(3 * len(triangles), np.int64)
+    dark_neighbours = np.empty(3 * len(triangles), np.int64)
     count = 0
     for triangle in triangles:
         for beside in neighbours[triangle]:
             if beside >= 0 and codes[beside] == REACHED:
                 codes[beside] = PENUMBRA
-                found[count] = beside
+                dark_neighbours[count] = beside
                 count += 1
-    return found[:count]
+    return dark_neighbours[:count]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -135,6 +135,6 @@ def neighbours_of(triangles: NDArray[np.uint32]) -> NDArray[np.int64]:
     key = sides[:, 0] * (int(triangles.max()) + 1) + sides[:, 1]
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(key[order[1:]] == key[order[:-1]])
-    found = np.full(3 * count, -1, np.int64)
-    found[order[same]], found[order[same + 1]] = order[same + 1] // 3, order[same] // 3
-    return found.reshape(count, 3)
+    neighbours = np.full(3 * count, -1, np.int64)
+    neighbours[order[same]], neighbours[order[same + 1]] = order[same + 1] // 3, order[same] // 3
+    return neighbours.reshape(count, 3)

@@ -66,11 +66,11 @@ class MeasuredView:
     @cached_property
     def by_led(self) -> dict[int, list[LightFrame]]:
         """Frames of each LED, LEDs rising."""
-        found: dict[int, list[LightFrame]] = {}
+        frames_of_led: dict[int, list[LightFrame]] = {}
         for frame in self.frames:
             if frame.led is not None:
-                found.setdefault(frame.led, []).append(frame)
-        return dict(sorted(found.items()))
+                frames_of_led.setdefault(frame.led, []).append(frame)
+        return dict(sorted(frames_of_led.items()))
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ class Powers:
         rows = np.array([self._row.get(int(led), -1) for led in leds])
 
         def picked(values: Floats) -> Floats:
-            found: Floats = values[rows]
-            found[rows < 0] = np.nan
-            return found
+            led_values: Floats = values[rows]
+            led_values[rows < 0] = np.nan
+            return led_values
 
         return Powers(leds, *map(picked, (self.power, self.board_c, self.u_own, self.u_shared)))
 
@@ -151,9 +151,9 @@ class MeasuredRun:
 
     def power_of(self, frame: LightFrame) -> Floats:
         """[channels] power of the LED of a frame at its board's temperature and time; NaN where there is none."""
-        known = self.powers.of(np.array([frame.led]))
-        warmer_k = frame.temperature_c - float(known.board_c[0])
-        power: Floats = known.power[0] * self.drift.factor(warmer_k, frame.t_s)
+        powers = self.powers.of(np.array([frame.led]))
+        warmer_k = frame.temperature_c - float(powers.board_c[0])
+        power: Floats = powers.power[0] * self.drift.factor(warmer_k, frame.t_s)
         return power
 
     @property
@@ -212,8 +212,8 @@ def _direct_light_alone(rig: Rig) -> bool:
     """Tell whether light is direct alone, by the settings of the simulated world, as docs/reference/rig.md has
     them."""
     world = {} if rig.world is None else rig.world.settings
-    asked = world.get("interreflection")
-    return world.get("shading") == "flat" if asked is None else asked is False
+    interreflection = world.get("interreflection")
+    return world.get("shading") == "flat" if interreflection is None else interreflection is False
 
 
 def emission_of(record: Record) -> Emission:
@@ -233,25 +233,25 @@ def read_powers(path: Path, channels: Sequence[str]) -> Powers:
     def column(name: str) -> Floats:
         return np.stack([[float(row[f"{name}_{channel}"]) for channel in channels] for row in rows])
 
-    whole, own = column("u"), column("u_own")
-    shared = np.sqrt(np.maximum(whole**2 - own**2, 0.0))
+    whole, u_own = column("u"), column("u_own")
+    u_shared = np.sqrt(np.maximum(whole**2 - u_own**2, 0.0))
     board_c = np.array([float(row["board_c"]) for row in rows])
-    return Powers(np.array([int(row["id"]) for row in rows]), column("power"), board_c, own, shared)
+    return Powers(np.array([int(row["id"]) for row in rows]), column("power"), board_c, u_own, u_shared)
 
 
 def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
     """Raises InputError for two runs of one name, and for runs of different objects or sensors."""
     first = measured_runs[0]
-    names = [measured.run.folder.name for measured in measured_runs]
+    names = [measured_run.run.folder.name for measured_run in measured_runs]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{twice}: two runs have this name; rename the folder of one, or name each run once")
-    for other in measured_runs[1:]:
-        if not np.array_equal(first.corners_mm, other.corners_mm):
+    for other_run in measured_runs[1:]:
+        if not np.array_equal(first.corners_mm, other_run.corners_mm):
             raise InputError(
-                f"{other.run.folder}: shows another object, or in another place, than {first.run.folder}"
+                f"{other_run.run.folder}: shows another object, or in another place, than {first.run.folder}"
             )
-        if first.channels != other.channels:
-            raise InputError(f"{other.run.folder}: was taken with another sensor than {first.run.folder}")
+        if first.channels != other_run.channels:
+            raise InputError(f"{other_run.run.folder}: was taken with another sensor than {first.run.folder}")
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
@@ -284,22 +284,24 @@ def _u_signal(records: Mapping[str, Path]) -> float:
     """Return the uncertainty of the signal, from the figures with which records of the kinds in `U_SIGNAL` were
     accepted."""
     square = 0.0
-    for kind, what in U_SIGNAL.items():
+    for kind, prefix in U_SIGNAL.items():
         if kind in records:
-            square += sum(one.found**2 for one in read_record(records[kind]).limits if one.what.startswith(what))
+            square += sum(
+                limit.found**2 for limit in read_record(records[kind]).limits if limit.what.startswith(prefix)
+            )
     return math.sqrt(square)
 
 
 def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:
     """Records by their kind, those that are not used left out. Raises InputError for two of a kind."""
-    found: dict[str, Path] = {}
+    path_of_kind: dict[str, Path] = {}
     for path in paths:
         kind = read_record(path).kind
-        if kind in found:
-            raise InputError(f"{path} and {found[kind]} are both of the kind `{kind}`; name one of them")
+        if kind in path_of_kind:
+            raise InputError(f"{path} and {path_of_kind[kind]} are both of the kind `{kind}`; name one of them")
         if kind in USED:
-            found[kind] = path
-    return found
+            path_of_kind[kind] = path
+    return path_of_kind
 
 
 def _views(
@@ -312,18 +314,22 @@ def _views(
             lit.setdefault(frame.view, []).append(frame)
     if not lit:
         raise InputError(f"{run.folder}: no proven frame under a single LED; acquire the plan first")
-    poses = {name: _only_pose(run, name, mine) for name, mine in lit.items()}
+    poses = {name: _only_pose(run, name, view_frames) for name, view_frames in lit.items()}
     base_from_flange = np.stack(list(poses.values()))
     if has_axis_zeros(hand_eye):
         arm = described_arm(rig)
         if arm is None:
             raise InputError(f"{hand_eye}: has zeros of axes, but the run's rig describes no arm")
-        joints_deg = np.stack([mine[0].joints_deg for mine in lit.values() if mine[0].joints_deg is not None])
-        calibrated = read_arm(hand_eye, arm.arm)
-        base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, calibrated, prior)
+        joints_deg = np.stack(
+            [view_frames[0].joints_deg for view_frames in lit.values() if view_frames[0].joints_deg is not None]
+        )
+        calibration = read_arm(hand_eye, arm.arm)
+        base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, calibration, prior)
     base_from_camera = base_from_flange @ prior.flange_from_camera
     views = zip(lit.items(), base_from_camera, pointings(prior, base_from_camera, middle_mm), strict=True)
-    return tuple(MeasuredView(name, pose, tuple(mine), known) for (name, mine), pose, known in views), prior
+    return tuple(
+        MeasuredView(name, pose, tuple(view_frames), pointing) for (name, view_frames), pose, pointing in views
+    ), prior
 
 
 def _only_pose(run: Run, view: str, frames: Sequence[LightFrame]) -> Floats:

@@ -58,10 +58,10 @@ def camera_covariance(prior: CameraPrior, base_from_camera: Floats, doubts: Doub
     by_hand_eye[:, :3, :3] = base_from_flange[:, :3, :3]
     by_hand_eye[:, 3:, 3:] = np.eye(3)
     by_record = np.concatenate([by_hand_eye, by_flange @ prior.by_axes(base_from_flange)], axis=2)
-    spread = block_diag(np.eye(lens), by_record.reshape(6 * count, -1))
-    own = np.diag(np.repeat([doubts.arm_mm**2, np.radians(doubts.arm_deg) ** 2], 3))
-    scatter = block_diag(np.zeros((lens, lens)), *(by_flange @ own @ np.swapaxes(by_flange, 1, 2)))
-    result: Floats = spread @ prior.covariance @ spread.T + scatter
+    propagation = block_diag(np.eye(lens), by_record.reshape(6 * count, -1))
+    flange_covariance = np.diag(np.repeat([doubts.arm_mm**2, np.radians(doubts.arm_deg) ** 2], 3))
+    scatter = block_diag(np.zeros((lens, lens)), *(by_flange @ flange_covariance @ np.swapaxes(by_flange, 1, 2)))
+    result: Floats = propagation @ prior.covariance @ propagation.T + scatter
     return result
 
 
@@ -84,16 +84,18 @@ class Pointing:
         def seen(steps: Floats) -> Floats:
             shift = steps[len(self.free) :]
             steps_of_lens = zip(self.free, steps, strict=False)
-            bent = replace(lens, **{name: getattr(lens, name) + float(step) for name, step in steps_of_lens})
+            bent_lens = replace(lens, **{name: getattr(lens, name) + float(step) for name, step in steps_of_lens})
             camera = moved(base_from_camera[None], shift[None, :6])[0]
             there = (points_mm - self.middle_mm) @ rotation(shift[9:]).T + self.middle_mm + shift[6:9]
             inside = (there - camera[:3, 3]) @ camera[:3, :3]
-            found: Floats = optics.project(inside, bent.vector()).pixels
-            return found
+            pixels: Floats = optics.project(inside, bent_lens.vector()).pixels
+            return pixels
 
         sizes = np.sqrt(np.diag(self.covariance))
         steps = _SMALL * np.diag(np.where(sizes > 0.0, sizes, 1.0))
-        by_step = np.stack([(seen(one) - seen(-one)) / (2.0 * one.max()) for one in steps], axis=-1)
+        by_step = np.stack(
+            [(seen(deviation) - seen(-deviation)) / (2.0 * deviation.max()) for deviation in steps], axis=-1
+        )
         in_pixels = np.einsum("nki,ij,nkj->n", by_step, self.covariance, by_step) / 2.0
         depth_mm = (points_mm - base_from_camera[:3, 3]) @ base_from_camera[:3, 2]
         return float(np.sqrt(np.mean(in_pixels * (depth_mm / lens.fx) ** 2)))
@@ -103,9 +105,9 @@ def pointings(prior: CameraPrior, base_from_camera: Floats, middle_mm: Floats) -
     """Return the pointings of the views of an object from poses [v, 4, 4], by a camera's records and what no
     record states."""
     whole, lens = camera_covariance(prior, base_from_camera, STATED), len(prior.free)
-    found = []
+    view_pointings = []
     for view in range(len(base_from_camera)):
-        own = [*range(lens), *range(lens + 6 * view, lens + 6 * view + 6)]
-        covariance = block_diag(whole[np.ix_(own, own)], STATED.mesh_covariance)
-        found.append(Pointing(prior.free, covariance, middle_mm))
-    return tuple(found)
+        indices = [*range(lens), *range(lens + 6 * view, lens + 6 * view + 6)]
+        covariance = block_diag(whole[np.ix_(indices, indices)], STATED.mesh_covariance)
+        view_pointings.append(Pointing(prior.free, covariance, middle_mm))
+    return tuple(view_pointings)

@@ -72,8 +72,8 @@ class SignalReader:
         self.pixels = np.zeros((count, channels), np.int32)
         """[triangles, channels]"""
         _count(surface.places, radiometry.channel, self.pixels)
-        each = np.sqrt(np.maximum(self.pixels, 1))
-        self.u_response = np.where(self.pixels > 0, radiometry.u_pixel / each, np.inf)
+        root_counts = np.sqrt(np.maximum(self.pixels, 1))
+        self.u_response = np.where(self.pixels > 0, radiometry.u_pixel / root_counts, np.inf)
         """[triangles, channels] relative standard uncertainty that all means share, of pixels' responses."""
         starts = np.concatenate([[0], np.cumsum(self.pixels.ravel(), dtype=np.int64)])
         places = np.empty(starts[-1], np.int32)
@@ -145,6 +145,6 @@ def _list(triangle, channel, next_place, places):  # type: ignore[no-untyped-def
     for row in range(triangle.shape[0]):
         for column in range(width):
             if triangle[row, column] >= 0:
-                mine = triangle[row, column] * channels + channel[row, column]
-                places[next_place[mine]] = row * width + column
-                next_place[mine] += 1
+                list_number = triangle[row, column] * channels + channel[row, column]
+                places[next_place[list_number]] = row * width + column
+                next_place[list_number] += 1

@@ -75,8 +75,8 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
         off = absolute(loaded(codes, row) - np.float32(REACHED))
         per_irradiance = if_less(off, np.float32(0.5), per_irradiance, _NAN)
         for channel in range(f.shape[2]):
-            own = (first + row) * f.shape[2] + channel
-            begin, end = lists.starts[own], lists.starts[own + 1]
+            list_number = (first + row) * f.shape[2] + channel
+            begin, end = lists.starts[list_number], lists.starts[list_number + 1]
             signal, u_signal = _signal(begin, end, channel, lists, response, darks, shots)
             value = signal * per_irradiance / loaded(lamps.powers, channel)
             size = absolute(value)
@@ -124,7 +124,7 @@ def _signal(begin, end, channel, lists, response, darks, shots):  # type: ignore
 def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: ignore[no-untyped-def]
     """Return the mean of one pass, and its variance. NaN where no pixel is, where one is at the range's top, where
     the mean is at its bottom."""
-    none, one = np.float32(0.0), np.float32(1.0)
+    none, unity = np.float32(0.0), np.float32(1.0)
     square, cube = response.curve[channel, 0], response.curve[channel, 1]
     in_dark, gain = response.noise[channel, 0], response.noise[channel, 1]
     slots, dark = shots.slots[number], darks[shots.exposures[number]]
@@ -134,12 +134,12 @@ def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: 
         highest = larger(highest, dn)
         signal = dn - dark[pixel]
         above = above + signal
-        total = total + even * signal * (one + signal * (square + signal * cube))
+        total = total + even * signal * (unity + signal * (square + signal * cube))
         variance = variance + even * even * (in_dark + gain * larger(signal, none))
     count = np.float32(end - begin)
-    mean = total * (one / (count * shots.times_s[number]))
+    mean = total * (unity / (count * shots.times_s[number]))
     mean = if_less(highest, response.top_dn, mean, _NAN)
     mean = if_less(response.least_dn * count, above, mean, _NAN)
     mean = if_less(np.float32(0.5), loaded(shots.there, number), mean, _NAN)
-    scale = one / (count * shots.times_s[number])
+    scale = unity / (count * shots.times_s[number])
     return mean, variance * (scale * scale)

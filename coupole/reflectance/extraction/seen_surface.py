@@ -69,21 +69,23 @@ def seen_surface(
     def trace(first: int) -> None:
         rows = slice(first, min(first + _ROWS, height))
         _turned(directions_of_rows(lens, width, rows.start, rows.stop), base_from_camera, ways[rows])
-        met, distance = mesh.first_met(eye_mm, ways[rows].reshape(-1, 3))
-        hit[rows], far[rows] = met.reshape(-1, width), distance.reshape(-1, width)
+        triangle, distance = mesh.first_met(eye_mm, ways[rows].reshape(-1, 3))
+        hit[rows], far[rows] = triangle.reshape(-1, width), distance.reshape(-1, width)
 
     optics = _circle(lens, *blur) if blur is not None else (0.0, 1.0, np.inf)
-    used = np.zeros((height, width), np.bool_)
+    pixel_in_use = np.zeros((height, width), np.bool_)
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(trace, range(0, height, _ROWS)))
         bands = range(1, height - 1, _ROWS)
-        list(pool.map(lambda row: _judge(hit, far, ways, normals, axis, lens.fx, *optics, row, used), bands))
-    seen = np.zeros(len(normals), np.bool_)
-    seen[hit[used]] = True
-    place = np.cumsum(seen, dtype=np.int32) - 1
-    hit[~used] = -1
-    hit[used] = place[hit[used]]
-    return SeenSurface(hit, np.flatnonzero(seen))
+        list(
+            pool.map(lambda row: _judge(hit, far, ways, normals, axis, lens.fx, *optics, row, pixel_in_use), bands)
+        )
+    triangle_in_view = np.zeros(len(normals), np.bool_)
+    triangle_in_view[hit[pixel_in_use]] = True
+    place = np.cumsum(triangle_in_view, dtype=np.int32) - 1
+    hit[~pixel_in_use] = -1
+    hit[pixel_in_use] = place[hit[pixel_in_use]]
+    return SeenSurface(hit, np.flatnonzero(triangle_in_view))
 
 
 def _circle(
@@ -103,8 +105,8 @@ def _turned(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
             x, y, z = directions[row, column]
             length = np.sqrt(x * x + y * y + z * z)
             for k in range(3):
-                turned = base_from_camera[k, 0] * x + base_from_camera[k, 1] * y + base_from_camera[k, 2] * z
-                ways[row, column, k] = turned / length
+                component = base_from_camera[k, 0] * x + base_from_camera[k, 1] * y + base_from_camera[k, 2] * z
+                ways[row, column, k] = component / length
 
 
 @numba.njit(cache=True, nogil=True)
@@ -136,8 +138,8 @@ def directions_of_rows(lens: Intrinsics, width: int, first: int, end: int) -> Fl
     rows = np.unique(np.append(np.arange(first, end, _GRID_PX), end - 1))
     columns = np.unique(np.append(np.arange(0, width, _GRID_PX), width - 1))
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
-    found = unproject(grid, lens)
-    coarse = (found[:, :2] / found[:, 2:]).reshape(len(rows), len(columns), 2)
+    directions = unproject(grid, lens)
+    coarse = (directions[:, :2] / directions[:, 2:]).reshape(len(rows), len(columns), 2)
     across = np.stack(
         [[np.interp(np.arange(width), columns, line[:, k]) for line in coarse] for k in range(2)], axis=-1
     )

@@ -77,10 +77,10 @@ class ViewPass:
         in_order, most = list(chain.from_iterable(frames)), max(map(len, frames))
         ring = FrameRing(in_order, self.measured.frames.size_px, most)
         with ThreadPoolExecutor(threads) as pool, ring:
-            for part, mine in zip(parts, frames, strict=True):
+            for part, part_frames in zip(parts, frames, strict=True):
                 codes = codes_of(part, pool)
-                slots = [ring.take() for _ in mine]
-                shots, lamps = self._shots(mine, ring.pixels, slots), self._lamps(part)
+                slots = [ring.take() for _ in part_frames]
+                shots, lamps = self._shots(part_frames, ring.pixels, slots), self._lamps(part)
                 work = (pool.submit(self._block, part, rows, shots, lamps, codes[:, rows]) for rows in blocks)
                 yield from _in_order(work, _AHEAD * threads)
                 ring.give_back(slots)
@@ -91,13 +91,13 @@ class ViewPass:
         passes: dict[tuple[float, int], dict[int, int]] = {}
         for frame, slot in zip(frames, slots, strict=True):
             lane, again = lane_of.setdefault(int(frame.led or 0), len(lane_of)), 0
-            while lane in (taken := passes.setdefault((frame.exposure_us, again), {})):
+            while lane in (pass_slots := passes.setdefault((frame.exposure_us, again), {})):
                 again += 1
-            taken[lane] = slot
+            pass_slots[lane] = slot
         slot_of = np.full((len(passes), LANES), slots[0], np.int64)
         there = np.zeros(slot_of.shape, np.uint8)
-        for number, taken in enumerate(passes.values()):
-            slot_of[number, list(taken)], there[number, list(taken)] = list(taken.values()), 1
+        for number, pass_slots in enumerate(passes.values()):
+            slot_of[number, list(pass_slots)], there[number, list(pass_slots)] = list(pass_slots.values()), 1
         times_s = np.array([1e-6 * exposure_us for exposure_us, _ in passes], np.float32)
         exposures = np.array([self.reader.exposures[exposure_us] for exposure_us, _ in passes])
         return Shots(pixels, slot_of, there, times_s, exposures)
@@ -130,10 +130,10 @@ class ViewPass:
 def _in_order(work: Iterable[Future[Samples]], most: int) -> Iterator[Samples]:
     """Yield the results of the work in its order; at most `most` pieces are begun, or wait to be taken, at a
     time."""
-    begun: deque[Future[Samples]] = deque()
-    for one in work:
-        begun.append(one)
-        if len(begun) == most:
-            yield begun.popleft().result()
-    while begun:
-        yield begun.popleft().result()
+    futures: deque[Future[Samples]] = deque()
+    for future in work:
+        futures.append(future)
+        if len(futures) == most:
+            yield futures.popleft().result()
+    while futures:
+        yield futures.popleft().result()

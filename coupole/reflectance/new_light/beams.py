@@ -109,10 +109,10 @@ def lighting_of(
                 emitters.append(area := _area(light, base_from_support, strength, samples))
                 beams += _beams_of_area(area, samples)
             case EnvironmentLight():
-                found = _environment(light, turn, channels, samples)
-                if found is not None:
-                    emitters.append(found[0])
-                    beams += found[1]
+                environment = _environment(light, turn, channels, samples)
+                if environment is not None:
+                    emitters.append(environment[0])
+                    beams += environment[1]
     return Lighting(tuple(beams), tuple(emitters))
 
 
@@ -123,8 +123,10 @@ def _led(light: LedLight, views: Sequence[ViewSamples], strength: Floats, paper:
             row = int(rows[0])
             full_scale = np.nan_to_num(view.full_scales[row]) * strength / math.pi
             return Beam(True, view.led_mm[row], view.led_normals[row], 2 if paper else 1, full_scale)
-    known = np.unique(np.concatenate([view.leds for view in views]))
-    raise InputError(f"the result has no LED {light.number}, only {len(known)} from {known[0]} to {known[-1]}")
+    led_numbers = np.unique(np.concatenate([view.leds for view in views]))
+    raise InputError(
+        f"the result has no LED {light.number}, only {len(led_numbers)} from {led_numbers[0]} to {led_numbers[-1]}"
+    )
 
 
 def _area(light: AreaLight, base_from_support: Floats, strength: Floats, samples: int) -> Emitter:

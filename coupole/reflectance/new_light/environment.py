@@ -67,9 +67,9 @@ class Environment:
         across = (number * _GOLDEN + 0.5) % 1.0
         row, down = _placed(by_row, (number + 0.5) / count)
         column, right = np.empty(count, np.int64), np.empty(count)
-        for one in np.unique(row):
-            here = row == one
-            column[here], right[here] = _placed(np.append(0.0, np.cumsum(light[one])), across[here])
+        for row_number in np.unique(row):
+            here = row == row_number
+            column[here], right[here] = _placed(np.append(0.0, np.cumsum(light[row_number])), across[here])
         height, width = mean.shape
         edges = np.cos(np.linspace(0.0, math.pi, height + 1))
         up = edges[row] + down * (edges[row + 1] - edges[row])
@@ -106,15 +106,15 @@ def _read(path: Path) -> NDArray[np.float32]:
         raise InputError(f"{path}: expected an environment in a file .exr or .hdr")
     if path.suffix.lower() == ".hdr":
         try:
-            found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         except cv2.error:  # more pixels than OpenCV takes
-            found = None
-        if found is None:
+            picture = None
+        if picture is None:
             raise InputError(f"{path}: expected a Radiance file that can be read")
-        return np.ascontiguousarray(found[..., ::-1], np.float32)
+        return np.ascontiguousarray(picture[..., ::-1], np.float32)
     try:
         with OpenEXR.File(str(path)) as file:
-            channels = {name: np.asarray(one.pixels) for name, one in file.channels().items()}
+            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
     except (OSError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: expected an OpenEXR file that can be read: {error}") from error
     for name in ("RGB", "RGBA"):

@@ -33,23 +33,27 @@ def add_mirrored(
     )  # fmt: skip
 
     def add(rows: slice) -> None:
-        seen, places_mm, part = surface.seen[rows], surface.places_mm[rows], picture[rows]
-        asking = np.zeros(seen.shape, np.bool_)
-        _asking(seen, places_mm, surface.camera_mm, coats, *of_emitter[:3], emitter.density, lobe_rays, asking)
+        triangles, places_mm, part = surface.seen[rows], surface.places_mm[rows], picture[rows]
+        asking = np.zeros(triangles.shape, np.bool_)
+        _asking(
+            triangles, places_mm, surface.camera_mm, coats, *of_emitter[:3], emitter.density, lobe_rays, asking
+        )
         row, column = np.nonzero(asking)
         if not len(row):
             return
         pixels = np.stack([row, column], axis=1)
-        starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[seen[row, column]].astype(np.float32)
-        met, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3), np.float32)
+        starts_mm = places_mm[row, column] + RAY_START_MM * surface.normals[triangles[row, column]].astype(
+            np.float32
+        )
+        hits, ways_mm = np.empty(len(pixels), np.int64), np.empty((len(pixels), 3), np.float32)
         gains, sums = np.empty((len(pixels), part.shape[2])), np.zeros((len(pixels), part.shape[2]), np.float32)
         for ray in range(lobe_rays):
             count = _mirror(
-                pixels, rows.start, seen, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter, ray,
-                lobe_rays, met, gains, ways_mm,
+                pixels, rows.start, triangles, places_mm, surface.camera_mm, surface.normals, coats, *of_emitter,
+                ray, lobe_rays, hits, gains, ways_mm,
             )  # fmt: skip
-            free = ~mesh.blocked_along(starts_mm[met[:count]], ways_mm[:count])
-            sums[met[:count][free]] += gains[:count][free]
+            free = ~mesh.blocked_along(starts_mm[hits[:count]], ways_mm[:count])
+            sums[hits[:count][free]] += gains[:count][free]
         part[row, column] += sums
 
     in_strips(len(picture), add)
@@ -156,13 +160,13 @@ def _on_area(place, way, axes, centre_mm, halves_mm, density):  # type: ignore[n
 def _in_environment(way, axes, radiance, density):  # type: ignore[no-untyped-def]
     """Return how far shadows of an environment reach, its beams per sr in a direction, and its pixel there."""
     height, width, channels = radiance.shape
-    middle, left, up = 0.0, 0.0, 0.0
+    middle, leftward, up = 0.0, 0.0, 0.0
     for k in range(3):
         middle += way[k] * axes[0, k]
-        left += way[k] * axes[1, k]
+        leftward += way[k] * axes[1, k]
         up += way[k] * axes[2, k]
     row = min(int(math.acos(min(1.0, max(-1.0, up))) / math.pi * height), height - 1)
-    column = min(int((0.5 - math.atan2(left, middle) / (2.0 * math.pi)) * width), width - 1)
+    column = min(int((0.5 - math.atan2(leftward, middle) / (2.0 * math.pi)) * width), width - 1)
     mean = 0.0
     for channel in range(channels):
         mean += radiance[row, column, channel] / channels

@@ -76,15 +76,18 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
     """Return the surface of a measured view; a mesh of fewer than some hundred seen triangles is seen at the
     triangles' centres."""
     with h5py.File(view.path, "r") as file:
-        seen, centres_mm, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]
-    places_mm = np.full((*seen.shape, 3), np.nan, np.float32)
-    found = _directions(seen, centres_mm, view.camera_mm)
-    if found is None:
-        places_mm[seen >= 0] = centres_mm[seen[seen >= 0]]
+        triangle_of_pixel, centres_mm, normals = file["seen"][()], file["centres_mm"][()], file["normals"][()]
+    places_mm = np.full((*triangle_of_pixel.shape, 3), np.nan, np.float32)
+    polynomial = _directions(triangle_of_pixel, centres_mm, view.camera_mm)
+    if polynomial is None:
+        places_mm[triangle_of_pixel >= 0] = centres_mm[triangle_of_pixel[triangle_of_pixel >= 0]]
     else:
-        given = *found, view.camera_mm, centres_mm, normals
-        in_strips(len(seen), lambda rows: _meet(rows.start, seen[rows], *given, places_mm[rows]))
-    return Surface(seen, places_mm, view.camera_mm, view.triangles, centres_mm, normals)
+        geometry = *polynomial, view.camera_mm, centres_mm, normals
+        in_strips(
+            len(triangle_of_pixel),
+            lambda rows: _meet(rows.start, triangle_of_pixel[rows], *geometry, places_mm[rows]),
+        )
+    return Surface(triangle_of_pixel, places_mm, view.camera_mm, view.triangles, centres_mm, normals)
 
 
 def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
@@ -99,7 +102,7 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
     base_from_camera, focal_px = _aimed(result, camera)
     width, height = camera.size_px
     camera_mm = base_from_camera[:3, 3]
-    seen = np.full((height, width), -1, np.int32)
+    triangle_of_pixel = np.full((height, width), -1, np.int32)
     places_mm = np.full((height, width, 3), np.nan, np.float32)
 
     def trace(rows: slice) -> None:
@@ -107,17 +110,17 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
         local = [(x - (width - 1) / 2) / focal_px, (y - (height - 1) / 2) / focal_px, np.ones(x.shape)]
         ways = np.stack(local, axis=-1) @ base_from_camera[:3, :3].T
         ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-        met = mesh.first_met(camera_mm, ways.reshape(-1, 3).astype(np.float32))
-        number, distance = (one.reshape(x.shape) for one in met)
+        hits = mesh.first_met(camera_mm, ways.reshape(-1, 3).astype(np.float32))
+        number, distance = (hit.reshape(x.shape) for hit in hits)
         here = np.where(number >= 0, places[number], -1)
         here[np.einsum("hwk,hwk->hw", normals[here], ways) >= 0.0] = -1
-        seen[rows] = here
+        triangle_of_pixel[rows] = here
         places_mm[rows] = np.where((here >= 0)[..., None], camera_mm + distance[..., None] * ways, np.nan)
 
     in_strips(height, trace)
-    if not (seen >= 0).any():
+    if not (triangle_of_pixel >= 0).any():
         raise InputError("--from: no pixel of this camera sees a measured part of the object; look at it")
-    return Surface(seen, places_mm, camera_mm, triangles, corners_mm.mean(axis=1), normals)
+    return Surface(triangle_of_pixel, places_mm, camera_mm, triangles, corners_mm.mean(axis=1), normals)
 
 
 def in_strips(height: int, work: Callable[[slice], None]) -> None:
@@ -169,29 +172,29 @@ def _directions(
     count = np.bincount(triangle, minlength=len(centres_mm)).astype(np.float64)
     if np.count_nonzero(count) < _LEAST_TRIANGLES:
         return None
-    known = count > 0
-    sums = [np.bincount(triangle, axis, len(count))[known] for axis in (column, row)]
-    pixels = np.stack(sums, axis=1) / count[known, None]
-    ways = centres_mm[known] - camera_mm
+    in_view = count > 0
+    sums = [np.bincount(triangle, axis, len(count))[in_view] for axis in (column, row)]
+    pixels = np.stack(sums, axis=1) / count[in_view, None]
+    ways = centres_mm[in_view] - camera_mm
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     forward = ways.mean(axis=0) / np.linalg.norm(ways.mean(axis=0))
     right = np.cross([0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [1.0, 0.0, 0.0], forward)
     right /= np.linalg.norm(right)
     frame = np.stack([right, np.cross(forward, right), forward])
     local = ways @ frame.T
-    wanted = local[:, :2] / local[:, 2:]
+    tangents = local[:, :2] / local[:, 2:]
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
     scale = np.maximum(0.5 * float(np.ptp(pixels, axis=0).max()), 1.0)
     x, y = ((pixels - middle) / scale).T
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     design = np.stack([x**i * y**j for i, j in powers], axis=1)
-    weight = np.sqrt(count[known])
+    weight = np.sqrt(count[in_view])
     for _ in range(2):
-        found = np.linalg.lstsq(design * weight[:, None], wanted * weight[:, None], rcond=None)[0]
-        off = np.linalg.norm(design @ found - wanted, axis=1)
-        weight = np.where(off <= _OUTLIER * np.median(off), np.sqrt(count[known]), 0.0)
+        fitted_coefficients = np.linalg.lstsq(design * weight[:, None], tangents * weight[:, None], rcond=None)[0]
+        off = np.linalg.norm(design @ fitted_coefficients - tangents, axis=1)
+        weight = np.where(off <= _OUTLIER * np.median(off), np.sqrt(count[in_view]), 0.0)
     coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
-    for (i, j), pair in zip(powers, found, strict=True):
+    for (i, j), pair in zip(powers, fitted_coefficients, strict=True):
         coefficients[i, j] = pair
     return np.append(middle, scale), coefficients, frame
 

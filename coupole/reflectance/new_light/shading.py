@@ -62,8 +62,8 @@ def coats_of(materials: TriangleMaterials) -> Coats:
 def alike(beams: Iterable[Beam]) -> Iterator[list[Beam]]:
     """Up to eight neighbouring beams of one kind, which are shaded together."""
     for _, same in groupby(beams, key=lambda beam: (beam.near, beam.exponent, beam.density > 0.0)):
-        kept = list(same)
-        yield from (kept[first : first + LANES] for first in range(0, len(kept), LANES))
+        beams_alike = list(same)
+        yield from (beams_alike[first : first + LANES] for first in range(0, len(beams_alike), LANES))
 
 
 def add_beams(
@@ -74,8 +74,8 @@ def add_beams(
 
     def across(of: Callable[[Beam], Floats]) -> NDArray[np.float32]:
         """[..., 8]: one lane for each beam."""
-        made = np.stack([of(beam) for beam in beams], axis=1)
-        return np.pad(made, ((0, 0), (0, LANES - len(beams))), mode="edge").astype(np.float32, order="C")
+        columns = np.stack([of(beam) for beam in beams], axis=1)
+        return np.pad(columns, ((0, 0), (0, LANES - len(beams))), mode="edge").astype(np.float32, order="C")
 
     strengths = across(lambda beam: beam.strength)
     strengths[:, len(beams) :] = 0.0
@@ -99,16 +99,24 @@ def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, bea
     three = np.resize(beam.strength, 3)
     single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, three))
     camera_mm, place, axis, strength = single
-    flat = [one.reshape(codes.size, -1) for one in (surface.seen, surface.places_mm, codes, picture)]
+    flat = [
+        pixel_array.reshape(codes.size, -1) for pixel_array in (surface.seen, surface.places_mm, codes, picture)
+    ]
 
     def add(pixels: list[NDArray[Any]]) -> None:
-        seen, places_mm, here, part = (one.reshape(len(one) // LANES, -1) for one in pixels)
-        _add_beam(seen, places_mm, here, coats, camera_mm, beam.near, place, axis, beam.exponent, strength, part)
+        triangles, places_mm, here, part = (
+            pixel_array.reshape(len(pixel_array) // LANES, -1) for pixel_array in pixels
+        )
+        _add_beam(
+            triangles, places_mm, here, coats, camera_mm, beam.near, place, axis, beam.exponent, strength, part
+        )
 
     eights, rest = divmod(codes.size, LANES)
-    in_strips(eights, lambda part: add([one[part.start * LANES : part.stop * LANES] for one in flat]))
+    in_strips(
+        eights, lambda part: add([pixel_array[part.start * LANES : part.stop * LANES] for pixel_array in flat])
+    )
     if rest:
-        last = [np.resize(one[-rest:], (LANES, one.shape[1])) for one in flat]
+        last = [np.resize(pixel_array[-rest:], (LANES, pixel_array.shape[1])) for pixel_array in flat]
         add(last)
         flat[-1][-rest:] = last[-1][:rest]
 
@@ -135,11 +143,11 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
     square = dx * dx + dy * dy + dz * dz
     distance = math.sqrt(square)
     way[0], way[1], way[2] = dx / distance, dy / distance, dz / distance
-    found = 1e6 / square
+    reach = 1e6 / square
     if exponent > 0:
         cosine = max(-(way[0] * axis[0] + way[1] * axis[1] + way[2] * axis[2]), 0.0)
-        found *= cosine if exponent == 1 else cosine * cosine
-    return found
+        reach *= cosine if exponent == 1 else cosine * cosine
+    return reach
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -150,11 +158,11 @@ def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-de
         return dx, dy, dz, lanes(np.float32(1.0))
     dx, dy, dz = dx - x, dy - y, dz - z
     inverse = np.float32(1.0) / root(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz, found = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
+    dx, dy, dz, reach = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
     for _ in range(exponent):
         cosine = dx * loaded(axes, 0) + dy * loaded(axes, 1) + dz * loaded(axes, 2)
-        found = found * larger(np.float32(-1.0) * cosine, np.float32(0.0))
-    return dx, dy, dz, found
+        reach = reach * larger(np.float32(-1.0) * cosine, np.float32(0.0))
+    return dx, dy, dz, reach
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -184,13 +192,13 @@ def _add_beams(  # type: ignore[no-untyped-def]
                 alpha2 = alpha * alpha
                 lobe = d / (nl * b + nv * root(alpha2 + (np.float32(1.0) - alpha2) * nl * nl))
                 if lobe_rays > 0 and shines(coat):
-                    mine = loaded(densities, 0)
-                    shared = reach * mine / (mine + reach * d * (lobe_rays / (nv + b)))
+                    ray_densities = loaded(densities, 0)
+                    shared_reach = reach * ray_densities / (ray_densities + reach * d * (lobe_rays / (nv + b)))
                     if near:
-                        least = mine * _across(places, axes, place)
+                        least = ray_densities * _across(places, axes, place)
                         peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, alpha)
-                        shared = if_less(least, lanes(np.float32(peak)), shared, reach)
-                    reach = shared
+                        shared_reach = if_less(least, lanes(np.float32(peak)), shared_reach, reach)
+                    reach = shared_reach
             reach = if_less(lit, half, reach * nl, none)
             for channel in range(channels):
                 light = reach * loaded(strengths, channel)
@@ -201,9 +209,9 @@ def _add_beams(  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
     """Eight neighbouring pixels in the lanes: arrays [n, 8], [n, 8 coordinates], [n, 8 channels]."""
-    triangle, one, none, half = np.zeros(LANES, np.int64), np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    triangle, unity, none, half = np.zeros(LANES, np.int64), np.float32(1.0), np.float32(0.0), np.float32(0.5)
     for eight in range(len(seen)):
-        lit = if_less(absolute(loaded(codes, eight) - np.float32(LIT)), half, one, none)
+        lit = if_less(absolute(loaded(codes, eight) - np.float32(LIT)), half, unity, none)
         if total(lit) == none:
             continue
         for k in range(LANES):
@@ -213,7 +221,7 @@ def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, expon
         x, y, z = in_turns(places_mm, eight)
         l0, l1, l2, reach = _reach_from(near, place, axis, exponent, x, y, z)
         v0, v1, v2 = camera_mm[0] - x, camera_mm[1] - y, camera_mm[2] - z
-        inverse = one / root(v0 * v0 + v1 * v1 + v2 * v2)
+        inverse = unity / root(v0 * v0 + v1 * v1 + v2 * v2)
         v0, v1, v2 = v0 * inverse, v1 * inverse, v2 * inverse
         nl, nv = larger(n0 * l0 + n1 * l1 + n2 * l2, none), n0 * v0 + n1 * v1 + n2 * v2
         lobe = _lobe(n0, n1, n2, l0 + v0, l1 + v1, l2 + v2, nl, nv, alpha)
@@ -236,24 +244,24 @@ def _reach_from(near, place, axis, exponent, x, y, z):  # type: ignore[no-untype
         return lanes(place[0]), lanes(place[1]), lanes(place[2]), lanes(np.float32(1.0))
     dx, dy, dz = place[0] - x, place[1] - y, place[2] - z
     inverse = np.float32(1.0) / root(dx * dx + dy * dy + dz * dz)
-    dx, dy, dz, found = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
+    dx, dy, dz, reach = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
     for _ in range(exponent):
-        found = found * larger(np.float32(-1.0) * (dx * axis[0] + dy * axis[1] + dz * axis[2]), np.float32(0.0))
-    return dx, dy, dz, found
+        reach = reach * larger(np.float32(-1.0) * (dx * axis[0] + dy * axis[1] + dz * axis[2]), np.float32(0.0))
+    return dx, dy, dz, reach
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def]
     """D V of eight pixels, by `_facets`' sines; 0 where the normal looks away from the camera."""
-    one, none = np.float32(1.0), np.float32(0.0)
+    unity, none = np.float32(1.0), np.float32(0.0)
     x, y, z = n1 * h2 - n2 * h1, n2 * h0 - n0 * h2, n0 * h1 - n1 * h0
     sin2 = (x * x + y * y + z * z) / (h0 * h0 + h1 * h1 + h2 * h2)
     alpha2 = alpha * alpha
-    rest = one - alpha2
+    rest = unity - alpha2
     t = alpha2 + rest * sin2
     a, b = root(alpha2 + rest * nl * nl), root(alpha2 + rest * nv * nv)
-    found = np.float32(0.5 / math.pi) * alpha2 / (t * t * (nl * b + nv * a))
-    return if_less(none, nv, found, none)
+    lobe = np.float32(0.5 / math.pi) * alpha2 / (t * t * (nl * b + nv * a))
+    return if_less(none, nv, lobe, none)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -291,7 +299,7 @@ def _add_values(seen, places_mm, codes, values, near, place, axis, exponent, str
 @numba.njit(cache=True, nogil=True)
 def shines(coat):  # type: ignore[no-untyped-def]
     """Tell whether a material has a lobe at all."""
-    found = False
+    any_coat = False
     for number in range(KS, len(coat)):
-        found |= coat[number] > 0.0
-    return found
+        any_coat |= coat[number] > 0.0
+    return any_coat

@@ -80,16 +80,16 @@ def _trace_rays(  # type: ignore[no-untyped-def]
 def _asked_on_grid(codes):  # type: ignore[no-untyped-def]
     """Pixels, by squares whose rays go together."""
     (height, width), side = codes.shape, _PACKET * CELL_PX
-    found = np.empty(((height + CELL_PX - 1) // CELL_PX) * ((width + CELL_PX - 1) // CELL_PX), np.int64)
+    pixels = np.empty(((height + CELL_PX - 1) // CELL_PX) * ((width + CELL_PX - 1) // CELL_PX), np.int64)
     count = 0
     for top in range(0, height, side):
-        for left in range(0, width, side):
+        for left_column in range(0, width, side):
             for row in range(top, min(top + side, height), CELL_PX):
-                for column in range(left, min(left + side, width), CELL_PX):
+                for column in range(left_column, min(left_column + side, width), CELL_PX):
                     if codes[row, column] == ASKED:
-                        found[count] = row * width + column
+                        pixels[count] = row * width + column
                         count += 1
-    return found[:count]
+    return pixels[:count]
 
 
 def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
@@ -124,10 +124,10 @@ def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
     for i in range(down):
         for j in range(across - 1):
             row, column = (first + i) * CELL_PX, j * CELL_PX
-            one = codes[row, column]
-            if one not in (LIT, SHADED) or codes[row, column + CELL_PX] != one:
+            code = codes[row, column]
+            if code not in (LIT, SHADED) or codes[row, column + CELL_PX] != code:
                 continue
-            if codes[row + CELL_PX, column] != one or codes[row + CELL_PX, column + CELL_PX] != one:
+            if codes[row + CELL_PX, column] != code or codes[row + CELL_PX, column + CELL_PX] != code:
                 continue
             ends = False
             for y in range(row, row + CELL_PX):
@@ -140,23 +140,23 @@ def _close_cells(codes, first, open_cells):  # type: ignore[no-untyped-def]
 def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
     """Pixels of cells [n, 2] that need a ray."""
     height, width = codes.shape
-    found = np.empty(len(cells) * CELL_PX * CELL_PX, np.int64)
+    pixels = np.empty(len(cells) * CELL_PX * CELL_PX, np.int64)
     count = 0
     for cell in range(len(cells)):
         row, column = cells[cell, 0] * CELL_PX, cells[cell, 1] * CELL_PX
         for y in range(row, min(row + CELL_PX, height)):
             for x in range(column, min(column + CELL_PX, width)):
                 if codes[y, x] == ASKED:
-                    found[count] = y * width + x
+                    pixels[count] = y * width + x
                     count += 1
-    return found[:count]
+    return pixels[:count]
 
 
 @numba.njit(cache=True, nogil=True)
 def _spread(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
     """Open the closed neighbours of cells [n, 2] with a pixel at the common side that differs from them; which."""
     down, across = open_cells.shape
-    found = np.empty((4 * len(fresh), 2), np.int64)
+    opened_cells = np.empty((4 * len(fresh), 2), np.int64)
     count = 0
     for cell in range(len(fresh)):
         i, j = fresh[cell]
@@ -166,20 +166,20 @@ def _spread(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
                 continue
             if _differs(codes, i * CELL_PX, j * CELL_PX, di, dj, codes[y * CELL_PX, x * CELL_PX]):
                 open_cells[y, x] = True
-                found[count, 0], found[count, 1] = y, x
+                opened_cells[count, 0], opened_cells[count, 1] = y, x
                 count += 1
-    return found[:count]
+    return opened_cells[:count]
 
 
 @numba.njit(cache=True, nogil=True)
 def _differs(codes, row, column, down, across, one):  # type: ignore[no-untyped-def]
     """Tell whether one of a cell's pixels at its side was found to be other than `one`."""
     height, width = codes.shape
-    other = SHADED if one == LIT else LIT
+    opposite = SHADED if one == LIT else LIT
     for step in range(CELL_PX):
         y = row + (step if down == 0 else (CELL_PX - 1 if down > 0 else 0))
         x = column + (step if across == 0 else (CELL_PX - 1 if across > 0 else 0))
-        if y < height and x < width and codes[y, x] == other:
+        if y < height and x < width and codes[y, x] == opposite:
             return True
     return False
 

@@ -6,6 +6,7 @@ import csv
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -53,27 +54,33 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
     """Read a dome's CSV (`#` comments, then a header, then one LED a line), from `files` if they are given;
     InputError with all its problems."""
     files = InputFiles() if files is None else files
+    try:
+        if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
+            raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
+        return _parsed(files.read(path).decode("utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str, path: str) -> LedTable:
+    """Return the table of this text, whose arrays cannot be written; a session reads its dome several times."""
     problems: list[Problem] = []
     rows: list[list[float]] = []
     first_line_of_id: dict[int, int] = {}
 
     def wrong(line: int, message: str, key: str = "") -> None:
-        problems.append(Problem(str(path), line, 1 if line else 0, key, message))
+        problems.append(Problem(path, line, 1 if line else 0, key, message))
 
-    try:
-        if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
-            raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
-        lines = files.read(path).decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
-    numbered_lines = [(n, text) for n, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")]
+    lines = enumerate(text.splitlines(), 1)
+    numbered_lines = [(n, line) for n, line in lines if line.strip() and not line.startswith("#")]
     header = numbered_lines[0] if numbered_lines else (0, "")
     if tuple(field.strip() for field in header[1].split(",")) != COLUMNS:
         wrong(header[0], f"expected the header `{','.join(COLUMNS)}`, found `{header[1]}`")
         raise InputError(problems)
-    for line, text in numbered_lines[1:]:
+    for line, fields in numbered_lines[1:]:
         try:
-            values = [float(field) for field in next(csv.reader([text]))]
+            values = [float(field) for field in next(csv.reader([fields]))]
         except (ValueError, csv.Error) as error:
             wrong(line, str(error))
             continue
@@ -93,7 +100,10 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
         raise InputError(problems)
     table = np.array(rows)
     normals = table[:, 5:8] / np.linalg.norm(table[:, 5:8], axis=1, keepdims=True)
-    return LedTable(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], normals, table[:, 8])
+    arrays = table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:5], normals, table[:, 8]
+    for array in (table, *arrays):
+        array.flags.writeable = False
+    return LedTable(*arrays)
 
 
 def _mistakes(values: list[float]) -> Iterator[tuple[str, str]]:

@@ -44,12 +44,12 @@ class Proof:
 
 def _rooms() -> list[Proof]:
     """All tests at full scale, a folder each."""
-    folders = sorted(path.parent.name for path in (ROOT / "tests").glob("*/") if any(path.rglob("test_*.py")))
-    found = []
+    folders = sorted(path.name for path in (ROOT / "tests").iterdir() if any(path.rglob("test_*.py")))
+    proofs = []
     for folder in folders:
         apart = f" --ignore {_APART[f'tests/{folder}']}" if f"tests/{folder}" in _APART else ""
-        found.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}"))
-    return found
+        proofs.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}"))
+    return proofs
 
 
 PROOFS = (
@@ -144,8 +144,8 @@ def _commit() -> str:
 def kept() -> dict[str, Ended]:
     """The last end of each proof."""
     lines = ENDED.read_text(encoding="utf-8").splitlines() if ENDED.exists() else []
-    found = [Ended(**json.loads(line)) for line in lines]
-    return {one.name: one for one in found}
+    ends = [Ended(**json.loads(line)) for line in lines]
+    return {ended.name: ended for ended in ends}
 
 
 def keep(ended: Ended) -> None:
@@ -153,21 +153,21 @@ def keep(ended: Ended) -> None:
         file.write(json.dumps(asdict(ended)) + "\n")
 
 
-def table(found: dict[str, Ended]) -> str:
+def table(ends: dict[str, Ended]) -> str:
     """Return a table in Markdown of every proof, also of those that were not run."""
     lines = [
         "| proof | shows | date, commit | machine | minutes | ended | last line |",
         "|---|---|---|---|---|---|---|",
     ]
     for proof in PROOFS:
-        one = found.get(proof.name)
-        if one is None:
+        ended = ends.get(proof.name)
+        if ended is None:
             lines.append(f"| {proof.name} | {proof.shows} | not run | | | | |")
             continue
-        verdict = "good" if one.code == 0 else f"**exit {one.code}**"
-        figure = re.sub(r"\s+", " ", one.figure).replace("|", "/")
+        verdict = "good" if ended.code == 0 else f"**exit {ended.code}**"
+        figure = re.sub(r"\s+", " ", ended.figure).replace("|", "/")
         lines.append(
-            f"| {proof.name} | {proof.shows} | {one.date}, {one.commit} | {one.machine} | {one.minutes:.1f} "
+            f"| {proof.name} | {proof.shows} | {ended.date}, {ended.commit} | {ended.machine} | {ended.minutes:.1f} "
             f"| {verdict} | {figure} |"
         )
     return "\n".join(lines)
@@ -188,7 +188,7 @@ def main() -> int:
     LOGS.mkdir(parents=True, exist_ok=True)
     failed = False
     if not options.table:
-        good = set() if options.again else {name for name, one in kept().items() if one.code == 0}
+        good = set() if options.again else {name for name, ended in kept().items() if ended.code == 0}
         for proof in PROOFS:
             if proof.name in good or (options.only and proof.name not in options.only):
                 continue

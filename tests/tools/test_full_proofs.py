@@ -55,3 +55,14 @@ def test_the_table_names_what_was_not_run(
     assert run(monkeypatch, "--table") == 0
     assert capsys.readouterr().out.count("| not run |") == 2
     assert not count.exists()
+
+
+def test_every_folder_of_tests_is_a_proof_and_every_command_is_there() -> None:
+    names = [proof.name for proof in full_proofs.PROOFS]
+    assert len(set(names)) == len(names)
+    folders = {path.relative_to(REPO / "tests").parts[0] for path in (REPO / "tests").rglob("*/test_*.py")}
+    assert {name.removeprefix("tests-") for name in names if name.startswith("tests-")} == folders
+    for proof in full_proofs.PROOFS:
+        paths = [word for word in proof.command.split() if word.startswith(("tools/", "tests/"))]
+        assert paths, proof
+        assert all((REPO / path).exists() for path in paths), proof

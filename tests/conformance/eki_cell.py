@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
-from robot_conformance import UNHURRIED_S, RobotCell
+from robot_cells import UNHURRIED_S, RobotCell
 
 from coupole.devices import Robot
 from drivers.kuka.eki.driver import KukaEki, Settings

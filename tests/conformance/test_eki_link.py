@@ -23,7 +23,7 @@ from arms import KR10_R1100_SIXX
 from beside import beside
 from eki_cell import EkiCell
 from pydantic import ValidationError
-from robot_conformance import AWAY_DEG
+from robot_cells import AWAY_DEG
 
 from coupole import supervision
 from coupole.errors import DeviceFault, DeviceLost, DeviceTimeout

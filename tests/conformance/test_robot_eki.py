@@ -16,7 +16,8 @@ import pytest
 from arms import KR10_R1100_SIXX
 from eki_cell import SAMPLE_MS, EkiCell
 from pydantic import ValidationError
-from robot_conformance import AWAY_DEG, HOME_DEG, RobotConformance
+from robot_cells import AWAY_DEG, HOME_DEG
+from robot_conformance import RobotConformance
 
 from coupole.devices import ArmCondition
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused

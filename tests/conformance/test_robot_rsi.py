@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_conformance import AWAY_DEG, HOME_DEG, KukaCell, RobotConformance
+from robot_cells import AWAY_DEG, HOME_DEG, KukaCell
+from robot_conformance import RobotConformance
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.kuka.rsi.driver import KukaRsi

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_conformance import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell, RobotConformance
+from robot_cells import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell
+from robot_conformance import RobotConformance
 from ur import needs_ur_rtde
 
 from coupole.devices import ArmCondition

@@ -272,10 +272,15 @@ class Workers:
 
     def end(self) -> None:
         """Wait until all is done, and end the threads: within a `bounded` call, if their work may hang."""
+        threads = self._threads
+        self.end_soon()
+        for thread in threads:
+            thread.join()
+
+    def end_soon(self) -> None:
+        """End the threads once all is done; does not wait for it."""
         for _ in self._threads:
             self._queue.put(None)
-        for thread in self._threads:
-            thread.join()
         self._threads = []
 
 

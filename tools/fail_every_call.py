@@ -12,6 +12,7 @@ arm stood, by kind of failure. Exits with 1 if anything was wrong in any case.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import multiprocessing
 import os
@@ -45,6 +46,8 @@ Case = tuple[Event, ...]
 def one(case: Case) -> dict[str, Any]:
     """One case, in a folder that is removed."""
     begun_s = time.monotonic()
+    gc.unfreeze()  # `cells.here` freezes what a session leaves, with the files and memory that it holds
+    gc.collect()
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         try:
             if len(case) == 1 and case[0].kind in KINDS:

@@ -86,6 +86,10 @@ class BurstRunner:
         self.times_s: list[float] = []
         """Durations of the bursts, from the start to the last proof of each, on the rig's clock."""
 
+    def end(self) -> None:
+        """No more bursts come: end the thread that uploads tables, once it is done. Does not wait for it."""
+        self._uploader.end_soon()
+
     def exposure(self, burst: Burst) -> Exposure:
         """Return the settings that the camera must have for a burst."""
         return Exposure(burst.timing.exposure_us, self._gain_db, burst.hardware)

@@ -120,6 +120,7 @@ class Sequencer:
             self._cell.make_safe()
             raise
         finally:
+            self._burst_runner.end()
             self.outcome.duration_s = (self._cell.clock.now_ns() - start_ns) / 1e9
             self.conclude(self._recorder.proven())
         if self.outcome.missing or self.outcome.missing_darks:

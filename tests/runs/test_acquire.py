@@ -72,6 +72,13 @@ def test_json_leaves_standard_error_to_errors(clean: Clean) -> None:
 # -- what a clean run leaves ----------------------------------------------------------------------------------
 
 
+def test_a_run_that_ended_leaves_no_thread_of_its_own(clean: Clean) -> None:
+    workers = {"upload", "keep", "commit"}
+    cells.wait_until(
+        lambda: not workers & {thread.name for thread in threading.enumerate()}, "the end of the run's threads"
+    )
+
+
 def test_every_shot_is_proven_once_and_verify_finds_it_whole(clean: Clean) -> None:
     cells.assert_each_shot_proven_once(clean.run)
 

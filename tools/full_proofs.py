@@ -48,7 +48,8 @@ def _rooms() -> list[Proof]:
     proofs = []
     for folder in folders:
         apart = f" --ignore {_APART[f'tests/{folder}']}" if f"tests/{folder}" in _APART else ""
-        proofs.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}"))
+        command = f"{_PYTEST} tests/{folder}{apart}"
+        proofs.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", command))
     return proofs
 
 
@@ -167,8 +168,8 @@ def table(ends: dict[str, Ended]) -> str:
         verdict = "good" if ended.code == 0 else f"**exit {ended.code}**"
         figure = re.sub(r"\s+", " ", ended.figure).replace("|", "/")
         lines.append(
-            f"| {proof.name} | {proof.shows} | {ended.date}, {ended.commit} | {ended.machine} | {ended.minutes:.1f} "
-            f"| {verdict} | {figure} |"
+            f"| {proof.name} | {proof.shows} | {ended.date}, {ended.commit} | {ended.machine} "
+            f"| {ended.minutes:.1f} | {verdict} | {figure} |"
         )
     return "\n".join(lines)
 

@@ -72,11 +72,11 @@ def test_json_leaves_standard_error_to_errors(clean: Clean) -> None:
 # -- what a clean run leaves ----------------------------------------------------------------------------------
 
 
-def test_a_run_that_ended_leaves_no_thread_of_its_own(clean: Clean) -> None:
-    workers = {"upload", "keep", "commit"}
-    cells.wait_until(
-        lambda: not workers & {thread.name for thread in threading.enumerate()}, "the end of the run's threads"
-    )
+def test_a_run_that_ended_leaves_no_thread_of_its_own(cell: CellFolder) -> None:
+    cell.write(views=[TOP], lights=TWO_LIGHTS)
+    before = set(threading.enumerate())
+    assert cells.here("acquire", cell.plan, "--json").code == 0
+    cells.wait_until(lambda: not set(threading.enumerate()) - before, "the end of the run's threads")
 
 
 def test_every_shot_is_proven_once_and_verify_finds_it_whole(clean: Clean) -> None:

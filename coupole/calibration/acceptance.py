@@ -30,28 +30,28 @@ class Allowed:
 
 def words_of(limits: Sequence[Allowed]) -> str:
     """The limits for a command's help."""
-    return "; ".join(f"{each.name}={each.usual:g} ({each.what})" for each in limits)
+    return "; ".join(f"{limit.name}={limit.usual:g} ({limit.what})" for limit in limits)
 
 
 def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
     """`NAME=VALUE` as operators write it. Raises InputError: no such limit, given twice, not a positive number."""
-    found: dict[str, float] = {}
-    known = {each.name for each in limits}
+    limit_by_name: dict[str, float] = {}
+    names = {limit.name for limit in limits}
     for word in words:
         name, _, text = word.partition("=")
-        if name not in known:
+        if name not in names:
             raise InputError(
-                f"--limit {word}: expected one of {', '.join(each.name for each in limits)}, then =VALUE"
+                f"--limit {word}: expected one of {', '.join(limit.name for limit in limits)}, then =VALUE"
             )
-        if name in found:
+        if name in limit_by_name:
             raise InputError(f"--limit {word}: {name} is given twice")
         try:
-            found[name] = float(text)
+            limit_by_name[name] = float(text)
         except ValueError:
-            found[name] = math.nan
-        if not 0.0 < found[name] < math.inf:
+            limit_by_name[name] = math.nan
+        if not 0.0 < limit_by_name[name] < math.inf:
             raise InputError(f"--limit {word}: expected a number greater than 0 after `{name}=`")
-    return found
+    return limit_by_name
 
 
 def against_limits(
@@ -63,12 +63,12 @@ def against_limits(
 
     return tuple(
         Limit(
-            what=each.what,
-            found=found[each.name],
-            limit=wanted.get(each.name, each.usual),
-            unit=each.unit,
-            name=each.name,
-            usual=each.usual if each.name in wanted else None,
+            what=limit.what,
+            found=found[limit.name],
+            limit=wanted.get(limit.name, limit.usual),
+            unit=limit.unit,
+            name=limit.name,
+            usual=limit.usual if limit.name in wanted else None,
         )
-        for each in limits
+        for limit in limits
     )

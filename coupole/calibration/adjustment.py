@@ -123,31 +123,31 @@ def adjust(
     """
     factors = np.ones(len(groups))
     blocks = evaluate(state)
-    kept = [np.ones(len(block.residuals), dtype=np.bool_) for block in blocks]
-    weights = [k.astype(np.float64) for k in kept]
+    masks = [np.ones(len(block.residuals), dtype=np.bool_) for block in blocks]
+    weights = [k.astype(np.float64) for k in masks]
     rejecting = any(group.rejects for group in groups)
-    taken = 0
+    step_count = 0
     for robust in (True, False) if rejecting else (False,):
         for _ in range(_MAX_ROUNDS):
             if robust:
                 weights = [_huber(b, groups[b.group].rejects, factors[b.group]) for b in blocks]
             state, blocks, steps = _descend(state, blocks, evaluate, move, weights, factors, parameters, what)
-            taken += steps
+            step_count += steps
             if robust:
-                seen = _robust_factors(blocks, groups, factors)
+                new_factors = _robust_factors(blocks, groups, factors)
             else:
-                seen = _seen_factors(blocks, groups, kept, weights, factors, parameters, what)
-            settled = bool(np.all(np.abs(seen / factors - 1) < _SETTLED))
-            factors = seen
-            if not robust and (rejected := _reject(blocks, groups, kept, factors)):
-                kept, settled = rejected, False
-                weights = [k.astype(np.float64) for k in kept]
-            if settled:
+                new_factors = _seen_factors(blocks, groups, masks, weights, factors, parameters, what)
+            is_settled = bool(np.all(np.abs(new_factors / factors - 1) < _SETTLED))
+            factors = new_factors
+            if not robust and (new_masks := _reject(blocks, groups, masks, factors)):
+                masks, is_settled = new_masks, False
+                weights = [k.astype(np.float64) for k in masks]
+            if is_settled:
                 break
         if robust:
-            kept = _reject(blocks, groups, kept, factors) or kept
-            weights = [k.astype(np.float64) for k in kept]
-    return _summary(state, blocks, groups, kept, weights, factors, parameters, what, taken)
+            masks = _reject(blocks, groups, masks, factors) or masks
+            weights = [k.astype(np.float64) for k in masks]
+    return _summary(state, blocks, groups, masks, weights, factors, parameters, what, step_count)
 
 
 def _normals(
@@ -156,9 +156,9 @@ def _normals(
     """Normal matrices [groups, p, p] and right-hand sides [groups, p], with the stated noise."""
     matrices, sides = np.zeros((groups, parameters, parameters)), np.zeros((groups, parameters))
     for block, weight in zip(blocks, weights, strict=True):
-        weighted = block.jacobian * weight[:, None]
-        matrices[block.group][np.ix_(block.columns, block.columns)] += weighted.T @ block.jacobian
-        sides[block.group][block.columns] += weighted.T @ block.residuals
+        weighted_jacobian = block.jacobian * weight[:, None]
+        matrices[block.group][np.ix_(block.columns, block.columns)] += weighted_jacobian.T @ block.jacobian
+        sides[block.group][block.columns] += weighted_jacobian.T @ block.residuals
     return matrices, sides
 
 
@@ -186,19 +186,19 @@ def _descend(
         normal = np.einsum("g,gij->ij", factors**-2.0, matrices)
         side = factors**-2.0 @ sides
         while True:
-            damped = normal + damping * np.diag(np.diag(normal))
-            change = cho_solve(_factored(damped, what), side)
-            tried = move(state, change)
-            tried_blocks = evaluate(tried)
+            damped_normal = normal + damping * np.diag(np.diag(normal))
+            change = cho_solve(_factored(damped_normal, what), side)
+            tried_state = move(state, change)
+            tried_blocks = evaluate(tried_state)
             tried_cost = _cost(tried_blocks, weights, factors)
             if tried_cost <= cost or damping > 1e8:
                 break
             damping *= 10
         if not tried_cost <= cost:
             return state, blocks, step
-        gain, predicted = cost - tried_cost, float(change @ side)
-        state, blocks, cost, damping = tried, tried_blocks, tried_cost, max(damping / 10, 1e-12)
-        if predicted < 1e-7 or gain < 1e-12 * cost:  # a step of 3e-4 of the uncertainty
+        gain, predicted_gain = cost - tried_cost, float(change @ side)
+        state, blocks, cost, damping = tried_state, tried_blocks, tried_cost, max(damping / 10, 1e-12)
+        if predicted_gain < 1e-7 or gain < 1e-12 * cost:  # a step of 3e-4 of the uncertainty
             return state, blocks, step
     raise InputError(
         f"{what}: no convergence in {_MAX_STEPS} steps. Look for views of another board or camera, and take views "
@@ -239,12 +239,12 @@ def _huber(block: Block, size: int, factor: float) -> Floats:
 def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: Floats) -> Floats:
     """Noise from the median of absolute residuals, for groups that may have gross errors; unchanged for the
     others."""
-    seen = factors.copy()
+    new_factors = factors.copy()
     for number, group in enumerate(groups):
         if group.rejects and group.estimated:
             residuals = np.concatenate([b.residuals for b in blocks if b.group == number])
-            seen[number] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
-    return seen
+            new_factors[number] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
+    return new_factors
 
 
 def _seen_factors(
@@ -259,15 +259,15 @@ def _seen_factors(
     """Noise of each group from its squared residuals over its redundancy."""
     matrices, _ = _normals(blocks, weights, len(groups), parameters)
     covariance = _covariance(matrices, factors, what)
-    seen = factors.copy()
+    new_factors = factors.copy()
     for number, group in enumerate(groups):
         if not group.estimated:
             continue
         chi2, count = _chi2(blocks, kept, number)
         redundancy = count - float(np.sum(covariance * matrices[number])) / factors[number] ** 2
         if redundancy >= _LEAST_REDUNDANCY:
-            seen[number] = max(np.sqrt(chi2 / redundancy), _LEAST_FACTOR)
-    return seen
+            new_factors[number] = max(np.sqrt(chi2 / redundancy), _LEAST_FACTOR)
+    return new_factors
 
 
 def _covariance(matrices: Floats, factors: Floats, what: str) -> Floats:
@@ -296,8 +296,8 @@ def _reject(
         limit = REJECT_SIGMA * factors[block.group] / np.sqrt(size or 1)
         good = np.repeat(_observations(block.residuals, size) <= limit, size) if size else before
         result.append(before & good)
-    unchanged = all((a == b).all() for a, b in zip(result, kept, strict=True))
-    return None if unchanged else result
+    is_unchanged = all((a == b).all() for a, b in zip(result, kept, strict=True))
+    return None if is_unchanged else result
 
 
 def _summary(
@@ -320,8 +320,8 @@ def _summary(
         chi2, count = _chi2(blocks, kept, number)
         whole = sum(len(block.residuals) for block in blocks if block.group == number)
         redundancy = count - float(np.sum(covariance * information))
-        told = group.estimated and redundancy >= _LEAST_REDUNDANCY
-        redundancies.append(redundancy if told else np.inf)
+        has_redundancy = group.estimated and redundancy >= _LEAST_REDUNDANCY
+        redundancies.append(redundancy if has_redundancy else np.inf)
         size = group.rejects or 1
         components.append(Component(group.name, float(factors[number]), (whole - count) // size, redundancy, chi2))
     shares = np.asarray(contributions) / np.diag(covariance)

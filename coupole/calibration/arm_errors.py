@@ -14,11 +14,11 @@ _STEP_DEG = 1e-3
 def axis_sensitivity(arm: Arm, joints_deg: ArrayLike) -> Floats:
     """[n, 6, 6] for joints [n, 6]: step of the flange in its own frame (mm, radians) by degrees of each axis."""
     joints = np.asarray(joints_deg, dtype=np.float64)
-    found = np.empty((len(joints), 6, 6))
+    sensitivity = np.empty((len(joints), 6, 6))
     for number, at in enumerate(joints):
         for axis in range(6):
             change = _STEP_DEG * np.eye(6)[axis]
             before, after = forward(arm, at - change), forward(arm, at + change)
             step = between(before, after) / (2 * _STEP_DEG)
-            found[number, :, axis] = [*(before[:3, :3].T @ step[:3]), *step[3:]]
-    return found
+            sensitivity[number, :, axis] = [*(before[:3, :3].T @ step[:3]), *step[3:]]
+    return sensitivity

@@ -57,8 +57,8 @@ def calibrated_poses(
     """Reported poses [v, 4, 4] corrected by the axis zeros, and the camera's prior for them, which includes the
     uncertainty of the zeros."""
     sensitivity = axis_sensitivity(arm.model, joints_deg)
-    known = replace(prior, covariance=arm.covariance, axis_sensitivity=sensitivity[:, :, 1:])
-    return _moved(base_from_flange, sensitivity, arm), known
+    arm_prior = replace(prior, covariance=arm.covariance, axis_sensitivity=sensitivity[:, :, 1:])
+    return _moved(base_from_flange, sensitivity, arm), arm_prior
 
 
 def corrected_poses(base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm) -> Floats:
@@ -70,5 +70,5 @@ def _moved(base_from_flange: Floats, sensitivity: Floats, arm: CalibratedArm) ->
     steps = sensitivity @ arm.zeros_deg
     moves = np.broadcast_to(np.eye(4), base_from_flange.shape).copy()
     moves[:, :3, :3], moves[:, :3, 3] = rotation(steps[:, 3:]), steps[:, :3]
-    moved: Floats = base_from_flange @ moves
-    return moved
+    base_from_moved_flange: Floats = base_from_flange @ moves
+    return base_from_moved_flange

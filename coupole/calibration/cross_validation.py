@@ -44,22 +44,22 @@ def left_out(
 ) -> LeftOut:
     """`views` are the numbers of each view's blocks; `covariance` is that of all parameters, with these noises."""
     ratios, off = np.zeros(len(views)), np.zeros(len(views))
-    for number, mine in enumerate(views):
-        columns = np.unique(np.concatenate([blocks[i].columns for i in mine]))
+    for number, members in enumerate(views):
+        columns = np.unique(np.concatenate([blocks[i].columns for i in members]))
         jacobians, residuals, of_group = [], [], []
-        for i in mine:
-            block, kept = blocks[i], weights[i] > 0
-            jacobian = np.zeros((int(kept.sum()), len(columns)))
-            jacobian[:, np.searchsorted(columns, block.columns)] = block.jacobian[kept] / factors[block.group]
+        for i in members:
+            block, keep = blocks[i], weights[i] > 0
+            jacobian = np.zeros((int(keep.sum()), len(columns)))
+            jacobian[:, np.searchsorted(columns, block.columns)] = block.jacobian[keep] / factors[block.group]
             jacobians.append(jacobian)
-            residuals.append(block.residuals[kept] / factors[block.group])
+            residuals.append(block.residuals[keep] / factors[block.group])
             of_group.append(np.full(len(jacobian), block.group == group))
         jacobian, residual = np.concatenate(jacobians), np.concatenate(residuals)
         hat = jacobian @ covariance[np.ix_(columns, columns)] @ jacobian.T
         values, vectors = np.linalg.eigh(np.eye(len(residual)) - hat)
-        told = values > _OWN
-        along = vectors[:, told].T @ residual
-        ratios[number] = np.sqrt(np.sum(along**2 / values[told]) / max(int(told.sum()), 1))
-        predicted = (vectors[:, told] @ (along / values[told]))[np.concatenate(of_group)]
-        off[number] = factors[group] * np.sqrt(np.mean(predicted**2))
+        usable = values > _OWN
+        along = vectors[:, usable].T @ residual
+        ratios[number] = np.sqrt(np.sum(along**2 / values[usable]) / max(int(usable.sum()), 1))
+        prediction = (vectors[:, usable] @ (along / values[usable]))[np.concatenate(of_group)]
+        off[number] = factors[group] * np.sqrt(np.mean(prediction**2))
     return LeftOut(ratios, off)

@@ -33,9 +33,12 @@ def read_accepted(path: Path, kind: Kind) -> Record:
     record = read_record(path)
     if record.kind != kind:
         raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
-    missed = [limit for limit in record.limits if not limit.passed]
-    if missed:
-        why = "; ".join(f"{one.what} is {one.found:.3g} {one.unit}, at most {one.limit:.3g}" for one in missed)
+    failures = [limit for limit in record.limits if not limit.passed]
+    if failures:
+        why = "; ".join(
+            f"{failure.what} is {failure.found:.3g} {failure.unit}, at most {failure.limit:.3g}"
+            for failure in failures
+        )
         raise InputError(f"{path}: not accepted: {why}. Calibrate anew, or allow more with --limit there")
     return record
 
@@ -44,14 +47,14 @@ def refuse_read_otherwise(path: Path, record: Record, given: Collection[str]) ->
     """Raise InputError if a record of LEDs' powers was made with a response or a flat field and none is among the
     kinds `given`, or the other way round: frames must be read as those were that the powers come from."""
     for kind in SHAPE_SIGNAL:
-        told = record.fixed.get(READ_WITH + kind)
+        read_with = record.fixed.get(READ_WITH + kind)
         beside = _made_with(path, record, kind)
-        if (told or (told is None and beside)) and kind not in given:
+        if (read_with or (read_with is None and beside)) and kind not in given:
             raise InputError(
                 f"{path}: was made with a {kind} record; without one frames would be read otherwise, and all that "
                 f"is found would be off. Name {beside or 'it'} too"
             )
-        if told == 0.0 and kind in given:
+        if read_with == 0.0 and kind in given:
             raise InputError(
                 f"{path}: was made without a {kind} record; with one frames would be read otherwise, and all that "
                 "is found would be off. Leave it out, or calibrate the LEDs' powers anew with it"
@@ -60,9 +63,9 @@ def refuse_read_otherwise(path: Path, record: Record, given: Collection[str]) ->
 
 def _made_with(path: Path, record: Record, kind: str) -> Path | None:
     """A record of a kind that another was made with, if it lies beside it."""
-    used = {line.sha256 for line in record.inputs if "/" not in line.name}
+    input_hashes = {line.sha256 for line in record.inputs if "/" not in line.name}
     for beside in sorted(path.parent.glob("*.yaml")):
-        if hashlib.sha256(beside.read_bytes()).hexdigest() in used:
+        if hashlib.sha256(beside.read_bytes()).hexdigest() in input_hashes:
             try:
                 if read_record(beside).kind == kind:
                     return beside
@@ -73,10 +76,10 @@ def _made_with(path: Path, record: Record, kind: str) -> Path | None:
 
 def refuse_same_images(path: Path, record: Record, inputs: Sequence[tuple[str, str]]) -> None:
     """Raise InputError if a record was made from some of these images: they would count twice."""
-    own = {line.sha256 for line in record.inputs if "/" in line.name}
-    if shared := [name for name, sha256 in inputs if "/" in name and sha256 in own]:
+    image_hashes = {line.sha256 for line in record.inputs if "/" in line.name}
+    if common := [name for name, sha256 in inputs if "/" in name and sha256 in image_hashes]:
         raise InputError(
-            f"{path}: was made from the same images ({shared[0]}), which would count twice. Leave it out: the "
+            f"{path}: was made from the same images ({common[0]}), which would count twice. Leave it out: the "
             "lens is estimated from these images anyway"
         )
 
@@ -86,8 +89,10 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
     temperature."""
     holds = record.validity
     if about.begun is not None and record.simulated != about.simulated:
-        made, taken = ("a simulated cell" if one.simulated else "a real cell" for one in (record, about))
-        raise InputError(f"{path}: was made in {made}; the images are of {taken}")
+        record_cell, images_cell = (
+            "a simulated cell" if source.simulated else "a real cell" for source in (record, about)
+        )
+        raise InputError(f"{path}: was made in {record_cell}; the images are of {images_cell}")
     if about.begun is not None and about.begun >= holds.expires:
         raise InputError(
             f"{path}: expired on {holds.expires:%Y-%m-%d %H:%M} UTC, before these images were taken "
@@ -101,12 +106,12 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
                 f"{holds.focus_tolerance_mm:g} mm; the images were taken at {about.focus_distance_mm:g} mm. "
                 "Name the record of this focus"
             )
-    for what, valid, found in (
+    for label, valid, figure in (
         ("focal length", holds.focal_length_mm, about.focal_length_mm),
         ("f-number", holds.f_number, about.f_number),
     ):
-        if valid is not None and found is not None and abs(valid - found) > _SAME_FIGURE * valid:
-            raise InputError(f"{path}: holds for {what} {valid:g}; the images were taken with {found:g}")
+        if valid is not None and figure is not None and abs(valid - figure) > _SAME_FIGURE * valid:
+            raise InputError(f"{path}: holds for {label} {valid:g}; the images were taken with {figure:g}")
     if holds.size_px is not None and holds.size_px != size_px:
         raise InputError(
             f"{path}: holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; these have "

@@ -54,8 +54,8 @@ class Picture:
         w] that repeats over the image."""
         if self.pattern in (COLOUR, MONO):
             return self.plane(channel), np.ones((1, 1), np.bool_)
-        known = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
-        return self.values, known
+        mask = np.array([letter == channel[0].upper() for letter in self.pattern]).reshape(2, 2)
+        return self.values, mask
 
     def _refuse_grey(self, channel: Channel) -> None:
         if channel != "green":

@@ -48,20 +48,20 @@ class InForce:
 def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tuple[InForce, ...]:
     """The records that a plan names, read from `files` if they are given. Raises InputError with the problems of
     all files."""
-    found: list[InForce] = []
+    records: list[InForce] = []
     problems: list[Problem] = []
-    others: list[str] = []
+    messages: list[str] = []
     for path in paths:
         try:
-            found.append(InForce(path, read_record(path, files)))
+            records.append(InForce(path, read_record(path, files)))
         except InputError as error:
             problems += error.problems
-            others += [] if error.problems else [str(error)]
-    if others:
-        raise InputError("\n".join([*others, *map(str, problems)]))
+            messages += [] if error.problems else [str(error)]
+    if messages:
+        raise InputError("\n".join([*messages, *map(str, problems)]))
     if problems:
         raise InputError(problems)
-    return tuple(found)
+    return tuple(records)
 
 
 def refusals(named: Sequence[InForce], here: Situation, needed: Sequence[str] = NEEDED) -> list[str]:
@@ -98,12 +98,12 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
                 f"holds for a focus of {holds.focus_distance_mm:g} mm (within {holds.focus_tolerance_mm:g}); the "
                 f"rig is focused at {here.focus_distance_mm:g} mm. Calibrate at this focus, or turn the ring back"
             )
-    for what, unit, valid, found in (
+    for label, unit, valid, rig_figure in (
         ("focal length", " mm", holds.focal_length_mm, here.focal_length_mm),
         ("aperture", "", holds.f_number, here.f_number),
     ):
-        if valid is not None and abs(valid - found) > _SAME * valid:
-            reasons.append(f"holds for {what} {valid:g}{unit}; the rig has {found:g}{unit}")
+        if valid is not None and abs(valid - rig_figure) > _SAME * valid:
+            reasons.append(f"holds for {label} {valid:g}{unit}; the rig has {rig_figure:g}{unit}")
     if holds.size_px is not None and holds.size_px != here.size_px:
         reasons.append(
             f"holds for frames of {holds.size_px[0]} x {holds.size_px[1]} pixels; the camera gives "

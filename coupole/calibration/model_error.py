@@ -64,7 +64,7 @@ class ModelError:
     suspects: tuple[Suspected, ...]
 
     def of(self, name: str) -> Suspected:
-        return next(one for one in self.suspects if one.name == name)
+        return next(suspect for suspect in self.suspects if suspect.name == name)
 
 
 def with_suspects(
@@ -83,14 +83,14 @@ def with_suspects(
     """
     noise = float(factors[group])
     for _ in range(_ROUNDS):
-        scaled = factors.copy()
-        scaled[group] = noise
-        fit = _Fit(blocks, weights, scaled, parameters, suspects, group)
+        scaled_factors = factors.copy()
+        scaled_factors[group] = noise
+        fit = _Fit(blocks, weights, scaled_factors, parameters, suspects, group)
         logs = fit.most_likely(redundancy, [True] * len(suspects))
         again = noise * float(np.exp(0.5 * logs[0]))
-        settled = abs(again / noise - 1.0) < _SETTLED
+        is_settled = abs(again / noise - 1.0) < _SETTLED
         noise = again
-        if settled:
+        if is_settled:
             break
     return fit.result(logs, redundancy, noise)
 
@@ -108,8 +108,8 @@ class _Fit:
         group: int,
     ) -> None:
         self.suspects = suspects
-        modes = np.concatenate([one.modes for one in suspects], axis=1) / factors[group]
-        self.of_mode = np.repeat(np.arange(len(suspects)), [one.modes.shape[1] for one in suspects])
+        modes = np.concatenate([suspect.modes for suspect in suspects], axis=1) / factors[group]
+        self.of_mode = np.repeat(np.arange(len(suspects)), [suspect.modes.shape[1] for suspect in suspects])
         normal = np.zeros((parameters, parameters))
         cross, gram, side = np.zeros((parameters, modes.shape[1])), 0.0, np.zeros(modes.shape[1])
         self.chi2, first = 0.0, 0
@@ -121,20 +121,20 @@ class _Fit:
                 continue
             rows = slice(first, first + len(weight))
             first += len(weight)
-            kept = modes[rows] * weight[:, None]
+            weighted_modes = modes[rows] * weight[:, None]
             residuals = block.residuals / factors[group]
-            cross[block.columns] += jacobian.T @ kept
-            gram = gram + modes[rows].T @ kept
-            side += kept.T @ residuals
+            cross[block.columns] += jacobian.T @ weighted_modes
+            gram = gram + modes[rows].T @ weighted_modes
+            side += weighted_modes.T @ residuals
             self.chi2 += float(weight @ residuals**2)
             self._own.append((jacobian, block, weight, rows))
         self.modes, self.cross = modes, cross
         self.covariance = np.asarray(cho_solve(cho_factor(normal), np.eye(parameters)))
-        left = gram - cross.T @ self.covariance @ cross
-        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
-        told = values > _NULL * max(float(np.max(np.diag(gram))), 1e-300)
-        self.root = np.sqrt(values[told])[:, None] * vectors[:, told].T
-        self.seen = (vectors[:, told].T @ side) / np.sqrt(values[told])
+        remaining_gram = gram - cross.T @ self.covariance @ cross
+        values, vectors = np.linalg.eigh(0.5 * (remaining_gram + remaining_gram.T))
+        usable = values > _NULL * max(float(np.max(np.diag(gram))), 1e-300)
+        self.root = np.sqrt(values[usable])[:, None] * vectors[:, usable].T
+        self.seen = (vectors[:, usable].T @ side) / np.sqrt(values[usable])
 
     def _spread(self, logs: Floats) -> Floats:
         """[modes] prior variances."""
@@ -149,10 +149,12 @@ class _Fit:
         """Return minus twice the log-likelihood, by the logarithms of the noise's variance and of the suspects'
         amplitudes squared."""
         factor = cho_factor(self._variance(logs), lower=True)
-        told = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(self.seen @ cho_solve(factor, self.seen))
+        modes_part = 2.0 * float(np.sum(np.log(np.diag(factor[0])))) + float(
+            self.seen @ cho_solve(factor, self.seen)
+        )
         rest = max(redundancy - len(self.seen), 1.0)
-        unexplained = max(self.chi2 - float(self.seen @ self.seen), 0.0)
-        return told + rest * float(logs[0]) + unexplained * float(np.exp(-logs[0]))
+        unexplained_chi2 = max(self.chi2 - float(self.seen @ self.seen), 0.0)
+        return modes_part + rest * float(logs[0]) + unexplained_chi2 * float(np.exp(-logs[0]))
 
     def most_likely(self, redundancy: float, allowed: Sequence[bool]) -> Floats:
         """[1 + suspects] those logarithms; suspects that are not allowed have none."""
@@ -169,33 +171,33 @@ class _Fit:
             logs[free] = values
             return self.minus_twice_log_likelihood(logs, redundancy)
 
-        found = minimize(cost, start[free], method="L-BFGS-B", bounds=bounds)
+        minimum = minimize(cost, start[free], method="L-BFGS-B", bounds=bounds)
         best = start.copy()
-        best[free] = found.x
+        best[free] = minimum.x
         return best
 
     def result(self, logs: Floats, redundancy: float, noise: float) -> ModelError:
-        spread = self._spread(logs)
+        variances = self._spread(logs)
         factor = cho_factor(self._variance(logs))
-        gain = spread[:, None] * self.root.T
+        gain = variances[:, None] * self.root.T
         coefficients = gain @ cho_solve(factor, self.seen)
-        covariance = np.diag(spread) - gain @ cho_solve(factor, gain.T)
+        covariance = np.diag(variances) - gain @ cho_solve(factor, gain.T)
         by = self.covariance @ self.cross
         step = -by @ coefficients
         at_best = self.minus_twice_log_likelihood(logs, redundancy)
         suspects = []
         for number, suspect in enumerate(self.suspects):
-            own = self.of_mode == number
+            own_modes = self.of_mode == number
             without = self.most_likely(redundancy, [n != number for n in range(len(self.suspects))])
             evidence = self.minus_twice_log_likelihood(without, redundancy) - at_best
-            pattern = self._pattern(np.where(own, coefficients, 0.0), by)
+            pattern = self._pattern(np.where(own_modes, coefficients, 0.0), by)
             suspects.append(
                 Suspected(
                     suspect.name,
                     float(np.exp(0.5 * logs[1 + number])),
                     max(float(evidence), 0.0),
-                    coefficients[own],
-                    covariance[np.ix_(own, own)],
+                    coefficients[own_modes],
+                    covariance[np.ix_(own_modes, own_modes)],
                     pattern * noise,
                 )
             )
@@ -206,7 +208,7 @@ class _Fit:
         step = -by @ coefficients
         total, count = 0.0, 0
         for jacobian, block, weight, rows in self._own:
-            left = self.modes[rows] @ coefficients + jacobian @ step[block.columns]
-            total += float(weight @ left**2)
+            pattern = self.modes[rows] @ coefficients + jacobian @ step[block.columns]
+            total += float(weight @ pattern**2)
             count += int(weight.sum())
         return float(np.sqrt(total / max(count, 1)))

@@ -49,8 +49,8 @@ def unproject(pixels: Floats, intrinsics: Intrinsics) -> Floats:
     vector = intrinsics.vector()
     rays = np.concatenate([(pixels - vector[2:4]) / vector[:2], np.ones((len(pixels), 1))], axis=1)
     for _ in range(_NEWTON_STEPS):
-        seen = optics.project(rays, vector)
-        rays[:, :2] += np.linalg.solve(seen.by_point[:, :, :2], (pixels - seen.pixels)[:, :, None])[:, :, 0]
+        image = optics.project(rays, vector)
+        rays[:, :2] += np.linalg.solve(image.by_point[:, :, :2], (pixels - image.pixels)[:, :, None])[:, :, 0]
     if len(pixels) and not np.abs(optics.project(rays, vector).pixels - pixels).max() < 1e-6:
         raise InputError("camera record: its distortion cannot be undone at the border of the image")
     directions: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -155,9 +155,9 @@ def _refined(
         normal[rows] += across
         side[rows] += across @ view.base_from_camera[:3, 3]
     solvable = agreeing.sum(axis=1) >= 2
-    moved = points.copy()
-    moved[solvable] = np.linalg.solve(normal[solvable], side[solvable][:, :, None])[:, :, 0]
-    return moved
+    moved_points = points.copy()
+    moved_points[solvable] = np.linalg.solve(normal[solvable], side[solvable][:, :, None])[:, :, 0]
+    return moved_points
 
 
 def _chosen(
@@ -170,14 +170,16 @@ def _chosen(
     """Candidates by number of views, then by residual, each with detections that no earlier one uses."""
     agreeing = off_px <= tolerance_px
     rms_px = np.sqrt(np.where(agreeing, off_px, 0.0) ** 2).mean(axis=1)
-    taken: set[tuple[int, int]] = set()
-    chosen = []
+    taken_pairs: set[tuple[int, int]] = set()
+    agreeing_points = []
     for row in np.lexsort((rms_px, -agreeing.sum(axis=1))):
-        seen = [(int(v), int(nearest[row, v])) for v in np.flatnonzero(agreeing[row])]
-        free = [pair for pair in seen if pair not in taken]
-        if len(free) < least_views or 2 * len(free) < len(seen):
+        pairs = [(int(v), int(nearest[row, v])) for v in np.flatnonzero(agreeing[row])]
+        free = [pair for pair in pairs if pair not in taken_pairs]
+        if len(free) < least_views or 2 * len(free) < len(pairs):
             continue
-        taken.update(free)
+        taken_pairs.update(free)
         residual_px = float(np.sqrt(np.mean([off_px[row, v] ** 2 for v, _ in free])))
-        chosen.append(SeenPoint(points[row], tuple(v for v, _ in free), tuple(p for _, p in free), residual_px))
-    return chosen
+        agreeing_points.append(
+            SeenPoint(points[row], tuple(v for v, _ in free), tuple(p for _, p in free), residual_px)
+        )
+    return agreeing_points

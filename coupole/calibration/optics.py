@@ -77,14 +77,14 @@ def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
     slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # dg / d(r^2)
     xd = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    one, nought = np.ones_like(x), np.zeros_like(x)
+    ones, zeros = np.ones_like(x), np.zeros_like(x)
     by_intrinsics = np.empty((len(points), 2, 9))
     by_intrinsics[:, 0] = np.stack(
         [
             xd,
-            nought,
-            one,
-            nought,
+            zeros,
+            ones,
+            zeros,
             fx * x * r2,
             fx * x * r2**2,
             fx * 2 * x * y,
@@ -95,10 +95,10 @@ def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
     )
     by_intrinsics[:, 1] = np.stack(
         [
-            nought,
+            zeros,
             yd,
-            nought,
-            one,
+            zeros,
+            ones,
             fy * y * r2,
             fy * y * r2**2,
             fy * (r2 + 2 * y * y),
@@ -107,8 +107,8 @@ def project(points_camera_mm: ArrayLike, intrinsics: ArrayLike) -> Projected:
         ],
         axis=-1,
     )
-    crossed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y  # dxd/dy = dyd/dx
-    by_x = np.stack([fx * (g + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x), fy * crossed], axis=-1)
-    by_y = np.stack([fx * crossed, fy * (g + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x)], axis=-1)
+    cross_term = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y  # dxd/dy = dyd/dx
+    by_x = np.stack([fx * (g + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x), fy * cross_term], axis=-1)
+    by_y = np.stack([fx * cross_term, fy * (g + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x)], axis=-1)
     by_point = np.stack([by_x, by_y, -(by_x * x[:, None] + by_y * y[:, None])], axis=-1) / depth[:, None, None]
     return Projected(np.stack([fx * xd + cx, fy * yd + cy], axis=-1), by_intrinsics, by_point)

@@ -83,7 +83,9 @@ def match_points(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Mat
         )
     best.sort(key=lambda entry: (-entry[0], entry[1]))
     count, rms_mm, motion = best[0]
-    rivals = max((n for n, _, other in best[1:] if _differ(motion, other, known_mm, tolerance_mm)), default=0)
+    rivals = max(
+        (n for n, _, other_motion in best[1:] if _differ(motion, other_motion, known_mm, tolerance_mm)), default=0
+    )
     if rivals > _AMBIGUOUS_SHARE * count:
         raise InputError(
             f"targets: two motions fit: one brings {count} targets together, another {rivals}. The stickers are "
@@ -97,8 +99,8 @@ def _triangles(points: Floats) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.
     """Corners [t, 3] ordered by the side against them, longest last, and those sides [t, 3]."""
     neighbours = min(NEIGHBOURS, len(points) - 1)
     near = cKDTree(points).query(points, neighbours + 1)[1]
-    chosen = {tuple(sorted((row[0], a, b))) for row in near for a, b in combinations(row[1:], 2)}
-    corners = np.array(sorted(chosen))
+    triples = {tuple(sorted((row[0], a, b))) for row in near for a, b in combinations(row[1:], 2)}
+    corners = np.array(sorted(triples))
     across = np.stack(
         [points[corners[:, (k + 1) % 3]] - points[corners[:, (k + 2) % 3]] for k in range(3)], axis=1
     )
@@ -112,27 +114,27 @@ def _triangles(points: Floats) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.
 
 def _motions(found_mm: Floats, known_mm: Floats, tolerance_mm: float) -> Iterator[Floats]:
     """Motions known -> found of pairs of triangles with the same sides, the closest pairs first."""
-    found, found_sides = _triangles(found_mm)
-    known, known_sides = _triangles(known_mm)
-    if not len(found) or not len(known):
+    found_triangles, found_sides = _triangles(found_mm)
+    known_triangles, known_sides = _triangles(known_mm)
+    if not len(found_triangles) or not len(known_triangles):
         return
     similar = cKDTree(known_sides).query_ball_point(found_sides, 2 * tolerance_mm)
     pairs = [(f, k) for f, ks in enumerate(similar) for k in ks]
     off = [float(np.abs(found_sides[f] - known_sides[k]).max()) for f, k in pairs]
     for place in np.argsort(off, kind="stable")[:_TRIES]:
         f, k = pairs[place]
-        yield rigid_motion(known_mm[known[k]], found_mm[found[f]])
+        yield rigid_motion(known_mm[known_triangles[k]], found_mm[found_triangles[f]])
 
 
 def _pairs(tree: cKDTree, motion: Floats, known_mm: Floats, tolerance_mm: float) -> Pairs:
     """Each found point with the nearest known one, one to one."""
-    off_mm, found = tree.query(known_mm @ motion[:3, :3].T + motion[:3, 3], distance_upper_bound=tolerance_mm)
-    taken: dict[int, int] = {}
-    for known in np.argsort(off_mm):
-        if np.isfinite(off_mm[known]):
-            taken.setdefault(int(found[known]), int(known))
-    keys = np.array(sorted(taken), dtype=np.intp)
-    return keys, np.array([taken[int(key)] for key in keys], dtype=np.intp)
+    off_mm, nearest = tree.query(known_mm @ motion[:3, :3].T + motion[:3, 3], distance_upper_bound=tolerance_mm)
+    known_of_found: dict[int, int] = {}
+    for known_row in np.argsort(off_mm):
+        if np.isfinite(off_mm[known_row]):
+            known_of_found.setdefault(int(nearest[known_row]), int(known_row))
+    keys = np.array(sorted(known_of_found), dtype=np.intp)
+    return keys, np.array([known_of_found[int(key)] for key in keys], dtype=np.intp)
 
 
 def _rms(motion: Floats, found_mm: Floats, known_mm: Floats, pairs: Pairs) -> float:

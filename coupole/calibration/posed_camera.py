@@ -37,8 +37,8 @@ class CameraPrior:
     @property
     def hand_eye_covariance(self) -> Floats:
         """[6, 6], mm and rad."""
-        own = slice(len(self.free), len(self.free) + 6)
-        return self.covariance[own, own]
+        hand_eye_part = slice(len(self.free), len(self.free) + 6)
+        return self.covariance[hand_eye_part, hand_eye_part]
 
     def by_axes(self, base_from_flange: Floats) -> Floats:
         """[v, 6, k] step of each pose [v, 4, 4], as in `rotations.moved`, per degree of the axes."""
@@ -66,8 +66,8 @@ def read_posed_camera(hand_eye: Path, camera: Path | None, about: About, size_px
 def _prior(record: Record) -> CameraPrior:
     lens, free = intrinsics_of(record)
     names = [parameter.name for parameter in record.parameters]
-    wanted = [n for n in names if n.removesuffix("_px") in free] + list(step_names(HAND_EYE))
-    at = [names.index(name) for name in wanted]
+    needed_names = [n for n in names if n.removesuffix("_px") in free] + list(step_names(HAND_EYE))
+    at = [names.index(name) for name in needed_names]
     units = np.ones(len(at))
     units[-3:] = np.radians(1.0)
     covariance = record.covariance_matrix[np.ix_(at, at)] * np.outer(units, units)

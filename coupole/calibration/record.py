@@ -191,14 +191,14 @@ class Record(Model):
 
     def value(self, name: str) -> float:
         """A figure that was estimated or held. Raises KeyError if there is none."""
-        found = {p.name: p.value for p in self.parameters if p.value is not None} | self.fixed
-        return found[name]
+        figures = {p.name: p.value for p in self.parameters if p.value is not None} | self.fixed
+        return figures[name]
 
 
 def sealed(**content: Any) -> Record:
     """A record of this content, with its hash. Raises pydantic's ValidationError for invalid content."""
-    unsealed = Record.model_construct(**content, schema_version=1, sha256="")
-    plain = json.loads(unsealed.model_dump_json(exclude={"sha256"}))
+    draft = Record.model_construct(**content, schema_version=1, sha256="")
+    plain = json.loads(draft.model_dump_json(exclude={"sha256"}))
     return Record.model_validate_json(json.dumps({**plain, "sha256": content_sha256(plain)}))
 
 
@@ -285,11 +285,11 @@ def _covariance_problems(record: Record) -> Iterator[str]:
 def _file_problems(record: Record, folder: Path, files: InputFiles) -> Iterator[str]:
     for file in record.files:
         try:
-            found = files.sha256(folder / file.name)
+            sha256 = files.sha256(folder / file.name)
         except OSError as error:
             yield f"expected {file.name} beside the record: {reason(error)}"
             continue
-        if found != file.sha256:
+        if sha256 != file.sha256:
             yield f"{file.name} beside the record was changed after it was made: it has another checksum"
 
 
@@ -307,6 +307,6 @@ def _lines(plain: dict[str, Any]) -> Iterator[str]:
 def intrinsics_of(record: Record) -> tuple[Intrinsics, tuple[str, ...]]:
     """The lens of a record, and its estimated parameters in the covariance's order."""
     values = {p.name: p.value for p in record.parameters} | dict(record.fixed)
-    named = {name.removesuffix("_px"): value for name, value in values.items()}
-    lens = Intrinsics(**{name: float(named.get(name) or 0.0) for name in NAMES})
+    value_of = {name.removesuffix("_px"): value for name, value in values.items()}
+    lens = Intrinsics(**{name: float(value_of.get(name) or 0.0) for name in NAMES})
     return lens, tuple(n for p in record.parameters if (n := p.name.removesuffix("_px")) in NAMES)

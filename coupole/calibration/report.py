@@ -75,8 +75,8 @@ def draw(outcome: Outcome) -> bytes:
     record = outcome.record
     verdict = "accepted" if record.passed else "NOT ACCEPTED"
     images = f": {len(record.images)} images" if record.images else ""
-    what = f"{record.kind} calibration {record.name}{images}, {verdict}"
-    figure.suptitle(what + (" (simulated)" if record.simulated else ""), fontsize=16, color=DARK)
+    title = f"{record.kind} calibration {record.name}{images}, {verdict}"
+    figure.suptitle(title + (" (simulated)" if record.simulated else ""), fontsize=16, color=DARK)
     for ax in figure.axes:
         ax.spines[["top", "right"]].set_visible(False)
         ax.tick_params(colors=DARK)
@@ -91,12 +91,12 @@ def draw(outcome: Outcome) -> bytes:
 
 def _page(record: Record, picture: bytes) -> str:
     name = html.escape(f"{record.kind} calibration {record.name}")
-    simulated = "<p>Simulated: no real camera.</p>" if record.simulated else ""
+    simulated_note = "<p>Simulated: no real camera.</p>" if record.simulated else ""
     data = base64.b64encode(picture).decode()
     remarks = "".join(f"<li>{html.escape(remark)}" for remark in record.remarks)
     return (
         f"{HEAD}<title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
-        f"{simulated}{_limits(record)}<h2>Result</h2>{_transforms(record)}{_parameters(record)}{_noise(record)}"
+        f"{simulated_note}{_limits(record)}<h2>Result</h2>{_transforms(record)}{_parameters(record)}{_noise(record)}"
         + (f"<h2>Remarks</h2><ul>{remarks}</ul>" if remarks else "")
         + f'<h2>Residuals</h2><img src="data:image/png;base64,{data}" alt="residuals">{_validity(record)}'
     )

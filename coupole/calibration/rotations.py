@@ -25,8 +25,8 @@ def rotation(vectors_rad: ArrayLike) -> Floats:
     across = skew(v)
     sine = np.sinc(angle / np.pi)
     versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    turned: Floats = np.eye(3) + sine * across + versine * (across @ across)
-    return turned
+    rotations: Floats = np.eye(3) + sine * across + versine * (across @ across)
+    return rotations
 
 
 def quaternion(rotations: ArrayLike) -> Floats:
@@ -47,8 +47,8 @@ def quaternion(rotations: ArrayLike) -> Floats:
     best = np.argmax(np.einsum("...ii->...i", outer), axis=-1)
     q = np.take_along_axis(outer, best[..., None, None], axis=-1)[..., 0]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    signed: Floats = np.where(q[..., :1] < 0, -q, q)
-    return signed
+    quaternions: Floats = np.where(q[..., :1] < 0, -q, q)
+    return quaternions
 
 
 def rotation_vector(rotations: ArrayLike) -> Floats:
@@ -65,9 +65,9 @@ def nearest_rotation(matrices: ArrayLike) -> Floats:
     """The rotation nearest to a matrix [..., 3, 3] (polar decomposition; determinant +1)."""
     u, _, vt = np.linalg.svd(np.asarray(matrices, dtype=np.float64))
     turn: Floats = np.asarray(u @ vt)
-    handed = np.ones((*turn.shape[:-2], 3))
-    handed[..., 2] = np.sign(np.linalg.det(turn))
-    return np.asarray(u * handed[..., None, :] @ vt)
+    signs = np.ones((*turn.shape[:-2], 3))
+    signs[..., 2] = np.sign(np.linalg.det(turn))
+    return np.asarray(u * signs[..., None, :] @ vt)
 
 
 def moved(a_from_b: Floats, steps: Floats) -> Floats:
@@ -87,8 +87,8 @@ def between(a_from_b: Floats, other: Floats) -> Floats:
 def inverses(a_from_b: Floats) -> Floats:
     """`b_from_a` of transforms [..., 4, 4]."""
     result = np.zeros_like(a_from_b)
-    turned = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = -(turned @ a_from_b[..., :3, 3:])[..., 0]
+    inverse_turns = np.swapaxes(a_from_b[..., :3, :3], -1, -2)
+    result[..., :3, :3] = inverse_turns
+    result[..., :3, 3] = -(inverse_turns @ a_from_b[..., :3, 3:])[..., 0]
     result[..., 3, 3] = 1.0
     return result

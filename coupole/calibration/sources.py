@@ -147,8 +147,8 @@ def _of_run(run: Run) -> Sources:
         records = file.records[[frame.index for frame in lit]]
         pose = file.poses[int(records["pose"][0])]
         lit_records += list(records)
-        read = partial(_mean_frame, view, file, lit, dark)
-        images.append(Source(view, read, tuple(map(float, pose["joints_deg"]))))
+        reader = partial(_mean_frame, view, file, lit, dark)
+        images.append(Source(view, reader, tuple(map(float, pose["joints_deg"]))))
         flanges.append(np.array(pose["base_from_flange"], dtype=np.float64))
         inputs.append((f"{run.folder.name}/views/{path.name}", frames_sha256([*lit, *dark])))
         about = about_of(run, file)
@@ -160,18 +160,18 @@ def _of_run(run: Run) -> Sources:
 
 def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list[FrameProven]:
     """The frames of the pose with most frames: a view has two poses if the arm was moved during it."""
-    taken = Counter(int(table[frame.index]["pose"]) for frame in frames)
-    return [frame for frame in frames if int(table[frame.index]["pose"]) == taken.most_common(1)[0][0]]
+    frame_counts = Counter(int(table[frame.index]["pose"]) for frame in frames)
+    return [frame for frame in frames if int(table[frame.index]["pose"]) == frame_counts.most_common(1)[0][0]]
 
 
 def _mean_frame(name: str, file: View, lit: Sequence[FrameProven], dark: Sequence[FrameProven]) -> Picture:
     """Mean of the frames at the longest exposure with few clipped pixels, dark frames subtracted."""
     exposures = {frame.shot: int(file.records[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
-        mine = [frame for frame in lit if exposures[frame.shot] == exposure_us]
-        frames = [file.proven_pixels(frame) for frame in _spread(mine)]
-        clipped = np.mean([np.mean(frame >= file.white_dn) for frame in frames])
-        if clipped < _CLIPPED:
+        exposure_frames = [frame for frame in lit if exposures[frame.shot] == exposure_us]
+        frames = [file.proven_pixels(frame) for frame in _spread(exposure_frames)]
+        clipped_share = np.mean([np.mean(frame >= file.white_dn) for frame in frames])
+        if clipped_share < _CLIPPED:
             break
     mean = _mean(frames)
     darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
@@ -219,7 +219,7 @@ def _joined(parts: Sequence[Sources]) -> Sources:
     """Several runs as one. Raises InputError if they were taken with different lenses or cameras."""
     first = parts[0]
     for part in parts[1:]:
-        here, there = (replace(one.about, temperature_c=None, begun=None) for one in (part, first))
+        here, there = (replace(source.about, temperature_c=None, begun=None) for source in (part, first))
         if here != there:
             raise InputError(f"runs with different cameras, lenses or focus: {part.about} and {first.about}")
     warm = [t for part in parts if part.about.temperature_c for t in part.about.temperature_c]

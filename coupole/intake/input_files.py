@@ -53,8 +53,8 @@ class InputFiles:
 
     def changes(self) -> list[str]:
         """List what happened on the disk to files since they were read, one sentence each; each is told once."""
-        found = [f"{path} {how}" for path, read in self._read.items() if (how := _change(path, read))]
-        new = [sentence for sentence in found if sentence not in self._told]
+        sentences = [f"{path} {how}" for path, state in self._read.items() if (how := _change(path, state))]
+        new = [sentence for sentence in sentences if sentence not in self._told]
         self._told |= set(new)
         return new
 

@@ -72,7 +72,7 @@ def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = Fal
         return value
 
     try:
-        found = json.loads(
+        content = json.loads(
             text, parse_int=whole, parse_constant=constant, parse_float=None if allow_nan else finite
         )
     except json.JSONDecodeError as error:
@@ -83,7 +83,7 @@ def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = Fal
         _refuse(text, _first_too_deep(text), name, line, f"nested deeper than {MAX_DEPTH} levels")
     if _deeper_than_allowed(text):
         _refuse(text, _first_too_deep(text), name, line, f"nested deeper than {MAX_DEPTH} levels")
-    return found
+    return content
 
 
 def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
@@ -105,8 +105,8 @@ def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
     except RecursionError as error:
         raise InputError([Problem(name, line, 1, "", f"nested deeper than {MAX_DEPTH} levels")]) from error
     except (YAMLError, ValueError, OverflowError, TypeError) as error:
-        what = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise NotDataError([Problem(name, line, 1, "", f"is no YAML of plain data: {what}")]) from error
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise NotDataError([Problem(name, line, 1, "", f"is no YAML of plain data: {reason}")]) from error
 
 
 def _values(node: Any, known: dict[int, int]) -> int:
@@ -116,7 +116,7 @@ def _values(node: Any, known: dict[int, int]) -> int:
     known[id(node)] = MAX_VALUES + 1
     inside = node.value if isinstance(node.value, list) else ()
     count = 1 + sum(
-        _values(one, known) for part in inside for one in (part if isinstance(part, tuple) else (part,))
+        _values(child, known) for part in inside for child in (part if isinstance(part, tuple) else (part,))
     )
     known[id(node)] = count
     return count
@@ -129,8 +129,8 @@ def _decoded(raw: bytes | str, name: str, line: int) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = raw[: error.start].decode("utf-8-sig", "replace")
-        what = f"not UTF-8: byte 0x{raw[error.start]:02x}"
-        raise NotDataError([_problem(before, len(before), name, line, what)]) from error
+        reason = f"not UTF-8: byte 0x{raw[error.start]:02x}"
+        raise NotDataError([_problem(before, len(before), name, line, reason)]) from error
 
 
 def _deeper_than_allowed(text: str) -> bool:
@@ -147,18 +147,18 @@ def _deeper_than_allowed(text: str) -> bool:
 def _first_too_deep(text: str) -> int:
     """Offset of the first bracket that opens a level too many, outside strings."""
     depth = 0
-    for found in re.finditer(r'"(?:[^"\\]|\\.)*"|[\[\]{}]', text, re.DOTALL):
-        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(found.group(), 0)
+    for token in re.finditer(r'"(?:[^"\\]|\\.)*"|[\[\]{}]', text, re.DOTALL):
+        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(token.group(), 0)
         if depth > MAX_DEPTH:
-            return found.start()
+            return token.start()
     return 0
 
 
 def _place_of(text: str, token: str) -> int:
     """Offset of the first such token outside strings."""
-    for found in re.finditer(rf'"(?:[^"\\]|\\.)*"|(?<![\w.+-]){re.escape(token)}(?![\w.])', text, re.DOTALL):
-        if not found.group().startswith('"'):
-            return found.start()
+    for match in re.finditer(rf'"(?:[^"\\]|\\.)*"|(?<![\w.+-]){re.escape(token)}(?![\w.])', text, re.DOTALL):
+        if not match.group().startswith('"'):
+            return match.start()
     return 0
 
 

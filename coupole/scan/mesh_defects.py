@@ -41,12 +41,12 @@ def find_defects(mesh: Mesh) -> Defects:
     keys = np.empty(3 * len(mesh.triangles), np.uint64)
     _fill_edge_keys(mesh.triangles, keys)
     keys.sort()
-    open_edges, (non_manifold, crowded), (flipped, turned) = _count_edges(keys)
+    open_edges, (non_manifold, crowded_edge), (flipped_count, turned_edge) = _count_edges(keys)
     return Defects(
         non_manifold,
-        _triangle_with(mesh.triangles, crowded) if non_manifold else -1,
-        flipped,
-        _triangle_with(mesh.triangles, turned) if flipped else -1,
+        _triangle_with(mesh.triangles, crowded_edge) if non_manifold else -1,
+        flipped_count,
+        _triangle_with(mesh.triangles, turned_edge) if flipped_count else -1,
         open_edges,
         degenerate,
         first_degenerate,
@@ -103,7 +103,7 @@ def _count_edges(keys):  # type: ignore[no-untyped-def]
     """Number of open edges; number and first key of edges with more than two triangles; the same for flipped
     edges."""
     none = np.uint64(0)
-    open_edges, crowded, turned, first_crowded, first_turned = 0, 0, 0, none, none
+    open_edges, crowded_count, turned_count, first_crowded, first_turned = 0, 0, 0, none, none
     at = 0
     while at < len(keys):
         end = at + 1
@@ -112,13 +112,13 @@ def _count_edges(keys):  # type: ignore[no-untyped-def]
         if end - at == 1:
             open_edges += 1
         elif end - at > 2:
-            first_crowded = keys[at] if crowded == 0 else first_crowded
-            crowded += 1
+            first_crowded = keys[at] if crowded_count == 0 else first_crowded
+            crowded_count += 1
         elif keys[at] == keys[at + 1]:
-            first_turned = keys[at] if turned == 0 else first_turned
-            turned += 1
+            first_turned = keys[at] if turned_count == 0 else first_turned
+            turned_count += 1
         at = end
-    return open_edges, (crowded, first_crowded), (turned, first_turned)
+    return open_edges, (crowded_count, first_crowded), (turned_count, first_turned)
 
 
 @numba.njit(cache=True, nogil=True)

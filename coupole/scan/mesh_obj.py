@@ -71,8 +71,8 @@ def _fill_obj(data, vertices, triangles):  # type: ignore[no-untyped-def]
         if kind == 1:
             for axis in range(3):
                 at = mesh_text.skip_blanks(data, at, end)
-                value, at, found = mesh_text.decimal(data, at, end)
-                if not found:
+                value, at, is_number = mesh_text.decimal(data, at, end)
+                if not is_number:
                     return NOT_A_NUMBER, line
                 vertices[v, axis] = value
             v += 1
@@ -81,8 +81,8 @@ def _fill_obj(data, vertices, triangles):  # type: ignore[no-untyped-def]
             at = mesh_text.skip_blanks(data, at, end)
             while at < end:
                 stop = mesh_text.token_end(data, at, end)
-                value, after, found = mesh_text.whole(data, at, stop)
-                if not found or (after < stop and data[after] != 47):
+                value, after, is_number = mesh_text.whole(data, at, stop)
+                if not is_number or (after < stop and data[after] != 47):
                     return NOT_A_NUMBER, line
                 corner = v + value if value < 0 else value - 1
                 if corner < 0 or corner >= len(vertices):

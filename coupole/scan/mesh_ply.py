@@ -61,12 +61,12 @@ def read_ply(source: MeshFile) -> Mesh:
 
 def _expect_possible(source: MeshFile, element: _Element, *, ascii_text: bool) -> None:
     """Raise InputError if the file is too short for an element, or a property stands twice."""
-    path, names = source.path, [described[0] for described in element.properties]
+    path, names = source.path, [field[0] for field in element.properties]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(
             f"{path}: element `{element.name}` has property `{twice[0]}` twice; expected each name once"
         )
-    kinds = [_PLY_TYPES.get(described[1], "u1") for described in element.properties]  # of a list, its count
+    kinds = [_PLY_TYPES.get(field[1], "u1") for field in element.properties]  # of a list, its count
     least_bytes = 2 * len(kinds) if ascii_text else sum(np.dtype(kind).itemsize for kind in kinds)
     expect_room(path, f"`{element.name}`", element.count, max(1, least_bytes), source.size_bytes + 1)
 
@@ -94,8 +94,8 @@ def _ply_header(source: MeshFile) -> tuple[str, list[_Element], int, int]:
                 case ["ply"] | ["comment" | "obj_info", *_]:
                     pass
                 case _:
-                    found = " ".join(words) or "nothing"
-                    raise InputError(f"{path}:{number}: expected a line of a PLY header, found `{found[:60]}`")
+                    text = " ".join(words) or "nothing"
+                    raise InputError(f"{path}:{number}: expected a line of a PLY header, found `{text[:60]}`")
     raise InputError(f"{path}: expected `end_header`; the header has no end")
 
 
@@ -105,7 +105,7 @@ def _with(element: _Element, described: tuple[str, ...]) -> _Element:
 
 def _plain_record(path: Path, element: _Element, order: str) -> np.dtype[np.void]:
     """Layout of an element without lists."""
-    if any(len(described) == 3 for described in element.properties):
+    if any(len(field) == 3 for field in element.properties):
         raise InputError(f"{path}: element `{element.name}` holds lists; only faces may")
     return np.dtype([(name, order + _PLY_TYPES[kind]) for name, kind in element.properties])
 
@@ -116,8 +116,8 @@ def _binary_vertices(path: Path, file, element: _Element, order: str) -> NDArray
         raise InputError(f"{path}: expected vertices with x, y and z, found {', '.join(record.names or ())}")
     vertices = np.empty((element.count, 3), np.float32)
     if record.names == ("x", "y", "z") and record.itemsize == 12 and order == "<":
-        read = file.readinto(vertices.data.cast("B")) if element.count else 0
-        expect_records(path, "vertex", element.count, read // 12)
+        byte_count = file.readinto(vertices.data.cast("B")) if element.count else 0
+        expect_records(path, "vertex", element.count, byte_count // 12)
     else:
         for first in range(0, element.count, CHUNK):
             part = read_records(file, record, min(CHUNK, element.count - first))
@@ -132,13 +132,13 @@ def _binary_vertices(path: Path, file, element: _Element, order: str) -> NDArray
 
 
 def _binary_triangles(path: Path, file, element: _Element, order: str, vertices: int) -> NDArray[np.uint32]:  # type: ignore[no-untyped-def]
-    lists = [described for described in element.properties if len(described) == 3]
+    lists = [field for field in element.properties if len(field) == 3]
     if len(lists) != 1 or lists[0][0] not in ("vertex_indices", "vertex_index"):
         raise InputError(f"{path}: expected faces with one list, `vertex_indices`")
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for described in element.properties:
-        if len(described) == 3:
-            kinds = [_PLY_TYPES.get(kind, "") for kind in described[1:]]
+    for field in element.properties:
+        if len(field) == 3:
+            kinds = [_PLY_TYPES.get(kind, "") for kind in field[1:]]
             if kinds[0] not in ("u1", "i1", "u2", "i2", "u4", "i4") or kinds[1] not in (
                 "i4",
                 "u4",
@@ -147,21 +147,21 @@ def _binary_triangles(path: Path, file, element: _Element, order: str, vertices:
                 "u1",
             ):
                 raise InputError(
-                    f"{path}: expected faces as lists of whole numbers, found {' of '.join(described[1:])}"
+                    f"{path}: expected faces as lists of whole numbers, found {' of '.join(field[1:])}"
                 )
             fields += [("corners", order + kinds[0]), ("indices", order + kinds[1], (3,))]
         else:
-            fields.append((described[0], order + _PLY_TYPES[described[1]]))
+            fields.append((field[0], order + _PLY_TYPES[field[1]]))
     record = np.dtype(fields)
     triangles = np.empty((element.count, 3), np.uint32)
     for first in range(0, element.count, CHUNK):
-        wanted = min(CHUNK, element.count - first)
-        part = read_records(file, record, wanted)
+        record_count = min(CHUNK, element.count - first)
+        part = read_records(file, record, record_count)
         corners = part["corners"]
         if (wrong := np.flatnonzero(corners != 3)).size:
-            found = int(corners[wrong[0]])
-            raise InputError(f"{path}: face {first + wrong[0]}: expected 3 corners, found {found}: no triangle")
-        expect_records(path, "face", element.count, first + len(part), first + wanted)
+            count = int(corners[wrong[0]])
+            raise InputError(f"{path}: face {first + wrong[0]}: expected 3 corners, found {count}: no triangle")
+        expect_records(path, "face", element.count, first + len(part), first + record_count)
         triangles[first : first + len(part)] = part["indices"]
         expect_corners(path, triangles[first : first + len(part)], vertices, first)
     return triangles
@@ -171,7 +171,7 @@ def _read_ascii_ply(source: MeshFile, elements: list[_Element], at: int, line: i
     path, data = source.path, source.mapped()
     vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
     for element in elements:
-        names = [described[0] for described in element.properties]
+        names = [field[0] for field in element.properties]
         if element.name == "vertex":
             _plain_record(path, element, "<")
             if not {"x", "y", "z"} <= set(names):
@@ -209,8 +209,8 @@ def _fill_vertices(data, at, line, columns, vertices):  # type: ignore[no-untype
         end = mesh_text.line_end(data, at)
         for column in range(last_column + 1):
             at = mesh_text.skip_blanks(data, at, end)
-            value, at, found = mesh_text.decimal(data, at, end)
-            if not found:
+            value, at, is_number = mesh_text.decimal(data, at, end)
+            if not is_number:
                 return (TOO_FEW if end >= len(data) else NOT_A_NUMBER), at, line
             for axis in range(3):
                 if columns[axis] == column:
@@ -227,8 +227,8 @@ def _fill_faces(data, at, line, triangles, vertices):  # type: ignore[no-untyped
         end = mesh_text.line_end(data, at)
         for k in range(4):
             at = mesh_text.skip_blanks(data, at, end)
-            value, at, found = mesh_text.whole(data, at, end)
-            if not found:
+            value, at, is_number = mesh_text.whole(data, at, end)
+            if not is_number:
                 return (TOO_FEW if end >= len(data) else NOT_A_NUMBER), at, line
             if k == 0:
                 if value != 3:

@@ -24,15 +24,15 @@ def read_stl(source: MeshFile) -> Mesh:
     with source.opened() as file:
         header = file.read(_STL_HEADER_BYTES)
         count = int.from_bytes(file.read(4), "little")
-    expected = _STL_HEADER_BYTES + 4 + count * _STL_RECORD.itemsize
-    if size != expected:
+    file_bytes = _STL_HEADER_BYTES + 4 + count * _STL_RECORD.itemsize
+    if size != file_bytes:
         if header.lstrip()[:5] == b"solid":
             return _read_ascii_stl(source)
         if size < _STL_HEADER_BYTES + 4:
             raise InputError(f"{path}: expected a header of 84 bytes; the file has {size}")
         at = (size - _STL_HEADER_BYTES - 4) // _STL_RECORD.itemsize
         raise InputError(
-            f"{path}: the file ends in triangle {at} of {count}, or is not an STL: {size} bytes, not {expected}"
+            f"{path}: the file ends in triangle {at} of {count}, or is not an STL: {size} bytes, not {file_bytes}"
         )
     welder = _Welder(count)
     with source.opened() as file:
@@ -60,10 +60,10 @@ def _read_ascii_stl(source: MeshFile) -> Mesh:
 
 @numba.njit(cache=True, nogil=True)
 def _starts_with(data, at, end, word):  # type: ignore[no-untyped-def]
-    found = end - at >= len(word)
+    matches = end - at >= len(word)
     for k in range(len(word)):
-        found = found and data[at + k] == word[k]
-    return found
+        matches = matches and data[at + k] == word[k]
+    return matches
 
 
 @numba.njit(cache=True, nogil=True)
@@ -86,8 +86,8 @@ def _fill_ascii_stl(data, word, points):  # type: ignore[no-untyped-def]
             at += len(word)
             for axis in range(3):
                 at = mesh_text.skip_blanks(data, at, end)
-                value, at, found = mesh_text.decimal(data, at, end)
-                if not found:
+                value, at, is_number = mesh_text.decimal(data, at, end)
+                if not is_number:
                     return NOT_A_NUMBER, line
                 points[n, axis] = value
             n += 1
@@ -106,11 +106,11 @@ class _Welder:
         self._known, self._filled = 0, 0
 
     def add(self, corners: NDArray[np.float32]) -> None:
-        points, done = corners.reshape(-1, 3), 0
+        points, welded_count = corners.reshape(-1, 3), 0
         out = self._triangles.reshape(-1)[3 * self._filled :]
-        while done < len(points):
-            done, self._known = _weld(points, done, self._slots, self._vertices, self._known, out)
-            if done < len(points):  # not enough room: more vertices than a closed surface has
+        while welded_count < len(points):
+            welded_count, self._known = _weld(points, welded_count, self._slots, self._vertices, self._known, out)
+            if welded_count < len(points):  # not enough room: more vertices than a closed surface has
                 self._vertices = np.concatenate([self._vertices, np.empty_like(self._vertices)])
                 self._slots = np.full(2 * len(self._slots), -1, np.int64)
                 _fill_slots(self._slots, self._vertices, self._known)
@@ -126,10 +126,10 @@ def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
     key = np.empty(3, np.float32)
     key[0], key[1], key[2] = x + np.float32(0.0), y + np.float32(0.0), z + np.float32(0.0)  # -0 becomes 0
     bits = key.view(np.uint32)
-    mixed = np.uint64(bits[0]) * np.uint64(0x9E3779B97F4A7C15)
-    mixed = (mixed ^ (mixed >> np.uint64(29)) ^ np.uint64(bits[1])) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(32)) ^ np.uint64(bits[2])) * np.uint64(0x94D049BB133111EB)
-    at = np.int64((mixed ^ (mixed >> np.uint64(31))) & np.uint64(len(slots) - 1))
+    mix = np.uint64(bits[0]) * np.uint64(0x9E3779B97F4A7C15)
+    mix = (mix ^ (mix >> np.uint64(29)) ^ np.uint64(bits[1])) * np.uint64(0xBF58476D1CE4E5B9)
+    mix = (mix ^ (mix >> np.uint64(32)) ^ np.uint64(bits[2])) * np.uint64(0x94D049BB133111EB)
+    at = np.int64((mix ^ (mix >> np.uint64(31))) & np.uint64(len(slots) - 1))
     while slots[at] >= 0:
         n = slots[at]
         if vertices[n, 0] == x and vertices[n, 1] == y and vertices[n, 2] == z:

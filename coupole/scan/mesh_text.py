@@ -75,8 +75,8 @@ def decimal(data, at, end):  # type: ignore[no-untyped-def]
             break
         at += 1
     if at < stop and (data[at] | 32) == 101:
-        power, at, found = whole(data, at + 1, stop)
-        any_digit = any_digit and found
+        power, at, has_power = whole(data, at + 1, stop)
+        any_digit = any_digit and has_power
         exponent += power
     value = np.float64(mantissa) * 10.0**exponent if exponent >= 0 else np.float64(mantissa) / 10.0**-exponent
     return (-value if negative else value), at, any_digit and at == stop

@@ -56,7 +56,7 @@ def write_scan(scan: Scan, sources: Sequence[Path], unit: str, folder: Path) -> 
 
     `sources` are the scanner's files, `unit` is the mesh's unit in them. Raises OSError.
     """
-    found = {
+    summary = {
         "schema_version": 1,
         "software": f"coupole {coupole.__version__}",
         "imported": utc_now(),
@@ -67,8 +67,8 @@ def write_scan(scan: Scan, sources: Sequence[Path], unit: str, folder: Path) -> 
     _write_ply(folder / "mesh.ply", scan.mesh.vertices, scan.mesh.triangles)
     if len(scan.targets_mm):
         _write_targets(folder / "targets.csv", scan)
-    (folder / "scan.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    return found
+    (folder / "scan.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    return summary
 
 
 def _sha256(path: Path) -> str:

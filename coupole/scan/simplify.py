@@ -12,13 +12,13 @@ def simplified(
     """Vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in each cell of a
     grid are merged, with cells as large as needed."""
     size_mm = float(np.ptp(vertices_mm, axis=0).max(initial=0.0))
-    cells, found = 512, (vertices_mm, faces)
-    while len(found[1]) > faces_at_most:
+    cells, surface = 512, (vertices_mm, faces)
+    while len(surface[1]) > faces_at_most:
         places = np.floor((vertices_mm - vertices_mm.min(axis=0)) * (cells / size_mm)).astype(np.int64)
-        _, merged, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
-        merged = merged.reshape(-1)
-        means = np.stack([np.bincount(merged, column) / count for column in vertices_mm.T], axis=1)
-        a, b, c = merged[faces].T
-        found = means, merged[faces][(a != b) & (b != c) & (c != a)]
+        _, cell_of, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+        cell_of = cell_of.reshape(-1)
+        means = np.stack([np.bincount(cell_of, column) / count for column in vertices_mm.T], axis=1)
+        a, b, c = cell_of[faces].T
+        surface = means, cell_of[faces][(a != b) & (b != c) & (c != a)]
         cells = cells * 3 // 4
-    return found
+    return surface

@@ -50,8 +50,8 @@ def read_targets(path: Path) -> Targets:
             continue
         words = _words(line, path, number)
         if _REMARK.match(line) or (not rows and not any(_NUMBER.match(word) for word in words[-3:])):
-            for found in _UNIT.findall(line):
-                units.setdefault(_unit(found), number)
+            for unit_word in _UNIT.findall(line):
+                units.setdefault(_unit(unit_word), number)
             continue
         rows.append((number, words))
     if not rows:
@@ -87,18 +87,18 @@ def _words(line: str, path: Path, number: int) -> list[str]:
 def _targets(path: Path, rows: list[tuple[int, list[str]]], unit: str) -> Targets:
     first, columns = rows[0][0], len(rows[0][1])
     if columns not in _COLUMNS:
-        wanted = "; ".join(f"{n} ({what})" for n, what in _COLUMNS.items())
-        raise InputError(f"{path}:{first}: expected columns {wanted}; found {columns}")
-    named = columns in (4, 7)
-    names, numbers = [], np.empty((len(rows), columns - named))
+        expected_columns = "; ".join(f"{n} ({meaning})" for n, meaning in _COLUMNS.items())
+        raise InputError(f"{path}:{first}: expected columns {expected_columns}; found {columns}")
+    has_names = columns in (4, 7)
+    names, numbers = [], np.empty((len(rows), columns - has_names))
     for row, (line, words) in enumerate(rows):
         if len(words) != columns:
             raise InputError(f"{path}:{line}: expected {columns} columns as in line {first}, found {len(words)}")
-        names.append(words[0] if named else str(row + 1))
-        for column, word in enumerate(words[named:]):
+        names.append(words[0] if has_names else str(row + 1))
+        for column, word in enumerate(words[has_names:]):
             if not _NUMBER.match(word):
                 raise InputError(
-                    f"{path}:{line}: expected a number in column {column + named + 1}, found `{word[:40]}`"
+                    f"{path}:{line}: expected a number in column {column + has_names + 1}, found `{word[:40]}`"
                 )
             numbers[row, column] = float(word)
     if len(set(names)) < len(names):

@@ -33,11 +33,11 @@ class Case:
     @property
     def robot(self) -> str:
         """The largest noise of the robot by its records, as text."""
-        found = [{line.name: line.found for line in item.record.noise} for item in self.records]
-        found = [noise for noise in found if {"robot position", "robot orientation"} <= set(noise)]
-        if not found:
+        noises = [{line.name: line.found for line in item.record.noise} for item in self.records]
+        noises = [noise for noise in noises if {"robot position", "robot orientation"} <= set(noise)]
+        if not noises:
             return "no record"
-        worst = max(found, key=lambda noise: noise["robot position"])
+        worst = max(noises, key=lambda noise: noise["robot position"])
         return f"{1e3 * worst['robot position']:.0f} um, {worst['robot orientation']:.2g} deg"
 
 
@@ -55,24 +55,24 @@ class Accuracy:
 
     def cell(self, case: int) -> str:
         """Our figure as text."""
-        found = self.ours[case]
-        if found is None:
+        figure = self.ours[case]
+        if figure is None:
             return "no record"
-        if len(found) == 2:
-            return f"[{found[0]:+.2%}, {found[1]:+.2%}]"
-        return f"{found[0]:.2g} {self.unit}"
+        if len(figure) == 2:
+            return f"[{figure[0]:+.2%}, {figure[1]:+.2%}]"
+        return f"{figure[0]:.2g} {self.unit}"
 
 
 def accuracies(cases: Sequence[Case]) -> tuple[Accuracy, ...]:
     """The table. `read_records` has checked that the records' files exist."""
     lines = [
-        Accuracy(what, unit, paper, tuple(_by_record(case, kind, figure) for case in cases))
-        for what, unit, paper, kind, figure in _LINES
+        Accuracy(label, unit, paper, tuple(_by_record(case, kind, figure) for case in cases))
+        for label, unit, paper, kind, figure in _LINES
     ]
     for key, (low, high) in PAPER_SPREAD.items():
-        ours = tuple(None if case.spread is None else getattr(case.spread, key) for case in cases)
+        our_figures = tuple(None if case.spread is None else getattr(case.spread, key) for case in cases)
         paper = f"[{low:+.2%}, {high:+.2%}]"
-        lines.append(Accuracy(f"samples, {SPREAD_WORDS[key]}", "", paper, ours))
+        lines.append(Accuracy(f"samples, {SPREAD_WORDS[key]}", "", paper, our_figures))
     return tuple(lines)
 
 
@@ -97,13 +97,13 @@ def _camera_in_base(item: InForce) -> float:
 
 def _led_centres_mm(item: InForce) -> Floats:
     """[found LEDs] standard uncertainty of centres."""
-    covariance, found = _leds(item, "centre_covariance")
-    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2))[found])
+    covariance, found_leds = _leds(item, "centre_covariance")
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2))[found_leds])
 
 
 def _led_normals_deg(item: InForce) -> Floats:
-    covariance, found = _leds(item, "normal_covariance")
-    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2))[found])
+    covariance, found_leds = _leds(item, "normal_covariance")
+    return np.asarray(np.sqrt(np.trace(covariance, axis1=1, axis2=2))[found_leds])
 
 
 def _leds(item: InForce, name: str) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:

@@ -257,16 +257,16 @@ def shares_of(
 
     whole = half_width(frozenset())
     nominal = abs(linearly.result.estimate)
-    found = []
+    shares = []
     for group in groups:
-        mine = [i for i, q in enumerate(inputs.quantities) if q.source_group == group]
+        members = [i for i, q in enumerate(inputs.quantities) if q.source_group == group]
         without = half_width(frozenset({group}))
         alone = half_width(frozenset(groups) - {group})
-        share = float(linearly.shares[mine].sum())
-        found.append(
+        share = float(linearly.shares[members].sum())
+        shares.append(
             Share(group, known.figure(group), known.source(group), share, 1.0 - without / whole, alone / nominal)
         )
-    return tuple(sorted(found, key=lambda share: -share.alone))
+    return tuple(sorted(shares, key=lambda share: -share.alone))
 
 
 @dataclass(frozen=True)

@@ -88,6 +88,6 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
 def _turned(vectors: Floats, turns_rad: Floats) -> Floats:
     """Vectors [..., 3] turned by small rotation vectors [..., 3], to second order, at unit length."""
     once = np.cross(turns_rad, vectors)
-    turned = vectors + once + 0.5 * np.cross(turns_rad, once)
-    result: Floats = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    turned_vectors = vectors + once + 0.5 * np.cross(turns_rad, once)
+    result: Floats = turned_vectors / np.linalg.norm(turned_vectors, axis=-1, keepdims=True)
     return result

@@ -22,12 +22,12 @@ def page(
 ) -> str:
     """The whole page; `picture` is the PNG, `doubts` are reasons not to rely on the records."""
     data = base64.b64encode(picture).decode()
-    warned = "".join(f"<p class=bad>{html.escape(doubt)}" for doubt in doubts)
+    doubt_lines = "".join(f"<p class=bad>{html.escape(doubt)}" for doubt in doubts)
     return (
         f"{HEAD}<title>Uncertainty budget</title><style>{STYLE}</style>"
         f"<h1>Uncertainty of a reflectance</h1>"
         f"<p>Light at {budget.geometry.incidence_deg:g} deg; relative to the value. {budget.numeric.trials} trials"
-        f"{'' if budget.numeric.stable else ', too few for two digits of u'}.{warned}{_result(budget)}"
+        f"{'' if budget.numeric.stable else ', too few for two digits of u'}.{doubt_lines}{_result(budget)}"
         f"<h2>Samples over a dome, 68 %</h2>{_spread(spread)}"
         f"<h2>What dominates</h2>{_sources(budget)}"
         f'<img src="data:image/png;base64,{data}" alt="distribution, sources, samples">'

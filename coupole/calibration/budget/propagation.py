@@ -63,15 +63,15 @@ class Inputs:
         matrix is not positive semidefinite."""
         names = [q.name for q in self.quantities]
         matrix = np.eye(len(names))
-        for one, other, coefficient in self.correlations:
-            for name in (one, other):
+        for first, second, coefficient in self.correlations:
+            for name in (first, second):
                 if name not in names:
                     raise InputError(
                         f"budget: correlation of `{name}`: no such input; there are {', '.join(names)}"
                     )
                 if self.quantities[names.index(name)].shape != "normal":
                     raise InputError(f"budget: correlation of `{name}`: only normal inputs can be correlated here")
-            i, j = names.index(one), names.index(other)
+            i, j = names.index(first), names.index(second)
             matrix[i, j] = matrix[j, i] = coefficient
         if np.linalg.eigvalsh(matrix)[0] < -1e-9:
             raise InputError("budget: no quantities can have these correlations: their matrix has a negative root")
@@ -168,16 +168,16 @@ def linear(model: Model, inputs: Inputs, coverages: Sequence[float] = COVERAGES)
     parts = sensitivities * u
     terms = parts[:, None] * inputs.matrix() * parts
     variance = float(terms.sum())
-    combined = float(np.sqrt(max(variance, 0.0)))
+    combined_u = float(np.sqrt(max(variance, 0.0)))
     dof = np.array([q.degrees_of_freedom for q in inputs.quantities])
     fourth = float(np.sum(parts**4 / dof))
     effective = variance**2 / fourth if fourth > 0.0 else float("inf")
     intervals = []
     for coverage in coverages:
         k = float(stdtrit(min(effective, 1e6), 0.5 + coverage / 2))
-        intervals.append(Interval(coverage, estimate - k * combined, estimate + k * combined, "normal"))
+        intervals.append(Interval(coverage, estimate - k * combined_u, estimate + k * combined_u, "normal"))
     shares = terms.sum(axis=1) / variance if variance > 0.0 else np.zeros(len(u))
-    result = Propagated(estimate, combined, tuple(intervals), 0, np.zeros(0))
+    result = Propagated(estimate, combined_u, tuple(intervals), 0, np.zeros(0))
     return Linear(result, sensitivities, shares, effective)
 
 
@@ -210,9 +210,9 @@ def monte_carlo(
         limits = [end for p in coverages for end in ends(samples, p)]
         figures.append([float(samples.mean()), float(samples.std(ddof=1)), *limits])
         if len(batches) > 1:
-            found = np.array(figures)
-            scatter = 2.0 * found.std(axis=0, ddof=1) / np.sqrt(len(batches))
-            stable = bool((scatter <= within * tolerance(_pooled(found[:, 0], found[:, 1]), digits)).all())
+            table = np.array(figures)
+            scatter = 2.0 * table.std(axis=0, ddof=1) / np.sqrt(len(batches))
+            stable = bool((scatter <= within * tolerance(_pooled(table[:, 0], table[:, 1]), digits)).all())
     samples = np.sort(np.concatenate(batches))
     intervals = []
     for p, numerical in zip(coverages, scatter[2:].reshape(-1, 2).max(axis=1), strict=True):
@@ -239,20 +239,20 @@ def trials_of(
 
 def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 1) -> tuple[Validation, ...]:
     """JCGM 101, 8.1: do the ends of the linear intervals agree with Monte Carlo's within the tolerance of u?"""
-    found = []
+    validations = []
     for interval in linear_result.intervals:
-        other = numeric.interval(interval.coverage, "symmetric")
-        found.append(
+        numeric_interval = numeric.interval(interval.coverage, "symmetric")
+        validations.append(
             Validation(
                 interval.coverage,
                 digits,
-                abs(interval.low - other.low),
-                abs(interval.high - other.high),
+                abs(interval.low - numeric_interval.low),
+                abs(interval.high - numeric_interval.high),
                 tolerance(numeric.u, digits),
-                other.numerical,
+                numeric_interval.numerical,
             )
         )
-    return tuple(found)
+    return tuple(validations)
 
 
 def tolerance(u: float, digits: int) -> float:
@@ -271,7 +271,7 @@ def draw(
     """Samples [trials] of each quantity (JCGM 101, section 6.4). `half` [n, n] is a root of the correlations. The
     half widths of bounded distributions are those of JCGM 101, table 1."""
     normal = random.standard_normal((trials, len(inputs.quantities))) @ half.T
-    found = {}
+    samples = {}
     for i, q in enumerate(inputs.quantities):
         if q.shape == "normal":
             standard = normal[:, i]
@@ -283,8 +283,8 @@ def draw(
             standard = np.sqrt(6.0) * random.triangular(-1.0, 0.0, 1.0, trials)
         else:
             standard = np.sqrt(2.0) * np.sin(2.0 * np.pi * random.random(trials))
-        found[q.name] = q.value + (0.0 if q.source_group in fixed else q.u) * standard
-    return found
+        samples[q.name] = q.value + (0.0 if q.source_group in fixed else q.u) * standard
+    return samples
 
 
 def _sorted(values: Floats, *, infinite: float = 0.0) -> Floats:

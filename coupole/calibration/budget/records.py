@@ -35,24 +35,24 @@ class Said:
 def read_records(paths: Sequence[Path]) -> tuple[InForce, ...]:
     """The records at `paths`; of a folder, those of the kinds that a budget uses. Raises InputError: no such file,
     no such record in a folder, a record of a kind that a budget does not use, two of one kind."""
-    found: list[InForce] = []
+    records: list[InForce] = []
     for path in paths:
         if path.is_dir():
             inside = of_use(read_in_force([file for file in sorted(path.glob("*.yaml")) if _is_record(file)]))
             if not inside:
                 raise InputError(f"{path}: expected records of the kinds {_KINDS} in this folder")
-            found += inside
+            records += inside
         else:
-            found += read_in_force([path])
-    for number, item in enumerate(found):
+            records += read_in_force([path])
+    for number, item in enumerate(records):
         if reader_of(item.record.kind) is None:
             raise InputError(
                 f"{item.path}: a record of the kind `{item.record.kind}` is not used by a budget; expected "
                 f"{_KINDS}"
             )
-        if any(item.record.kind == other.record.kind for other in found[:number]):
+        if any(item.record.kind == earlier.record.kind for earlier in records[:number]):
             raise InputError(f"{item.path}: a second record of the kind `{item.record.kind}`; give one of each")
-    return tuple(found)
+    return tuple(records)
 
 
 def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
@@ -62,18 +62,18 @@ def of_use(items: Sequence[InForce]) -> tuple[InForce, ...]:
 
 def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
     """Reasons not to rely on records: limits that were exceeded, an expired validity."""
-    missed = [
+    missed_limits = [
         f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
         for item in items
         for limit in item.record.limits
         if not limit.passed
     ]
-    expired = [
+    expired_records = [
         f"{item.path}: expired on {item.record.validity.expires:%Y-%m-%d %H:%M} UTC"
         for item in items
         if now >= item.record.validity.expires
     ]
-    return (*missed, *expired)
+    return (*missed_limits, *expired_records)
 
 
 def known_from(items: Sequence[InForce], start: Known) -> Known:
@@ -84,11 +84,11 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
     for item in items:
         if item.record.kind == "camera" and "hand-eye" in kinds:
             continue  # rays use the lens that the hand-eye record has, with their common covariance
-        read = reader_of(item.record.kind)
-        assert read is not None  # `read_records` and `of_use` let no other pass
-        said = read(item.record, item.path)
-        changes |= said.figures
-        sources += [(group, _called(item.record)) for group in said.sources]
+        reader = reader_of(item.record.kind)
+        assert reader is not None  # `read_records` and `of_use` let no other pass
+        statement = reader(item.record, item.path)
+        changes |= statement.figures
+        sources += [(group, _called(item.record)) for group in statement.sources]
     if {"leds", "mesh"} <= kinds:
         # No record keeps the share of the hand-eye's error in LEDs and mesh, so they count as independent. A tenth
         # of a millimetre between LED and mesh, which is more than that share, changes an irradiance by 0.02 %.
@@ -109,10 +109,10 @@ def _is_record(file: Path) -> bool:
 
 
 def _of_response(record: Record, path: Path) -> Said:
-    read = max(record.value("dark_variance_dn2.G") - 1.0 / 12.0, 0.0) ** 0.5
+    read_noise_dn = max(record.value("dark_variance_dn2.G") - 1.0 / 12.0, 0.0) ** 0.5
     figures = {
         "gain_dn_per_e": record.value("gain_dn_per_e.G"),
-        "read_noise_dn": read,
+        "read_noise_dn": read_noise_dn,
         "full_scale_dn": record.value("range_dn"),
         "response": _limit_found(record, path, "uncertainty of linearity"),
     }
@@ -134,9 +134,9 @@ def _of_led_power(record: Record, path: Path) -> Said:
     names = lines[0].split(",")
     values = np.genfromtxt(lines[1:], delimiter=",", ndmin=2)
     good = values[:, names.index("power_G")] > 0
-    own, all_of_it = values[good, names.index("u_own_G")], values[good, names.index("u_G")]
-    common = np.sqrt(np.maximum(all_of_it**2 - own**2, 0.0))
-    figures = {"power_own": float(np.median(own)), "power_common": float(np.median(common))}
+    u_own, u_all = values[good, names.index("u_own_G")], values[good, names.index("u_G")]
+    common = np.sqrt(np.maximum(u_all**2 - u_own**2, 0.0))
+    figures = {"power_own": float(np.median(u_own)), "power_common": float(np.median(common))}
     return Said(figures, ("LED power, own", "LED power, common"))
 
 
@@ -227,18 +227,18 @@ def ray_mm(record: Record, distance_mm: float) -> float:
     """
     lens, free = intrinsics_of(record)
     names = [parameter.name for parameter in record.parameters]
-    wanted = [n for n in names if n.removesuffix("_px") in free] + list(step_names(_SEEN_FROM_HAND_EYE))
-    at = [names.index(name) for name in wanted]
+    needed_names = [n for n in names if n.removesuffix("_px") in free] + list(step_names(_SEEN_FROM_HAND_EYE))
+    at = [names.index(name) for name in needed_names]
     covariance = record.covariance_matrix[np.ix_(at, at)]
     half = np.array(record.validity.size_px or (2 * lens.cx, 2 * lens.cy)) / 2.0
     points = distance_mm * np.column_stack([_FIELD * half / (lens.fx, lens.fy), np.ones(len(_FIELD))])
-    seen = optics.project(points, lens.vector())
+    projection = optics.project(points, lens.vector())
     turn = record.transforms[_SEEN_FROM_HAND_EYE].matrix()[:3, :3]
     by_step = np.concatenate(
         [np.broadcast_to(-turn.T, (len(points), 3, 3)), np.radians(skew(points))], axis=2
     )  # -(r x p) = p x r
-    by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in free]]
-    slopes: Floats = np.concatenate([by_lens, seen.by_point @ by_step], axis=2)
+    by_lens = projection.by_intrinsics[:, :, [optics.NAMES.index(name) for name in free]]
+    slopes: Floats = np.concatenate([by_lens, projection.by_point @ by_step], axis=2)
     variance_px2 = np.einsum("kia,ab,kib->k", slopes, covariance, slopes)
     return float(np.sqrt(variance_px2.mean()) * distance_mm / lens.fx)
 

@@ -92,8 +92,8 @@ class Chart(Model):
     @property
     def centres_mm(self) -> Floats:
         """[patches, 2], in the order of `patch_names`."""
-        kept = np.array([name not in self.without for name in self._all_names])
-        return np.asarray(self._all_centres_mm()[kept])
+        in_use = np.array([name not in self.without for name in self._all_names])
+        return np.asarray(self._all_centres_mm()[in_use])
 
     def _all_centres_mm(self) -> Floats:
         x = (np.arange(self.columns) - (self.columns - 1) / 2.0) * self.pitch_mm[0]
@@ -163,10 +163,10 @@ def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     values_path = document.resolve(chart.values)
     values = read_chart_values(values_path, chart.unit)
     if missing := [name for name in names if name not in values.xyz]:
-        listed = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
+        absent = ", ".join(missing[:8]) + (f" and {len(missing) - 8} more" if len(missing) > 8 else "")
         has = ", ".join(list(values.xyz)[:6])
-        raise InputError(f"{values_path}: has no values of {listed} (it has {has}, ...); set `names` in {path}")
-    known = KnownChart(chart, np.stack([values.xyz[name] for name in names]), (path, values_path))
-    if not known.neutral:
+        raise InputError(f"{values_path}: has no values of {absent} (it has {has}, ...); set `names` in {path}")
+    known_chart = KnownChart(chart, np.stack([values.xyz[name] for name in names]), (path, values_path))
+    if not known_chart.neutral:
         raise InputError(f"{path}: expected a grey patch of L* above {_LEAST_GREY_LIGHTNESS:g}; found none")
-    return known
+    return known_chart

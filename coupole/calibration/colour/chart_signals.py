@@ -110,13 +110,13 @@ def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
     count = len(names)
     mean, u, sd = (np.empty((count, 3)) for _ in range(3))
     full = np.zeros(count, np.bool_)
-    found = [pixels_inside(polygon, picture.signal.shape) for polygon in picture.patches_px]
-    if outside := [name for name, inside in zip(names, found, strict=True) if inside is None]:
+    patch_pixels = [pixels_inside(polygon, picture.signal.shape) for polygon in picture.patches_px]
+    if outside := [name for name, inside in zip(names, patch_pixels, strict=True) if inside is None]:
         raise InputError(
             f"{picture.name}: outside the picture are the patches {_list(outside)}; correct the chart's place, or "
             "name its corners with --corners"
         )
-    for p, inside in enumerate(found):
+    for p, inside in enumerate(patch_pixels):
         assert inside is not None
         for c, channel in enumerate("RGB"):
             take = samples_of(picture, channel, inside)
@@ -125,10 +125,10 @@ def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
                     f"{picture.name}: the patch {names[p]} has {len(take)} pixels of {channel}, expected "
                     f"{_LEAST_PIXELS} or more; go nearer"
                 )
-            values, saturated = values_at(picture, c, (inside[0][take], inside[1][take]))
+            values, is_saturated = values_at(picture, c, (inside[0][take], inside[1][take]))
             mean[p, c], sd[p, c] = values.mean(), values.std(ddof=1)
             u[p, c] = sd[p, c] / np.sqrt(len(values))
-            full[p] |= bool(saturated.any())
+            full[p] |= bool(is_saturated.any())
     return Reading(mean, u, sd, full)
 
 
@@ -139,9 +139,9 @@ def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, 
     with the names of patches that are dark, or saturated or in shadow under more than half of them.
     """
     light = lights if lights.ndim == 3 else lights[:, :, None]
-    mean, u = (np.stack([getattr(one, what) for one in readings]) / light for what in ("mean", "u"))
-    sd = np.stack([one.pixel_sd / np.maximum(one.mean, 1e-300) for one in readings])
-    good = ~np.stack([one.full for one in readings])
+    mean, u = (np.stack([getattr(reading, field) for reading in readings]) / light for field in ("mean", "u"))
+    sd = np.stack([reading.pixel_sd / np.maximum(reading.mean, 1e-300) for reading in readings])
+    good = ~np.stack([reading.full for reading in readings])
     bright = [n for n in range(len(names)) if 2 * good[:, n].sum() < len(good)]
     _refuse(bright, names, "saturated under most lights", "expose less")
     dark = ~(np.nanmedian(np.where(good[:, :, None], mean, np.nan), axis=0) > 0.0).all(axis=1)
@@ -152,13 +152,15 @@ def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, 
         remarks.append(f"saturated, and left out: {_list(full)}")
     strength, patch = _split(mean, good)
     if len(readings) >= _LEAST_LIGHTS:
-        expected = strength[:, None] * patch
-        noise = u / expected
-        odd = (np.abs(mean / expected - 1.0) > np.maximum(_ODD, _ODD_SIGMA * noise)).any(axis=2) & good
+        expected_signal = strength[:, None] * patch
+        noise = u / expected_signal
+        odd = (np.abs(mean / expected_signal - 1.0) > np.maximum(_ODD, _ODD_SIGMA * noise)).any(axis=2) & good
         few = [n for n in range(len(names)) if 2 * odd[:, n].sum() > good[:, n].sum()]
         _refuse(few, names, "in shadow, or glossy, under most lights", "free the light's way to the chart")
-        if listed := [f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(odd[k])])}" for k in _with(odd)]:
-            remarks.append(f"in shadow or glossy, and left out: {_list(listed)}")
+        if odd_patches := [
+            f"{lit[k]} on {_list([names[int(n)] for n in np.flatnonzero(odd[k])])}" for k in _with(odd)
+        ]:
+            remarks.append(f"in shadow or glossy, and left out: {_list(odd_patches)}")
         good &= ~odd
         strength, patch = _split(mean, good)
     else:
@@ -168,24 +170,24 @@ def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, 
 
 def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Strengths [lights, 3], of mean 1, and patches [patches, 3] whose products are the signals, by medians."""
-    masked = np.where(good[:, :, None], mean, np.nan)
-    patch = np.nanmedian(masked, axis=0)
+    good_mean = np.where(good[:, :, None], mean, np.nan)
+    patch = np.nanmedian(good_mean, axis=0)
     strength = np.ones((len(mean), mean.shape[2]))
     for _ in range(_ROUNDS):
         usable = [k for k in range(len(mean)) if good[k].any()]
-        strength[usable] = np.nanmedian(masked[usable] / patch, axis=1)
+        strength[usable] = np.nanmedian(good_mean[usable] / patch, axis=1)
         strength /= strength[usable].mean(axis=0)
-        patch = np.nanmedian(masked / strength[:, None], axis=0)
+        patch = np.nanmedian(good_mean / strength[:, None], axis=0)
     return strength, patch
 
 
 def _averaged(mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], remarks: tuple[str, ...]) -> Signals:
     """Means over the lights; their uncertainty is the larger of noise and scatter."""
     count = good.sum(axis=0)[:, None]
-    masked = np.where(good[:, :, None], mean, np.nan)
-    average = np.nanmean(masked, axis=0)
+    good_mean = np.where(good[:, :, None], mean, np.nan)
+    average = np.nanmean(good_mean, axis=0)
     noise = np.sqrt((np.where(good[:, :, None], u, 0.0) ** 2).sum(axis=0)) / count
-    scatter = np.sqrt(np.nansum((masked - average) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
+    scatter = np.sqrt(np.nansum((good_mean - average) ** 2, axis=0) / np.maximum(count - 1, 1) / count)
     typical = np.nanmedian(np.where(good[:, :, None], sd, np.nan), axis=0)
     return Signals(average, np.maximum(noise, scatter), typical, remarks)
 

@@ -47,7 +47,7 @@ def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
         raise InputError(f"{path}: cannot read the values of the chart: {reason(error)}") from error
     fields, rows = _cgats(path, text) if "BEGIN_DATA_FORMAT" in text else _csv(path, text)
     upper = [field.strip().strip('"').upper() for field in fields]
-    name_at = next((upper.index(one) for one in _NAMES if one in upper), None)
+    name_at = next((upper.index(column) for column in _NAMES if column in upper), None)
     if name_at is None:
         raise InputError(
             f"{path}: expected a column of names ({', '.join(_NAMES)}), found {', '.join(fields[:8])}"
@@ -55,16 +55,16 @@ def read_chart_values(path: Path, unit: Unit = "auto") -> ChartValues:
     names = [row[name_at].strip() for _, row in rows]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{path}: the patch {twice} is given twice; keep one line, or the mean of several")
-    bands = [(float(found[1]), at) for at, field in enumerate(upper) if (found := _BAND.fullmatch(field))]
+    bands = [(float(match[1]), at) for at, field in enumerate(upper) if (match := _BAND.fullmatch(field))]
     if len(bands) >= _LEAST_BANDS:
         bands.sort()
         table = _numbers(path, rows, [at for _, at in bands])
         xyz = xyz_of_spectra(np.array([nm for nm, _ in bands]), _fractions(path, table, unit))
         return ChartValues(dict(zip(names, xyz, strict=True)))
     for columns, turn in ((_LAB, xyz_of), (_XYZ, lambda values: values / 100.0)):
-        for wanted in columns:
-            if all(one in upper for one in wanted):
-                values = turn(_numbers(path, rows, [upper.index(one) for one in wanted]))
+        for column_names in columns:
+            if all(column in upper for column in column_names):
+                values = turn(_numbers(path, rows, [upper.index(column) for column in column_names]))
                 return ChartValues(dict(zip(names, values, strict=True)))
     raise InputError(
         f"{path}: expected spectra ({_LEAST_BANDS} columns such as SPECTRAL_NM400 or more), LAB_L LAB_A LAB_B or "

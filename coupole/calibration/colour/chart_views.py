@@ -74,13 +74,13 @@ class ChartReader:
     def suited(self) -> list[LightFrame]:
         """Frames under light that does not graze the chart or shine from it into the camera. Raises InputError if
         there is none."""
-        chosen = [frame for frame in self._frames.lit if self._suits(frame)]
-        if not chosen:
+        frames = [frame for frame in self._frames.lit if self._suits(frame)]
+        if not frames:
             raise InputError(
                 "colour: no light suits: all graze the chart, or are reflected into the camera; expected LEDs at "
                 "about 45 degrees to the chart, seen from above"
             )
-        return chosen
+        return frames
 
     def picture(self, frame: LightFrame, light: Floats) -> ChartPicture:
         """A frame as linear signals, DN/s over the flat field."""
@@ -111,12 +111,12 @@ class ChartReader:
         import cv2
 
         corners = np.column_stack([setting.chart.corners_mm, np.zeros(4)])
-        found, turn, shift = cv2.solvePnP(
+        is_solved, turn, shift = cv2.solvePnP(
             corners, setting.corners_px, setting.lens.matrix(), setting.lens.distortion(), flags=cv2.SOLVEPNP_IPPE
         )
         camera_from_chart = np.eye(4)
         camera_from_chart[:3, :3], camera_from_chart[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
-        if not found or camera_from_chart[2, 2] > 0.0:
+        if not is_solved or camera_from_chart[2, 2] > 0.0:
             raise InputError(
                 "--corners: expected the middles of the top left, top right, bottom right and bottom left patch, "
                 "clockwise on the chart; these show its back"
@@ -147,8 +147,8 @@ class ChartReader:
         towards /= np.linalg.norm(towards, axis=1)[:, None]
         away = frame.base_from_camera[:3, 3] - points
         away /= np.linalg.norm(away, axis=1)[:, None]
-        mirrored = 2.0 * (away @ normal)[:, None] * normal - away
-        off_deg = np.degrees(np.arccos(np.clip((towards * mirrored).sum(axis=1), -1.0, 1.0)))
+        reflection = 2.0 * (away @ normal)[:, None] * normal - away
+        off_deg = np.degrees(np.arccos(np.clip((towards * reflection).sum(axis=1), -1.0, 1.0)))
         return bool((towards @ normal).min() > _LEAST_COSINE and off_deg.min() > _GLOSS_DEG)
 
     def _light(self, frame: LightFrame) -> Floats:

@@ -115,8 +115,8 @@ def _least_squares(terms: Floats, xyz: Floats) -> Floats:
             "colour: the channels are too much alike on this chart to tell its colours apart; expected a colour "
             "camera and patches of many hues"
         )
-    left = (xyz - terms[:, -1:] * D50_WHITE) * weight[:, None]
-    free, *_ = np.linalg.lstsq(design, left)
+    target = (xyz - terms[:, -1:] * D50_WHITE) * weight[:, None]
+    free, *_ = np.linalg.lstsq(design, target)
     return _whole(np.asarray(free.T))
 
 
@@ -125,8 +125,8 @@ def _least_de00(terms: Floats, lab: Floats, first: Floats) -> Floats:
     from scipy.optimize import least_squares
 
     shape = _free(first).shape
-    found = least_squares(partial(_missed, terms, lab, first, shape), _free(first).ravel(), method="lm")
-    return _whole(found.x.reshape(shape))
+    fit = least_squares(partial(_missed, terms, lab, first, shape), _free(first).ravel(), method="lm")
+    return _whole(fit.x.reshape(shape))
 
 
 def _missed(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int], free: Floats) -> Floats:
@@ -188,7 +188,7 @@ def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
     follow (metamerism) is no noise: `leave_out` has it.
     """
     lab = lab_of(seen.xyz)
-    balanced = seen.signal / profile.white_signal
+    signal = seen.signal / profile.white_signal
     free = _free(profile.coefficients)
 
     def parts(balanced: Floats, free: Floats, lab: Floats) -> Floats:
@@ -200,13 +200,13 @@ def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
         step = np.zeros(free.size)
         step[n] = _LOG_STEP
         change = step.reshape(free.shape)
-        rows.append((parts(balanced, free + change, lab) - parts(balanced, free - change, lab)).ravel())
+        rows.append((parts(signal, free + change, lab) - parts(signal, free - change, lab)).ravel())
     design = np.column_stack(rows) / (2.0 * _LOG_STEP)
     inverse = np.linalg.inv(design.T @ design + _HELD**2 * np.eye(free.size))
     gain = inverse @ design.T
     full = np.asarray(np.kron(np.eye(3), np.vstack([np.eye(free.shape[1]), -np.ones(free.shape[1])])), np.float64)
-    by_noise: list[Floats] = [gain @ column for column in _by_noise(seen, profile, balanced, parts, free, lab)]
-    by_chart: list[Floats] = [gain @ column for column in _by_chart(seen, balanced, parts, free, lab)]
+    by_noise: list[Floats] = [gain @ column for column in _by_noise(seen, profile, signal, parts, free, lab)]
+    by_chart: list[Floats] = [gain @ column for column in _by_chart(seen, signal, parts, free, lab)]
     return _outer(by_noise, full), _outer(by_chart, full)
 
 
@@ -237,21 +237,21 @@ def _by_chart(seen: Balanced, balanced: Floats, parts: Parts, free: Floats, lab:
     grey = list(seen.neutral)
     for patch in range(len(lab)):
         for axis in range(3):
-            moved = []
+            moved_parts = []
             for sign in (1.0, -1.0):
-                other = lab.copy()
-                other[patch, axis] += sign * _LAB_STEP
+                moved_lab = lab.copy()
+                moved_lab[patch, axis] += sign * _LAB_STEP
                 here = balanced
                 if seen.white is None and patch in grey:
-                    luminance = xyz_of(other)[grey, 1]
+                    luminance = xyz_of(moved_lab)[grey, 1]
                     white = luminance @ balanced[grey] / (luminance @ luminance)
                     first = seen.xyz[grey, 1]
                     here = balanced * (first @ balanced[grey] / (first @ first)) / white
-                moved.append(parts(here, free, other))
-            columns.append((seen.u_lab / (2.0 * _LAB_STEP)) * (moved[0] - moved[1]).ravel())
+                moved_parts.append(parts(here, free, moved_lab))
+            columns.append((seen.u_lab / (2.0 * _LAB_STEP)) * (moved_parts[0] - moved_parts[1]).ravel())
     return columns
 
 
 def _outer(columns: Sequence[Floats], full: Floats) -> Floats:
-    stacked = np.column_stack(columns)
-    return np.asarray(full @ (stacked @ stacked.T) @ full.T)
+    matrix = np.column_stack(columns)
+    return np.asarray(full @ (matrix @ matrix.T) @ full.T)

@@ -86,8 +86,8 @@ def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames |
             sharp.append(picture)
         tell()
     signals = combined(names, readings, np.stack(lights), lit)
-    found = edges_of(mean_picture(sharp), [edge.name for edge in setting.chart.edges]) if sharp else {}
-    return Seen(signals, found, next(iter(whites.values()), None))
+    edges = edges_of(mean_picture(sharp), [edge.name for edge in setting.chart.edges]) if sharp else {}
+    return Seen(signals, edges, next(iter(whites.values()), None))
 
 
 @dataclass(frozen=True)
@@ -111,37 +111,37 @@ def colour_outcome(
     seen: Seen, known: KnownChart, setting: ChartSetting, frames: LightFrames, request: Request, progress: Progress
 ) -> Outcome:
     """The record of a profile, with the profile as ICC file and a table of the patches beside it."""
-    made, balanced = make_profiles(seen.signals, known, progress)
-    lab = lab_of(made.chosen.xyz(balanced.signal))
-    figures = figures_of(seen, known, made, balanced, lab)
-    by_noise, by_chart = covariance_of(balanced, made.profiles["matrix"])
+    forms, balanced_signals = make_profiles(seen.signals, known, progress)
+    lab = lab_of(forms.chosen.xyz(balanced_signals.signal))
+    figures = figures_of(seen, known, forms, balanced_signals, lab)
+    by_noise, by_chart = covariance_of(balanced_signals, forms.profiles["matrix"])
     edges = [(name, colours[1]) for name, colours in seen.edges.items()]
     return sealed_outcome(
         "colour",
         request,
         frames,
         frames.size_px,
-        _parameters(made.profiles["matrix"], by_noise, by_chart, len(balanced.signal)),
+        _parameters(forms.profiles["matrix"], by_noise, by_chart, len(balanced_signals.signal)),
         by_noise + by_chart,
-        partial(draw_colour, known, lab, made.missed.de, edges),
-        limits=against_limits(COLOUR, request.limits, {"mean": made.missed.mean, "worst": made.missed.worst}),
+        partial(draw_colour, known, lab, forms.missed.de, edges),
+        limits=against_limits(COLOUR, request.limits, {"mean": forms.missed.mean, "worst": forms.missed.worst}),
         files={
-            f"{request.name}.icc": icc_profile(made.chosen, made.profiles["matrix"], request.name, request.now),
-            f"{request.name}.csv": _patch_table(known, balanced, made, lab).encode(),
+            f"{request.name}.icc": icc_profile(forms.chosen, forms.profiles["matrix"], request.name, request.now),
+            f"{request.name}.csv": _patch_table(known, balanced_signals, forms, lab).encode(),
         },
-        fixed=_fixed(made, figures),
-        remarks=(_chosen(made), *(said(figure) for figure in figures), *seen.signals.remarks),
+        fixed=_fixed(forms, figures),
+        remarks=(_chosen(forms), *(said(figure) for figure in figures), *seen.signals.remarks),
         more_inputs=setting.inputs,
     )
 
 
 def make_profiles(signals: Signals, known: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
     """Both forms with their errors on patches left out."""
-    balanced = Balanced(signals.mean, signals.u, known.xyz, known.chart.u_lab, known.neutral)
-    tell: Callable[[], None] = counter(progress, len(FORMS) * len(balanced.signal))
-    profiles = {form: fit_profile(balanced, form) for form in FORMS}
-    left = {form: leave_out(balanced, form, tell) for form in FORMS}
-    return _Made(profiles, left, better(left["matrix"], left["root-polynomial"])), balanced
+    balanced_signals = Balanced(signals.mean, signals.u, known.xyz, known.chart.u_lab, known.neutral)
+    tell: Callable[[], None] = counter(progress, len(FORMS) * len(balanced_signals.signal))
+    profiles = {form: fit_profile(balanced_signals, form) for form in FORMS}
+    de00_of = {form: leave_out(balanced_signals, form, tell) for form in FORMS}
+    return _Made(profiles, de00_of, better(de00_of["matrix"], de00_of["root-polynomial"])), balanced_signals
 
 
 def figures_of(seen: Seen, known: KnownChart, made: _Made, balanced: Balanced, lab: Floats) -> list[Figure]:
@@ -158,18 +158,18 @@ def figures_of(seen: Seen, known: KnownChart, made: _Made, balanced: Balanced, l
 
 def _chosen(made: _Made) -> str:
     errors = "; ".join(
-        f"{form}: mean {left.mean:.2f}, 95 % {left.quantile(0.95):.2f}, largest {left.worst:.2f}"
-        for form, left in made.left_out.items()
+        f"{form}: mean {form_de00.mean:.2f}, 95 % {form_de00.quantile(0.95):.2f}, largest {form_de00.worst:.2f}"
+        for form, form_de00 in made.left_out.items()
     )
     return f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {made.form}"
 
 
 def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: int) -> list[Parameter]:
     """The matrix's coefficients, row by row."""
-    found = []
+    parameters = []
     for n, (axis, channel) in enumerate((axis, channel) for axis in "XYZ" for channel in "rgb"):
         noise, chart = by_noise[n, n], by_chart[n, n]
-        found.append(
+        parameters.append(
             Parameter(
                 name=f"{MATRIX}{axis}{channel}",
                 value=float(matrix.coefficients[n // 3, n % 3]),
@@ -178,32 +178,34 @@ def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: in
                 dominated_by="noise of signals" if noise > chart else "patches' own values",
             )
         )
-    return found
+    return parameters
 
 
 def _fixed(made: _Made, figures: Sequence[Figure]) -> dict[str, float]:
     """Balance, DNG's matrix, the root-polynomial, errors and figures."""
     matrix, roots = made.profiles["matrix"], made.profiles["root-polynomial"]
     white = matrix.white_signal
-    fixed = {f"neutral.{channel}": float(w) for channel, w in zip(CHANNELS, white / white.max(), strict=True)}
+    fixed_figures = {
+        f"neutral.{channel}": float(w) for channel, w in zip(CHANNELS, white / white.max(), strict=True)
+    }
     to_camera = (white / white.max())[:, None] * np.linalg.inv(matrix.coefficients)
-    fixed |= {
+    fixed_figures |= {
         f"dng_color_matrix.{channel}{axis}": float(to_camera[c, a])
         for c, channel in enumerate("rgb")
         for a, axis in enumerate("XYZ")
     }
-    fixed |= {
+    fixed_figures |= {
         f"root_polynomial.{axis}.{term}": float(roots.coefficients[a, t])
         for a, axis in enumerate("XYZ")
         for t, term in enumerate(_TERMS)
     }
-    for form, left in made.left_out.items():
-        fixed |= {
-            f"left_out.{form}.mean_de00": left.mean,
-            f"left_out.{form}.q95_de00": left.quantile(0.95),
-            f"left_out.{form}.worst_de00": left.worst,
+    for form, form_de00 in made.left_out.items():
+        fixed_figures |= {
+            f"left_out.{form}.mean_de00": form_de00.mean,
+            f"left_out.{form}.q95_de00": form_de00.quantile(0.95),
+            f"left_out.{form}.worst_de00": form_de00.worst,
         }
-    return fixed | {f"figure.{figure.name}": figure.value for figure in figures}
+    return fixed_figures | {f"figure.{figure.name}": figure.value for figure in figures}
 
 
 def _patch_table(known: KnownChart, balanced: Balanced, made: _Made, lab: Floats) -> str:

@@ -33,8 +33,8 @@ def draw_colour(
     axes[0, 0].set_xticks(range(len(de)), names, rotation=90, fontsize=8)
     axes[0, 0].axhline(float(np.mean(de)), color=GREY)
     axes[0, 0].set(title="CIEDE2000 of each patch, left out of the profile", ylabel="dE00")
-    for seen, true in zip(lab, known.lab, strict=True):
-        axes[0, 1].plot([true[1], seen[1]], [true[2], seen[2]], color=GREY)
+    for seen_lab, true_lab in zip(lab, known.lab, strict=True):
+        axes[0, 1].plot([true_lab[1], seen_lab[1]], [true_lab[2], seen_lab[2]], color=GREY)
     axes[0, 1].plot(known.lab[:, 1], known.lab[:, 2], "o", color=DARK, mfc="none", label="chart")
     axes[0, 1].plot(lab[:, 1], lab[:, 2], ".", color=RED, label="by the profile")
     axes[0, 1].legend(frameon=False)

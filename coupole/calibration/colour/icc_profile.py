@@ -46,13 +46,13 @@ def icc_profile(chosen: Profile, matrix: Profile, name: str, created: datetime) 
 
 def _file(tags: dict[bytes, bytes], created: datetime) -> bytes:
     start = _HEAD_BYTES + 4 + _TAG_BYTES * len(tags)
-    listed, content = struct.pack(">I", len(tags)), b""
+    tag_table, content = struct.pack(">I", len(tags)), b""
     places: dict[bytes, int] = {}
     for name, data in tags.items():
         if data not in places:
             places[data] = start + len(content)
             content += data + bytes(-len(data) % 4)
-        listed += struct.pack(">4sII", name, places[data], len(data))
+        tag_table += struct.pack(">4sII", name, places[data], len(data))
     when = created.astimezone(UTC)
     head = struct.pack(
         ">I4sI4s4s4s6H4s4sI4sIQI12s4s",
@@ -60,7 +60,7 @@ def _file(tags: dict[bytes, bytes], created: datetime) -> bytes:
         when.year, when.month, when.day, when.hour, when.minute, when.second,
         b"acsp", bytes(4), 0, bytes(4), 0, 0, 0, _fixed(D50_WHITE), bytes(4),
     )  # fmt: skip
-    whole = head + bytes(_HEAD_BYTES - len(head)) + listed + content
+    whole = head + bytes(_HEAD_BYTES - len(head)) + tag_table + content
     # The identity is over the file without flags, rendering intent and itself (7.2.18), which are 0 here.
     return whole[:84] + hashlib.md5(whole, usedforsecurity=False).digest() + whole[100:]
 
@@ -76,8 +76,8 @@ def _xyz(values: Floats) -> bytes:
 
 def _text(text: str) -> bytes:
     """multiLocalizedUnicodeType with one English text."""
-    encoded = text.encode("utf-16-be")
-    return b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(encoded), 28) + encoded
+    utf16 = text.encode("utf-16-be")
+    return b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(utf16), 28) + utf16
 
 
 def _power(exponent: float) -> bytes:

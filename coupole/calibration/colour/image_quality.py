@@ -46,16 +46,18 @@ class Tolerance:
 
     def level(self, value: float) -> str:
         """Return the level in words, such as `ISO 19264-1 A, FADGI 4 stars`."""
-        said = []
+        levels = []
         if self.iso:
-            met = [letter for letter, most in zip("ABC", self.iso, strict=True) if self._within(value, most, True)]
-            said.append(f"ISO 19264-1 {met[0]}" if met else "below ISO 19264-1 C")
+            letters = [
+                letter for letter, most in zip("ABC", self.iso, strict=True) if self._within(value, most, True)
+            ]
+            levels.append(f"ISO 19264-1 {letters[0]}" if letters else "below ISO 19264-1 C")
         if self.fadgi:
             stars = [
                 n for n, most in zip((4, 3, 2, 1), self.fadgi, strict=True) if self._within(value, most, False)
             ]
-            said.append(f"FADGI {stars[0]} star{'s' if stars[0] > 1 else ''}" if stars else "below FADGI 1 star")
-        return ", ".join(said)
+            levels.append(f"FADGI {stars[0]} star{'s' if stars[0] > 1 else ''}" if stars else "below FADGI 1 star")
+        return ", ".join(levels)
 
     def _within(self, value: float, bound: float, reached: bool) -> bool:
         if self.at_least:
@@ -121,7 +123,7 @@ def noise_figures(mean: Floats, pixel_sd: Floats, profile: Profile, neutral: Seq
 
 def edges_of(picture: ChartPicture, names: Sequence[str]) -> dict[str, tuple[SlantedEdge, ...]]:
     """Each edge in red, green and blue. Raises InputError for edges outside the picture, and as `slanted_edge`."""
-    found = {}
+    edges = {}
     for name, polygon in zip(names, picture.edges_px, strict=True):
         inside = pixels_inside(polygon, picture.signal.shape)
         if inside is None:
@@ -134,8 +136,8 @@ def edges_of(picture: ChartPicture, names: Sequence[str]) -> dict[str, tuple[Sla
             if full.any():
                 raise InputError(f"{picture.name}: the edge {name} is saturated; expose less, or leave it out")
             colours.append(slanted_edge(columns.astype(float), rows.astype(float), values, f"{name}, {channel}"))
-        found[name] = tuple(colours)
-    return found
+        edges[name] = tuple(colours)
+    return edges
 
 
 def edge_figures(edges: Mapping[str, Sequence[SlantedEdge]]) -> list[Figure]:

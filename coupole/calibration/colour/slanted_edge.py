@@ -73,8 +73,8 @@ def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge"
     def left(unknowns: Floats) -> Floats:
         return np.asarray((_model(unknowns, x, y) - values) / (light - dark))
 
-    found = least_squares(left, start, x_scale=[0.01, 0.1, 1e-4, 0.2, light - dark, light - dark])
-    angle, offset, bend, _, low, high = found.x
+    fit = least_squares(left, start, x_scale=[0.01, 0.1, 1e-4, 0.2, light - dark, light - dark])
+    angle, offset, bend, _, low, high = fit.x
     slant_deg = np.degrees(abs((angle + np.pi / 4.0) % (np.pi / 2.0) - np.pi / 4.0))
     if slant_deg < _LEAST_SLANT_DEG:
         raise InputError(
@@ -99,8 +99,8 @@ def _distance(angle: float, offset: float, bend: float, x: Floats, y: Floats) ->
 def _model(unknowns: Floats, x: Floats, y: Floats) -> Floats:
     from scipy.special import ndtr
 
-    angle, offset, bend, spread, low, high = unknowns
-    return np.asarray(low + (high - low) * ndtr(_distance(angle, offset, bend, x, y) / max(abs(spread), 0.05)))
+    angle, offset, bend, spread_px, low, high = unknowns
+    return np.asarray(low + (high - low) * ndtr(_distance(angle, offset, bend, x, y) / max(abs(spread_px), 0.05)))
 
 
 def _response(away: Floats, values: Floats) -> tuple[Floats, Floats]:

@@ -109,26 +109,26 @@ def adjust_leds(
         np.zeros(len(prior.covariance) - len(prior.free) - 6),
     )
     problem = problem_of(seen, place, boards, base_from_flange, prior, stated)
-    factors, kept, taken = np.ones(len(GROUPS)), np.ones(len(place), np.bool_), 0
-    state, taken = _descend(problem, state, factors, kept, 3.0 * HUBER)
+    factors, keep, step_count = np.ones(len(GROUPS)), np.ones(len(place), np.bool_), 0
+    state, step_count = _descend(problem, state, factors, keep, 3.0 * HUBER)
     problem = at_centres(problem, state)
     for robust in (True, False):
         for _ in range(_MOST_ROUNDS):
-            state, steps = _descend(problem, state, factors, kept, HUBER if robust else np.inf)
-            taken += steps
+            state, steps = _descend(problem, state, factors, keep, HUBER if robust else np.inf)
+            step_count += steps
             residuals = whitened(problem, state)
             off = np.sqrt(np.mean(residuals**2, axis=1))
-            before, seen_factors = kept, factors.copy()
+            before, seen_factors = keep, factors.copy()
             if robust:
                 seen_factors[SPOTS] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
             else:
-                seen_factors = _solved(problem, state, factors, kept).seen
-            settled = bool(np.all(np.abs(seen_factors / factors - 1) < _SETTLED))
+                seen_factors = _solved(problem, state, factors, keep).seen
+            is_settled = bool(np.all(np.abs(seen_factors / factors - 1) < _SETTLED))
             factors = seen_factors
-            kept = off <= REJECT_SIGMA * factors[SPOTS] / np.sqrt(2)
-            if settled and (robust or bool((kept == before).all())):
+            keep = off <= REJECT_SIGMA * factors[SPOTS] / np.sqrt(2)
+            if is_settled and (robust or bool((keep == before).all())):
                 break
-    return _summary(problem, state, factors, kept, taken)
+    return _summary(problem, state, factors, keep, step_count)
 
 
 # -- normal equations, board by board ---------------------------------------------------------------------
@@ -159,24 +159,24 @@ def _board_parts(
     root = np.sqrt(weights)[:, None] / factors[SPOTS]
     for board, (rows, columns) in enumerate(zip(problem.sightings_of, problem.columns_of, strict=True)):
         places = problem.boards.rows_of(board)
-        count, own = len(rows), 6 + 3 * len(places)
-        jacobian = np.zeros((count, 2, own + len(columns)))
+        count, own_count = len(rows), 6 + 3 * len(places)
+        jacobian = np.zeros((count, 2, own_count + len(columns)))
         jacobian[:, :, :6] = linear.by_board[rows]
         at = np.arange(count)[:, None]
         led = np.searchsorted(places, problem.place[rows])
         view = np.searchsorted(columns[: -problem.of_camera : 6], 6 * problem.view[rows])
         for axis in range(2):
             jacobian[at, axis, 6 + 3 * led[:, None] + np.arange(3)] = linear.by_offset[rows, axis]
-            jacobian[at, axis, own + 6 * view[:, None] + np.arange(6)] = linear.by_view[rows, axis]
+            jacobian[at, axis, own_count + 6 * view[:, None] + np.arange(6)] = linear.by_view[rows, axis]
         jacobian[:, :, -problem.of_camera :] = linear.by_camera[rows]
         jacobian *= root[rows][:, :, None]
         flat = jacobian.reshape(2 * count, jacobian.shape[2])
         residuals = (linear.residuals[rows] * root[rows]).ravel()
-        normal, side = flat[:, :own].T @ flat, flat[:, :own].T @ residuals
-        held = np.concatenate([table_sigmas(problem), np.full(own - 6, tolerance)]) ** -2
-        normal[np.arange(own), np.arange(own)] += held
-        side += held * np.concatenate([off_table[board], -state.offsets_mm[places].ravel()])
-        yield _BoardPart(normal[:, :own], normal[:, own:], side, flat, columns), residuals
+        normal, side = flat[:, :own_count].T @ flat, flat[:, :own_count].T @ residuals
+        prior_weights = np.concatenate([table_sigmas(problem), np.full(own_count - 6, tolerance)]) ** -2
+        normal[np.arange(own_count), np.arange(own_count)] += prior_weights
+        side += prior_weights * np.concatenate([off_table[board], -state.offsets_mm[places].ravel()])
+        yield _BoardPart(normal[:, :own_count], normal[:, own_count:], side, flat, columns), residuals
 
 
 def _normal(
@@ -185,20 +185,22 @@ def _normal(
     """The boards' parts with G = own^-1 [cross, side] of each; the reduced normal matrix and right-hand side of
     the shared parameters."""
     parts: list[_BoardPart] = []
-    eliminated: list[Floats] = []
+    solutions: list[Floats] = []
     views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
     matrix, side = np.zeros((problem.shared, problem.shared)), np.zeros(problem.shared)
     for part, residuals in _board_parts(problem, state, linearised(problem, state), factors, weights):
-        shared = part.jacobian[:, len(part.own) :]
-        solved = _solve(part.own, np.column_stack([part.cross, part.side]))
-        matrix[np.ix_(part.columns, part.columns)] += shared.T @ shared - part.cross.T @ solved[:, :-1]
-        side[part.columns] += shared.T @ residuals - part.cross.T @ solved[:, -1]
+        shared_jacobian = part.jacobian[:, len(part.own) :]
+        solution = _solve(part.own, np.column_stack([part.cross, part.side]))
+        matrix[np.ix_(part.columns, part.columns)] += (
+            shared_jacobian.T @ shared_jacobian - part.cross.T @ solution[:, :-1]
+        )
+        side[part.columns] += shared_jacobian.T @ residuals - part.cross.T @ solution[:, -1]
         parts.append(part)
-        eliminated.append(solved)
-    held = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
-    off = held * pose_errors(problem, state)
-    by_axes = held[:, None] * problem.by_axes
-    matrix[np.arange(views), np.arange(views)] += np.tile(held, len(problem.reported))
+        solutions.append(solution)
+    pose_weights = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
+    off = pose_weights * pose_errors(problem, state)
+    by_axes = pose_weights[:, None] * problem.by_axes
+    matrix[np.arange(views), np.arange(views)] += np.tile(pose_weights, len(problem.reported))
     matrix[:views, axes] -= by_axes.reshape(views, -1)
     matrix[axes, :views] -= by_axes.reshape(views, -1).T
     matrix[axes, axes] += np.einsum("vij,vik->jk", problem.by_axes, by_axes)
@@ -207,7 +209,7 @@ def _normal(
     camera = problem.prior_whiten.T @ problem.prior_whiten
     matrix[views:, views:] += camera
     side[views:] -= camera @ camera_step(problem, state)
-    return parts, eliminated, matrix, side
+    return parts, solutions, matrix, side
 
 
 def _descend(
@@ -218,16 +220,16 @@ def _descend(
     for step in range(1, _MOST_STEPS + 1):
         off = np.sqrt(np.sum(whitened(problem, state) ** 2, axis=1)) / factors[SPOTS]
         weights = np.where(kept, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
-        parts, eliminated, matrix, side = _normal(problem, state, factors, weights)
-        shared = cho_solve(_factored(matrix), side)
-        own = [s[:, -1] - s[:, :-1] @ shared[p.columns] for p, s in zip(parts, eliminated, strict=True)]
-        share, tried = 1.0, stepped(problem, state, shared, own, 1.0)
-        while (now := cost_of(problem, tried, factors, kept, huber)) > cost * (1 + 1e-12) and share > 1e-3:
+        parts, solutions, matrix, side = _normal(problem, state, factors, weights)
+        shared_step = cho_solve(_factored(matrix), side)
+        own_steps = [s[:, -1] - s[:, :-1] @ shared_step[p.columns] for p, s in zip(parts, solutions, strict=True)]
+        share, tried_state = 1.0, stepped(problem, state, shared_step, own_steps, 1.0)
+        while (now := cost_of(problem, tried_state, factors, kept, huber)) > cost * (1 + 1e-12) and share > 1e-3:
             share /= 2
-            tried = stepped(problem, state, shared, own, share)
+            tried_state = stepped(problem, state, shared_step, own_steps, share)
         if now > cost * (1 + 1e-12):
             return state, step
-        state, gain, cost = tried, cost - now, now
+        state, gain, cost = tried_state, cost - now, now
         if gain < _STILL * max(cost, 1.0):
             return state, step
     raise InputError(
@@ -265,24 +267,24 @@ class _Solved:
 
 
 def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_]) -> _Solved:
-    parts, eliminated, matrix, _ = _normal(problem, state, factors, kept.astype(np.float64))
-    shared = cho_solve(_factored(matrix), np.eye(len(matrix)))
-    own: list[Floats] = []
+    parts, solutions, matrix, _ = _normal(problem, state, factors, kept.astype(np.float64))
+    shared_covariance = cho_solve(_factored(matrix), np.eye(len(matrix)))
+    own_covariances: list[Floats] = []
     alone: list[Floats] = []
-    taken = np.zeros(len(GROUPS))
-    for part, solved in zip(parts, eliminated, strict=True):
-        count, gain = len(part.own), solved[:, :-1]
-        block = shared[np.ix_(part.columns, part.columns)]
+    used_freedom = np.zeros(len(GROUPS))
+    for part, solution in zip(parts, solutions, strict=True):
+        count, gain = len(part.own), solution[:, :-1]
+        block = shared_covariance[np.ix_(part.columns, part.columns)]
         alone.append(_solve(part.own, np.eye(count)))
-        own.append(alone[-1] + gain @ block @ gain.T)
-        whole = np.block([[own[-1], -gain @ block], [-block @ gain.T, block]])
-        taken[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
-        taken[TOLERANCE] += float(np.trace(own[-1][6:, 6:]))
-        assert count == len(own[-1])
-    variance = _of_pose_errors(problem, shared)
-    taken[TOLERANCE] /= (problem.stated.tolerance_mm * factors[TOLERANCE]) ** 2
-    scaled = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
-    taken[POSITION], taken[ORIENTATION] = scaled[:, :3].sum(), scaled[:, 3:].sum()
+        own_covariances.append(alone[-1] + gain @ block @ gain.T)
+        whole = np.block([[own_covariances[-1], -gain @ block], [-block @ gain.T, block]])
+        used_freedom[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
+        used_freedom[TOLERANCE] += float(np.trace(own_covariances[-1][6:, 6:]))
+        assert count == len(own_covariances[-1])
+    variance = _of_pose_errors(problem, shared_covariance)
+    used_freedom[TOLERANCE] /= (problem.stated.tolerance_mm * factors[TOLERANCE]) ** 2
+    scaled_variance = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
+    used_freedom[POSITION], used_freedom[ORIENTATION] = scaled_variance[:, :3].sum(), scaled_variance[:, 3:].sum()
     off = pose_errors(problem, state) / problem.sigmas
     groups = (
         whitened(problem, state)[kept],
@@ -290,11 +292,16 @@ def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
         off[:, :3],
         off[:, 3:],
     )
-    redundancy = np.array([part.size for part in groups]) - taken
+    redundancy = np.array([part.size for part in groups]) - used_freedom
     chi2 = np.array([float(np.sum(part**2)) for part in groups])
-    seen = np.sqrt(chi2 / np.maximum(redundancy, 1e-9))
-    told = redundancy >= _LEAST_REDUNDANCY
-    return _Solved(own, alone, np.where(told, np.maximum(seen, _LEAST_FACTOR), factors), redundancy)
+    seen_factors = np.sqrt(chi2 / np.maximum(redundancy, 1e-9))
+    has_redundancy = redundancy >= _LEAST_REDUNDANCY
+    return _Solved(
+        own_covariances,
+        alone,
+        np.where(has_redundancy, np.maximum(seen_factors, _LEAST_FACTOR), factors),
+        redundancy,
+    )
 
 
 def _of_pose_errors(problem: Problem, shared: Floats) -> Floats:
@@ -302,28 +309,28 @@ def _of_pose_errors(problem: Problem, shared: Floats) -> Floats:
     views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
     with_axes = shared[:views, axes].reshape(*problem.by_axes.shape)
     by = problem.by_axes
-    own = np.diag(shared)[:views].reshape(-1, 6)
+    own_variance = np.diag(shared)[:views].reshape(-1, 6)
     joint: Floats = np.einsum("vij,jk,vik->vi", by, shared[axes, axes], by) - 2 * np.sum(with_axes * by, axis=2)
-    return own + joint
+    return own_variance + joint
 
 
 def _summary(
     problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], steps: int
 ) -> LedGeometry:
-    solved = _solved(problem, state, factors, kept)
+    solution = _solved(problem, state, factors, kept)
     boards = problem.boards
     centres = np.empty((len(boards.places_mm), 3, 3))
     shared_part = np.empty(len(centres))
     normals = np.empty((len(boards.numbers), 2, 2))
-    for board, (own, alone) in enumerate(zip(solved.own, solved.alone, strict=True)):
+    for board, (own_covariance, alone) in enumerate(zip(solution.own, solution.alone, strict=True)):
         turn = state.base_from_board[board, :3, :3]
-        normals[board] = np.degrees(np.degrees(own[3:5, 3:5]))
+        normals[board] = np.degrees(np.degrees(own_covariance[3:5, 3:5]))
         for led, place in enumerate(boards.rows_of(board)):
-            by = np.zeros((3, len(own)))
+            by = np.zeros((3, len(own_covariance)))
             by[:, :3] = np.eye(3)
             by[:, 3:6] = -turn @ skew(boards.places_mm[place] + state.offsets_mm[place])
             by[:, 6 + 3 * led : 9 + 3 * led] = turn
-            centres[place] = by @ own @ by.T
+            centres[place] = by @ own_covariance @ by.T
             shared_part[place] = 1 - np.trace(by @ alone @ by.T) / np.trace(centres[place])
     residuals = _solve(problem.whiten, whitened(problem, state)[:, :, None])[:, :, 0]
     step = camera_step(problem, state) / np.sqrt(np.diag(problem.prior.covariance))
@@ -334,7 +341,7 @@ def _summary(
         normals,
         shared_part,
         factors,
-        solved.redundancy,
+        solution.redundancy,
         residuals,
         kept,
         step,

@@ -41,8 +41,8 @@ class Boards:
     def in_base(self, base_from_board: Floats, offsets_mm: Floats | float = 0.0) -> Floats:
         """Centres [n, 3] of LEDs for these poses of the boards and offsets of the LEDs on them."""
         pose = base_from_board[self.board_of]
-        turned: Floats = np.einsum("nij,nj->ni", pose[:, :3, :3], self.places_mm + offsets_mm)
-        return turned + pose[:, :3, 3]
+        turned_mm: Floats = np.einsum("nij,nj->ni", pose[:, :3, :3], self.places_mm + offsets_mm)
+        return turned_mm + pose[:, :3, 3]
 
 
 def placed(boards: Boards, found_mm: Floats) -> Floats:

@@ -33,21 +33,21 @@ def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> 
     """LEDs by uncertainty; arrows from the table's place of a board to the one found, enlarged; red rings for LEDs
     not found."""
     place = found.new_table.positions_mm
-    known = np.isfinite(found.u_mm)
+    is_known = np.isfinite(found.u_mm)
     order = np.argsort(np.nan_to_num(found.u_mm))
-    order = order[known[order]]
+    order = order[is_known[order]]
     x, y = place[:, across], place[:, up]
     dots = ax.scatter(x[order], y[order], c=1e3 * found.u_mm[order], s=9, cmap="viridis", linewidths=0)
     ax.figure.colorbar(dots, ax=ax, label="u of the centre (um)", shrink=0.8)
-    ax.scatter(x[~known], y[~known], s=40, facecolors="none", edgecolors=RED, linewidths=1.5)
+    ax.scatter(x[~is_known], y[~is_known], s=40, facecolors="none", edgecolors=RED, linewidths=1.5)
     boards = np.unique(found.table.boards)
     before = np.array([found.table.positions_mm[found.table.boards == b].mean(axis=0) for b in boards])
     after = np.array([place[found.table.boards == b].mean(axis=0) for b in boards])
     shift = after - before
-    enlarged = _round(_ARROW_MM / max(float(np.median(np.linalg.norm(shift, axis=1))), 1e-6))
+    enlargement = _round(_ARROW_MM / max(float(np.median(np.linalg.norm(shift, axis=1))), 1e-6))
     ax.quiver(
         *before[:, [across, up]].T,
-        *shift[:, [across, up]].T * enlarged,
+        *shift[:, [across, up]].T * enlargement,
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -57,17 +57,17 @@ def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> 
     names = "xyz"
     ax.set(
         aspect="equal", xlabel=f"{names[across]} (mm, base)", ylabel=f"{names[up]} (mm, base)",
-        title=f"{title}; shifts of boards x {enlarged:g}",
+        title=f"{title}; shifts of boards x {enlargement:g}",
     )  # fmt: skip
     if up == 2:
         ax.invert_yaxis()  # the arm hangs: z of its base points down
 
 
 def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
-    known = found.u_mm[np.isfinite(found.u_mm)] * 1e3
-    ax.hist(known, bins=40, range=(0, float(np.percentile(known, 99.5)) * 1.1), color=BLUE)
+    u_um = found.u_mm[np.isfinite(found.u_mm)] * 1e3
+    ax.hist(u_um, bins=40, range=(0, float(np.percentile(u_um, 99.5)) * 1.1), color=BLUE)
     for share, style in ((50, "-"), (95, "--")):
-        value = float(np.percentile(known, share))
+        value = float(np.percentile(u_um, share))
         ax.axvline(value, color=RED, ls=style, label=f"{share} %: {value:.0f} um")
     ax.legend(frameon=False)
     ax.set(title="Uncertainty of centres", xlabel="u (um)", ylabel="LEDs")
@@ -75,17 +75,17 @@ def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
 
 def _draw_residuals(ax: Axes, found: LedsFound) -> None:
     """Residuals of all spots; those left out in red, at the rim if they are larger."""
-    residuals, kept = found.geometry.residuals_px, found.geometry.kept
-    reach = 6.0 * float(np.sqrt(np.mean(residuals[kept] ** 2)))
+    residuals, keep = found.geometry.residuals_px, found.geometry.kept
+    reach = 6.0 * float(np.sqrt(np.mean(residuals[keep] ** 2)))
     x, y = np.clip(residuals, -reach, reach).T
-    ax.scatter(x[kept], y[kept], s=3, color=BLUE, alpha=0.4, linewidths=0)
-    ax.scatter(x[~kept], y[~kept], s=16, color=RED, marker="x")
+    ax.scatter(x[keep], y[keep], s=3, color=BLUE, alpha=0.4, linewidths=0)
+    ax.scatter(x[~keep], y[~keep], s=16, color=RED, marker="x")
     ax.axhline(0, color=GREY, lw=0.8)
     ax.axvline(0, color=GREY, lw=0.8)
-    out = int((~kept).sum())
+    out = int((~keep).sum())
     ax.set(
         xlim=(-1.05 * reach, 1.05 * reach), ylim=(-1.05 * reach, 1.05 * reach), aspect="equal",
-        title=f"Residuals of {kept.sum()} spots, {out} left out", xlabel="x (px)", ylabel="y (px)",
+        title=f"Residuals of {keep.sum()} spots, {out} left out", xlabel="x (px)", ylabel="y (px)",
     )  # fmt: skip
 
 

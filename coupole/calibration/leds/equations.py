@@ -140,8 +140,8 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
 
 def whitened(problem: Problem, state: LedState) -> Floats:
     """Residuals [k, 2] over the stated noise."""
-    projected = optics.project(points_seen(problem, state)[2], state.lens)
-    result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projected.pixels)
+    projection = optics.project(points_seen(problem, state)[2], state.lens)
+    result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projection.pixels)
     return result
 
 
@@ -163,20 +163,20 @@ class Linear:
 
 def linearised(problem: Problem, state: LedState) -> Linear:
     on_board, in_flange, in_camera = points_seen(problem, state)
-    projected = optics.project(in_camera, state.lens)
-    by_point = problem.whiten @ projected.by_point
+    projection = optics.project(in_camera, state.lens)
+    by_point = problem.whiten @ projection.by_point
     by_flange_point = by_point @ state.flange_from_camera[:3, :3].T
     by_base_point = by_flange_point @ np.swapaxes(state.base_from_flange[problem.view, :3, :3], 1, 2)
     turn = state.base_from_board[problem.boards.board_of[problem.place], :3, :3]
     by_offset = by_base_point @ turn
     free = [optics.NAMES.index(name) for name in problem.prior.free]
     return Linear(
-        np.einsum("kij,kj->ki", problem.whiten, problem.observed - projected.pixels),
+        np.einsum("kij,kj->ki", problem.whiten, problem.observed - projection.pixels),
         np.concatenate([by_base_point, -by_offset @ skew(on_board)], axis=2),
         by_offset,
         np.concatenate([-by_base_point, by_flange_point @ skew(in_flange)], axis=2),
         np.concatenate(
-            [problem.whiten @ projected.by_intrinsics[:, :, free], -by_flange_point, by_point @ skew(in_camera)],
+            [problem.whiten @ projection.by_intrinsics[:, :, free], -by_flange_point, by_point @ skew(in_camera)],
             axis=2,
         ),
     )

@@ -68,24 +68,24 @@ def led_plan(
     for _ in range(_ROUNDS):
         tell(f"choosing views among {len(joints_deg)} postures")
         lens, size_px, margin_px = _camera(cell.rig)
-        chosen = led_views(
+        choice = led_views(
             boards, _cameras(cell.rig, joints_deg), lens, size_px, enough=enough, margin_px=margin_px
         )
-        if chosen.few:
+        if choice.few:
             raise InputError(
                 f"leds: expected to see each board {enough} times; of {len(joints_deg)} postures too few see "
-                f"boards {', '.join(map(str, chosen.few[:12]))}. Draw more, or another --seed"
+                f"boards {', '.join(map(str, choice.few[:12]))}. Draw more, or another --seed"
             )
-        tell(f"planning paths to {len(chosen.views)} views")
+        tell(f"planning paths to {len(choice.views)} views")
         views = [
             ViewPose(f"l{number:03d}", None, tuple(joints_deg[view.candidate].tolist()), None)
-            for number, view in enumerate(chosen.views)
+            for number, view in enumerate(choice.views)
         ]
         visits = plan_itinerary(views, cell.rig, bodies, cell.rig.motion.home_joints_deg).visits
-        cut_off = [view.candidate for view, visit in zip(chosen.views, visits, strict=True) if visit is None]
+        cut_off = [view.candidate for view, visit in zip(choice.views, visits, strict=True) if visit is None]
         if not cut_off:
-            lines = [_line(number, joints_deg, view) for number, view in enumerate(chosen.views)]
-            head = _HEAD.format(views=len(lines), images=chosen.images, enough=enough, name=name, rig=rig)
+            lines = [_line(number, joints_deg, view) for number, view in enumerate(choice.views)]
+            head = _HEAD.format(views=len(lines), images=choice.images, enough=enough, name=name, rig=rig)
             return head + "\n".join(lines) + "\n" + _TAIL
         joints_deg = np.delete(joints_deg, cut_off, axis=0)
     raise InputError(f"leds: no paths to all of the views were found in {_ROUNDS} rounds. Try another --seed")
@@ -99,16 +99,16 @@ def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.
     low[5], high[5] = max(low[5], -_TURN_DEG), min(high[5], _TURN_DEG)
     joints_deg = np.round(random.uniform(np.ceil(low), np.floor(high), (drawn, 6)))
     lens, size_px, margin_px = _camera(rig)
-    seen = boards_seen(boards, _cameras(rig, joints_deg), lens, size_px, margin_px)
-    keep = np.flatnonzero(seen.sum(axis=1) >= _LEAST_BOARDS)
+    visible = boards_seen(boards, _cameras(rig, joints_deg), lens, size_px, margin_px)
+    keep = np.flatnonzero(visible.sum(axis=1) >= _LEAST_BOARDS)
     keep = keep[singularities.margin(arm, joints_deg[keep]) >= 1.0]
     tightest_mm = [bodies.tightest_mm(joints_deg[part]) for part in np.array_split(keep, -(-len(keep) // 500))]
     keep = keep[np.concatenate(tightest_mm) >= 0.0] if len(keep) else keep
-    seen = seen[keep]
+    visible = visible[keep]
     # Some are kept because they see many boards, some because they see boards that few others see.
-    rare = seen @ (1.0 / np.maximum(seen.sum(axis=0), 1))
+    rare = visible @ (1.0 / np.maximum(visible.sum(axis=0), 1))
     half = _MOST_CANDIDATES // 2
-    best = np.unique(np.concatenate([np.argsort(-rare)[:half], np.argsort(-seen.sum(axis=1))[:half]]))
+    best = np.unique(np.concatenate([np.argsort(-rare)[:half], np.argsort(-visible.sum(axis=1))[:half]]))
     return np.asarray(joints_deg[keep[best]])
 
 

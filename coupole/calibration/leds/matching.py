@@ -87,20 +87,20 @@ def match_leds(
     table_mm = boards.in_base(boards.base_from_board)
     rays = np.einsum("kij,kj->ki", base_from_camera[seen.view, :3, :3], unproject(seen.pixels, lens))
     eyes_mm = base_from_camera[seen.view, :3, 3]
-    spread = tolerance_px / lens.fx
+    tolerance_rad = tolerance_px / lens.fx
     found_mm = np.full((len(ids), 3), np.nan)
     agreeing: list[NDArray[np.intp]] = []
     near = cKDTree(table_mm)
     order = np.argsort(seen.led, kind="stable")
-    for mine in np.split(order, np.flatnonzero(np.diff(seen.led[order])) + 1) if len(order) else []:
-        inside = _agreeing(rays[mine], eyes_mm[mine], seen.view[mine], spread, near, reach_mm)
+    for led_rows in np.split(order, np.flatnonzero(np.diff(seen.led[order])) + 1) if len(order) else []:
+        inside = _agreeing(rays[led_rows], eyes_mm[led_rows], seen.view[led_rows], tolerance_rad, near, reach_mm)
         if len(inside):
-            rows = mine[inside]
+            rows = led_rows[inside]
             found_mm[seen.led[rows[0]]] = _meeting(rays[rows], eyes_mm[rows])
             agreeing.append(rows)
-    kept = seen.only(np.concatenate(agreeing) if agreeing else np.zeros(0, np.intp))
+    agreeing_sightings = seen.only(np.concatenate(agreeing) if agreeing else np.zeros(0, np.intp))
     place_of, wiring = _places(found_mm, table_mm, ids, boards)
-    return Matching(found_mm, place_of, kept, (*_unseen(seen, found_mm, ids), *wiring))
+    return Matching(found_mm, place_of, agreeing_sightings, (*_unseen(seen, found_mm, ids), *wiring))
 
 
 def _agreeing(
@@ -150,10 +150,10 @@ def _off(points: Floats, rays: Floats, eyes_mm: Floats) -> Floats:
 
 
 def _nearest_of_each_view(off: Floats, views: Indices) -> Indices:
-    chosen = [
+    nearest = [
         rows[int(np.argmin(off[rows]))] for view in np.unique(views) if len(rows := np.flatnonzero(views == view))
     ]
-    inside = np.array(chosen, dtype=np.intp)
+    inside = np.array(nearest, dtype=np.intp)
     return inside[off[inside] < 1.0]
 
 
@@ -162,8 +162,8 @@ def _meeting(rays: Floats, eyes_mm: Floats) -> Floats:
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     weight = np.ones(len(rays))
     for _ in range(2):
-        weighted = across * weight[:, None, None]
-        point = np.linalg.solve(weighted.sum(axis=0), np.einsum("nij,nj->i", weighted, eyes_mm))
+        weighted_across = across * weight[:, None, None]
+        point = np.linalg.solve(weighted_across.sum(axis=0), np.einsum("nij,nj->i", weighted_across, eyes_mm))
         weight = 1.0 / np.sum((point - eyes_mm) ** 2, axis=1)
     return np.asarray(point)
 
@@ -208,13 +208,13 @@ def _places(
     near_mm = 0.4 * spacing_mm
     off_mm = np.linalg.norm(found_mm - table_mm, axis=1)
     astray = np.flatnonzero(off_mm > near_mm)
-    moved = [
+    moved_boards = [
         b
         for b in np.unique(boards.board_of[astray])
         if _moved(boards.rows_of(b), found_mm, table_mm) and not _on_another(b, found_mm, tree, near_mm, boards)
     ]
     faults = []
-    for row in astray[~np.isin(boards.board_of[astray], moved)]:
+    for row in astray[~np.isin(boards.board_of[astray], moved_boards)]:
         distance_mm, place = tree.query(found_mm[row])
         here[row] = place if distance_mm < near_mm else -1
         if here[row] < 0:
@@ -284,5 +284,5 @@ def fault_lines(faults: Sequence[LedFault]) -> tuple[str, ...]:
     dead = [fault.leds[0] for fault in faults if fault.kind == "dead"]
     if len(dead) < 4:
         return tuple(fault.text for fault in faults)
-    others = tuple(fault.text for fault in faults if fault.kind != "dead")
-    return (f"{len(dead)} LEDs are dead, no spot in any frame: {', '.join(map(str, dead))}", *others)
+    other_lines = tuple(fault.text for fault in faults if fault.kind != "dead")
+    return (f"{len(dead)} LEDs are dead, no spot in any frame: {', '.join(map(str, dead))}", *other_lines)

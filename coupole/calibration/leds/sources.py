@@ -85,26 +85,26 @@ def find_leds(
         raise InputError(
             f"{', '.join(map(str, paths))}: no proven frame under a single LED; acquire the plan first"
         )
-    collected = _Collected([(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs])
-    done = count(1)
+    collection = _Collected([(f"{run.folder.name}/run.json", sha256(run.folder / "run.json")) for run in runs])
+    numbers = count(1)
     for run, view, proven in work:
         name = view if len(runs) == 1 else f"{run.folder.name}/{view}"
-        _collect(collected, run, view, name, proven, row_of, lambda: progress(next(done), total))
-    assert collected.camera is not None, "every view has a camera"
-    about, size_px = collected.camera
+        _collect(collection, run, view, name, proven, row_of, lambda: progress(next(numbers), total))
+    assert collection.camera is not None, "every view has a camera"
+    about, size_px = collection.camera
     return LedImages(
-        _sightings(collected),
-        np.stack(collected.poses),
-        tuple(collected.views),
+        _sightings(collection),
+        np.stack(collection.poses),
+        tuple(collection.views),
         size_px,
-        tuple(collected.left_out),
+        tuple(collection.left_out),
         replace(
             about,
-            temperature_c=temperature_range_c(collected.lit_records),
+            temperature_c=temperature_range_c(collection.lit_records),
             begun=max(run.created for run in runs),
         ),
-        tuple(collected.inputs),
-        np.stack(collected.joints_deg),
+        tuple(collection.inputs),
+        np.stack(collection.joints_deg),
     )
 
 
@@ -120,7 +120,7 @@ def _collect(
     """Add one view's poses and the spots of its frames under single LEDs."""
     path = run.view_path(view)
     file = read_view(path, proven)
-    records, reported = file.records, file.poses
+    records, reported_poses = file.records, file.poses
     camera = about_of(run, file), (file.layout.width_px, file.layout.height_px)
     if collected.camera is not None and camera != collected.camera:
         raise InputError(
@@ -136,8 +136,8 @@ def _collect(
     for pose in sorted({frame.pose[1] for frame in lit}):
         number_of[pose] = len(collected.views)
         collected.views.append(name)
-        collected.poses.append(np.array(reported[pose]["base_from_flange"], dtype=np.float64))
-        collected.joints_deg.append(np.array(reported[pose]["joints_deg"], dtype=np.float64))
+        collected.poses.append(np.array(reported_poses[pose]["base_from_flange"], dtype=np.float64))
+        collected.joints_deg.append(np.array(reported_poses[pose]["joints_deg"], dtype=np.float64))
     collected.lit_records += [records[frame.frame.index] for frame in lit]
     darks = _darks(file, proven)
     for frame in lit:
@@ -166,10 +166,12 @@ def _sightings(collected: _Collected) -> LedSightings:
 
 def _by_view(run: Run) -> dict[str, list[FrameProven]]:
     """Proven frames of the views that have some under single LEDs."""
-    found: dict[str, list[FrameProven]] = {}
+    frames_of: dict[str, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
-        found.setdefault(shot.view, []).append(frame)
-    return {view: frames for view, frames in found.items() if any(isinstance(f.shot.light, Led) for f in frames)}
+        frames_of.setdefault(shot.view, []).append(frame)
+    return {
+        view: frames for view, frames in frames_of.items() if any(isinstance(f.shot.light, Led) for f in frames)
+    }
 
 
 def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list[_LedFrame]:
@@ -181,10 +183,10 @@ def _single_leds(proven: Sequence[FrameProven], records: Any, view: str) -> list
         led = frame.shot.light.id
         record = records[frame.index]
         pose = int(record["pose"])
-        found = _LedFrame(frame.shot, led, (view, pose), int(record["exposure_us"]), frame)
+        led_frame = _LedFrame(frame.shot, led, (view, pose), int(record["exposure_us"]), frame)
         before = shortest.get((led, pose))
-        if before is None or found.exposure_us < before.exposure_us:
-            shortest[led, pose] = found
+        if before is None or led_frame.exposure_us < before.exposure_us:
+            shortest[led, pose] = led_frame
     return list(shortest.values())
 
 

@@ -76,19 +76,19 @@ def find_spots(frame: NDArray[np.uint16], dark: Floats | float, pattern: str, wh
     count, _, boxes, _ = cv2.connectedComponentsWithStats(lit.astype(np.uint8), connectivity=8)
     brightest = float(np.max(at_green - black)) / white
     places = sorted(range(1, count), key=lambda label: -int(boxes[label, cv2.CC_STAT_AREA]))
-    good, rejected = [], []
+    good, rejections = [], []
     for label in [p for p in places if 4 * boxes[p, cv2.CC_STAT_AREA] > LEAST_AREA_PX][:MOST_SPOTS]:
-        left, top, across, down = (2 * int(v) for v in boxes[label, :4])
-        rows = slice(max(top - _MARGIN_PX, 0), min(top + down + _MARGIN_PX, frame.shape[0]))
-        columns = slice(max(left - _MARGIN_PX, 0), min(left + across + _MARGIN_PX, frame.shape[1]))
+        x, y, width, height = (2 * int(v) for v in boxes[label, :4])
+        rows = slice(max(y - _MARGIN_PX, 0), min(y + height + _MARGIN_PX, frame.shape[0]))
+        columns = slice(max(x - _MARGIN_PX, 0), min(x + width + _MARGIN_PX, frame.shape[1]))
         black = dark[rows, columns] if isinstance(dark, np.ndarray) else dark
-        found = _spot(np.asarray((frame[rows, columns] - black) / white, dtype=np.float64))
-        if isinstance(found, str):
-            rejected.append(f"at ({left + across // 2}, {top + down // 2}): {found}")
+        spot = _spot(np.asarray((frame[rows, columns] - black) / white, dtype=np.float64))
+        if isinstance(spot, str):
+            rejections.append(f"at ({x + width // 2}, {y + height // 2}): {spot}")
         else:
             corner = np.array([columns.start, rows.start], dtype=np.float64)
-            good.append(Spot(found.pixel + corner, found.covariance, found.area_px, found.fill))
-    return Spots(tuple(good), tuple(rejected), brightest)
+            good.append(Spot(spot.pixel + corner, spot.covariance, spot.area_px, spot.fill))
+    return Spots(tuple(good), tuple(rejections), brightest)
 
 
 def outline_offsets(
@@ -124,8 +124,8 @@ def _spot(signal: Floats) -> Spot | str:
     if count < 2:
         return "too faint at full resolution"
     label = 1 + int(np.argmax(boxes[1:, cv2.CC_STAT_AREA]))
-    left, top, across, down = (int(v) for v in boxes[label, :4])
-    if left == 0 or top == 0 or left + across == weight.shape[1] or top + down == weight.shape[0]:
+    column, row, width, height = (int(v) for v in boxes[label, :4])
+    if column == 0 or row == 0 or column + width == weight.shape[1] or row + height == weight.shape[0]:
         return "cut by the frame's edge"
     weight = np.where(labels == label, weight, 0.0)
     area = float(weight.sum())

@@ -64,27 +64,29 @@ def led_views(
 ) -> LedViews:
     """Choose among candidates [c, 4, 4] until each board is seen completely `enough` times."""
     visible, information = _sightings(boards, base_from_camera, lens, size_px, margin_px)
-    needed = np.full(len(boards.numbers), enough)
-    known = np.tile(np.eye(3) / _START_MM**2, (len(needed), 1, 1))
+    views_needed = np.full(len(boards.numbers), enough)
+    total_information = np.tile(np.eye(3) / _START_MM**2, (len(views_needed), 1, 1))
     free = np.ones(len(base_from_camera), np.bool_)
-    chosen: list[LedView] = []
-    gain = _gain(known, information)
+    views: list[LedView] = []
+    gain = _gain(total_information, information)
     while True:
-        wanted = visible & free[:, None] & (needed > 0)[None]
-        best = int(np.argmax(np.where(wanted, gain, 0.0).sum(axis=1)))
-        if not wanted[best].any():
+        useful = visible & free[:, None] & (views_needed > 0)[None]
+        best = int(np.argmax(np.where(useful, gain, 0.0).sum(axis=1)))
+        if not useful[best].any():
             break
         free[best] = False
-        rows = np.flatnonzero(wanted[best])
-        known[rows] += information[best, rows]
-        gain[:, rows] = _gain(known[rows], information[:, rows])
-        needed[rows] -= 1
-        chosen.append(LedView(best, tuple(int(n) for n in boards.numbers[rows])))
+        rows = np.flatnonzero(useful[best])
+        total_information[rows] += information[best, rows]
+        gain[:, rows] = _gain(total_information[rows], information[:, rows])
+        views_needed[rows] -= 1
+        views.append(LedView(best, tuple(int(n) for n in boards.numbers[rows])))
     leds = np.bincount(boards.board_of)
     of = {int(number): row for row, number in enumerate(boards.numbers)}
-    images = sum(int(leds[of[number]]) for view in chosen for number in view.boards)
-    few = tuple(int(n) for n in boards.numbers[needed > 0])
-    return LedViews(tuple(chosen), images, few, np.sqrt(np.trace(np.linalg.inv(known), axis1=1, axis2=2)))
+    images = sum(int(leds[of[number]]) for view in views for number in view.boards)
+    few = tuple(int(n) for n in boards.numbers[views_needed > 0])
+    return LedViews(
+        tuple(views), images, few, np.sqrt(np.trace(np.linalg.inv(total_information), axis1=1, axis2=2))
+    )
 
 
 def boards_seen(
@@ -107,20 +109,20 @@ def _sightings(
     leds_mm = boards.in_base(boards.base_from_board)
     normals = boards.base_from_board[boards.board_of, :3, 2]
     camera_from_base = inverses(base_from_camera)
-    seen = np.empty((len(base_from_camera), len(leds_mm)), np.bool_)
+    visible = np.empty((len(base_from_camera), len(leds_mm)), np.bool_)
     for number, pose in enumerate(camera_from_base):
         there = leds_mm @ pose[:3, :3].T + pose[:3, 3]
         towards = base_from_camera[number, :3, 3] - leds_mm
         distance = np.linalg.norm(towards, axis=1)
         facing = np.einsum("ni,ni->n", towards, normals) / distance
-        seen[number] = (there[:, 2] > NEAREST_MM) & (distance < FARTHEST_MM)
-        seen[number] &= facing > np.cos(np.radians(MOST_ANGLE_DEG))
-        rows = np.flatnonzero(seen[number])
+        visible[number] = (there[:, 2] > NEAREST_MM) & (distance < FARTHEST_MM)
+        visible[number] &= facing > np.cos(np.radians(MOST_ANGLE_DEG))
+        rows = np.flatnonzero(visible[number])
         pixels = optics.project(there[rows], lens.vector()).pixels
         inside = (pixels > margin_px) & (pixels < np.array(size_px) - 1 - margin_px)
-        seen[number, rows] = inside.all(axis=1)
+        visible[number, rows] = inside.all(axis=1)
     count = len(boards.numbers)
-    whole = np.stack([seen[:, boards.rows_of(b)].all(axis=1) for b in range(count)], axis=1)
+    whole = np.stack([visible[:, boards.rows_of(b)].all(axis=1) for b in range(count)], axis=1)
     middles = boards.base_from_board[:, :3, 3]
     rays = middles[None] - base_from_camera[:, None, :3, 3]
     distance = np.linalg.norm(rays, axis=2, keepdims=True)

@@ -134,11 +134,11 @@ class _InTableOrder:
 
 
 def _in_table_order(geometry: LedGeometry, matching: Matching, boards: Boards) -> _InTableOrder:
-    found = matching.place_of >= 0
-    place = np.where(found, matching.place_of, np.arange(len(found)))
+    is_found = matching.place_of >= 0
+    place = np.where(is_found, matching.place_of, np.arange(len(is_found)))
     u_mm = np.sqrt(np.trace(geometry.centre_covariance, axis1=1, axis2=2))
     u_deg = np.sqrt(np.trace(geometry.normal_covariance, axis1=1, axis2=2))[boards.board_of]
-    return _InTableOrder(found, place, u_mm[place], u_deg[place])
+    return _InTableOrder(is_found, place, u_mm[place], u_deg[place])
 
 
 def _matched(images: LedImages, table: LedTable, boards: Boards, prior: CameraPrior, stated: Stated) -> Matching:
@@ -229,9 +229,9 @@ def _h5(
     count: int,
 ) -> bytes:
     """Uncertainties by LED, in the table's order; equal numbers give equal bytes."""
-    kept = geometry.kept
-    views = np.bincount(place[kept], minlength=count)
-    square = np.bincount(place[kept], np.sum(geometry.residuals_px[kept] ** 2, axis=1), minlength=count)
+    keep = geometry.kept
+    views = np.bincount(place[keep], minlength=count)
+    square = np.bincount(place[keep], np.sum(geometry.residuals_px[keep] ** 2, axis=1), minlength=count)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
         file.attrs["frame"] = "base"
@@ -246,10 +246,10 @@ def _h5(
         put("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
         put("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
-        shared = (
+        shared_text = (
             "[leds] of the centre's variance that comes from poses, lens and hand-eye, as its neighbours' does"
         )
-        put("shared_part", geometry.shared_part[where], "", shared)
+        put("shared_part", geometry.shared_part[where], "", shared_text)
         put("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
         put("views", views[where], "", "[leds] that it was found in")
         put("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
@@ -259,10 +259,10 @@ def _h5(
 
 def _of_faults(faults: Sequence[LedFault], accepted: bool) -> Limit:
     count = float(sum(fault.is_wrong for fault in faults))
-    what = "faults of LEDs and wires"
+    label = "faults of LEDs and wires"
     if accepted and count:
-        return Limit(what=what, found=count, limit=count, unit="", usual=0.0)
-    return Limit(what=what, found=count, limit=0.0, unit="")
+        return Limit(what=label, found=count, limit=count, unit="", usual=0.0)
+    return Limit(what=label, found=count, limit=0.0, unit="")
 
 
 def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]) -> list[LedFault]:
@@ -270,7 +270,7 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
     shift_mm = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     turn = np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3]
     turn_deg = np.degrees(np.linalg.norm(rotation_vector(turn), axis=1))
-    seen = np.isin(np.arange(len(boards.numbers)), boards.board_of[place])
+    is_seen = np.isin(np.arange(len(boards.numbers)), boards.board_of[place])
     return [
         LedFault(
             "moved",
@@ -278,7 +278,7 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
             f"board {boards.numbers[b]} stands {shift_mm[b]:.1f} mm and {turn_deg[b]:.2f} deg from its table. "
             "Its new place is in this record",
         )
-        for b in np.flatnonzero(seen & ((shift_mm > MOVED_MM) | (turn_deg > MOVED_DEG)))
+        for b in np.flatnonzero(is_seen & ((shift_mm > MOVED_MM) | (turn_deg > MOVED_DEG)))
     ]
 
 
@@ -327,8 +327,8 @@ def _noise(geometry: LedGeometry, stated: Stated) -> tuple[Noise, ...]:
         (stated.robot_deg, stated.robot_deg * geometry.noise[ORIENTATION]),
     )
     return tuple(
-        Noise(name=name, unit=unit, stated=float(said), found=float(seen), redundancy=float(left))
-        for name, unit, (said, seen), left in zip(GROUPS, units, numbers, geometry.redundancy, strict=True)
+        Noise(name=name, unit=unit, stated=float(before), found=float(after), redundancy=float(freedom))
+        for name, unit, (before, after), freedom in zip(GROUPS, units, numbers, geometry.redundancy, strict=True)
     )
 
 

@@ -108,12 +108,12 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
     if (share := float(np.mean(part >= picture.white))) > CLIPPED_SHARE:
         return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
-    seen = _refined(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
-    if len(seen.ids) < LEAST_CORNERS:
-        return f"{len(seen.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
-    if np.linalg.matrix_rank(seen.board_mm[:, :2] - seen.board_mm[0, :2]) < 2:
+    sighting = _refined(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
+    if len(sighting.ids) < LEAST_CORNERS:
+        return f"{len(sighting.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
+    if np.linalg.matrix_rank(sighting.board_mm[:, :2] - sighting.board_mm[0, :2]) < 2:
         return "all corners seen lie on one line"
-    return seen
+    return sighting
 
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
@@ -125,24 +125,24 @@ def _refined(rough: Sighting, board: Board, picture: Picture, channel: Channel) 
     """The corners to a fraction of a pixel, without false ones. Corners that are too close together for a fit are
     located by OpenCV's gradient method."""
     window_px = _window_px(board, rough.ids, rough.pixels)
-    values, known = picture.measured(channel)
-    if not enough_pixels(known, window_px):
+    values, mask = picture.measured(channel)
+    if not enough_pixels(mask, window_px):
         side_px = max(2, int(window_px / np.sqrt(2)))
         return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))
-    found = fit_corners(values, known, rough.pixels, window_px)
-    return Sighting(rough.name, rough.ids[found.fits], rough.board_mm[found.fits], found.pixels[found.fits])
+    fit = fit_corners(values, mask, rough.pixels, window_px)
+    return Sighting(rough.name, rough.ids[fit.fits], rough.board_mm[fit.fits], fit.pixels[fit.fits])
 
 
 def refine(image: NDArray[Any], corners: Floats, window_px: int) -> Floats:
     """Corners [n, 2] by OpenCV's `cornerSubPix`, `window_px` being half its window."""
     import cv2
 
-    scaled = np.ascontiguousarray(image, dtype=np.float32)
-    scaled *= np.float32(255.0 / max(float(scaled.max()), 1e-9))
+    grey = np.ascontiguousarray(image, dtype=np.float32)
+    grey *= np.float32(255.0 / max(float(grey.max()), 1e-9))
     points = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
     until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
-    found = cv2.cornerSubPix(scaled, points, (window_px, window_px), (-1, -1), until)
-    return np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    fine_corners = cv2.cornerSubPix(grey, points, (window_px, window_px), (-1, -1), until)
+    return np.asarray(fine_corners, dtype=np.float64).reshape(-1, 2)
 
 
 def _eight_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
@@ -184,21 +184,21 @@ def _charuco(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp]
     squares = (board.corners[0] + 1, board.corners[1] + 1)
     markers = aruco.getPredefinedDictionary(getattr(aruco, board.dictionary))
     assert board.marker_mm is not None  # as `Board` has checked
-    printed = aruco.CharucoBoard(squares, board.square_mm, board.marker_mm, markers)
-    printed.setLegacyPattern(board.legacy_pattern)
-    found: Any
+    charuco = aruco.CharucoBoard(squares, board.square_mm, board.marker_mm, markers)
+    charuco.setLegacyPattern(board.legacy_pattern)
+    corners: Any
     ids: Any  # OpenCV's stubs do not say that both are None where no corner was found
-    found, ids, _, _ = aruco.CharucoDetector(printed).detectBoard(picture)
+    corners, ids, _, _ = aruco.CharucoDetector(charuco).detectBoard(picture)
     if ids is None:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
-    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    return np.asarray(ids, dtype=np.intp).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
 
 
 def _chess(board: Board, picture: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Floats]:
     import cv2
 
-    found, corners = cv2.findChessboardCorners(picture, board.corners)
-    if not found:
+    is_found, corners = cv2.findChessboardCorners(picture, board.corners)
+    if not is_found:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
     points = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     if board.has_a_top and not _starts_dark(board, picture, points):

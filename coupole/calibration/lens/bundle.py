@@ -139,10 +139,10 @@ def calibrate_hand_eye(
     seen_poses = np.stack([board_pose(sighting, intrinsics) for sighting in sightings])
     start = solve(poses.base_from_flange, seen_poses)
     axes = 0 if poses.axis_sensitivity is None else poses.axis_sensitivity.shape[2]
-    stated = robot.pose_sigmas(axes_known=axes > 0)
+    stated_sigmas = robot.pose_sigmas(axes_known=axes > 0)
     sigmas = (
-        max(stated[0], start.scatter_mm / 3**0.5, _LEAST_SIGMA_MM),
-        max(stated[1], float(np.radians(start.scatter_deg)) / 3**0.5, _LEAST_SIGMA_RAD),
+        max(stated_sigmas[0], start.scatter_mm / 3**0.5, _LEAST_SIGMA_MM),
+        max(stated_sigmas[1], float(np.radians(start.scatter_deg)) / 3**0.5, _LEAST_SIGMA_RAD),
     )
     layout = Layout(free, axes, board_scale_u_ppm > 0)
     problem = Bundle(
@@ -156,7 +156,7 @@ def calibrate_hand_eye(
         np.zeros(axes),
         np.broadcast_to(np.eye(4), (len(sightings), 4, 4)).copy(),
     )
-    found = adjust(
+    adjustment = adjust(
         state,
         problem.evaluate,
         problem.move,
@@ -165,9 +165,9 @@ def calibrate_hand_eye(
         what="hand-eye",
     )
     if size_px is None:
-        return _result(found, problem, start, stated, tuple(sightings))
-    better, doubts = _doubted(found, problem, size_px)
-    result = _result(better, problem, start, stated, tuple(sightings))
+        return _result(adjustment, problem, start, stated_sigmas, tuple(sightings))
+    better, doubts = _doubted(adjustment, problem, size_px)
+    result = _result(better, problem, start, stated_sigmas, tuple(sightings))
     return replace(result, noise=replace(result.noise, pixel_px=doubts.sigma_px), doubts=doubts)
 
 
@@ -175,10 +175,10 @@ def _doubted(found: Adjusted[State], problem: Bundle, size_px: tuple[int, int]) 
     """The result with what the model may lack."""
     state, count = found.state, len(problem.corners.parts)
     field = Field.of(state.intrinsics, problem.layout.free, size_px)
-    seen = Seen(field, problem.corners, problem.camera_from_board(state))
+    scene = Seen(field, problem.corners, problem.camera_from_board(state))
     views = [(view, count + 2 * view, count + 2 * view + 1) for view in range(count)]
     doubts, step, covariance = doubts_of(
-        found, problem.evaluate(state), views, seen, range(problem.layout.hand_eye)
+        found, problem.evaluate(state), views, scene, range(problem.layout.hand_eye)
     )
     return replace(found, state=problem.move(state, step), covariance=covariance), doubts
 
@@ -191,20 +191,20 @@ def _result(
     sightings: tuple[Sighting, ...],
 ) -> HandEyeCalibration:
     layout, state = problem.layout, found.state
-    shared, units = layout.shared, layout.units
-    turned = np.degrees(rotation_vector(state.pose_errors[:, :3, :3]))
+    shared_count, units = layout.shared, layout.units
+    turns_deg = np.degrees(rotation_vector(state.pose_errors[:, :3, :3]))
     return HandEyeCalibration(
         state.flange_from_camera,
         state.base_from_board,
         Intrinsics(*map(float, state.intrinsics)),
         layout.names,
-        found.covariance[:shared, :shared] * np.outer(units, units),
-        found.degrees[:shared],
-        found.contributions[:, :shared],
+        found.covariance[:shared_count, :shared_count] * np.outer(units, units),
+        found.degrees[:shared_count],
+        found.contributions[:, :shared_count],
         found.components,
         state.scale,
         state.axis_zeros_deg,
-        np.hstack([state.pose_errors[:, :3, 3], turned]),
+        np.hstack([state.pose_errors[:, :3, 3], turns_deg]),
         tuple(PIXEL_SIGMA_PX * r.reshape(-1, 2) for r in found.residuals[: len(sightings)]),
         start,
         RobotFound(

@@ -75,19 +75,19 @@ def calibrate_camera(
     start = first_guess(sightings, size_px, model)
     corners = Corners.of(sightings)
     columns = [optics.NAMES.index(name) for name in free]
-    own = len(free)
+    free_count = len(free)
 
     def evaluate(state: CameraState) -> list[Block]:
-        seen = optics.project(corners.in_camera(state.camera_from_board), state.intrinsics)
-        turned = state.camera_from_board[corners.view, :3, :3] @ skew(corners.board_mm)
-        by_pose = np.concatenate([seen.by_point, -seen.by_point @ turned], axis=-1)
-        jacobian = np.concatenate([seen.by_intrinsics[:, :, columns], by_pose], axis=-1) / PIXEL_SIGMA_PX
-        residuals = (corners.pixels - seen.pixels) / PIXEL_SIGMA_PX
+        projection = optics.project(corners.in_camera(state.camera_from_board), state.intrinsics)
+        by_turn = state.camera_from_board[corners.view, :3, :3] @ skew(corners.board_mm)
+        by_pose = np.concatenate([projection.by_point, -projection.by_point @ by_turn], axis=-1)
+        jacobian = np.concatenate([projection.by_intrinsics[:, :, columns], by_pose], axis=-1) / PIXEL_SIGMA_PX
+        residuals = (corners.pixels - projection.pixels) / PIXEL_SIGMA_PX
         return [
             Block(
                 residuals[part].ravel(),
-                jacobian[part].reshape(-1, own + 6),
-                np.r_[0:own, own + 6 * view : own + 6 * view + 6],
+                jacobian[part].reshape(-1, free_count + 6),
+                np.r_[0:free_count, free_count + 6 * view : free_count + 6 * view + 6],
                 0,
             )
             for view, part in enumerate(corners.parts)
@@ -95,19 +95,19 @@ def calibrate_camera(
 
     def move(state: CameraState, change: Floats) -> CameraState:
         intrinsics = state.intrinsics.copy()
-        intrinsics[columns] += change[:own]
-        return CameraState(intrinsics, moved(state.camera_from_board, change[own:].reshape(-1, 6)))
+        intrinsics[columns] += change[:free_count]
+        return CameraState(intrinsics, moved(state.camera_from_board, change[free_count:].reshape(-1, 6)))
 
     groups = [Group("corners", estimated=True, rejects=2)]
-    found = adjust(start, evaluate, move, groups, own + 6 * len(sightings), what="camera")
+    adjustment = adjust(start, evaluate, move, groups, free_count + 6 * len(sightings), what="camera")
     if not doubted:
-        return _result(found, free, sightings, size_px)
-    state = found.state
+        return _result(adjustment, free, sightings, size_px)
+    state = adjustment.state
     field = Field.of(state.intrinsics, free, size_px)
-    seen = Seen(field, corners, state.camera_from_board)
+    scene = Seen(field, corners, state.camera_from_board)
     views = [[view] for view in range(len(sightings))]
-    doubts, step, covariance = doubts_of(found, evaluate(state), views, seen, range(own))
-    better = replace(found, state=move(state, step), covariance=covariance)
+    doubts, step, covariance = doubts_of(adjustment, evaluate(state), views, scene, range(free_count))
+    better = replace(adjustment, state=move(state, step), covariance=covariance)
     result = _result(better, free, sightings, size_px)
     return replace(result, sigma_px=doubts.sigma_px, doubts=doubts)
 
@@ -115,17 +115,17 @@ def calibrate_camera(
 def _result(
     found: Adjusted[CameraState], free: tuple[str, ...], sightings: Sequence[Sighting], size_px: tuple[int, int]
 ) -> CameraCalibration:
-    own = len(free)
+    free_count = len(free)
     intrinsics = Intrinsics(*map(float, found.state.intrinsics))
     return CameraCalibration(
         intrinsics,
         free,
-        found.covariance[:own, :own],
-        found.degrees[:own],
+        found.covariance[:free_count, :free_count],
+        found.degrees[:free_count],
         PIXEL_SIGMA_PX * found.factor("corners"),
         found.state.camera_from_board,
         tuple(PIXEL_SIGMA_PX * residuals.reshape(-1, 2) for residuals in found.residuals),
-        tuple(kept.reshape(-1, 2)[:, 0] for kept in found.kept),
+        tuple(keep.reshape(-1, 2)[:, 0] for keep in found.kept),
         tuple(sightings),
         size_px,
     )
@@ -136,8 +136,10 @@ def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: 
     it."""
     import cv2
 
-    chosen = [sightings[i] for i in np.unique(np.linspace(0, len(sightings) - 1, _START_VIEWS).astype(int))]
-    fixed = {
+    start_sightings = [
+        sightings[i] for i in np.unique(np.linspace(0, len(sightings) - 1, _START_VIEWS).astype(int))
+    ]
+    flags_of = {
         "pinhole": cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
         "radial": cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
         "brown4": cv2.CALIB_FIX_K3,
@@ -145,12 +147,12 @@ def first_guess(sightings: Sequence[Sighting], size_px: tuple[int, int], model: 
     }
     try:
         _, matrix, distortion, *_ = cv2.calibrateCameraExtended(
-            [sighting.board_mm.astype(np.float32) for sighting in chosen],
-            [sighting.pixels.astype(np.float32) for sighting in chosen],
+            [sighting.board_mm.astype(np.float32) for sighting in start_sightings],
+            [sighting.pixels.astype(np.float32) for sighting in start_sightings],
             size_px,
             np.eye(3),
             np.zeros(5),
-            flags=fixed[model],
+            flags=flags_of[model],
         )
     except cv2.error as error:
         raise InputError(
@@ -165,13 +167,13 @@ def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
     """`camera_from_board` from one image with known intrinsics. Raises InputError if there is none."""
     import cv2
 
-    found, turn, shift = cv2.solvePnP(
+    is_solved, turn, shift = cv2.solvePnP(
         sighting.board_mm, sighting.pixels, intrinsics.matrix(), intrinsics.distortion()
     )
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation(np.ravel(turn)), np.ravel(shift)
     in_front = (sighting.board_mm @ pose[:3, :3].T + pose[:3, 3])[:, 2] > 0
-    if not found or not in_front.all():
+    if not is_solved or not in_front.all():
         raise InputError(f"{sighting.name}: no pose of the board fits its corners. Leave this image out.")
     return pose
 
@@ -179,6 +181,6 @@ def board_pose(sighting: Sighting, intrinsics: Intrinsics) -> Floats:
 def without_gross_errors(calibration: CameraCalibration) -> tuple[Sighting, ...]:
     """The sightings, less the corners that were left out."""
     return tuple(
-        replace(sighting, ids=sighting.ids[kept], board_mm=sighting.board_mm[kept], pixels=sighting.pixels[kept])
-        for sighting, kept in zip(calibration.sightings, calibration.kept, strict=True)
+        replace(sighting, ids=sighting.ids[keep], board_mm=sighting.board_mm[keep], pixels=sighting.pixels[keep])
+        for sighting, keep in zip(calibration.sightings, calibration.kept, strict=True)
     )

@@ -45,18 +45,23 @@ class ChannelLenses:
         """Shift of a channel's image against another's, px [k, 2], and its covariance, px^2 [k, 2, 2]. `pixels`
         [k, 2] are the places in the field at which a lens without distortion would image the directions.
         """
-        one, other = self.intrinsics[channel], self.intrinsics[against]
-        directions = (pixels - (other.cx, other.cy)) / (other.fx, other.fy)
+        channel_lens, reference_lens = self.intrinsics[channel], self.intrinsics[against]
+        directions = (pixels - (reference_lens.cx, reference_lens.cy)) / (reference_lens.fx, reference_lens.fy)
         points = np.column_stack([directions, np.ones(len(directions))])
-        seen = {name: optics.project(points, lens.vector()) for name, lens in ((channel, one), (against, other))}
+        projections = {
+            name: optics.project(points, lens.vector())
+            for name, lens in ((channel, channel_lens), (against, reference_lens))
+        }
         slopes = np.zeros((len(points), 2, len(self.names)))
         for at, name in enumerate(self.names):
             owner, _, parameter = name.partition(".")
             for name_of, sign in ((channel, 1.0), (against, -1.0)):
                 if owner in (name_of, SHARED):
-                    slopes[:, :, at] += sign * seen[name_of].by_intrinsics[:, :, optics.NAMES.index(parameter)]
-        spread = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
-        return seen[channel].pixels - seen[against].pixels, spread
+                    slopes[:, :, at] += (
+                        sign * projections[name_of].by_intrinsics[:, :, optics.NAMES.index(parameter)]
+                    )
+        covariance = slopes @ self.covariance @ np.swapaxes(slopes, 1, 2)
+        return projections[channel].pixels - projections[against].pixels, covariance
 
 
 def calibrate_channels(
@@ -67,15 +72,15 @@ def calibrate_channels(
     Raises InputError: channels with different numbers of images, or images that do not determine a lens.
     """
     channels = tuple(sightings)
-    counts = {len(seen) for seen in sightings.values()}
+    counts = {len(channel_sightings) for channel_sightings in sightings.values()}
     if len(counts) != 1:
         raise InputError(f"camera: every channel needs the same images; found {sorted(counts)} of them")
     starts = {channel: calibrate_camera(sightings[channel], size_px, model) for channel in channels}
     corners = {channel: Corners.of(sightings[channel]) for channel in channels}
     first = starts[channels[0]]
-    own = [optics.NAMES.index(name) for name in first.free if name in OWN]
+    own_columns = [optics.NAMES.index(name) for name in first.free if name in OWN]
     common = [optics.NAMES.index(name) for name in first.free if name not in OWN]
-    images, width = counts.pop(), len(own)
+    images, width = counts.pop(), len(own_columns)
     of_lens = width * len(channels) + len(common)
     lenses = np.stack([starts[channel].intrinsics.vector() for channel in channels])
     lenses[:, common] = lenses[0, common]
@@ -84,15 +89,15 @@ def calibrate_channels(
         lenses, poses = at
         blocks = []
         for number, channel in enumerate(channels):
-            mine = corners[channel]
-            seen = optics.project(mine.in_camera(poses), lenses[number])
-            turned = poses[mine.view, :3, :3] @ skew(mine.board_mm)
-            by_pose = np.concatenate([seen.by_point, -seen.by_point @ turned], axis=-1)
-            by_lens = seen.by_intrinsics[:, :, own + common]
+            channel_corners = corners[channel]
+            projection = optics.project(channel_corners.in_camera(poses), lenses[number])
+            by_turn = poses[channel_corners.view, :3, :3] @ skew(channel_corners.board_mm)
+            by_pose = np.concatenate([projection.by_point, -projection.by_point @ by_turn], axis=-1)
+            by_lens = projection.by_intrinsics[:, :, own_columns + common]
             jacobian = np.concatenate([by_lens, by_pose], axis=-1) / PIXEL_SIGMA_PX
-            residuals = (mine.pixels - seen.pixels) / PIXEL_SIGMA_PX
+            residuals = (channel_corners.pixels - projection.pixels) / PIXEL_SIGMA_PX
             of_mine = np.r_[width * number : width * (number + 1), width * len(channels) : of_lens]
-            for view, part in enumerate(mine.parts):
+            for view, part in enumerate(channel_corners.parts):
                 pose = of_lens + 6 * view
                 where = np.r_[of_mine, pose : pose + 6]
                 blocks.append(
@@ -102,19 +107,19 @@ def calibrate_channels(
 
     def move(at: tuple[Floats, Floats], change: Floats) -> tuple[Floats, Floats]:
         lenses = at[0].copy()
-        lenses[:, own] += change[: width * len(channels)].reshape(len(channels), width)
+        lenses[:, own_columns] += change[: width * len(channels)].reshape(len(channels), width)
         lenses[:, common] += change[width * len(channels) : of_lens]
         return lenses, moved(at[1], change[of_lens:].reshape(-1, 6))
 
     groups = [Group(channel, estimated=True, rejects=2) for channel in channels]
     state = (lenses, first.camera_from_board)
-    found = adjust(state, evaluate, move, groups, of_lens + 6 * images, what="camera")
-    names = [f"{channel}.{optics.NAMES[column]}" for channel in channels for column in own]
+    adjustment = adjust(state, evaluate, move, groups, of_lens + 6 * images, what="camera")
+    names = [f"{channel}.{optics.NAMES[column]}" for channel in channels for column in own_columns]
     names += [f"{SHARED}.{optics.NAMES[column]}" for column in common]
     return ChannelLenses(
-        {channel: Intrinsics(*map(float, found.state[0][i])) for i, channel in enumerate(channels)},
+        {channel: Intrinsics(*map(float, adjustment.state[0][i])) for i, channel in enumerate(channels)},
         tuple(names),
-        found.covariance[:of_lens, :of_lens],
-        found.degrees[:of_lens],
-        {channel: PIXEL_SIGMA_PX * found.factor(channel) for channel in channels},
+        adjustment.covariance[:of_lens, :of_lens],
+        adjustment.degrees[:of_lens],
+        {channel: PIXEL_SIGMA_PX * adjustment.factor(channel) for channel in channels},
     )

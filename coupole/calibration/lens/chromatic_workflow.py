@@ -45,16 +45,16 @@ class ChromaticFound:
 def chromatic_from(found: Found, sources: Sources, board: Board, model: str, request: Request) -> ChromaticFound:
     """A lens for each colour from the same images. Raises InputError for images without colours."""
     fit = calibrate_camera(found.sightings, found.size_px, model)
-    kept = without_gross_errors(fit)
+    good_sightings = without_gross_errors(fit)
     sightings: dict[str, list[Sighting]] = {
-        channel: _in_channel(channel, kept, found, sources, board) for channel in CHANNELS
+        channel: _in_channel(channel, good_sightings, found, sources, board) for channel in CHANNELS
     }
     lenses = calibrate_channels(sightings, found.size_px, model)
     field_px = _field(found.size_px)
     shifts: dict[str, tuple[Floats, Floats]] = {
         channel: lenses.shift(channel, "green", field_px) for channel in CHANNELS[1:]
     }
-    u_px = max(float(np.sqrt(np.trace(spread, axis1=1, axis2=2).max())) for _, spread in shifts.values())
+    u_px = max(float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max())) for _, covariance in shifts.values())
     residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
     record = sealed(
         kind="chromatic",
@@ -67,7 +67,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
                 unit="px",
                 stated=0.0,
                 found=sigma,
-                redundancy=_redundancy(kept, fit.free),
+                redundancy=_redundancy(good_sightings, fit.free),
             )
             for channel, sigma in lenses.sigma_px.items()
         ),
@@ -79,7 +79,7 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
             for name in optics.NAMES
             if name not in fit.free
         },
-        images=image_lines(kept, residuals, fit.sightings),
+        images=image_lines(good_sightings, residuals, fit.sightings),
         **content_of(found, sources, request),
     )
     return ChromaticFound(record, lenses, found.size_px, field_px, shifts)
@@ -92,8 +92,8 @@ def _in_channel(
     if channel == "green":
         return list(kept)
     return [
-        in_channel(board, sources.images[number].read(), channel, seen)
-        for number, seen in zip(found.chosen, kept, strict=True)
+        in_channel(board, sources.images[number].read(), channel, sighting)
+        for number, sighting in zip(found.chosen, kept, strict=True)
     ]
 
 
@@ -105,11 +105,11 @@ def _field(size_px: tuple[int, int]) -> Floats:
 
 def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
     u = np.sqrt(np.diag(lenses.covariance))
-    found = []
+    parameters = []
     for at, full in enumerate(lenses.names):
         channel, _, name = full.partition(".")
         lens = lenses.intrinsics["green" if channel == SHARED else channel]
-        found.append(
+        parameters.append(
             Parameter(
                 name=f"{channel}.{unit_name(name)}",
                 value=float(getattr(lens, name)),
@@ -118,12 +118,12 @@ def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
                 dominated_by="corners",
             )
         )
-    return tuple(found)
+    return tuple(parameters)
 
 
 def _redundancy(kept: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
     """Redundancy of one channel, which shares the poses of the images with the others."""
-    return float(sum(2 * len(seen.ids) for seen in kept) - len(free) - 6 * len(kept) / len(CHANNELS))
+    return float(sum(2 * len(sighting.ids) for sighting in kept) - len(free) - 6 * len(kept) / len(CHANNELS))
 
 
 def _remark(channel: str, shift: Floats, spread: Floats) -> str:
@@ -143,9 +143,9 @@ def draw_chromatic(found: ChromaticFound, figure: Figure) -> None:
     """Fill the figure: shifts over the field above, along the radius below, red to the left, blue to the right."""
     axes = figure.subplots(2, 2)
     longest = max(float(np.linalg.norm(shift, axis=1).max()) for shift, _ in found.shifts.values())
-    enlarged = float(f"{0.06 * found.size_px[0] / max(longest, 1e-6):.1g}")
+    enlargement = float(f"{0.06 * found.size_px[0] / max(longest, 1e-6):.1g}")
     for column, (channel, colour) in enumerate((("red", RED), ("blue", BLUE))):
-        _draw_field(axes[0, column], found, channel, colour, enlarged)
+        _draw_field(axes[0, column], found, channel, colour, enlargement)
         _draw_radius(axes[1, column], found, channel, colour)
 
 
@@ -163,13 +163,13 @@ def _draw_field(ax: Axes, found: ChromaticFound, channel: str, colour: str, enla
 
 def _draw_radius(ax: Axes, found: ChromaticFound, channel: str, colour: str) -> None:
     """The shift away from the principal point, with its 95 % interval."""
-    shift, spread = found.shifts[channel]
+    shift, covariance = found.shifts[channel]
     lens = found.lenses.intrinsics["green"]
     away = found.field_px - (lens.cx, lens.cy)
     radius = np.linalg.norm(away, axis=1)
     outward = away / np.maximum(radius, 1e-9)[:, None]
     along = np.einsum("ki,ki->k", shift, outward)
-    u = np.sqrt(np.einsum("ki,kij,kj->k", outward, spread, outward))
+    u = np.sqrt(np.einsum("ki,kij,kj->k", outward, covariance, outward))
     ax.errorbar(radius, along, 1.96 * u, fmt=".", color=colour, lw=0.8)
     ax.axhline(0.0, color=DARK, lw=0.8)
     ax.set(title=f"{channel}: outward, 95 %", xlabel="from the principal point (px)", ylabel="px")

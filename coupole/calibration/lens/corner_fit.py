@@ -66,13 +66,13 @@ def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, ra
     image.
     """
     values = np.ascontiguousarray(image, dtype=np.float32)
-    found = np.full((len(rough), _UNKNOWNS), np.nan)
+    unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
     mask, starts = np.ascontiguousarray(known), np.ascontiguousarray(rough, dtype=np.float64)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
-        list(pool.map(lambda part: _fit_all(values, mask, starts[part], radius_px, found[part]), parts))
-    fits = np.isfinite(found[:, _X])
-    return Corners(np.where(fits[:, None], found[:, :2], rough), fits, found[:, _SIGMA].copy())
+        list(pool.map(lambda part: _fit_all(values, mask, starts[part], radius_px, unknowns[part]), parts))
+    fits = np.isfinite(unknowns[:, _X])
+    return Corners(np.where(fits[:, None], unknowns[:, :2], rough), fits, unknowns[:, _SIGMA].copy())
 
 
 @numba.njit(cache=True, nogil=True)
@@ -143,20 +143,20 @@ def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
     squares, count, normal, right = _equations(image, known, x, y, radius, unknowns)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
-        damped = normal.copy()
+        damped_normal = normal.copy()
         for k in range(_UNKNOWNS):
-            damped[k, k] *= 1.0 + damping
-            damped[k, k] += 1e-12
-        tried = unknowns + np.linalg.solve(damped, right)
-        tried[_SIGMA] = min(max(tried[_SIGMA], _LEAST_SIGMA_PX), 0.5 * radius)
-        if math.hypot(tried[_X] - x, tried[_Y] - y) > 0.5 * radius or not np.all(np.isfinite(tried)):
+            damped_normal[k, k] *= 1.0 + damping
+            damped_normal[k, k] += 1e-12
+        trial = unknowns + np.linalg.solve(damped_normal, right)
+        trial[_SIGMA] = min(max(trial[_SIGMA], _LEAST_SIGMA_PX), 0.5 * radius)
+        if math.hypot(trial[_X] - x, trial[_Y] - y) > 0.5 * radius or not np.all(np.isfinite(trial)):
             return False
-        left, count, tried_normal, tried_right = _equations(image, known, x, y, radius, tried)
-        if left <= squares:
-            change = math.hypot(tried[_X] - unknowns[_X], tried[_Y] - unknowns[_Y])
+        tried_squares, count, tried_normal, tried_right = _equations(image, known, x, y, radius, trial)
+        if tried_squares <= squares:
+            change = math.hypot(trial[_X] - unknowns[_X], trial[_Y] - unknowns[_Y])
             for k in range(_UNKNOWNS):
-                unknowns[k] = tried[k]
-            squares, normal, right = left, tried_normal, tried_right
+                unknowns[k] = trial[k]
+            squares, normal, right = tried_squares, tried_normal, tried_right
             damping *= 0.1
             if change < _CLOSE_PX:
                 break
@@ -178,7 +178,7 @@ def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ign
     squares, count = 0.0, 0
     height, width = image.shape
     together = cos1 * cos2 + sin1 * sin2
-    spread = math.sqrt(sigma * sigma + 1.0 / 12.0)
+    blur_px = math.sqrt(sigma * sigma + 1.0 / 12.0)
     for row in range(max(0, math.ceil(middle_y - radius)), min(height, math.floor(middle_y + radius) + 1)):
         for col in range(max(0, math.ceil(middle_x - radius)), min(width, math.floor(middle_x + radius) + 1)):
             if not known[row % known.shape[0], col % known.shape[1]]:
@@ -189,23 +189,23 @@ def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ign
             # Distance on the left of an edge that points along (cos, sin), and how far along it.
             apart1, along1 = cos1 * down_y - sin1 * right_x, cos1 * right_x + sin1 * down_y
             apart2, along2 = cos2 * down_y - sin2 * right_x, cos2 * right_x + sin2 * down_y
-            one, one_apart, one_sigma = _edge(apart1, abs(cos1), abs(sin1), sigma)
-            two, two_apart, two_sigma = _edge(apart2, abs(cos2), abs(sin2), sigma)
+            edge_one, one_apart, one_sigma = _edge(apart1, abs(cos1), abs(sin1), sigma)
+            edge_two, two_apart, two_sigma = _edge(apart2, abs(cos2), abs(sin2), sigma)
             light = 1.0 + unknowns[_ALONG_X] * right_x + unknowns[_ALONG_Y] * down_y
-            checks = one * two + _crossing(apart1 / spread, apart2 / spread, together)
+            checks = edge_one * edge_two + _crossing(apart1 / blur_px, apart2 / blur_px, together)
             board = level + contrast * checks
-            by_one, by_two = light * contrast * two * one_apart, light * contrast * one * two_apart
+            by_one, by_two = light * contrast * edge_two * one_apart, light * contrast * edge_one * two_apart
             slope[_X] = by_one * sin1 + by_two * sin2 - board * unknowns[_ALONG_X]
             slope[_Y] = -by_one * cos1 - by_two * cos2 - board * unknowns[_ALONG_Y]
             slope[_FIRST], slope[_SECOND] = -by_one * along1, -by_two * along2
-            slope[_SIGMA] = light * contrast * (two * one_sigma + one * two_sigma)
+            slope[_SIGMA] = light * contrast * (edge_two * one_sigma + edge_one * two_sigma)
             slope[_LEVEL], slope[_CONTRAST] = light, light * checks
             slope[_ALONG_X], slope[_ALONG_Y] = board * right_x, board * down_y
-            left = image[row, col] - board * light
-            squares += left * left
+            residual = image[row, col] - board * light
+            squares += residual * residual
             count += 1
             for i in range(_UNKNOWNS):
-                right[i] += slope[i] * left
+                right[i] += slope[i] * residual
                 for j in range(i + 1):
                     normal[i, j] += slope[i] * slope[j]
     for i in range(_UNKNOWNS):

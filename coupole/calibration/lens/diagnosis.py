@@ -71,28 +71,28 @@ class Diagnosis:
 
     def sentences(self) -> tuple[str, ...]:
         """The findings as text; empty if robot and camera agree."""
-        found = []
+        lines = []
         if self.contradicts:
-            found.append(
+            lines.append(
                 f"robot and camera contradict each other: seen from the poses, the board's place scatters by "
                 f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
                 f"{self.expected.position_mm:.2g} mm and {self.expected.orientation_deg:.2g} deg"
             )
-            found += [
+            lines += [
                 f"likely cause: {h.sentence}: then {h.scatter_mm:.3g} mm and {h.scatter_deg:.3g} deg are left"
                 for h in self.likely[:1]
             ]
             if not self.likely:
-                found.append(
+                lines.append(
                     "no simple cause explains it: the robot may be worse than stated, or the board not flat"
                 )
-        found += [
+        lines += [
             f"{d.methods[0]}'s and {d.methods[1]}'s methods disagree by {d.distance_mm:.3g} mm and "
             f"{d.angle_deg:.3g} deg, {d.sigmas:.1f} times what noise explains"
             for d in self.disagreements
             if d.beyond_noise
         ]
-        return tuple(found)
+        return tuple(lines)
 
     def of_methods(self) -> str:
         """Differences of the closed forms, significant or not; empty with too few poses."""
@@ -121,16 +121,16 @@ def diagnose(
     poses: ReportedPoses, camera_from_board: Floats, expected: Expected, names: Sequence[str]
 ) -> Diagnosis:
     """Compare poses [n] with the board's poses by the images [n, 4, 4]; `names` are those of the images."""
-    given = scatter_of(poses.base_from_flange, camera_from_board)
-    found, score = Diagnosis(*given, expected, (), ()), expected.score(*given)
+    scatter = scatter_of(poses.base_from_flange, camera_from_board)
+    diagnosis, score = Diagnosis(*scatter, expected, (), ()), expected.score(*scatter)
     if score > _WORTH_A_LOOK:
-        tried = list(rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
-        tried += faults(poses.base_from_flange, camera_from_board, names, expected)
-        found = replace(found, likely=_likely(tried, expected, given))
-    if np.isfinite(given[0]):
+        candidates = list(rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
+        candidates += faults(poses.base_from_flange, camera_from_board, names, expected)
+        diagnosis = replace(diagnosis, likely=_likely(candidates, expected, scatter))
+    if np.isfinite(scatter[0]):
         apart = disagreements(poses.base_from_flange, camera_from_board, expected)
-        found = replace(found, disagreements=apart)
-    return found
+        diagnosis = replace(diagnosis, disagreements=apart)
+    return diagnosis
 
 
 def disagreements(
@@ -143,29 +143,31 @@ def disagreements(
     no solution.
     """
     try:
-        given = _by_method(base_from_flange, camera_from_board)
-        board = solution(base_from_flange, camera_from_board, given["Park"]).base_from_board
-        consistent = inverses(base_from_flange @ given["Park"]) @ board
+        hand_eye_of = _by_method(base_from_flange, camera_from_board)
+        board = solution(base_from_flange, camera_from_board, hand_eye_of["Park"]).base_from_board
+        consistent = inverses(base_from_flange @ hand_eye_of["Park"]) @ board
         random = np.random.default_rng(0)
         per_axis = np.repeat([expected.position_mm, np.radians(expected.orientation_deg)], 3) / np.sqrt(3)
-        drawn = [
+        draws = [
             _by_method(base_from_flange, moved(consistent, per_axis * random.normal(size=(len(consistent), 6))))
             for _ in range(_RESAMPLED)
         ]
     except InputError:
         return ()
     limit = float(stdtrit(_RESAMPLED, 1 - _FALSE_ALARMS / (2 * 6 * len(METHODS))))
-    found = []
-    for one, other in combinations(METHODS, 2):
-        difference = between(given[one], given[other])
-        by_noise = between(np.stack([d[one] for d in drawn]), np.stack([d[other] for d in drawn]))
+    comparisons = []
+    for first, second in combinations(METHODS, 2):
+        difference = between(hand_eye_of[first], hand_eye_of[second])
+        by_noise = between(np.stack([d[first] for d in draws]), np.stack([d[second] for d in draws]))
         sigma = np.sqrt(np.mean(by_noise**2, axis=0))
         sigmas = float(np.max(np.abs(difference) / np.maximum(sigma, 1e-12)))
         distance_mm, angle_deg = np.linalg.norm(difference[:3]), np.degrees(np.linalg.norm(difference[3:]))
-        found.append(
-            Disagreement((one, other), float(distance_mm), float(angle_deg), sigmas, beyond_noise=sigmas > limit)
+        comparisons.append(
+            Disagreement(
+                (first, second), float(distance_mm), float(angle_deg), sigmas, beyond_noise=sigmas > limit
+            )
         )
-    return tuple(found)
+    return tuple(comparisons)
 
 
 def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str, Floats]:

@@ -61,12 +61,12 @@ class Doubts:
 
     def sentences(self) -> Iterator[str]:
         """Yield the findings as sentences, for the record's remarks."""
-        for one in self.error.suspects:
-            if one.evidence >= CLEAR:
-                pattern_px = PIXEL_SIGMA_PX * one.pattern
+        for suspect in self.error.suspects:
+            if suspect.evidence >= CLEAR:
+                pattern_px = PIXEL_SIGMA_PX * suspect.pattern
                 yield (
-                    f"{_WORDS[one.name]}: its pattern in the residuals is {pattern_px:.2g} px "
-                    f"(log-likelihood ratio {one.evidence:.0f}); values and uncertainties account for it"
+                    f"{_WORDS[suspect.name]}: its pattern in the residuals is {pattern_px:.2g} px "
+                    f"(log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
                 )
         yield (
             f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predicted.ratio:.2f} of "
@@ -83,10 +83,10 @@ def doubts_of(
     view's blocks; `lens` the columns of the free intrinsics.
     """
     factors = np.array([component.factor for component in found.components])
-    weights = [kept.astype(np.float64) for kept in found.kept]
+    weights = [keep.astype(np.float64) for keep in found.kept]
     corners = seen.corners
-    computed = optics.project(corners.in_camera(seen.camera_from_board), seen.field.lens)
-    suspects = suspects_of(seen.field, corners, seen.camera_from_board, computed.by_point, computed.pixels)
+    projection = optics.project(corners.in_camera(seen.camera_from_board), seen.field.lens)
+    suspects = suspects_of(seen.field, corners, seen.camera_from_board, projection.by_point, projection.pixels)
     redundancy = found.components[0].redundancy
     error = with_suspects(blocks, weights, factors, len(found.covariance), redundancy, suspects)
     of_lens = error.of(LENS)
@@ -95,5 +95,5 @@ def doubts_of(
     left_px = seen.field.rms_px(of_lens.coefficients, of_lens.coefficient_covariance)
     pattern = left_px / seen.field.ray_u_px(covariance[columns])
     covariance[columns] *= 1.0 + pattern**2
-    predicted = left_out(views, blocks, weights, factors, found.covariance)
-    return Doubts(error, seen.field, predicted, pattern), error.step, covariance
+    prediction = left_out(views, blocks, weights, factors, found.covariance)
+    return Doubts(error, seen.field, prediction, pattern), error.step, covariance

@@ -41,12 +41,12 @@ def _draw_field(ax: Axes, shown: Shown) -> None:
     pixels, residuals = pixels[::step], residuals[::step]
     length = np.linalg.norm(residuals, axis=1)
     width, height = shown.size_px
-    enlarged = _round(0.02 * width / max(shown.pixel_px, 1e-6))
+    enlargement = _round(0.02 * width / max(shown.pixel_px, 1e-6))
     long = length > 3.0 * shown.pixel_px
     for part, colour in ((~long, BLUE), (long, RED)):
         ax.quiver(
             *pixels[part].T,
-            *residuals[part].T * enlarged,
+            *residuals[part].T * enlargement,
             angles="xy",
             scale_units="xy",
             scale=1,
@@ -54,11 +54,11 @@ def _draw_field(ax: Axes, shown: Shown) -> None:
             color=colour,
         )
     key_px = _round(2 * shown.pixel_px, 1)
-    ax.plot([0.04 * width, 0.04 * width + key_px * enlarged], [0.96 * height] * 2, color=DARK, lw=3)
+    ax.plot([0.04 * width, 0.04 * width + key_px * enlargement], [0.96 * height] * 2, color=DARK, lw=3)
     ax.text(0.04 * width, 0.94 * height, f"{key_px:g} px", color=DARK)
     ax.set(
         xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="x (px)", ylabel="y (px)",
-        title=f"Residuals, {enlarged:g} times enlarged; beyond 3 sigma in red",
+        title=f"Residuals, {enlargement:g} times enlarged; beyond 3 sigma in red",
     )  # fmt: skip
 
 
@@ -81,13 +81,13 @@ def _draw_coverage(ax: Axes, shown: Shown) -> None:
 def _draw_images(ax: Axes, shown: Shown) -> None:
     """Root mean square residual of each image, and that expected from noise alone."""
     rms = [np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in shown.residuals_px]
-    expected = shown.pixel_px * np.sqrt(2)
+    expected_px = shown.pixel_px * np.sqrt(2)
     place = np.arange(len(rms))
-    ax.bar(place, rms, color=[RED if value > 2 * expected else BLUE for value in rms], width=0.8)
-    ax.axhline(expected, color=DARK, ls="--", lw=1)
+    ax.bar(place, rms, color=[RED if value > 2 * expected_px else BLUE for value in rms], width=0.8)
+    ax.axhline(expected_px, color=DARK, ls="--", lw=1)
     ax.annotate(
         f"noise of a corner: {shown.pixel_px:.3g} px in x and y",
-        (1.0, expected),
+        (1.0, expected_px),
         xycoords=("axes fraction", "data"),
         ha="right",
         va="bottom",

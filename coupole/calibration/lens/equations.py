@@ -167,25 +167,25 @@ class Bundle:
         printed_mm = self.corners.board_mm
         board_mm = printed_mm * (1 + state.scale)
         board, hand_eye = state.base_from_board, state.flange_from_camera
-        reported = self.poses.base_from_flange[view]
-        zeroed = self._zero_steps(state)[view]
+        reported_poses = self.poses.base_from_flange[view]
+        zero_steps = self._zero_steps(state)[view]
         error = state.pose_errors[view]
 
         in_base = board_mm @ board[:3, :3].T + board[:3, 3]
-        in_reported = _into(reported, in_base)
-        in_zeroed = _into(zeroed, in_reported)
+        in_reported = _into(reported_poses, in_base)
+        in_zeroed = _into(zero_steps, in_reported)
         in_flange = _into(error, in_zeroed)
         in_camera = (in_flange - hand_eye[:3, 3]) @ hand_eye[:3, :3]
-        seen = optics.project(in_camera, state.intrinsics)
+        projection = optics.project(in_camera, state.intrinsics)
 
-        by_flange = seen.by_point @ hand_eye[:3, :3].T
+        by_flange = projection.by_point @ hand_eye[:3, :3].T
         by_zeroed = by_flange @ np.swapaxes(error[:, :3, :3], -1, -2)
-        by_reported = by_zeroed @ np.swapaxes(zeroed[:, :3, :3], -1, -2)
-        by_base = by_reported @ np.swapaxes(reported[:, :3, :3], -1, -2)
+        by_reported = by_zeroed @ np.swapaxes(zero_steps[:, :3, :3], -1, -2)
+        by_base = by_reported @ np.swapaxes(reported_poses[:, :3, :3], -1, -2)
         columns = [
-            seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in at.free]],
+            projection.by_intrinsics[:, :, [optics.NAMES.index(name) for name in at.free]],
             -by_flange,
-            seen.by_point @ skew(in_camera),
+            projection.by_point @ skew(in_camera),
             by_base,
             -by_base @ (board[:3, :3] @ skew(board_mm)),
         ]
@@ -196,7 +196,7 @@ class Bundle:
             columns.append(by_step @ self.poses.axis_sensitivity[view])
         columns += [-by_zeroed, by_flange @ skew(in_flange)]
         jacobian = np.concatenate(columns, axis=-1) / PIXEL_SIGMA_PX
-        residuals = (self.corners.pixels - seen.pixels) / PIXEL_SIGMA_PX
+        residuals = (self.corners.pixels - projection.pixels) / PIXEL_SIGMA_PX
         return [
             Block(
                 residuals[part].ravel(),
@@ -210,14 +210,14 @@ class Bundle:
     def _robot_blocks(self, state: State) -> list[Block]:
         """The error of each pose is zero within its noise. Rotations are small: the derivative of the logarithm is
         1."""
-        turned = rotation_vector(state.pose_errors[:, :3, :3])
+        turns_rad = rotation_vector(state.pose_errors[:, :3, :3])
         position_mm, orientation_rad = self.sigmas
         blocks = []
-        for number in range(len(turned)):
-            own = np.arange(*self._own(number).indices(2**31))
+        for number in range(len(turns_rad)):
+            columns = np.arange(*self._own(number).indices(2**31))
             shift = state.pose_errors[number, :3, 3]
-            blocks.append(Block(-shift / position_mm, np.eye(3) / position_mm, own[:3], 1))
-            blocks.append(Block(-turned[number] / orientation_rad, np.eye(3) / orientation_rad, own[3:], 2))
+            blocks.append(Block(-shift / position_mm, np.eye(3) / position_mm, columns[:3], 1))
+            blocks.append(Block(-turns_rad[number] / orientation_rad, np.eye(3) / orientation_rad, columns[3:], 2))
         return blocks
 
     def _held_blocks(self, state: State, names: list[str]) -> list[Block]:
@@ -225,8 +225,8 @@ class Bundle:
         at, blocks = self.layout, []
         if at.scaled:
             sigma = self.scale_sigma
-            held = Block(np.array([-state.scale / sigma]), np.eye(1) / sigma, np.array([at.scale]), 3)
-            blocks.append(replace(held, group=names.index(BOARD_SCALE)))
+            scale_block = Block(np.array([-state.scale / sigma]), np.eye(1) / sigma, np.array([at.scale]), 3)
+            blocks.append(replace(scale_block, group=names.index(BOARD_SCALE)))
         if at.axes:
             sigma = self.zero_sigma_deg
             columns = np.arange(at.zeros, at.shared)
@@ -234,8 +234,8 @@ class Bundle:
             blocks.append(Block(-state.axis_zeros_deg / sigma, weight, columns, names.index(AXIS_ZEROS)))
         weight_of_lens = self._lens_weight
         if weight_of_lens is not None and self.earlier is not None:
-            picked = [optics.NAMES.index(name) for name in at.free]
-            off = self.earlier.intrinsics.vector()[picked] - state.intrinsics[picked]
+            free_columns = [optics.NAMES.index(name) for name in at.free]
+            off = self.earlier.intrinsics.vector()[free_columns] - state.intrinsics[free_columns]
             columns = np.arange(at.hand_eye)
             blocks.append(Block(weight_of_lens @ off, weight_of_lens, columns, names.index(EARLIER)))
         return blocks

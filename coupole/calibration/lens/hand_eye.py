@@ -122,9 +122,9 @@ def daniilidis(pairs: Motions) -> Floats:
     seventh, eighth = np.linalg.svd(rows.reshape(-1, 8), full_matrices=False)[2][-2:]
     u, u_dual, v, v_dual = seventh[:4], seventh[4:], eighth[:4], eighth[4:]
     coefficients = np.array([u @ u_dual, u @ v_dual + v @ u_dual, v @ v_dual])
-    flipped = abs(coefficients[2]) > abs(coefficients[0])  # avoids division by a small leading coefficient
-    ratios = np.real(np.roots(coefficients[::-1] if flipped else coefficients))
-    pairs_of_weights = [(1.0, r) if flipped else (r, 1.0) for r in ratios]
+    is_flipped = abs(coefficients[2]) > abs(coefficients[0])  # avoids division by a small leading coefficient
+    ratios = np.real(np.roots(coefficients[::-1] if is_flipped else coefficients))
+    pairs_of_weights = [(1.0, r) if is_flipped else (r, 1.0) for r in ratios]
     weights = max(pairs_of_weights, key=lambda w: _norm2(w, u, v) / (w[0] ** 2 + w[1] ** 2))
     scale = 1 / np.sqrt(_norm2(weights, u, v))
     q, q_dual = (scale * (weights[0] * x + weights[1] * y) for x, y in ((u, v), (u_dual, v_dual)))
@@ -158,9 +158,9 @@ def _with_translation(turn: Floats, pairs: Motions) -> Floats:
     """(R_A - I) t_X = R_X t_B - t_A, by least squares over all pairs."""
     x = np.eye(4)
     x[:3, :3] = turn
-    left = (pairs.flange[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (pairs.camera[:, :3, 3] @ turn.T - pairs.flange[:, :3, 3]).ravel()
-    x[:3, 3] = np.linalg.lstsq(left, right, rcond=None)[0]
+    left_side = (pairs.flange[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right_side = (pairs.camera[:, :3, 3] @ turn.T - pairs.flange[:, :3, 3]).ravel()
+    x[:3, 3] = np.linalg.lstsq(left_side, right_side, rcond=None)[0]
     return x
 
 

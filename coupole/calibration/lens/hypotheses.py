@@ -64,10 +64,10 @@ class Hypothesis:
 def scatter_of(base_from_flange: Floats, camera_from_board: Floats) -> tuple[float, float]:
     """mm and degrees; infinite where the motions have no solution."""
     try:
-        found = solve(base_from_flange, camera_from_board)
+        hand_eye = solve(base_from_flange, camera_from_board)
     except InputError:
         return np.inf, np.inf
-    return found.scatter_mm, found.scatter_deg
+    return hand_eye.scatter_mm, hand_eye.scatter_deg
 
 
 def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
@@ -85,24 +85,31 @@ def faults(
 
 
 def _other_conventions(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
-    said = poses.convention
+    convention = poses.convention
     turns: list[tuple[str, dict[str, object]]] = [("", {})]
-    if said.rotation != "quaternion_wxyz":
+    if convention.rotation != "quaternion_wxyz":
         turns = [
             (words, {"rotation": kind, "order": order})
             for kind, word in (("abc", "Rz Ry Rx"), ("xyz", "Rx Ry Rz"), ("rotation_vector", "a rotation vector"))
             for order in ([(0, 1, 2)] if kind == "rotation_vector" else permutations(range(3)))
             for words in [f"{word}{'' if order == (0, 1, 2) else f' with the numbers in the order {order}'}"]
         ]
-    other_length = "m" if said.length_unit == "mm" else "mm"
-    other_angle = "rad" if said.angle_unit == "deg" else "deg"
-    other_sense = "flange_from_base" if said.gives == "base_from_flange" else "base_from_flange"
+    other_length = "m" if convention.length_unit == "mm" else "mm"
+    other_angle = "rad" if convention.angle_unit == "deg" else "deg"
+    other_sense = "flange_from_base" if convention.gives == "base_from_flange" else "base_from_flange"
     for length, angle, sense, (words, turn) in product(
-        (said.length_unit, other_length), (said.angle_unit, other_angle), (said.gives, other_sense), turns
+        (convention.length_unit, other_length),
+        (convention.angle_unit, other_angle),
+        (convention.gives, other_sense),
+        turns,
     ):
-        read = said.model_copy(update={"length_unit": length, "angle_unit": angle, "gives": sense, **turn})
-        if read != said and not (said.rotation == "quaternion_wxyz" and angle != said.angle_unit):
-            yield from _if_read_as(poses.numbers, said, read, words, camera_from_board)
+        reading = convention.model_copy(
+            update={"length_unit": length, "angle_unit": angle, "gives": sense, **turn}
+        )
+        if reading != convention and not (
+            convention.rotation == "quaternion_wxyz" and angle != convention.angle_unit
+        ):
+            yield from _if_read_as(poses.numbers, convention, reading, words, camera_from_board)
 
 
 def _if_read_as(
@@ -134,12 +141,12 @@ _WORDS = {"deg": "degrees", "rad": "radians"}
 def _other_board_unit(base_from_flange: Floats, camera_from_board: Floats) -> Iterator[Hypothesis]:
     """The board's squares given in m, or in um."""
     for factor, unit in ((1000.0, "m"), (1e-3, "um")):
-        scaled = camera_from_board.copy()
-        scaled[:, :3, 3] *= factor
-        distance_mm = float(np.median(np.linalg.norm(scaled[:, :3, 3], axis=1)))
+        scaled_poses = camera_from_board.copy()
+        scaled_poses[:, :3, 3] *= factor
+        distance_mm = float(np.median(np.linalg.norm(scaled_poses[:, :3, 3], axis=1)))
         if _PLAUSIBLE_MM[0] < distance_mm < _PLAUSIBLE_MM[1]:
             sentence = f"the board's squares are given in {unit}, not mm"
-            yield Hypothesis((UNITS,), sentence, *scatter_of(base_from_flange, scaled))
+            yield Hypothesis((UNITS,), sentence, *scatter_of(base_from_flange, scaled_poses))
 
 
 def _wrong_pairs(
@@ -152,10 +159,10 @@ def _wrong_pairs(
         sentence = f"image and pose of {names[left_out]} do not belong together"
         yield Hypothesis((WRONG_PAIR,), sentence, *scatter_of(base_from_flange[keep], camera_from_board[keep]))
     if count > _LEAST_SEGMENT + 1:
-        for one, other in combinations(_worst(base_from_flange, camera_from_board), 2):
+        for first, second in combinations(_worst(base_from_flange, camera_from_board), 2):
             order = np.arange(count)
-            order[[one, other]] = other, one
-            sentence = f"the poses of {names[min(one, other)]} and {names[max(one, other)]} are exchanged"
+            order[[first, second]] = second, first
+            sentence = f"the poses of {names[min(first, second)]} and {names[max(first, second)]} are exchanged"
             yield Hypothesis((WRONG_PAIR,), sentence, *scatter_of(base_from_flange[order], camera_from_board))
         for words, flange, camera in (
             ("after", base_from_flange[1:], camera_from_board[:-1]),
@@ -191,19 +198,21 @@ def _moved_board(
             pairs = [motions(base_from_flange[part], camera_from_board[part]) for part in parts]
         except InputError:
             continue
-        both = Motions(*(np.concatenate([getattr(p, what) for p in pairs]) for what in ("flange", "camera")))
-        flange_from_camera = park(both)
+        all_motions = Motions(
+            *(np.concatenate([getattr(p, field) for p in pairs]) for field in ("flange", "camera"))
+        )
+        flange_from_camera = park(all_motions)
         before, after = (solution(base_from_flange[p], camera_from_board[p], flange_from_camera) for p in parts)
         step = between(before.base_from_board, after.base_from_board)
         scatter = np.concatenate([before.scatter, after.scatter])
-        pooled = replace(before, scatter=scatter)
+        pooled_solution = replace(before, scatter=scatter)
         step_mm, step_deg = float(np.linalg.norm(step[:3])), float(np.degrees(np.linalg.norm(step[3:])))
         sentence = (
             f"the board was moved between {names[change - 1]} and {names[change]}, by {step_mm:.3g} mm and "
             f"{step_deg:.3g} deg"
         )
         sure = expected.score(step_mm, step_deg) > 1.0 and _by_chance(before, after) * count < _SURE
-        yield Hypothesis((MOVED_BOARD,), sentence, pooled.scatter_mm, pooled.scatter_deg, sure)
+        yield Hypothesis((MOVED_BOARD,), sentence, pooled_solution.scatter_mm, pooled_solution.scatter_deg, sure)
 
 
 def _by_chance(before: Solution, after: Solution) -> float:

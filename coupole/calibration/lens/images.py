@@ -30,7 +30,7 @@ def find_board(
     board: Board, sources: Sources, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Found:
     """Find the board in all images. Raises InputError if they differ in size, or none shows it."""
-    sightings, chosen, left_out = [], [], []
+    sightings, numbers, left_out = [], [], []
     size_px: tuple[int, int] | None = None
     for number, source in enumerate(sources.images):
         picture = source.read()
@@ -38,14 +38,14 @@ def find_board(
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")
         size_px = size
-        seen = detect(board, picture)
-        if isinstance(seen, str):
-            left_out.append(f"{source.name}: {seen}")
+        sighting = detect(board, picture)
+        if isinstance(sighting, str):
+            left_out.append(f"{source.name}: {sighting}")
         else:
-            sightings.append(seen)
-            chosen.append(number)
+            sightings.append(sighting)
+            numbers.append(number)
         progress(number + 1, len(sources.images))
     if not sightings or size_px is None:
         why = f"; {left_out[0]}" if left_out else ""
         raise InputError(f"the board is in none of {len(sources.images)} images{why}. Is it the one described?")
-    return Found(tuple(sightings), np.array(chosen, dtype=np.intp), size_px, tuple(left_out))
+    return Found(tuple(sightings), np.array(numbers, dtype=np.intp), size_px, tuple(left_out))

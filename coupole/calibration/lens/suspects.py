@@ -38,9 +38,9 @@ class Field:
     def of(lens: Floats, free: Sequence[str], size_px: tuple[int, int]) -> Field:
         bare = Field(lens, tuple(free), size_px, np.zeros((0, 0)))
         grid = bare.grid_px()
-        own, polynomials = bare._own(grid), bare._polynomials(grid)
+        slopes, polynomials = bare._own(grid), bare._polynomials(grid)
         return Field(
-            lens, tuple(free), size_px, np.asarray(np.linalg.lstsq(own, polynomials, rcond=None)[0], np.float64)
+            lens, tuple(free), size_px, np.asarray(np.linalg.lstsq(slopes, polynomials, rcond=None)[0], np.float64)
         )
 
     def grid_px(self) -> Floats:
@@ -56,10 +56,10 @@ class Field:
     def ray_u_px(self, covariance: Floats) -> float:
         """Root mean square over the field of the standard uncertainty of a direction's image, both coordinates, of
         a lens with this covariance [free, free]; a turn of the camera does not count."""
-        own = self._own(self.grid_px())
-        turns, lens = own[:, -3:], own[:, :-3]
-        left = lens - turns @ np.linalg.lstsq(turns, lens, rcond=None)[0]
-        return float(np.sqrt(2.0 * np.mean(np.einsum("ki,ij,kj->k", left, covariance, left))))
+        slopes = self._own(self.grid_px())
+        turns, lens = slopes[:, -3:], slopes[:, :-3]
+        without_turns = lens - turns @ np.linalg.lstsq(turns, lens, rcond=None)[0]
+        return float(np.sqrt(2.0 * np.mean(np.einsum("ki,ij,kj->k", without_turns, covariance, without_turns))))
 
     def rms_px(self, coefficients: Floats, covariance: Floats) -> float:
         """Root mean square over the field of a pattern, both coordinates, its uncertainty included."""
@@ -70,20 +70,20 @@ class Field:
     def _own(self, pixels: Floats) -> Floats:
         """[2 n, free + 3] derivatives by the free lens parameters and by a turn of the camera."""
         rays = np.column_stack([(pixels - self.lens[2:4]) / self.lens[:2], np.ones(len(pixels))])
-        seen = optics.project(rays, self.lens)
-        by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in self.free]]
+        projection = optics.project(rays, self.lens)
+        by_lens = projection.by_intrinsics[:, :, [optics.NAMES.index(name) for name in self.free]]
         turns = np.cross(np.eye(3)[None], rays[:, None])
-        by_turn = np.einsum("kij,kaj->kia", seen.by_point, turns)
+        by_turn = np.einsum("kij,kaj->kia", projection.by_point, turns)
         return np.concatenate([by_lens, by_turn], axis=2).reshape(2 * len(pixels), -1)
 
     def _polynomials(self, pixels: Floats) -> Floats:
         """[2 n, modes] products of Legendre's polynomials, in x and in y."""
         width, height = self.size_px
         x, y = 2.0 * pixels[:, 0] / (width - 1) - 1.0, 2.0 * pixels[:, 1] / (height - 1) - 1.0
-        found = _products(x, y, 0, _LENS_DEGREE)
-        both = np.zeros((len(pixels), 2, 2 * found.shape[1]))
-        both[:, 0, : found.shape[1]] = both[:, 1, found.shape[1] :] = found
-        return both.reshape(2 * len(pixels), -1)
+        products = _products(x, y, 0, _LENS_DEGREE)
+        modes = np.zeros((len(pixels), 2, 2 * products.shape[1]))
+        modes[:, 0, : products.shape[1]] = modes[:, 1, products.shape[1] :] = products
+        return modes.reshape(2 * len(pixels), -1)
 
 
 def _products(x: Floats, y: Floats, least: int, most: int) -> Floats:

@@ -64,7 +64,7 @@ class Shown:
 def camera_from(found: Found, sources: Sources, model: str, request: Request) -> tuple[CameraCalibration, Shown]:
     """Calibrate a lens from the images of a board."""
     fit = calibrate_camera(found.sightings, found.size_px, model, doubted=True)
-    kept = without_gross_errors(fit)
+    good_sightings = without_gross_errors(fit)
     residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
     u = np.sqrt(np.diag(fit.covariance))
     parameters = [
@@ -77,7 +77,7 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         )
         for i, name in enumerate(fit.free)
     ]
-    redundancy = float(np.sum([2 * k.sum() for k in fit.kept]) - len(fit.free) - 6 * len(kept))
+    redundancy = float(np.sum([2 * k.sum() for k in fit.kept]) - len(fit.free) - 6 * len(good_sightings))
     record = sealed(
         kind="camera",
         transforms={},
@@ -91,10 +91,10 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         ),
         remarks=(*found.left_out, *sentences_of(fit.doubts)),
         fixed=held(fit.intrinsics, fit.free),
-        images=image_lines(kept, residuals, fit.sightings),
+        images=image_lines(good_sightings, residuals, fit.sightings),
         **content_of(found, sources, request),
     )
-    return fit, _shown(record, found, kept, residuals, fit.sigma_px, None)
+    return fit, _shown(record, found, good_sightings, residuals, fit.sigma_px, None)
 
 
 def hand_eye_from(
@@ -118,15 +118,15 @@ def hand_eye_from(
             "direction and odd in the other, or a ChArUco board"
         )
     fit = calibrate_camera(found.sightings, found.size_px, model)
-    kept = without_gross_errors(fit)
-    chosen = ReportedPoses(sources.poses.numbers[found.chosen], sources.poses.convention)
+    good_sightings = without_gross_errors(fit)
+    reported_poses = ReportedPoses(sources.poses.numbers[found.chosen], sources.poses.convention)
     joints = [sources.images[i].joints_deg for i in found.chosen]
-    known = [j for j in joints if j is not None]
-    axes = axis_sensitivity(arm, known) if arm is not None and len(known) == len(joints) else None
-    diagnosis = _refused_if_contradicting(fit, chosen, robot, [s.name for s in kept])
+    joints_deg = [j for j in joints if j is not None]
+    axes = axis_sensitivity(arm, joints_deg) if arm is not None and len(joints_deg) == len(joints) else None
+    diagnosis = _refused_if_contradicting(fit, reported_poses, robot, [s.name for s in good_sightings])
     result = calibrate_hand_eye(
-        kept,
-        Poses(chosen.base_from_flange, axes),
+        good_sightings,
+        Poses(reported_poses.base_from_flange, axes),
         model=model,
         lens=lens or fit.intrinsics,
         robot=robot,
@@ -152,11 +152,11 @@ def hand_eye_from(
             *sentences_of(result.doubts),
         ),
         fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
-        images=image_lines(kept, result.residuals_px, fit.sightings),
+        images=image_lines(good_sightings, result.residuals_px, fit.sightings),
         **content_of(found, sources, request),
     )
-    shown = _shown(record, found, kept, result.residuals_px, result.noise.pixel_px, result.pose_errors)
-    return result, diagnosis, shown
+    drawing = _shown(record, found, good_sightings, result.residuals_px, result.noise.pixel_px, result.pose_errors)
+    return result, diagnosis, drawing
 
 
 def _refused_if_contradicting(
@@ -164,14 +164,14 @@ def _refused_if_contradicting(
 ) -> Diagnosis:
     """Diagnose how well robot and camera agree. Raises InputError if they do not and the cause is known."""
     robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
-    expected = expected_scatter(
+    expectation = expected_scatter(
         fit.camera_from_board,
         pixel_px=fit.sigma_px,
         focal_px=fit.intrinsics.fx,
         robot_mm=robot_mm,
         robot_deg=float(np.degrees(robot_rad)),
     )
-    diagnosis = diagnose(reported, fit.camera_from_board, expected, names)
+    diagnosis = diagnose(reported, fit.camera_from_board, expectation, names)
     if diagnosis.cause is not None:
         raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
     return diagnosis
@@ -202,18 +202,18 @@ def ray_u_px(fit: CameraCalibration) -> float:
         [(field - (fit.intrinsics.cx, fit.intrinsics.cy)) / (fit.intrinsics.fx, fit.intrinsics.fy)]
     )
     points = np.column_stack([rays, np.ones(len(rays))])
-    seen = optics.project(points, fit.intrinsics.vector())
-    by_lens = seen.by_intrinsics[:, :, [optics.NAMES.index(name) for name in fit.free]].reshape(-1, len(fit.free))
+    image = optics.project(points, fit.intrinsics.vector())
+    by_lens = image.by_intrinsics[:, :, [optics.NAMES.index(name) for name in fit.free]].reshape(-1, len(fit.free))
     turns = np.cross(np.eye(3)[None], points[:, None])  # d point / d rotation about each axis, [k, 3, 3]
-    by_turn = np.einsum("kij,kaj->kia", seen.by_point, turns).reshape(-1, 3)
-    left = by_lens - by_turn @ np.linalg.lstsq(by_turn, by_lens, rcond=None)[0]
-    variance = np.einsum("ki,ij,kj->k", left, fit.covariance, left)
+    by_turn = np.einsum("kij,kaj->kia", image.by_point, turns).reshape(-1, 3)
+    without_turns = by_lens - by_turn @ np.linalg.lstsq(by_turn, by_lens, rcond=None)[0]
+    variance = np.einsum("ki,ij,kj->k", without_turns, fit.covariance, without_turns)
     return float(np.sqrt(variance.reshape(-1, 2).sum(axis=1).max()))
 
 
 def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int]) -> float:
     """Share of the field's cells, 8 x 6, in which no corner was seen."""
-    pixels = np.concatenate([seen.pixels for seen in sightings])
+    pixels = np.concatenate([sighting.pixels for sighting in sightings])
     cells = np.floor(pixels * FIELD_CELLS / size_px).astype(int)
     return 1.0 - len(np.unique(cells, axis=0)) / (FIELD_CELLS[0] * FIELD_CELLS[1])
 
@@ -224,12 +224,12 @@ def image_lines(
     """Number of corners and residual of each image."""
     return tuple(
         ImageResidual(
-            name=seen.name,
-            corners=len(seen.ids),
-            rejected=len(before.ids) - len(seen.ids),
-            rms_px=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+            name=sighting.name,
+            corners=len(sighting.ids),
+            rejected=len(before.ids) - len(sighting.ids),
+            rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         )
-        for seen, left, before in zip(kept, residuals, all_seen, strict=True)
+        for sighting, residual, before in zip(kept, residuals, all_seen, strict=True)
     )
 
 
@@ -251,13 +251,13 @@ def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]
 
 def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
     """The figures that `acceptance.IMAGES` limits."""
-    rejected = np.concatenate([~keep for keep in fit.kept])
-    clipped = sum(": clipped" in line for line in found.left_out)
+    is_rejected = np.concatenate([~keep for keep in fit.kept])
+    clipped_count = sum(": clipped" in line for line in found.left_out)
     return {
         "pixel_px": fit.sigma_px,
         "bare_field": field_without_corners(fit.sightings, fit.size_px),
-        "rejected": float(rejected.mean()),
-        "clipped": clipped / (len(found.sightings) + len(found.left_out)),
+        "rejected": float(is_rejected.mean()),
+        "clipped": clipped_count / (len(found.sightings) + len(found.left_out)),
     }
 
 
@@ -305,19 +305,23 @@ def _hand_eye_parameters(result: HandEyeCalibration) -> tuple[Parameter, ...]:
 
 
 def _hand_eye_noise(result: HandEyeCalibration) -> tuple[Noise, ...]:
-    left: dict[str, Component] = {component.name: component for component in result.components}
+    component_of: dict[str, Component] = {component.name: component for component in result.components}
     noise = result.noise
     return (
-        _noise("corners", "px", 0.0, noise.pixel_px, left["corners"].redundancy),
+        _noise("corners", "px", 0.0, noise.pixel_px, component_of["corners"].redundancy),
         _noise(
-            "robot position", "mm", noise.stated_position_mm, noise.position_mm, left["robot position"].redundancy
+            "robot position",
+            "mm",
+            noise.stated_position_mm,
+            noise.position_mm,
+            component_of["robot position"].redundancy,
         ),
         _noise(
             "robot orientation",
             "deg",
             noise.stated_orientation_deg,
             noise.orientation_deg,
-            left["robot orientation"].redundancy,
+            component_of["robot orientation"].redundancy,
         ),
     )
 

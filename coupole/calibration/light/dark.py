@@ -81,32 +81,32 @@ def calibrate_dark(
     Transfer, 2007, section 11.1.2), which is not estimated. Raises InputError: too few frames or exposures, frames
     with light, saturated ones.
     """
-    listed = sorted(frames, key=lambda frame: (frame.exposure_s, frame.temperature_c))
-    exposures = {frame.exposure_s for frame in listed}
-    if len(listed) < _LEAST_FRAMES or len(exposures) < 2:
+    series = sorted(frames, key=lambda frame: (frame.exposure_s, frame.temperature_c))
+    exposures = {frame.exposure_s for frame in series}
+    if len(series) < _LEAST_FRAMES or len(exposures) < 2:
         raise InputError(
-            f"dark: expected {_LEAST_FRAMES} or more dark frames of 2 or more exposures, found {len(listed)} of "
+            f"dark: expected {_LEAST_FRAMES} or more dark frames of 2 or more exposures, found {len(series)} of "
             f"{len(exposures)}; acquire `coupole plan new darks`"
         )
-    known = [f.temperature_c for f in listed if np.isfinite(f.temperature_c)]
-    reference_c = float(np.mean(known)) if len(known) == len(listed) else None
+    temperatures_c = [f.temperature_c for f in series if np.isfinite(f.temperature_c)]
+    reference_c = float(np.mean(temperatures_c)) if len(temperatures_c) == len(series) else None
     seconds = np.array(
-        [f.exposure_s * warmth_of(f.temperature_c, reference_c, doubling_k) for f in listed], dtype=np.float64
+        [f.exposure_s * warmth_of(f.temperature_c, reference_c, doubling_k) for f in series], dtype=np.float64
     )
     sums = _Sums()
     pairs: list[tuple[float, float, float]] = []
     levels: list[tuple[float, float, float]] = []
     before: NDArray[np.uint16] | None = None
-    for number, (frame, t_s) in enumerate(zip(listed, seconds, strict=True)):
+    for number, (frame, t_s) in enumerate(zip(series, seconds, strict=True)):
         pixels = frame.read()
         _refuse_saturated(frame, pixels, white_dn)
         sums.add(frame.name, pixels, t_s)
         levels.append((frame.exposure_s, frame.temperature_c, float(np.median(pixels.mean(axis=1)))))
-        if before is not None and listed[number - 1].exposure_s == frame.exposure_s:
+        if before is not None and series[number - 1].exposure_s == frame.exposure_s:
             pairs.append((float(t_s), *_pair_variances(before, pixels)))
         before = pixels
-        progress(number + 1, len(listed))
-    _refuse_lit([f.name for f in listed], seconds, np.array([mean for _, _, mean in levels]))
+        progress(number + 1, len(series))
+    _refuse_lit([f.name for f in series], seconds, np.array([mean for _, _, mean in levels]))
     if not pairs:
         raise InputError("dark: expected two frames or more of one exposure; set `darks_per_view: 20` in the plan")
     offset, current, noise, cofactor = sums.lines()
@@ -116,7 +116,7 @@ def calibrate_dark(
         current,
         noise,
         cofactor,
-        len(listed) - 2,
+        len(series) - 2,
         *_noises(pairs, height, width),
         hot_pixels(current),
         reference_c,
@@ -128,8 +128,8 @@ def calibrate_dark(
 def hot_pixels(current_dn_per_s: Maps, sigma: float = HOT_SIGMA) -> NDArray[np.int64]:
     """[hot, 2] row and column of pixels with a high dark current, the hottest first."""
     median = np.median(current_dn_per_s)
-    spread = _MAD * np.median(np.abs(current_dn_per_s - median))
-    places = np.argwhere(current_dn_per_s > median + sigma * max(spread, 1e-9))
+    scatter = _MAD * np.median(np.abs(current_dn_per_s - median))
+    places = np.argwhere(current_dn_per_s > median + sigma * max(scatter, 1e-9))
     order = np.argsort(-current_dn_per_s[places[:, 0], places[:, 1]], kind="stable")
     return np.asarray(places[order], dtype=np.int64)
 
@@ -189,8 +189,8 @@ class _Sums:
         y, yt, yy = self._maps
         offset: Maps = np.float32(cofactor[0, 0]) * y + np.float32(cofactor[0, 1]) * yt
         slope: Maps = np.float32(cofactor[1, 0]) * y + np.float32(cofactor[1, 1]) * yt
-        left = np.maximum(yy - offset * y - slope * yt, np.float32(0.0))
-        noise: Maps = np.sqrt(left / np.float32(len(t) - 2))
+        squares = np.maximum(yy - offset * y - slope * yt, np.float32(0.0))
+        noise: Maps = np.sqrt(squares / np.float32(len(t) - 2))
         return np.add(offset, self._first, dtype=np.float32), slope, noise, cofactor
 
 
@@ -200,8 +200,8 @@ def _pair_variances(a: NDArray[np.uint16], b: NDArray[np.uint16]) -> tuple[float
     Pixels with shot noise of their own (hot ones) are left out.
     """
     difference = np.subtract(a, b, dtype=np.float32)
-    spread = _MAD * max(float(np.median(np.abs(difference - np.median(difference)))), 1.0)
-    difference[np.abs(difference) > 6.0 * spread] = np.nan
+    scatter = _MAD * max(float(np.median(np.abs(difference - np.median(difference)))), 1.0)
+    difference[np.abs(difference) > 6.0 * scatter] = np.nan
     rows = np.nanmean(difference, axis=1)
     within = float(np.nanvar(difference - rows[:, None], ddof=0)) / 2.0
     width = difference.shape[1]
@@ -223,9 +223,9 @@ def _refuse_saturated(frame: DarkFrame, pixels: NDArray[np.uint16], white_dn: in
 def _refuse_lit(names: list[str], t_s: NDArray[np.float64], mean_dn: NDArray[np.float64]) -> None:
     """Raise InputError if single frames lie far above the line through the others."""
     slope, start = _robust_line(t_s, mean_dn)
-    left = mean_dn - start - slope * t_s
-    scatter = max(_MAD * float(np.median(np.abs(left - np.median(left)))), _LIT_DN / _LIT)
-    lit = [name for name, off in zip(names, left, strict=True) if off > _LIT * scatter]
+    residuals_dn = mean_dn - start - slope * t_s
+    scatter = max(_MAD * float(np.median(np.abs(residuals_dn - np.median(residuals_dn)))), _LIT_DN / _LIT)
+    lit = [name for name, off in zip(names, residuals_dn, strict=True) if off > _LIT * scatter]
     if lit:
         raise InputError(
             f"dark: light fell into {len(lit)} of {len(names)} frames: {', '.join(lit[:5])}; close the dome and "

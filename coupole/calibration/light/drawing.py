@@ -65,18 +65,18 @@ def draw_response(
 ) -> None:
     """Photon transfer and its residuals, signal by exposure, deviation from a line."""
     axes = figure.subplots(2, 2)
-    for channel, found in transfers.items():
+    for channel, transfer in transfers.items():
         colour = CHANNEL_COLOURS[channel]
-        x, y, use = found.signal_dn, found.variance_dn2, found.used
-        line = found.read_noise_dn.value**2 + 1.0 / 12.0 + found.gain_dn_per_e.value * x
-        per_dn = found.electrons_per_dn
-        label = f"{channel}: {per_dn.value:.3f} ({per_dn.u:.1g}) e/DN, read {found.read_noise_e.value:.3g} e"
+        x, y, use = transfer.signal_dn, transfer.variance_dn2, transfer.used
+        line = transfer.read_noise_dn.value**2 + 1.0 / 12.0 + transfer.gain_dn_per_e.value * x
+        per_dn = transfer.electrons_per_dn
+        label = f"{channel}: {per_dn.value:.3f} ({per_dn.u:.1g}) e/DN, read {transfer.read_noise_e.value:.3g} e"
         axes[0, 0].plot(x, line, color=colour, lw=1, label=label)
         axes[0, 0].plot(x[use], y[use], "o", color=colour, ms=5, mfc="none")
         axes[0, 0].plot(x[~use], y[~use], "x", color=colour, ms=5)
         off = 100 * (y / line - 1.0)
         axes[0, 1].errorbar(
-            x[use], off[use], 100 * found.u_variance_dn2[use] / line[use], fmt="o", color=colour, ms=4, lw=1
+            x[use], off[use], 100 * transfer.u_variance_dn2[use] / line[use], fmt="o", color=colour, ms=4, lw=1
         )
     axes[0, 0].set(title="Photon transfer", xlabel="signal above dark (DN)", ylabel="variance (DN$^2$)")
     axes[0, 0].legend(frameon=False)
@@ -87,8 +87,8 @@ def draw_response(
         t, signal = straight.exposures_us * 1e-3, straight.signals_dn
         for group in (0, len(signal) // 2, len(signal) - 1):
             axes[1, 0].plot(t, signal[group], "o-", color=colour, ms=4, lw=1, mfc="none")
-        seen = np.isfinite(straight.deviations)
-        axes[1, 1].plot(signal[seen], 100 * straight.deviations[seen], ".", color=colour, ms=5)
+        is_known = np.isfinite(straight.deviations)
+        axes[1, 1].plot(signal[is_known], 100 * straight.deviations[is_known], ".", color=colour, ms=5)
         x = np.linspace(0.02, 1, 100) * straight.range_dn
         axes[1, 1].plot(x, 100 * (x / straight.linear(x) - 1), color=colour, lw=1.5)
     axes[1, 0].set(
@@ -114,32 +114,34 @@ def draw_flat_field(
     width, height = green.size_px
     x, y = np.meshgrid(np.linspace(0, width - 1, 160), np.linspace(0, height - 1, 120))
     g = green.at(np.stack([x, y], axis=-1))
-    shown = axes[0, 0].imshow(g, extent=(0, width, height, 0), cmap="viridis", aspect="equal")
+    image = axes[0, 0].imshow(g, extent=(0, width, height, 0), cmap="viridis", aspect="equal")
     levels = axes[0, 0].contour(x, y, g, levels=8, colors="white", linewidths=0.7)
     axes[0, 0].clabel(levels, fmt="%.2f", fontsize=8)
     axes[0, 0].plot(*green.parameters[:2], "+", color="white", ms=12)
     axes[0, 0].set(title="Fall-off g of green", xlabel="x (px)", ylabel="y (px)")
-    figure.colorbar(shown, ax=axes[0, 0], shrink=0.8)
+    figure.colorbar(image, ax=axes[0, 0], shrink=0.8)
     across = np.linspace(0.0, 1.0, 200)
     diagonal = np.stack([across * (width - 1), across * (height - 1)], axis=-1)
     place = (across - 0.5) * np.hypot(width, height)
     for channel, fit in fits.items():
-        cut, u = fit.at(diagonal), fit.u_at(diagonal)
+        profile, u = fit.at(diagonal), fit.u_at(diagonal)
         colour = CHANNEL_COLOURS[channel]
-        axes[0, 1].plot(place, cut, color=colour, lw=1.5, label=channel)
-        axes[0, 1].fill_between(place, cut * (1 - 20 * u), cut * (1 + 20 * u), color=colour, alpha=0.2, lw=0)
+        axes[0, 1].plot(place, profile, color=colour, lw=1.5, label=channel)
+        axes[0, 1].fill_between(
+            place, profile * (1 - 20 * u), profile * (1 + 20 * u), color=colour, alpha=0.2, lw=0
+        )
     axes[0, 1].legend(frameon=False)
     axes[0, 1].set(title="g along the diagonal; bands: 20 standard uncertainties", xlabel="from the middle (px)")
-    left = np.nanmean(np.stack(green.residuals), axis=0)
-    size = round(np.sqrt(width * height / len(left)))
+    residuals = np.nanmean(np.stack(green.residuals), axis=0)
+    size = round(np.sqrt(width * height / len(residuals)))
     columns = width // size
     limit = 3 * green.residual
-    shown = axes[1, 0].imshow(
-        100 * left[: len(left) // columns * columns].reshape(-1, columns),
+    image = axes[1, 0].imshow(
+        100 * residuals[: len(residuals) // columns * columns].reshape(-1, columns),
         extent=(0, width, height, 0), cmap="RdBu", vmin=-100 * limit, vmax=100 * limit, aspect="equal",
     )  # fmt: skip
     axes[1, 0].set(title="Residuals of green, mean of all views (%)", xlabel="x (px)", ylabel="y (px)")
-    figure.colorbar(shown, ax=axes[1, 0], shrink=0.8)
+    figure.colorbar(image, ax=axes[1, 0], shrink=0.8)
     _map(axes[1, 1], 100 * (ratio - 1), f"Pixels' own response (%), {len(spots)} dust spots ringed")
     for spot in spots[:40]:
         axes[1, 1].plot(spot.column_px, spot.row_px, "o", color=RED, ms=12, mfc="none")
@@ -152,17 +154,17 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
     lit = np.isfinite(green.power) & (green.power > 0)
     relative = green.power / np.mean(green.power[lit])
     x, y = _dome_map(positions, green.ids)
-    shown = axes[0, 0].scatter(x[lit], y[lit], c=relative[lit], cmap="viridis", s=14)
+    dots = axes[0, 0].scatter(x[lit], y[lit], c=relative[lit], cmap="viridis", s=14)
     axes[0, 0].plot(x[green.power == 0], y[green.power == 0], "x", color=RED, ms=9, mew=2)
     axes[0, 0].set(title="Power of green over the mean; dead in red", aspect="equal", xticks=[], yticks=[])
     axes[0, 0].spines[["left", "bottom"]].set_visible(False)
-    figure.colorbar(shown, ax=axes[0, 0], shrink=0.8)
+    figure.colorbar(dots, ax=axes[0, 0], shrink=0.8)
     for channel, power in powers.items():
         good = np.isfinite(power.power) & (power.power > 0)
         colour = CHANNEL_COLOURS[channel]
         values = power.power[good] / np.mean(power.power[good])
-        spread = f"{channel}: {np.std(values):.1%}"
-        axes[0, 1].hist(values, bins=40, histtype="step", color=colour, lw=1.5, label=spread)
+        label = f"{channel}: {np.std(values):.1%}"
+        axes[0, 1].hist(values, bins=40, histtype="step", color=colour, lw=1.5, label=label)
         axes[1, 0].plot(power.ids[good], 100 * power.u_own[good], ".", color=colour, ms=3)
         axes[1, 0].plot(power.ids[good], 100 * power.u_against_mean()[good], ".", color=colour, ms=3, alpha=0.3)
     axes[0, 1].legend(frameon=False, title="spread")
@@ -171,8 +173,8 @@ def draw_led_power(powers: Mapping[str, LedPower], positions: Positions, record:
         title="Relative standard uncertainty: own noise (dark), against the mean (pale)",
         xlabel="LED", ylabel="%", yscale="log",
     )  # fmt: skip
-    left = [residuals[np.isfinite(residuals)] for residuals in green.residuals]
-    axes[1, 1].boxplot([100 * part for part in left if len(part)], showfliers=False, patch_artist=False)
+    view_residuals = [residuals[np.isfinite(residuals)] for residuals in green.residuals]
+    axes[1, 1].boxplot([100 * part for part in view_residuals if len(part)], showfliers=False, patch_artist=False)
     axes[1, 1].axhline(0, color=GREY, lw=1)
     axes[1, 1].set(title=f"Residuals of green by view; noise {green.noise:.2%}", xlabel="view", ylabel="%")
 
@@ -202,6 +204,6 @@ def _map(ax: Axes, values: NDArray[np.float32], title: str) -> None:
     thin = values[::step, ::step]
     low, high = np.nanquantile(thin, [0.005, 0.995])
     extent = (0, values.shape[1], values.shape[0], 0)
-    shown = ax.imshow(thin, extent=extent, cmap="viridis", vmin=low, vmax=high, aspect="equal")
+    image = ax.imshow(thin, extent=extent, cmap="viridis", vmin=low, vmax=high, aspect="equal")
     ax.set(title=title, xlabel="x (px)", ylabel="y (px)")
-    ax.figure.colorbar(shown, ax=ax, shrink=0.8)
+    ax.figure.colorbar(image, ax=ax, shrink=0.8)

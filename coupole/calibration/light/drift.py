@@ -103,9 +103,9 @@ def fit_drift(
 
     Raises InputError: too few readings, a dark tile, a sudden change (with the frames before and after it).
     """
-    ordered = sorted(readings, key=lambda reading: reading.t_s)
-    _refuse_few(ordered)
-    if dark := [reading.name for reading in ordered if reading.ratio < 0.1]:
+    ordered_readings = sorted(readings, key=lambda reading: reading.t_s)
+    _refuse_few(ordered_readings)
+    if dark := [reading.name for reading in ordered_readings if reading.ratio < 0.1]:
         raise InputError(
             f"drift: the reference tile is dark in {', '.join(dark[:5])}; is the LED dead, or the tile hidden?"
         )
@@ -113,21 +113,21 @@ def fit_drift(
     precision = np.zeros((len(prior), len(prior)))
     precision[:3, :3] = np.diag(np.array([_UNKNOWN, u_rate_per_h, u_per_k]) ** -2.0)
     precision[3:, 3:] = np.linalg.inv(shared_covariance)
-    first = _solve(ordered, prior, precision)
+    first = _solve(ordered_readings, prior, precision)
     odd = _odd(first.left, first.noise)
-    used = [reading for reading, out in zip(ordered, odd, strict=True) if not out]
-    _refuse_few(used)
-    found = _solve(used, prior, precision) if odd.any() else first
-    _refuse_sudden([reading.name for reading in used], found.left, found.noise)
+    used_readings = [reading for reading, out in zip(ordered_readings, odd, strict=True) if not out]
+    _refuse_few(used_readings)
+    solution = _solve(used_readings, prior, precision) if odd.any() else first
+    _refuse_sudden([reading.name for reading in used_readings], solution.left, solution.noise)
     return Drift(
-        found.parameters[:3],
-        found.covariance[:3, :3],
-        used[0].t_s,
-        float(np.median(found.noise) * found.scale),
-        tuple(used),
-        found.left,
-        tuple(reading for reading, out in zip(ordered, odd, strict=True) if out),
-        found.freedom,
+        solution.parameters[:3],
+        solution.covariance[:3, :3],
+        used_readings[0].t_s,
+        float(np.median(solution.noise) * solution.scale),
+        tuple(used_readings),
+        solution.left,
+        tuple(reading for reading, out in zip(ordered_readings, odd, strict=True) if out),
+        solution.freedom,
     )
 
 
@@ -152,18 +152,18 @@ def _solve(readings: Sequence[Reading], prior: Floats, precision: Floats) -> _So
     ratio = np.array([reading.ratio for reading in readings])
     hours = np.array([(reading.t_s - readings[0].t_s) / 3600.0 for reading in readings])
     warm = np.nan_to_num(np.array([reading.warmer_k for reading in readings]))
-    shared = np.array([reading.by_shared for reading in readings]).reshape(len(readings), len(prior) - 3)
-    design = np.column_stack([np.ones_like(hours), hours, warm, shared])
+    shared_terms = np.array([reading.by_shared for reading in readings]).reshape(len(readings), len(prior) - 3)
+    design = np.column_stack([np.ones_like(hours), hours, warm, shared_terms])
     noise = np.array([reading.u_ratio for reading in readings]) / ratio
     freedom = max(1, len(readings) - 3)
     scale = 1.0
     for _ in range(3):
         weight = (noise * scale) ** -2.0
         covariance = np.asarray(np.linalg.inv(precision + design.T @ (design * weight[:, None])), np.float64)
-        found = covariance @ (precision @ prior + design.T @ (weight * np.log(ratio)))
-        left = np.log(ratio) - design @ found
-        scale = max(1.0, float(np.sqrt(np.sum((left / noise) ** 2) / freedom)))
-    return _Solved(found, covariance, left, noise, scale, float(freedom))
+        parameters = covariance @ (precision @ prior + design.T @ (weight * np.log(ratio)))
+        residuals = np.log(ratio) - design @ parameters
+        scale = max(1.0, float(np.sqrt(np.sum((residuals / noise) ** 2) / freedom)))
+    return _Solved(parameters, covariance, residuals, noise, scale, float(freedom))
 
 
 def _refuse_few(readings: Sequence[Reading]) -> None:

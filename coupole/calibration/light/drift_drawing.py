@@ -24,15 +24,15 @@ def draw_drift(drift: Drift, warmer_k: Floats, t_s: Floats, record: Record, figu
     minutes = np.array([reading.t_s - drift.start_s for reading in drift.used]) / 60.0
     warm = np.array([reading.warmer_k for reading in drift.used])
     by_fit = drift.factor(warm, 60.0 * minutes + drift.start_s)
-    seen = by_fit * np.exp(drift.residuals)
-    axes[0, 0].plot(minutes, 100 * seen, ".", color=GREY, ms=4, label="readings of the tile")
+    read_factors = by_fit * np.exp(drift.residuals)
+    axes[0, 0].plot(minutes, 100 * read_factors, ".", color=GREY, ms=4, label="readings of the tile")
     axes[0, 0].plot(minutes, 100 * by_fit, ".", color=BLUE, ms=3, label="by the fit")
     odd = [((reading.t_s - drift.start_s) / 60.0, 100 * reading.ratio) for reading in drift.odd]
     if odd:
         axes[0, 0].plot(*np.transpose(odd), "x", color=RED, label="left out")
     axes[0, 0].legend(frameon=False)
     axes[0, 0].set(title="Power over that of the calibration", xlabel="minutes", ylabel="%")
-    axes[0, 1].plot(warm, 100 * seen, ".", color=GREY, ms=4)
+    axes[0, 1].plot(warm, 100 * read_factors, ".", color=GREY, ms=4)
     axes[0, 1].set(title="The same by temperature", xlabel="warmer than when calibrated (K)", ylabel="%")
     axes[1, 0].hist(100 * drift.residuals, bins=40, color=BLUE)
     axes[1, 0].set(title=f"Residuals; noise of a reading {drift.noise:.2%}", xlabel="%", ylabel="readings")

@@ -68,8 +68,8 @@ def read_powers(path: Path) -> Powers:
     def numbers(key: str) -> Floats:
         return np.array([float(line[key]) for line in columns])
 
-    listed = [parameter.name for parameter in record.parameters]
-    at = [listed.index(f"{name}.{CHANNEL}") for name in names]
+    record_names = [parameter.name for parameter in record.parameters]
+    at = [record_names.index(f"{name}.{CHANNEL}") for name in names]
     return Powers(
         {int(line["id"]): row for row, line in enumerate(columns)},
         numbers(f"power_{CHANNEL}"),
@@ -97,10 +97,10 @@ def drift_outcome(
     lit = [frame for frame in frames.lit if frame.led is not None]
     if not lit:
         raise InputError("drift: no frame under an LED in this run")
-    read = TileReader(frames, setting, lit[0].read().shape)
-    shown = [found for found in _by_view(lit) if read.sees(found[0].base_from_camera)]
+    reader = TileReader(frames, setting, lit[0].read().shape)
+    views = [view_frames for view_frames in _by_view(lit) if reader.sees(view_frames[0].base_from_camera)]
     remarks: list[str] = []
-    readings = _readings(shown, read, setting, powers, remarks, progress)
+    readings = _readings(views, reader, setting, powers, remarks, progress)
     dark = [reading for reading in readings if reading.ratio < _DARK]
     if dark:
         remarks.append(f"{len(dark)} readings are dark (shadow, or a dead LED), not used: {_list(dark)}")
@@ -115,7 +115,7 @@ def drift_outcome(
     u = drift.u_factor(warmer_k, t_s)
     factor = drift.factor(warmer_k, t_s)
     left_out = (len(dark) + len(drift.odd)) / len(readings)
-    height, width = read.shape
+    height, width = reader.shape
     return sealed_outcome(
         "drift",
         request,
@@ -128,7 +128,7 @@ def drift_outcome(
         files={f"{request.name}.csv": _table(drift).encode()},
         fixed={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
         remarks=(
-            f"{len(drift.used)} readings in {len(shown)} views; factor {factor.min():.4f} to {factor.max():.4f}",
+            f"{len(drift.used)} readings in {len(views)} views; factor {factor.min():.4f} to {factor.max():.4f}",
             "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, board_c "
             "that of the LED in the powers' table",
             *remarks,
@@ -159,10 +159,10 @@ def _readings(
         )
     readings: list[Reading] = []
     frame_done = counter(progress, sum(map(len, shown)))
-    for found in shown:
-        view = read.view(found, frame_done)[CHANNEL]
+    for view_frames in shown:
+        view = read.view(view_frames, frame_done)[CHANNEL]
         rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
-        frame_of = {frame.led: frame for frame in found if frame.led is not None}
+        frame_of = {frame.led: frame for frame in view_frames if frame.led is not None}
         readings += [
             _reading(frame_of[row.led], row.value, row.u, row.design, powers)
             for row in rows
@@ -173,11 +173,11 @@ def _readings(
 
 def _by_view(lit: Sequence[LightFrame]) -> list[list[LightFrame]]:
     """Frames by view, exposure and repeat: each LED once."""
-    found: dict[tuple[str, int, int], list[LightFrame]] = {}
+    frames_of: dict[tuple[str, int, int], list[LightFrame]] = {}
     for frame in lit:
         label = frame.shot.label
-        found.setdefault((frame.view, label.exposure, label.repeat), []).append(frame)
-    return list(found.values())
+        frames_of.setdefault((frame.view, label.exposure, label.repeat), []).append(frame)
+    return list(frames_of.values())
 
 
 def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: Powers) -> Reading:
@@ -219,8 +219,10 @@ def _parameters(drift: Drift) -> list[Parameter]:
     u = np.sqrt(np.diag(drift.covariance))
     by = ("readings of the tile, its tilt", "prior of 0.5 % per hour", "prior of white LEDs, readings")
     return [
-        Parameter(name=name, value=float(value), u=float(one), degrees_of_freedom=drift.freedom, dominated_by=why)
-        for name, value, one, why in zip(NAMES, drift.parameters, u, by, strict=True)
+        Parameter(
+            name=name, value=float(value), u=float(sigma), degrees_of_freedom=drift.freedom, dominated_by=why
+        )
+        for name, value, sigma, why in zip(NAMES, drift.parameters, u, by, strict=True)
     ]
 
 
@@ -229,14 +231,14 @@ def _table(drift: Drift) -> str:
     text = io.StringIO()
     text.write("# the reference tile: signal over that expected from the calibrated power; residual of the fit\n")
     text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")
-    for reading, left in zip(drift.used, drift.residuals, strict=True):
+    for reading, residual in zip(drift.used, drift.residuals, strict=True):
         text.write(
             f"{reading.name},{reading.t_s:.6f},{reading.warmer_k:.2f},{reading.ratio:.6f},{reading.u_ratio:.2g},"
-            f"{left:.6f}\n"
+            f"{residual:.6f}\n"
         )
     return text.getvalue()
 
 
 def _list(readings: Sequence[Reading]) -> str:
-    named = ", ".join(reading.name for reading in readings[:5])
-    return named + (f" and {len(readings) - 5} more" if len(readings) > 5 else "")
+    names = ", ".join(reading.name for reading in readings[:5])
+    return names + (f" and {len(readings) - 5} more" if len(readings) > 5 else "")

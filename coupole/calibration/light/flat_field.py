@@ -98,8 +98,8 @@ class FlatField:
     def _slopes(self, pixels: Floats) -> Floats:
         """[5, ...] derivatives of ln g."""
         radial, by_centre = _radial(pixels, self.parameters[:2], self.focal_px, self.size_px)
-        moved = by_centre[:, 0] + np.einsum("k,ck...->c...", self.parameters[2:], by_centre[:, 1:])
-        return np.concatenate([moved, radial[1:]])
+        centre_slopes = by_centre[:, 0] + np.einsum("k,ck...->c...", self.parameters[2:], by_centre[:, 1:])
+        return np.concatenate([centre_slopes, radial[1:]])
 
 
 def fit_flat_field(
@@ -111,20 +111,20 @@ def fit_flat_field(
     panel_scale_mm: float = 100.0,
 ) -> FlatField:
     """Fit one channel. Raises InputError if the views do not separate panel and lens, or have too few blocks."""
-    used = [np.isfinite(view.signal) & (view.signal > 0) for view in views]
-    if len(views) < 3 or min(int(u.sum()) for u in used) < _LEAST_BLOCKS:
-        least = min((int(u.sum()) for u in used), default=0)
+    usable = [np.isfinite(view.signal) & (view.signal > 0) for view in views]
+    if len(views) < 3 or min(int(u.sum()) for u in usable) < _LEAST_BLOCKS:
+        least = min((int(u.sum()) for u in usable), default=0)
         raise InputError(
             f"flat field: expected three views or more with {_LEAST_BLOCKS} usable blocks each, found "
             f"{len(views)} with {least} or more; photograph the panel, shifted and turned, filling the field, "
             "unsaturated"
         )
-    blocks = _gathered(views, used, panel_scale_mm)
+    blocks = _gathered(views, usable, panel_scale_mm)
     fit = _fit(blocks, len(views), focal_px, size_px)
     covariance = _clustered(fit.design, fit.weight, fit.left, blocks.pixels)
-    parts = np.split(fit.left, np.cumsum([int(u.sum()) for u in used])[:-1])
+    parts = np.split(fit.left, np.cumsum([int(u.sum()) for u in usable])[:-1])
     residuals = []
-    for use, part in zip(used, parts, strict=True):
+    for use, part in zip(usable, parts, strict=True):
         whole = np.full(len(use), np.nan)
         whole[use] = part
         residuals.append(whole)
@@ -190,13 +190,13 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
     p = np.concatenate([np.array([size_px[0] - 1, size_px[1] - 1]) / 2.0, np.zeros(3)])
     rest = np.zeros(views + 5)
     weight = np.ones(len(blocks.logs))
-    sigma, left = 0.0, blocks.logs
+    sigma, residuals = 0.0, blocks.logs
     design = np.zeros((len(blocks.logs), 0))
     for _ in range(_ROUNDS):
         radial, by_centre = _radial(blocks.pixels, p[:2], focal_px, size_px)
-        moved = by_centre[:, 0] + np.einsum("k,ckn->cn", p[2:], by_centre[:, 1:])
-        design = np.column_stack([moved.T, radial[1:].T, brightness, blocks.panel_terms])
-        left = blocks.logs - radial[0] - radial[1:].T @ p[2:] - design[:, 5:] @ rest
+        centre_slopes = by_centre[:, 0] + np.einsum("k,ckn->cn", p[2:], by_centre[:, 1:])
+        design = np.column_stack([centre_slopes.T, radial[1:].T, brightness, blocks.panel_terms])
+        residuals = blocks.logs - radial[0] - radial[1:].T @ p[2:] - design[:, 5:] @ rest
         scale = np.linalg.norm(design, axis=0)
         normal = (design / scale).T @ ((design / scale) * weight[:, None])
         if np.linalg.cond(normal) > _INDEFINITE:
@@ -204,16 +204,16 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
                 "flat field: these views cannot tell the panel's unevenness from the lens's fall-off; add views "
                 "shifted both ways by a third of the field, and turned by 90 degrees or more about the view"
             )
-        step = np.linalg.solve(normal, (design / scale).T @ (weight * left)) / scale
+        step = np.linalg.solve(normal, (design / scale).T @ (weight * residuals)) / scale
         # Steps of the centre are limited: far outside the field, fall-off is no longer radial about it.
         step[:2] = np.clip(step[:2], -0.1 * max(size_px), 0.1 * max(size_px))
         p, rest = p + step[:5], rest + step[5:]
-        left = left - design @ step
-        sigma = max(_MAD * float(np.median(np.abs(left))), 1e-9)
-        weight = np.clip(1.0 - (left / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
+        residuals = residuals - design @ step
+        sigma = max(_MAD * float(np.median(np.abs(residuals))), 1e-9)
+        weight = np.clip(1.0 - (residuals / (_TUKEY * sigma)) ** 2, 0.0, None) ** 2
         if np.abs(step[:2]).max() < 1e-3 and np.abs(step[2:5]).max() < 1e-7:
             break
-    return _Fit(p, rest[-5:], design, left, weight, sigma)
+    return _Fit(p, rest[-5:], design, residuals, weight, sigma)
 
 
 def block_means(
@@ -233,9 +233,9 @@ def block_means(
             centres.append(((j + 0.5) * block_px - 0.5, (i + 0.5) * block_px - 0.5))
             full = saturated is not None and bool(saturated[part][mask[part]].mean() > 1e-3)
             middle = np.median(values)
-            spread = _MAD * np.median(np.abs(values - middle))
-            kept = values[np.abs(values - middle) <= 4.0 * max(float(spread), 1e-9)]
-            means.append(np.nan if full or not len(kept) else float(kept.mean()))
+            scatter = _MAD * np.median(np.abs(values - middle))
+            inliers = values[np.abs(values - middle) <= 4.0 * max(float(scatter), 1e-9)]
+            means.append(np.nan if full or not len(inliers) else float(inliers.mean()))
     return np.array(centres), np.array(means)
 
 
@@ -257,19 +257,19 @@ def dust_spots(ratio: NDArray[np.float32], *, smooth_px: int = 5, least_depth: f
     """
     from scipy import ndimage
 
-    known = np.isfinite(ratio)
-    filled = np.where(known, ratio, 1.0)
-    smooth = ndimage.uniform_filter(filled, smooth_px)
+    is_known = np.isfinite(ratio)
+    filled_ratio = np.where(is_known, ratio, 1.0)
+    smooth = ndimage.uniform_filter(filled_ratio, smooth_px)
     middle = float(np.median(smooth))
-    spread = _MAD * float(np.median(np.abs(smooth - middle)))
-    dark = smooth < middle - max(least_depth, 6.0 * spread)
+    scatter = _MAD * float(np.median(np.abs(smooth - middle)))
+    dark = smooth < middle - max(least_depth, 6.0 * scatter)
     labels, _ = ndimage.label(dark)
     spots = []
     for label, where in enumerate(ndimage.find_objects(labels), 1):
-        mine = labels[where] == label
-        at = np.argwhere(mine).mean(axis=0) + np.array([where[0].start, where[1].start])
-        depth = float(middle - smooth[where][mine].min())
-        spots.append(Spot(float(at[1]), float(at[0]), int(mine.sum()), depth))
+        inside = labels[where] == label
+        at = np.argwhere(inside).mean(axis=0) + np.array([where[0].start, where[1].start])
+        depth = float(middle - smooth[where][inside].min())
+        spots.append(Spot(float(at[1]), float(at[0]), int(inside.sum()), depth))
     return sorted(spots, key=lambda spot: -spot.depth)
 
 
@@ -301,22 +301,22 @@ def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int,
 def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> Floats:
     """Covariance of a weighted fit in which the errors of a block are the same in all views."""
     scale = np.linalg.norm(design, axis=0)
-    scaled = design / scale
-    bread = np.linalg.inv(scaled.T @ (scaled * weight[:, None]))
+    scaled_design = design / scale
+    bread = np.linalg.inv(scaled_design.T @ (scaled_design * weight[:, None]))
     _, cluster = np.unique(pixels, axis=0, return_inverse=True)
     order = np.argsort(cluster.ravel(), kind="stable")
     starts = np.flatnonzero(np.diff(cluster.ravel()[order])) + 1
     scores = []
     for members in np.split(order, starts):
-        mine, root = scaled[members], np.sqrt(weight[members])
-        hat = (root[:, None] * mine) @ bread @ (mine * root[:, None]).T
+        member_design, root = scaled_design[members], np.sqrt(weight[members])
+        hat = (root[:, None] * member_design) @ bread @ (member_design * root[:, None]).T
         # A block at the field's rim has leverage on the fit; its residual is that of a fit without it.
         alone = np.linalg.solve(np.eye(len(members)) - hat, root * left[members])
-        scores.append((mine * root[:, None]).T @ alone)
+        scores.append((member_design * root[:, None]).T @ alone)
     middle = np.array(scores).T @ np.array(scores)
     # Derivative of the weighted residuals by a step: that of Tukey's psi, which is less than its weight.
     u2 = 1.0 - np.sqrt(weight)
-    answer = np.linalg.inv(scaled.T @ (scaled * (np.sqrt(weight) * (1.0 - 5.0 * u2))[:, None]))
+    answer = np.linalg.inv(scaled_design.T @ (scaled_design * (np.sqrt(weight) * (1.0 - 5.0 * u2))[:, None]))
     return np.asarray(answer @ middle @ answer / scale / scale[:, None])
 
 

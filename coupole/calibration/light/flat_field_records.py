@@ -63,17 +63,17 @@ def flat_field_outcome(
     if not frames.lit:
         raise InputError("flat field: no frame with light; acquire `coupole plan new flat-field`")
     by_view = _brightest(frames)
-    base_from_panel = _plane_before([found[0].base_from_camera for found in by_view.values()], panel_mm)
+    base_from_panel = _plane_before([group[0].base_from_camera for group in by_view.values()], panel_mm)
     dark = dark_signal(frames, dark_record)
     channels = channels_of(frames.pattern)
     straight = {channel: linearise(response_record, channel, frames) for channel in channels}
     width, height = size_px = frames.size_px
     views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
-    for number, ((view, light), found) in enumerate(by_view.items()):
-        for channel, reduced in _reduced(
-            f"{view}/{light}", found, frames, dark, straight, base_from_panel
+    for number, ((view, light), group) in enumerate(by_view.items()):
+        for channel, block_view in _reduced(
+            f"{view}/{light}", group, frames, dark, straight, base_from_panel
         ).items():
-            views[channel].append(reduced)
+            views[channel].append(block_view)
         progress(number + 1, len(by_view))
     fits = {
         channel: fit_flat_field(views[channel], channel=channel, focal_px=frames.focal_px, size_px=size_px)
@@ -85,7 +85,7 @@ def flat_field_outcome(
     parameters, covariance = _flat_parameters(fits)
     corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
     worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
-    rejected = max(fit.rejected for fit in fits.values())
+    rejected_share = max(fit.rejected for fit in fits.values())
     deepest = max((spot.depth for spot in spots), default=0.0)
     dust = [f"({s.column_px:.0f}, {s.row_px:.0f}) by {s.depth:.1%}" for s in spots[:5]]
     remarks = [f"{len(spots)} dust spots on the sensor, the deepest at {', '.join(dust)}"] if spots else []
@@ -100,7 +100,7 @@ def flat_field_outcome(
         partial(pictures.draw_flat_field, fits, ratio, spots),
         limits=(
             limit_of("uncertainty in the field's corners", worst, _MOST_FLAT_U),
-            limit_of("share of blocks left out", rejected, 0.05),
+            limit_of("share of blocks left out", rejected_share, 0.05),
             limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
         ),
         files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
@@ -122,12 +122,12 @@ def _reduced(
     mean, black = mean_of(found), dark(found[0])
     height, width = mean.shape
     block_px = max(8, 2 * round(width / _BLOCKS / 2))
-    saturated = _any_saturated(found, frames.white_dn)
+    is_saturated = _any_saturated(found, frames.white_dn)
     views = {}
     for channel, linear in straight.items():
         mask = channel_mask((height, width), frames.pattern, channel)
         signal = linear(np.asarray(mean - black, np.float64))
-        pixels, values = block_means(signal, mask, block_px, saturated=saturated)
+        pixels, values = block_means(signal, mask, block_px, saturated=is_saturated)
         pose = found[0].base_from_camera
         places = panel_places(pixels, frames.focal_px, (width, height), pose, base_from_panel)
         views[channel] = FlatView(name, pixels, values, places)
@@ -139,16 +139,16 @@ def _brightest(frames: LightFrames) -> dict[tuple[str, Light], list[LightFrame]]
 
     Raises InputError if fewer than three views have such frames.
     """
-    found: dict[tuple[str, Light], list[LightFrame]] = {}
+    groups: dict[tuple[str, Light], list[LightFrame]] = {}
     for frame in sorted(frames.lit, key=lambda frame: -frame.exposure_us):
-        mine = found.setdefault((frame.view, frame.shot.light), [])
-        usable = not mine and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
-        if usable or (mine and mine[0].exposure_us == frame.exposure_us):
-            mine.append(frame)
-    views = {key: mine for key, mine in found.items() if mine}
+        group = groups.setdefault((frame.view, frame.shot.light), [])
+        usable = not group and bool(np.mean(frame.read() >= frames.white_dn) < _MOST_SATURATED)
+        if usable or (group and group[0].exposure_us == frame.exposure_us):
+            group.append(frame)
+    views = {key: group for key, group in groups.items() if group}
     if len(views) < 3:
         raise InputError(
-            f"flat field: expected three views or more that are not saturated, found {len(views)} of {len(found)}"
+            f"flat field: expected three views or more that are not saturated, found {len(views)} of {len(groups)}"
             "; bracket the exposure downwards"
         )
     return views
@@ -179,11 +179,11 @@ def _flat_parameters(fits: Mapping[str, FlatField]) -> tuple[list[Parameter], Fl
                 Parameter(
                     name=f"{name}.{channel}",
                     value=float(value),
-                    u=float(one),
+                    u=float(sigma),
                     degrees_of_freedom=fit.degrees_of_freedom,
                     dominated_by="pixels' own responses",
                 )
-                for name, value, one in zip(names, values, u, strict=True)
+                for name, value, sigma in zip(names, values, u, strict=True)
             ]
             blocks.append(covariance)
     return parameters, block_diagonal(blocks)
@@ -203,40 +203,40 @@ def _ratio(
     width, height = size_px
     total, squares = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in fits}
-    for found in views:
-        signal = mean_of(found) - dark(found[0])
+    for view_frames in views:
+        signal = mean_of(view_frames) - dark(view_frames[0])
         for channel, fit in fits.items():
             ratio = np.zeros((height, width), np.float32)
             for first in range(0, height, _ROWS):
                 rows = slice(first, min(first + _ROWS, height))
                 at = np.argwhere(masks[channel][rows]) + np.array([first, 0])
                 pixels = at[:, ::-1].astype(float)
-                pose = found[0].base_from_camera
+                pose = view_frames[0].base_from_camera
                 x, y = panel_places(pixels, fit.focal_px, size_px, pose, base_from_panel).T / 100.0
                 shine = np.exp(np.column_stack([x, y, x * x, x * y, y * y]) @ fit.panel)
                 values = straight[channel](signal[at[:, 0], at[:, 1]].astype(np.float64))
                 ratio[at[:, 0], at[:, 1]] = values / (fit.at(pixels) * shine)
-            mine = ratio[masks[channel]]
-            mine /= np.float32(np.median(mine))
-            total[masks[channel]] += mine
-            squares[masks[channel]] += (mine - 1) ** 2
+            channel_ratio = ratio[masks[channel]]
+            channel_ratio /= np.float32(np.median(channel_ratio))
+            total[masks[channel]] += channel_ratio
+            squares[masks[channel]] += (channel_ratio - 1) ** 2
     mean = total / np.float32(len(views))
     variance = (squares / np.float32(len(views)) - (mean - 1) ** 2) / (len(views) - 1)
     return mean, float(np.sqrt(max(float(variance.mean(dtype=np.float64)), 0.0)))
 
 
 def _any_saturated(frames: Sequence[LightFrame], white_dn: int) -> NDArray[np.bool_]:
-    found = frames[0].read() >= white_dn
+    is_saturated = frames[0].read() >= white_dn
     for frame in frames[1:]:
-        found |= frame.read() >= white_dn
-    return found
+        is_saturated |= frame.read() >= white_dn
+    return is_saturated
 
 
 def _map_of_pattern(maps: Mapping[str, NDArray[np.float32]], pattern: str) -> NDArray[np.float32]:
     """[H, W] with the pixels of each channel from that channel's map."""
     shape = next(iter(maps.values())).shape
-    found = np.zeros(shape, np.float32)
+    pattern_map = np.zeros(shape, np.float32)
     for channel, values in maps.items():
         mask = channel_mask((shape[0], shape[1]), pattern, channel)
-        found[mask] = values[mask]
-    return found
+        pattern_map[mask] = values[mask]
+    return pattern_map

@@ -103,11 +103,11 @@ class LightFrames:
         joints_deg = [frame.joints_deg for frame in self.frames if frame.joints_deg is not None]
         if len(joints_deg) < len(self.frames):
             raise InputError("frames without the arm's joints cannot be corrected by its axis zeros")
-        reported = np.stack([frame.base_from_flange for frame in self.frames]).reshape(-1, 16)
-        rows = np.concatenate([reported, np.array(joints_deg)], axis=1)
-        distinct, which = np.unique(rows, axis=0, return_inverse=True)  # a view's frames share a pose
-        found = corrected_poses(distinct[:, :16].reshape(-1, 4, 4), distinct[:, 16:], arm)
-        return list(found[which.reshape(-1)])
+        reported_poses = np.stack([frame.base_from_flange for frame in self.frames]).reshape(-1, 16)
+        rows = np.concatenate([reported_poses, np.array(joints_deg)], axis=1)
+        distinct, pose_of_frame = np.unique(rows, axis=0, return_inverse=True)  # a view's frames share a pose
+        poses = corrected_poses(distinct[:, :16].reshape(-1, 4, 4), distinct[:, 16:], arm)
+        return list(poses[pose_of_frame.reshape(-1)])
 
 
 def open_light_frames(paths: Sequence[Path]) -> LightFrames:
@@ -120,14 +120,14 @@ def open_light_frames(paths: Sequence[Path]) -> LightFrames:
         run = Run(path)
         inputs.append((f"{run.folder.name}/run.json", sha256(run.folder / "run.json")))
         for view_path, proven in _by_view(run).items():
-            found, here = _of_view(run, view_path, proven)
+            view_frames, here = _of_view(run, view_path, proven)
             if common is not None and here != common:
                 raise InputError(
                     f"{view_path}: expected frames as in the files before it ({common}), found {here}; calibrate "
                     "from runs of one camera, lens and gain"
                 )
             common = here
-            frames += found
+            frames += view_frames
             inputs.append((f"{run.folder.name}/views/{view_path.name}", frames_sha256(proven)))
     if common is None or not frames:
         raise InputError(f"{', '.join(map(str, paths))}: no proven frame; acquire the plan first")
@@ -150,18 +150,18 @@ def channels_of(pattern: str) -> tuple[str, ...]:
 
 def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
     """Lowest and highest, C; None if no frame has one."""
-    known = [frame.temperature_c for frame in frames if np.isfinite(frame.temperature_c)]
-    return (min(known), max(known)) if known else None
+    temperatures_c = [frame.temperature_c for frame in frames if np.isfinite(frame.temperature_c)]
+    return (min(temperatures_c), max(temperatures_c)) if temperatures_c else None
 
 
 def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
     """Proven frames by their view's file, without marks: these are dark, but light may still glow when they
     end."""
-    found: dict[Path, list[FrameProven]] = {}
+    frames_of: dict[Path, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
         if not isinstance(shot.light, PanelMark):
-            found.setdefault(run.view_path(shot.view), []).append(frame)
-    return found
+            frames_of.setdefault(run.view_path(shot.view), []).append(frame)
+    return frames_of
 
 
 def _of_view(

@@ -79,9 +79,9 @@ def irradiance_per_flux(
     towards = centres - points
     distance = np.linalg.norm(towards, axis=-1)
     cos_led = -np.sum(towards * axes, axis=-1) / distance
-    reached = (cos_led > 0.0) & (np.sum(towards * facing, axis=-1) > 0.0)
+    is_lit = (cos_led > 0.0) & (np.sum(towards * facing, axis=-1) > 0.0)
     value = np.sum(vector * facing, axis=-1) / (2.0 * np.pi * area_m2)
     if emission == "paper":
         value = value * cos_led
-    result: Floats = np.where(reached, np.maximum(value, 0.0), 0.0)
+    result: Floats = np.where(is_lit, np.maximum(value, 0.0), 0.0)
     return result

@@ -87,7 +87,7 @@ def prior_of(tile: Tile, places: int = 1) -> Floats:
 
 def _common_names(places: Sequence[int]) -> tuple[str, ...]:
     """[c] names of the shared figures, in the order of `prior_of`."""
-    of_places = [f"place{p}.{what}" for p in places for what in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
+    of_places = [f"place{p}.{figure}" for p in places for figure in ("tilt_x_deg", "tilt_y_deg", "height_mm")]
     return (*of_places, "ln_reflectance", "minnaert")
 
 
@@ -115,39 +115,39 @@ def calibrate_led_power(
     lit_elsewhere: set[int] = set()
     for v, view in enumerate(views):
         place = places.index(view.place)
-        found, not_used = rows_of(
+        view_rows, not_used = rows_of(
             v, view, positions, tile, emission,
             side_mm=side_mm, place=place, figures=len(names), remarks=remarks,
         )  # fmt: skip
-        rows += found
+        rows += view_rows
         lit_elsewhere |= not_used
     if not rows:
         raise InputError("LED power: no LED could be used: " + ("; ".join(remarks[:5]) or "all are too low"))
     rows, dead = without_dark(rows, views, ids, lit_elsewhere, remarks)
     y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
-    solved = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
+    solution = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
     redundancy = max(1.0, float(len(y) - len(np.unique(led))))
-    chi2 = float(np.sum(w * solved.left**2))
+    chi2 = float(np.sum(w * solution.left**2))
     factor = max(1.0, chi2 / redundancy) if len(y) > len(np.unique(led)) else 1.0
-    _refuse_moved(views, view_of, solved.left, w, design, redundancy)
-    used = np.zeros(len(ids), bool)
-    used[np.unique(led)] = True
-    power = np.where(used, np.exp(np.where(used, solved.log_power, 0.0)), np.nan)
+    _refuse_moved(views, view_of, solution.left, w, design, redundancy)
+    is_used = np.zeros(len(ids), bool)
+    is_used[np.unique(led)] = True
+    power = np.where(is_used, np.exp(np.where(is_used, solution.log_power, 0.0)), np.nan)
     power[dead] = 0.0
-    own = np.where(used, np.sqrt(factor / np.maximum(solved.weight, 1e-300)), np.nan)
-    missing = ids[~used & ~dead]
+    own_u = np.where(is_used, np.sqrt(factor / np.maximum(solution.weight, 1e-300)), np.nan)
+    missing = ids[~is_used & ~dead]
     if len(missing):
         remarks.append(f"{len(missing)} LEDs have no usable picture: {list_of(missing)}")
     return LedPower(
         ids,
         power,
-        own,
-        np.where(used[:, None], -solved.mean_design, np.nan),
+        own_u,
+        np.where(is_used[:, None], -solution.mean_design, np.nan),
         names,
-        solved.covariance,
-        solved.theta,
+        solution.covariance,
+        solution.theta,
         float(np.sqrt(factor / np.median(w))),
-        _by_view(views, view_of, ids[led], solved.left),
+        _by_view(views, view_of, ids[led], solution.left),
         tuple(remarks),
         redundancy,
     )
@@ -159,11 +159,11 @@ def _by_view(
     """Residuals of each view in the order of its LEDs [n]; NaN where an LED was not used."""
     residuals = []
     for v, view in enumerate(views):
-        mine = np.full(len(view.leds), np.nan)
+        view_residuals = np.full(len(view.leds), np.nan)
         where = {int(i): n for n, i in enumerate(view.leds)}
         for n in np.flatnonzero(view_of == v):
-            mine[where[int(led_of[n])]] = left[n]
-        residuals.append(mine)
+            view_residuals[where[int(led_of[n])]] = left[n]
+        residuals.append(view_residuals)
     return tuple(residuals)
 
 
@@ -186,8 +186,8 @@ def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: in
     mean_y = np.bincount(led, w * y, leds) / safe
     mean_design: Floats = np.column_stack([np.bincount(led, w * column, leds) / safe for column in design.T])
     off_y, off = y - mean_y[led], design - mean_design[led]
-    believed = np.maximum(prior, LEAST_PRIOR)
-    normal = np.diag(believed**-2.0) + off.T @ (off * w[:, None])
+    prior_sigmas = np.maximum(prior, LEAST_PRIOR)
+    normal = np.diag(prior_sigmas**-2.0) + off.T @ (off * w[:, None])
     covariance: Floats = np.asarray(np.linalg.inv(normal), np.float64)
     theta: Floats = covariance @ (off.T @ (w * off_y))
     return _Solved(mean_y - mean_design @ theta, weight, mean_design, theta, covariance, off_y - off @ theta)
@@ -203,11 +203,11 @@ def _refuse_moved(
 ) -> None:
     """Raise InputError if one view fits far better with its own tilt, although it has the same place as others."""
     for place in {view.place for view in views}:
-        mine = [v for v, view in enumerate(views) if view.place == place]
-        if len(mine) < 2:
+        members = [v for v, view in enumerate(views) if view.place == place]
+        if len(members) < 2:
             continue
         best: tuple[float, int, float] = (0.0, -1, 0.0)
-        for v in mine:
+        for v in members:
             at = view_of == v
             columns = [c for c in range(design.shape[1] - 2) if c % OF_PLACE < 2 and np.any(design[at][:, c])]
             if at.sum() < 10 or not columns:
@@ -216,7 +216,7 @@ def _refuse_moved(
             normal = part.T @ (part * w[at, None])
             step = np.linalg.solve(normal, part.T @ (w[at] * left[at]))
             # The fit absorbs a part of a view's own tilt, which the residuals therefore do not show.
-            share = len(mine) / (len(mine) - 1.0)
+            share = len(members) / (len(members) - 1.0)
             gain = float(step @ normal @ step) * share
             noise = max(1.0, (float(np.sum(w * left**2)) - gain) / redundancy)
             gain /= noise

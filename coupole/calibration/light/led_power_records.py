@@ -33,11 +33,11 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
     by_view: dict[tuple[str, float], list[LightFrame]] = {}
     for frame in lit:
         by_view.setdefault((frame.view, frame.exposure_us), []).append(frame)
-    read = TileReader(frames, setting, lit[0].read().shape)
+    reader = TileReader(frames, setting, lit[0].read().shape)
     views: dict[str, list[TileView]] = {channel: [] for channel in channels}
     tell = counter(progress, len(lit))
-    for found in by_view.values():
-        for channel, view in read.view(found, tell).items():
+    for view_frames in by_view.values():
+        for channel, view in reader.view(view_frames, tell).items():
             views[channel].append(view)
     powers = {
         channel: calibrate_led_power(views[channel], setting.positions, setting.tile, emission=setting.emission)
@@ -46,13 +46,13 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
     warm = board_temperatures(lit)
     covariance = covariance_of(powers, prior_of(setting.tile))
     parameters = _parameters(powers, covariance)
-    height, width = read.shape
+    height, width = reader.shape
     green = powers["G"]
     good = np.isfinite(green.power) & (green.power > 0)
     typical = float(np.median(green.u_against_mean()[good]))
     unusable = float(np.mean(~np.isfinite(green.power)))
-    others = np.setdiff1d(setting.positions.ids, green.ids)
-    remarks = [f"{len(others)} LEDs of the dome have no frame: {list_of(others)}"] if len(others) else []
+    other_ids = np.setdiff1d(setting.positions.ids, green.ids)
+    remarks = [f"{len(other_ids)} LEDs of the dome have no frame: {list_of(other_ids)}"] if len(other_ids) else []
     remarks += list(dict.fromkeys(remark for power in powers.values() for remark in power.remarks))
     return sealed_outcome(
         "led-power",
@@ -78,11 +78,11 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
 
 def board_temperatures(lit: Sequence[LightFrame]) -> dict[int, float]:
     """Mean temperature of each LED's board over its frames, C, for which its power holds; NaN if not known."""
-    seen: dict[int, list[float]] = {}
+    temperatures_c: dict[int, list[float]] = {}
     for frame in lit:
         assert frame.led is not None, "only frames under LEDs are read"
-        seen.setdefault(frame.led, []).append(frame.temperature_c)
-    return {led: float(np.mean(celsius)) for led, celsius in seen.items()}
+        temperatures_c.setdefault(frame.led, []).append(frame.temperature_c)
+    return {led: float(np.mean(celsius)) for led, celsius in temperatures_c.items()}
 
 
 def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) -> str:
@@ -110,12 +110,12 @@ def power_table(powers: Mapping[str, LedPower], board_c: Mapping[int, float]) ->
 
 def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Parameter]:
     """The mean power and the shared figures, by channel; the power of each LED is in the table."""
-    found = []
+    parameters = []
     u = iter(np.sqrt(np.diag(covariance)))
     for channel, power in powers.items():
         names = ["mean_power", *power.common_names]
         values = [_mean_and_slopes(power)[0], *power.found]
-        found += [
+        parameters += [
             Parameter(
                 name=f"{name}.{channel}",
                 value=float(value),
@@ -125,7 +125,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
             )
             for name, value in zip(names, values, strict=True)
         ]
-    return found
+    return parameters
 
 
 def _mean_and_slopes(power: LedPower) -> tuple[float, Floats]:
@@ -142,16 +142,16 @@ def covariance_of(powers: Mapping[str, LedPower], prior: Floats) -> Floats:
     """
     size = 1 + len(prior)
     whole = np.zeros((size * len(powers), size * len(powers)))
-    believed = np.diag(np.maximum(prior, LEAST_PRIOR) ** -2.0)
+    prior_weights = np.diag(np.maximum(prior, LEAST_PRIOR) ** -2.0)
     by_common = [np.vstack([_mean_and_slopes(power)[1], np.eye(len(prior))]) for power in powers.values()]
-    for i, one in enumerate(powers.values()):
-        for j, other in enumerate(powers.values()):
-            between = one.common_covariance
+    for i, first in enumerate(powers.values()):
+        for j, second in enumerate(powers.values()):
+            between = first.common_covariance
             if i != j:
-                between = between @ believed @ other.common_covariance
+                between = between @ prior_weights @ second.common_covariance
             block = by_common[i] @ between @ by_common[j].T
             if i == j:
-                good = np.isfinite(one.power) & (one.power > 0)
-                block[0, 0] += float(np.sum((one.power[good] * one.u_own[good]) ** 2)) / good.sum() ** 2
+                good = np.isfinite(first.power) & (first.power > 0)
+                block[0, 0] += float(np.sum((first.power[good] * first.u_own[good]) ** 2)) / good.sum() ** 2
             whole[i * size : (i + 1) * size, j * size : (j + 1) * size] = block
     return whole

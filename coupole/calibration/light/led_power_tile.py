@@ -83,12 +83,12 @@ class TileReader:
         base_from_camera = found[0].base_from_camera
         points_mm, pixels = self.patches(base_from_camera)
         _refuse_few(min(map(len, pixels)))
-        seen = {channel: np.zeros((2, len(found), len(points_mm))) for channel in self._masks}
-        saturated = np.zeros(len(found), np.bool_)
+        signals = {channel: np.zeros((2, len(found), len(points_mm))) for channel in self._masks}
+        is_saturated = np.zeros(len(found), np.bool_)
         for n, frame in enumerate(found):
             for channel, (mean, u, full) in self.means(frame, pixels).items():
-                seen[channel][:, n] = mean, u
-                saturated[n] |= full
+                signals[channel][:, n] = mean, u
+                is_saturated[n] |= full
             tell()
         leds = np.array([frame.led for frame in found], dtype=np.int64)
         return {
@@ -101,9 +101,9 @@ class TileReader:
                 leds,
                 signal,
                 u_signal,
-                saturated,
+                is_saturated,
             )
-            for channel, (signal, u_signal) in seen.items()
+            for channel, (signal, u_signal) in signals.items()
         }
 
     def sees(self, base_from_camera: Floats) -> bool:
@@ -120,15 +120,15 @@ class TileReader:
         corners, middles = [], []
         for i in range(_PATCHES):
             for j in range(_PATCHES):
-                (left, right), (top, bottom) = edges[i : i + 2], edges[j : j + 2]
-                corners += [(left, top), (right, top), (right, bottom), (left, bottom)]
-                middles.append((0.5 * (left + right), 0.5 * (top + bottom)))
+                (left_mm, right_mm), (top_mm, bottom_mm) = edges[i : i + 2], edges[j : j + 2]
+                corners += [(left_mm, top_mm), (right_mm, top_mm), (right_mm, bottom_mm), (left_mm, bottom_mm)]
+                middles.append((0.5 * (left_mm + right_mm), 0.5 * (top_mm + bottom_mm)))
         camera_from_tile = np.linalg.inv(base_from_camera) @ base_from_tile
         flat = np.column_stack([np.array(corners), np.zeros(len(corners))])
-        seen = flat @ camera_from_tile[:3, :3].T + camera_from_tile[:3, 3]
+        in_camera_mm = flat @ camera_from_tile[:3, :3].T + camera_from_tile[:3, 3]
         pixels = [np.zeros((0, 2), np.intp)] * len(middles)
-        if (seen[:, 2] > 0).all():
-            polygons = optics.project(seen, self._setting.lens.vector()).pixels.reshape(-1, 4, 2)
+        if (in_camera_mm[:, 2] > 0).all():
+            polygons = optics.project(in_camera_mm, self._setting.lens.vector()).pixels.reshape(-1, 4, 2)
             pixels = [_inside(polygon, self.shape) for polygon in polygons]
         points = np.column_stack([np.array(middles), np.zeros(len(middles))])
         return points @ base_from_tile[:3, :3].T + base_from_tile[:3, 3], pixels
@@ -140,19 +140,19 @@ class TileReader:
         saturated."""
         raw = frame.read()
         signal = raw - self._dark(frame)
-        found = {}
+        means_of = {}
         for channel, mask in self._masks.items():
-            means, us, full = np.zeros(len(patches)), np.zeros(len(patches)), False
+            means, u_means, full = np.zeros(len(patches)), np.zeros(len(patches)), False
             for p, pixels in enumerate(patches):
                 rows, columns = pixels[mask[pixels[:, 0], pixels[:, 1]]].T
                 values = self._straight[channel](signal[rows, columns].astype(np.float64))
                 if self._flat is not None:
                     values = values / self._flat[rows, columns]
                 values = values / (frame.exposure_us * 1e-6)
-                means[p], us[p] = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
+                means[p], u_means[p] = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
                 full |= bool((raw[rows, columns] >= self._white_dn).any())
-            found[channel] = means, us, full
-        return found
+            means_of[channel] = means, u_means, full
+        return means_of
 
 
 def _refuse_few(least: int) -> None:

@@ -55,8 +55,8 @@ class Linearity:
     def linear(self, signal_dn: Floats) -> Floats:
         """Linearised signal; same shape, DN above dark."""
         x = signal_dn / self.range_dn
-        corrected: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
-        return corrected
+        linear_dn: Floats = signal_dn * (1.0 + x * (self.coefficients[0] + x * self.coefficients[1]))
+        return linear_dn
 
 
 def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1e-3) -> Linearity:
@@ -67,18 +67,18 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     brighter.
     """
     refuse_all_clipped(pairs)
-    ordered = sorted(pairs, key=lambda pair: pair.exposure_us)
-    signals, u_signals = _grouped(ordered)
-    seen = np.asarray(np.isfinite(signals).any(axis=0))
-    ordered = [pair for pair, use in zip(ordered, seen, strict=True) if use]
-    signals, u_signals = signals[:, seen], u_signals[:, seen]
-    exposures = np.array([pair.exposure_us for pair in ordered])
+    ordered_pairs = sorted(pairs, key=lambda pair: pair.exposure_us)
+    signals, u_signals = _grouped(ordered_pairs)
+    is_seen = np.asarray(np.isfinite(signals).any(axis=0))
+    ordered_pairs = [pair for pair, use in zip(ordered_pairs, is_seen, strict=True) if use]
+    signals, u_signals = signals[:, is_seen], u_signals[:, is_seen]
+    exposures = np.array([pair.exposure_us for pair in ordered_pairs])
     if len(np.unique(exposures)) < 4:
         raise InputError(
             f"response: expected four exposures or more, found {len(np.unique(exposures))}; use a bracket"
         )
-    flicker = _flicker(ordered)
-    _refuse_contradictions(ordered, signals, flicker)
+    flicker = _flicker(ordered_pairs)
+    _refuse_contradictions(ordered_pairs, signals, flicker)
     fit = _fit(signals, u_signals, exposures, range_dn, flicker)
     coefficients, c_covariance = fit.coefficients, fit.covariance[:2, :2]
     x = np.linspace(0.05, 0.95, 91)
@@ -88,7 +88,7 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     worst = int(np.argmax(np.abs(deviation)))
     u_worst = float(np.sqrt(max(float(basis[:, worst] @ c_covariance @ basis[:, worst]), 0.0)))
     unlikely = float(chdtrc(2, coefficients @ np.linalg.solve(c_covariance, coefficients)))
-    _refuse_other_scene(ordered, fit.left, np.isfinite(signals), signals, u_signals)
+    _refuse_other_scene(ordered_pairs, fit.left, np.isfinite(signals), signals, u_signals)
     return Linearity(
         coefficients if unlikely < significance else np.zeros(2),
         c_covariance,
@@ -119,7 +119,7 @@ class _Fit:
 
 def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float, flicker: float) -> _Fit:
     """Curve, time offset (ms), logarithm of each group's rate over its start, relative light of each exposure."""
-    known = np.isfinite(signals)
+    is_known = np.isfinite(signals)
     start = np.nanmedian(signals / exposures, axis=1)
     scatter = max(flicker / np.sqrt(2.0), 1e-6)
 
@@ -131,15 +131,15 @@ def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float,
     def residuals(p: Floats) -> Floats:
         x = signals / range_dn
         made_linear = signals * (1.0 + x * (p[0] + x * p[1]))
-        left = (made_linear - expected(p)) / u_signals
-        return np.concatenate([left[known], p[-len(exposures) :] / scatter])
+        scaled_residuals = (made_linear - expected(p)) / u_signals
+        return np.concatenate([scaled_residuals[is_known], p[-len(exposures) :] / scatter])
 
     fit = least_squares(residuals, np.zeros(3 + len(start) + len(exposures)), method="trf", x_scale="jac")
     degrees = max(1, len(fit.fun) - len(fit.x))
     factor = max(1.0, 2.0 * fit.cost / degrees)  # Birge ratio: never smaller than the scatter of the data shows
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * factor
     deviations = signals / expected(fit.x) - 1.0
-    return _Fit(fit.x[:2], 1e3 * fit.x[2], covariance[:3, :3], fit.fun[: known.sum()], deviations)
+    return _Fit(fit.x[:2], 1e3 * fit.x[2], covariance[:3, :3], fit.fun[: is_known.sum()], deviations)
 
 
 def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
@@ -163,13 +163,13 @@ def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
 
 def _flicker(pairs: Sequence[Pair]) -> float:
     """Relative standard deviation of the light from frame to frame, from the two frames of each pair."""
-    found = []
+    differences = []
     for pair in pairs:
         keep = ~pair.saturated
         total = pair.first[keep].sum() + pair.second[keep].sum()
         if total > 0:
-            found.append(2.0 * (pair.first[keep].sum() - pair.second[keep].sum()) / total)
-    return float(np.sqrt(np.mean(np.square(found)) / 2.0))
+            differences.append(2.0 * (pair.first[keep].sum() - pair.second[keep].sum()) / total)
+    return float(np.sqrt(np.mean(np.square(differences)) / 2.0))
 
 
 def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: float) -> None:
@@ -207,5 +207,5 @@ def _refuse_other_scene(
 
 def _from_line(x: Floats, relative: Floats) -> Floats:
     """Relative deviations from the proportional line that halves their range."""
-    left: Floats = relative - 0.5 * (relative.max() + relative.min())
-    return left
+    deviations: Floats = relative - 0.5 * (relative.max() + relative.min())
+    return deviations

@@ -36,10 +36,10 @@ class Estimate:
 
 
 def refuse_all_clipped(pairs: Sequence[Pair]) -> None:
-    clipped = [pair for pair in pairs if pair.saturated.mean() > 0.5]
-    if len(clipped) > len(pairs) - 4:
+    bright = [pair for pair in pairs if pair.saturated.mean() > 0.5]
+    if len(bright) > len(pairs) - 4:
         raise InputError(
-            f"response: more than half of the pixels are saturated in {named(clipped)}; expected four exposures "
+            f"response: more than half of the pixels are saturated in {named(bright)}; expected four exposures "
             "or more without. Add shorter ones"
         )
 

@@ -65,7 +65,7 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
         raise InputError("response: expected two frames of each exposure; set `repeats: 2` in the plan")
     refuse_all_clipped(pairs)
     levels, variances, counts = _levels(*_squared_differences(pairs))
-    fit, used = _line_of_sound_levels(levels, variances, counts)
+    fit, is_used = _line_of_sound_levels(levels, variances, counts)
     if fit.slope <= 0.0 or fit.slope < 3.0 * np.sqrt(fit.covariance[1, 1]):
         raise InputError(
             "response: the variance of pixels does not grow with their signal; does the camera process its "
@@ -73,9 +73,9 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
         )
     read_var = fit.intercept - ROUNDING_VARIANCE
     u_read_var = float(np.sqrt(fit.covariance[0, 0]))
-    read = float(np.sqrt(max(read_var, u_read_var**2 / max(read_var, u_read_var))))
+    read_noise_dn = float(np.sqrt(max(read_var, u_read_var**2 / max(read_var, u_read_var))))
     gain = Estimate(fit.slope, float(np.sqrt(fit.covariance[1, 1])))
-    by_intercept, by_gain = 1.0 / (2 * read * fit.slope), -read / fit.slope**2
+    by_intercept, by_gain = 1.0 / (2 * read_noise_dn * fit.slope), -read_noise_dn / fit.slope**2
     slopes = np.array([by_intercept, by_gain])
     u_read_e = float(np.sqrt(slopes @ fit.covariance @ slopes))
     peak = int(np.argmax(np.where(levels > 0, variances, 0.0)))
@@ -84,8 +84,8 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
     saturation_e = saturation_dn / fit.slope
     return PhotonTransfer(
         gain,
-        Estimate(read, u_read_var / (2 * read)),
-        Estimate(read / fit.slope, u_read_e),
+        Estimate(read_noise_dn, u_read_var / (2 * read_noise_dn)),
+        Estimate(read_noise_dn / fit.slope, u_read_e),
         saturation_dn,
         Estimate(saturation_e, saturation_e * gain.u / gain.value),
         saturated_seen,
@@ -95,7 +95,7 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
         levels,
         variances,
         variances * np.sqrt(2.0 / counts),
-        used,
+        is_used,
     )
 
 
@@ -109,7 +109,7 @@ class _Line:
 
 def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
     """Mean of the two frames and their squared difference over 2, at each unsaturated pixel of all pairs."""
-    signal, squared = [], []
+    signal, squares = [], []
     for pair in pairs:
         keep = ~pair.saturated
         if keep.sum() < _LEAST_PIXELS:
@@ -119,30 +119,30 @@ def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
         ratio = float(difference.sum() / max(mean.sum(), 1e-9))
         difference = difference - ratio * mean  # flicker makes one frame of a pair brighter as a whole
         signal.append(mean)
-        squared.append(difference**2 / 2.0)
+        squares.append(difference**2 / 2.0)
     if not signal:
         raise InputError(f"response: {named(pairs)}: nearly all pixels are saturated; add shorter exposures")
-    return np.concatenate(signal), np.concatenate(squared)
+    return np.concatenate(signal), np.concatenate(squares)
 
 
 def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> tuple[_Line, NDArray[np.bool_]]:
     """The line through the levels that are neither saturated nor gross errors, and a mask [levels] of these."""
-    used = np.ones(len(levels), np.bool_)
-    fit = _line(levels, variances, counts, used)
+    is_used = np.ones(len(levels), np.bool_)
+    fit = _line(levels, variances, counts, is_used)
     for _ in range(10):
-        predicted = fit.intercept + fit.slope * levels
+        line_variances = fit.intercept + fit.slope * levels
         # Near saturation noise is clipped: the first level with too little variance and all above are left out.
-        short = (variances < _COLLAPSED * predicted) & (levels > np.median(levels))
+        short = (variances < _COLLAPSED * line_variances) & (levels > np.median(levels))
         beyond = levels >= levels[short].min() if short.any() else np.zeros(len(levels), np.bool_)
-        off = np.abs(variances - predicted) > _GROSS * predicted * np.sqrt(2.0 / counts)
+        off = np.abs(variances - line_variances) > _GROSS * line_variances * np.sqrt(2.0 / counts)
         # A level with a deviation below 3 % is not a gross error: it counts in chi^2.
-        off &= np.abs(variances - predicted) > 0.03 * predicted
+        off &= np.abs(variances - line_variances) > 0.03 * line_variances
         now = ~beyond & ~off
-        if now.sum() < 4 or (now == used).all():
+        if now.sum() < 4 or (now == is_used).all():
             break
-        used = now
-        fit = _line(levels, variances, counts, used)
-    return fit, used
+        is_used = now
+        fit = _line(levels, variances, counts, is_used)
+    return fit, is_used
 
 
 def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
@@ -165,17 +165,17 @@ def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
 def _line(signal: Floats, variance: Floats, counts: Floats, used: NDArray[np.bool_]) -> _Line:
     """Weighted line; weights by the line itself, as weights by single variances would bias it downwards."""
     x, y, n = signal[used], variance[used], counts[used]
-    expected = np.maximum(y, 1e-6)
+    expected_variance = np.maximum(y, 1e-6)
     design = np.column_stack([np.ones_like(x), x])
-    found, covariance = np.zeros(2), np.eye(2)
+    coefficients, covariance = np.zeros(2), np.eye(2)
     for _ in range(6):
-        weight = n / (2.0 * expected**2)
+        weight = n / (2.0 * expected_variance**2)
         covariance = np.asarray(np.linalg.inv(design.T @ (design * weight[:, None])), np.float64)
-        found = covariance @ (design.T @ (weight * y))
-        expected = np.maximum(design @ found, 0.05 * np.maximum(y, 1e-6))
-    left = (y - design @ found) ** 2 * n / (2.0 * expected**2)
-    per_degree = float(left.sum() / max(1, len(x) - 2))
-    return _Line(float(found[0]), float(found[1]), covariance * max(1.0, per_degree), per_degree)
+        coefficients = covariance @ (design.T @ (weight * y))
+        expected_variance = np.maximum(design @ coefficients, 0.05 * np.maximum(y, 1e-6))
+    squares = (y - design @ coefficients) ** 2 * n / (2.0 * expected_variance**2)
+    per_degree = float(squares.sum() / max(1, len(x) - 2))
+    return _Line(float(coefficients[0]), float(coefficients[1]), covariance * max(1.0, per_degree), per_degree)
 
 
 def _prnu(pairs: Sequence[Pair]) -> Estimate | None:

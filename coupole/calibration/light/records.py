@@ -70,7 +70,7 @@ def sealed_outcome(
     more_inputs: Sequence[tuple[str, str]] = (),
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
-    about, given = frames.about, files or {}
+    about, contents = frames.about, files or {}
     record = sealed(
         kind=kind,
         **request.head(),
@@ -80,14 +80,14 @@ def sealed_outcome(
         parameters=tuple(parameters),
         fixed=dict(fixed or {}),
         covariance=rows_of(covariance),
-        files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in given.items()),
+        files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in contents.items()),
         noise=tuple(noise),
         images=(),
         limits=tuple(limits),
         remarks=tuple(remarks),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*frames.inputs, *more_inputs)),
     )
-    return Outcome(record, partial(draw, record), given)
+    return Outcome(record, partial(draw, record), contents)
 
 
 # -- dark -----------------------------------------------------------------------------------------------------
@@ -97,8 +97,8 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
     """Dark frames of runs: maps of offset and current, noise, hot pixels."""
     if not frames.dark:
         raise InputError("dark: no dark frame in these runs; acquire `coupole plan new darks`")
-    listed = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
-    dark = calibrate_dark(listed, white_dn=frames.white_dn, progress=progress)
+    dark_frames = [DarkFrame(str(f.shot), f.exposure_us * 1e-6, f.temperature_c, f.read) for f in frames.dark]
+    dark = calibrate_dark(dark_frames, white_dn=frames.white_dn, progress=progress)
     height, width = dark.offset_dn.shape
     pixels = height * width
     values = {
@@ -115,10 +115,10 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         )
         for name, (value, u) in values.items()
     ]
-    fixed = {"doubling_k": dark.doubling_k, "offset_spread_dn": float(np.std(dark.offset_dn))}
-    fixed |= {} if dark.reference_c is None else {"reference_c": dark.reference_c}
-    fixed |= {f"cofactor.{i}{j}": float(dark.cofactor[i, j]) for i, j in ((0, 0), (0, 1), (1, 1))}
-    fixed["map_degrees_of_freedom"] = float(dark.degrees_of_freedom)
+    fixed_figures = {"doubling_k": dark.doubling_k, "offset_spread_dn": float(np.std(dark.offset_dn))}
+    fixed_figures |= {} if dark.reference_c is None else {"reference_c": dark.reference_c}
+    fixed_figures |= {f"cofactor.{i}{j}": float(dark.cofactor[i, j]) for i, j in ((0, 0), (0, 1), (1, 1))}
+    fixed_figures["map_degrees_of_freedom"] = float(dark.degrees_of_freedom)
     content = h5_of(
         {
             "offset_dn": dark.offset_dn,
@@ -137,7 +137,7 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         partial(pictures.draw_dark, dark),
         limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
         files={f"{request.name}.h5": content},
-        fixed=fixed,
+        fixed=fixed_figures,
         remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
     )
 
@@ -162,16 +162,16 @@ def dark_signal(frames: LightFrames, record_path: Path | None) -> Callable[[Ligh
         # LED boards are warmed by their own light: the coolest has nearly the temperature of the camera.
         warmth = 1.0 if warm is None else warmth_of(warm[0], reference_c, record.value("doubling_k"))
         return lambda frame: offset + current * np.float32(warmth * frame.exposure_us * 1e-6)
-    kept: dict[float, NDArray[np.float32]] = {}
+    dark_of_exposure: dict[float, NDArray[np.float32]] = {}
 
     def of_frames(frame: LightFrame) -> NDArray[np.float32]:
         exposure_us = frame.exposure_us
-        if exposure_us not in kept:
+        if exposure_us not in dark_of_exposure:
             alike = [f for f in frames.dark if f.exposure_us == exposure_us]
             if not alike:
                 return np.full(frame.read().shape, frames.black_dn, np.float32)
-            kept[exposure_us] = mean_of(alike)
-        return kept[exposure_us]
+            dark_of_exposure[exposure_us] = mean_of(alike)
+        return dark_of_exposure[exposure_us]
 
     return of_frames
 
@@ -205,15 +205,15 @@ def response_outcome(
     by_exposure: dict[float, list[LightFrame]] = {}
     for frame in lit:
         by_exposure.setdefault(frame.exposure_us, []).append(frame)
-    single = [exposure_us for exposure_us, found in by_exposure.items() if len(found) < 2]
+    single = [exposure_us for exposure_us, group in by_exposure.items() if len(group) < 2]
     if single:
         raise InputError(
             f"response: expected two frames of each exposure, found one of {single[0]:.0f} us; set `repeats: 2`"
         )
     pairs = _pairs_by_channel(frames, by_exposure, dark_signal(frames, dark_record), progress)
     range_dn = float(frames.white_dn - frames.black_dn)
-    transfers = {channel: photon_transfer(found) for channel, found in pairs.items()}
-    lines = {channel: linearity(found, range_dn) for channel, found in pairs.items()}
+    transfers = {channel: photon_transfer(group) for channel, group in pairs.items()}
+    lines = {channel: linearity(group, range_dn) for channel, group in pairs.items()}
     height, width = lit[0].read().shape
     parameters, covariance = _response_parameters(transfers, lines)
     worst = max(line.u_deviation for line in lines.values())
@@ -256,15 +256,15 @@ def _pairs_by_channel(
     """The first two frames of each exposure, dark signal subtracted."""
     channels = channels_of(frames.pattern)
     pairs: dict[str, list[Pair]] = {channel: [] for channel in channels}
-    for number, (exposure_us, found) in enumerate(sorted(by_exposure.items())):
-        black = dark(found[0])
-        first, second = (frame.read() for frame in found[:2])
+    for number, (exposure_us, exposure_frames) in enumerate(sorted(by_exposure.items())):
+        black = dark(exposure_frames[0])
+        first, second = (frame.read() for frame in exposure_frames[:2])
         for channel in channels:
             take = _sample(first.shape, frames.pattern, channel)
             raw_a, raw_b, under = first[take], second[take], black[take]
             full = np.maximum(raw_a, raw_b) >= frames.white_dn
             a, b = (np.subtract(raw, under, dtype=np.float64) for raw in (raw_a, raw_b))
-            pairs[channel].append(Pair(str(found[0].shot), exposure_us, a, b, full))
+            pairs[channel].append(Pair(str(exposure_frames[0].shot), exposure_us, a, b, full))
         progress(number + 1, len(by_exposure))
     return pairs
 
@@ -283,10 +283,10 @@ def _one_scene(frames: LightFrames) -> list[LightFrame]:
     """The frames of one view under one light: those with the most frames."""
     if not frames.lit:
         raise InputError("response: no frame with light; acquire `coupole plan new response`")
-    counted: dict[tuple[str, Light], list[LightFrame]] = {}
+    frames_of: dict[tuple[str, Light], list[LightFrame]] = {}
     for frame in frames.lit:
-        counted.setdefault((frame.view, frame.shot.light), []).append(frame)
-    return max(counted.values(), key=len)
+        frames_of.setdefault((frame.view, frame.shot.light), []).append(frame)
+    return max(frames_of.values(), key=len)
 
 
 def _sample(shape: tuple[int, ...], pattern: str, channel: str) -> NDArray[np.bool_]:
@@ -302,13 +302,13 @@ def _response_parameters(
 ) -> tuple[list[Parameter], Floats]:
     parameters: list[Parameter] = []
     blocks: list[Floats] = []
-    for channel, found in transfers.items():
+    for channel, transfer in transfers.items():
         line = lines[channel]
-        gain = found.gain_dn_per_e
-        intercept = found.read_noise_dn.value**2 + 1.0 / 12.0
-        freedom = float(max(1, found.used.sum() - 2))
+        gain = transfer.gain_dn_per_e
+        intercept = transfer.read_noise_dn.value**2 + 1.0 / 12.0
+        freedom = float(max(1, transfer.used.sum() - 2))
         values = [
-            ("dark_variance_dn2", intercept, float(np.sqrt(found.covariance[0, 0])), "read noise"),
+            ("dark_variance_dn2", intercept, float(np.sqrt(transfer.covariance[0, 0])), "read noise"),
             ("gain_dn_per_e", gain.value, gain.u, "shot noise"),
             ("c2", float(line.coefficients[0]), float(np.sqrt(line.covariance[0, 0])), "flicker"),
             ("c3", float(line.coefficients[1]), float(np.sqrt(line.covariance[1, 1])), "flicker"),
@@ -320,7 +320,7 @@ def _response_parameters(
         ]
         offset = np.array([[line.time_offset_us.u**2]])
         curve = np.block([[line.covariance, line.with_offset[:, None]], [line.with_offset[None], offset]])
-        blocks += [found.covariance, curve]
+        blocks += [transfer.covariance, curve]
     return parameters, block_diagonal(blocks)
 
 
@@ -367,8 +367,8 @@ def mean_of(frames: Sequence[LightFrame]) -> NDArray[np.float32]:
 
 def counter(progress: Progress, total: int) -> Callable[[], None]:
     """A function that advances a progress bar by one of `total`."""
-    done = count(1)
-    return lambda: progress(next(done), total)
+    numbers = count(1)
+    return lambda: progress(next(numbers), total)
 
 
 def h5_of(arrays: Mapping[str, NDArray[Any]]) -> bytes:

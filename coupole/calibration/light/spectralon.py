@@ -44,8 +44,8 @@ class Tile(Model):
     def brdf(self, cos_in: Floats, cos_out: Floats, *, minnaert: float | None = None) -> Floats:
         """f in 1/sr, for cosines of incidence and observation above 0."""
         k = self.minnaert if minnaert is None else minnaert
-        both = np.maximum(cos_in * cos_out, 1e-12)
-        value: Floats = self.reflectance * (k + 1.0) / (2.0 * np.pi) * both ** (k - 1.0)
+        cos_product = np.maximum(cos_in * cos_out, 1e-12)
+        value: Floats = self.reflectance * (k + 1.0) / (2.0 * np.pi) * cos_product ** (k - 1.0)
         return value
 
 

@@ -135,22 +135,22 @@ def rows_of(
         ratio, u_ratio = view.signal / h, view.u_signal / h
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
     rows: list[Row] = []
-    shaded: list[int] = []
+    shaded_leds: list[int] = []
     for n in np.flatnonzero(usable & ~view.saturated):
         middle = float(np.median(ratio[n]))
         # A shadow's edge across a part raises that part's noise, so the median noise of all parts is used.
         limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
         if (np.abs(ratio[n] - middle) > limit).any():
-            shaded.append(int(view.leds[n]))
+            shaded_leds.append(int(view.leds[n]))
             continue
         total = float(h[n].sum())
         u = float(np.sqrt(np.sum(view.u_signal[n] ** 2)) / total)
         rows.append(Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
-    if shaded:
-        remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded)}; not used")
+    if shaded_leds:
+        remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded_leds)}; not used")
     if (full := view.leds[view.saturated & usable]).size:
         remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
-    return rows, {*shaded, *map(int, full)}
+    return rows, {*shaded_leds, *map(int, full)}
 
 
 def _slopes(
@@ -209,18 +209,20 @@ def without_dark(
         return row.value > max(_DEAD_SIGMA * row.u, _DEAD_SHARE * bright)
 
     alive = {row.led for row in rows if lit(row)} | lit_elsewhere
-    seen = {row.led for row in rows}
-    dead = np.array([int(led) in seen - alive for led in ids])
+    seen_leds = {row.led for row in rows}
+    dead = np.array([int(led) in seen_leds - alive for led in ids])
     if dead.any():
         remarks.append(f"dead LEDs, or hidden in every view: {list_of(ids[dead])}")
     for v, view in enumerate(views):
-        shadowed = [row.led for row in rows if row.view == v and row.led in alive and not lit(row)]
-        if shadowed:
-            remarks.append(f"view {view.name}: the tile is wholly in shadow under {list_of(shadowed)}; not used")
+        shadowed_leds = [row.led for row in rows if row.view == v and row.led in alive and not lit(row)]
+        if shadowed_leds:
+            remarks.append(
+                f"view {view.name}: the tile is wholly in shadow under {list_of(shadowed_leds)}; not used"
+            )
     return [row for row in rows if lit(row)], dead
 
 
 def list_of(ids: Sequence[int] | NDArray[np.int64]) -> str:
     """The first of them by number, as text."""
-    named = ", ".join(f"{int(led)}" for led in list(ids)[:8])
-    return f"LED {named}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")
+    numbers = ", ".join(f"{int(led)}" for led in list(ids)[:8])
+    return f"LED {numbers}" + (f" and {len(ids) - 8} more" if len(ids) > 8 else "")

@@ -84,7 +84,7 @@ def find_stickers(
     window = min(int(4 * largest) | 1, (min(image.shape) // 2) | 1)
     local = cv2.boxFilter(smooth, -1, (window, window), borderType=cv2.BORDER_REFLECT)
     contours, _ = cv2.findContours((smooth > local).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    found: list[Sticker] = []
+    stickers: list[Sticker] = []
     for contour in contours:
         if len(contour) < 2 * np.pi * smallest * 0.5 or len(contour) > 16 * largest:
             continue
@@ -95,9 +95,11 @@ def find_stickers(
         if radii.max() < smallest or radii.min() < LEAST_AXES_RATIO * radii.max():
             continue
         sticker = _sticker(image, np.array([x, y]), radii, np.radians(turn_deg), lens, diameter_mm)
-        if sticker is not None and all(np.linalg.norm(sticker.middle - s.middle) > s.radius_px / 2 for s in found):
-            found.append(sticker)
-    return found
+        if sticker is not None and all(
+            np.linalg.norm(sticker.middle - s.middle) > s.radius_px / 2 for s in stickers
+        ):
+            stickers.append(sticker)
+    return stickers
 
 
 def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
@@ -129,45 +131,45 @@ def circle_poses(ellipse: Ellipse, radius_mm: float) -> tuple[Floats, Floats]:
 def fit_ellipse(points: Floats, floor: float = 0.0) -> Ellipse | None:
     """The ellipse nearest to points [n, 2], by Gauss-Newton on distances to first order, outliers left out; None
     if the points fit no ellipse. `floor` is a lower bound of the noise."""
-    used = np.ones(len(points), np.bool_)
+    keep = np.ones(len(points), np.bool_)
     centre = points.mean(axis=0)
-    spread = np.cov((points - centre).T)
-    values, axes = np.linalg.eigh(spread)
+    scatter = np.cov((points - centre).T)
+    values, axes = np.linalg.eigh(scatter)
     if values[0] <= 0:
         return None
     shape = axes @ np.diag(1 / np.sqrt(2 * values)) @ axes.T
     for _ in range(20):
         off = points - centre
-        turned = off @ shape
-        rho = np.linalg.norm(turned, axis=1)
-        slope = np.linalg.norm(turned @ shape, axis=1) / rho
+        on_circle = off @ shape
+        rho = np.linalg.norm(on_circle, axis=1)
+        slope = np.linalg.norm(on_circle @ shape, axis=1) / rho
         residual = (rho - 1) / slope
-        by_centre = -(turned @ shape) / (rho * slope)[:, None]
+        by_centre = -(on_circle @ shape) / (rho * slope)[:, None]
         by_shape = np.stack(
             [
-                turned[:, 0] * off[:, 0],
-                turned[:, 0] * off[:, 1] + turned[:, 1] * off[:, 0],
-                turned[:, 1] * off[:, 1],
+                on_circle[:, 0] * off[:, 0],
+                on_circle[:, 0] * off[:, 1] + on_circle[:, 1] * off[:, 0],
+                on_circle[:, 1] * off[:, 1],
             ],
             axis=1,
         )
-        jacobian = np.column_stack([by_centre, by_shape / (rho * slope)[:, None]])[used]
-        step, _, rank, _ = np.linalg.lstsq(jacobian, -residual[used], rcond=None)
-        sigma = max(1.4826 * float(np.median(np.abs(residual[used]))), floor)
+        jacobian = np.column_stack([by_centre, by_shape / (rho * slope)[:, None]])[keep]
+        step, _, rank, _ = np.linalg.lstsq(jacobian, -residual[keep], rcond=None)
+        sigma = max(1.4826 * float(np.median(np.abs(residual[keep]))), floor)
         if rank < 5 or not np.isfinite(step).all():
             return None
         centre = centre + step[:2]
         shape = shape + np.array([[step[2], step[3]], [step[3], step[4]]])
         if np.linalg.eigvalsh(shape)[0] <= 0:
             return None
-        used = np.abs(residual) < _FAR_SIGMA * sigma + 1e-15
-        if used.sum() < 12:
+        keep = np.abs(residual) < _FAR_SIGMA * sigma + 1e-15
+        if keep.sum() < 12:
             return None
         if np.linalg.norm(shape @ step[:2]) < 1e-9:
             break
-    rms = float(np.sqrt(np.sum(residual[used] ** 2) / max(int(used.sum()) - 5, 1)))
+    rms = float(np.sqrt(np.sum(residual[keep] ** 2) / max(int(keep.sum()) - 5, 1)))
     covariance = max(rms, floor) ** 2 * np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
-    return Ellipse(centre, shape, covariance, rms, used)
+    return Ellipse(centre, shape, covariance, rms, keep)
 
 
 def _sticker(
@@ -187,11 +189,11 @@ def _sticker(
         return None
     centres, normals = circle_poses(ellipse, diameter_mm / 2)
     points = np.vstack([np.append(ellipse.centre, 1.0), centres])
-    seen = optics.project(points, lens.vector())
-    by_flat = seen.by_point[0, :, :2]  # at depth 1
+    projection = optics.project(points, lens.vector())
+    by_flat = projection.by_point[0, :, :2]  # at depth 1
     return Sticker(
-        seen.pixels[0],
-        seen.pixels[1:],
+        projection.pixels[0],
+        projection.pixels[1:],
         normals,
         by_flat @ ellipse.covariance @ by_flat.T,
         float(widths.max() * lens.fx),

@@ -39,8 +39,8 @@ def _draw_frame(ax: Axes, found: MeshFound) -> None:
             list(outline_px(found, found.scan.mesh)), colors="#6fd08c", linewidths=0.8, label="outline of the mesh"
         )
     )
-    seen = np.array([s.middle for s in found.images.stickers[found.images.shown]])
-    ax.plot(seen[:, 0], seen[:, 1], "o", ms=13, mfc="none", color=BLUE, label="found in the image")
+    middles_px = np.array([s.middle for s in found.images.stickers[found.images.shown]])
+    ax.plot(middles_px[:, 0], middles_px[:, 1], "o", ms=13, mfc="none", color=BLUE, label="found in the image")
     should = reprojected(found, found.scan.targets_mm)
     ax.plot(should[:, 0], should[:, 1], "+", ms=13, color=RED, label="by the scan, through the result")
     ax.set(
@@ -54,8 +54,8 @@ def _draw_uncertainty(ax: Axes, found: MeshFound) -> None:
     """Uncertainty of each sticker's position in the base, drawn in the mesh's frame."""
     place = found.scan.targets_mm
     dots = ax.scatter(place[:, 0], place[:, 1], c=1e3 * found.u_mm, s=40, cmap="viridis")
-    lost = np.isin(found.scan.names, found.pose.missing)
-    ax.scatter(place[lost, 0], place[lost, 1], s=110, facecolors="none", edgecolors=RED)
+    is_missing = np.isin(found.scan.names, found.pose.missing)
+    ax.scatter(place[is_missing, 0], place[is_missing, 1], s=110, facecolors="none", edgecolors=RED)
     ax.figure.colorbar(dots, ax=ax, label="u of its place in the base (um)")
     ax.set(aspect="equal", xlabel="x (mm, mesh)", ylabel="y (mm, mesh)", title="Stickers; red: not found")
 

@@ -115,28 +115,30 @@ def mesh_to_robot(
     points = seen_points(views, intrinsics, tolerance_px=tolerance_px, depth_mm=depth_mm)
     found_mm = np.array([point.base_mm for point in points]).reshape(-1, 3)
     match = match_points(found_mm, targets_mm, tolerance_mm)
-    seen = [points[row] for row in match.found]
-    adjusted = _adjust(views, intrinsics, seen, targets_mm[match.known], match.found_from_known, stated, prior)
-    recognised = [names[row] for row in match.known.tolist()]
+    matched_points = [points[row] for row in match.found]
+    adjustment = _adjust(
+        views, intrinsics, matched_points, targets_mm[match.known], match.found_from_known, stated, prior
+    )
+    matched_names = [names[row] for row in match.known.tolist()]
     to_degrees = np.diag([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
-    sightings = sum(len(point.views) for point in seen)
+    sightings = sum(len(point.views) for point in matched_points)
     residuals = np.concatenate(
-        [r[k] for r, k in zip(adjusted.residuals[:sightings], adjusted.kept[:sightings], strict=True)]
+        [r[k] for r, k in zip(adjustment.residuals[:sightings], adjustment.kept[:sightings], strict=True)]
     )
     return MeshPose(
-        adjusted.state.base_from_mesh,
-        to_degrees @ adjusted.covariance[:6, :6] @ to_degrees,
-        tuple(recognised),
-        tuple(name for name in names if name not in set(recognised)),
-        len(points) - len(seen),
-        {name: len(point.views) for name, point in zip(recognised, seen, strict=True)},
+        adjustment.state.base_from_mesh,
+        to_degrees @ adjustment.covariance[:6, :6] @ to_degrees,
+        tuple(matched_names),
+        tuple(name for name in names if name not in set(matched_names)),
+        len(points) - len(matched_points),
+        {name: len(point.views) for name, point in zip(matched_names, matched_points, strict=True)},
         float(np.sqrt(np.mean(residuals**2)) * stated.sticker_px),
-        _by_view(adjusted, seen, len(views), stated.sticker_px),
+        _by_view(adjustment, matched_points, len(views), stated.sticker_px),
         match.rms_mm,
-        {component.name: component.factor for component in adjusted.components},
-        {component.name: component.redundancy for component in adjusted.components},
-        adjusted.degrees[:6],
-        tuple(adjusted.components[int(row)].name for row in adjusted.contributions[:, :6].argmax(axis=0)),
+        {component.name: component.factor for component in adjustment.components},
+        {component.name: component.redundancy for component in adjustment.components},
+        adjustment.degrees[:6],
+        tuple(adjustment.components[int(row)].name for row in adjustment.contributions[:, :6].argmax(axis=0)),
     )
 
 
@@ -144,13 +146,15 @@ def _by_view(
     adjusted: Adjusted[_State], seen: Sequence[SeenPoint], views: int, sticker_px: float
 ) -> tuple[tuple[int, int, float], ...]:
     view_of = np.concatenate([point.views for point in seen])
-    found = []
+    view_figures = []
     for view in range(views):
         rows = np.flatnonzero(view_of == view)
         good = [row for row in rows if adjusted.kept[row].all()]
         square = sum(float(np.sum(adjusted.residuals[row] ** 2)) for row in good)
-        found.append((len(good), len(rows) - len(good), sticker_px * float(np.sqrt(square / max(len(good), 1)))))
-    return tuple(found)
+        view_figures.append(
+            (len(good), len(rows) - len(good), sticker_px * float(np.sqrt(square / max(len(good), 1))))
+        )
+    return tuple(view_figures)
 
 
 @dataclass(frozen=True)
@@ -206,24 +210,24 @@ class _Problem:
         in_camera = np.einsum("nij,nj->ni", camera_from_base[:, :3, :3], in_base) + camera_from_base[:, :3, 3]
         vector = self.intrinsics.vector()
         vector[self.lens] += state.shared_step[: len(self.lens)]
-        projected = optics.project(in_camera, vector)
-        by_base = projected.by_point @ camera_from_base[:, :3, :3]
+        projection = optics.project(in_camera, vector)
+        by_base = projection.by_point @ camera_from_base[:, :3, :3]
         by_turn = by_base @ (-turn @ skew(places))
-        by_view = projected.by_point @ skew(in_camera)
-        by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projected.by_intrinsics[:, :, self.lens]]
+        by_view = projection.by_point @ skew(in_camera)
+        by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projection.by_intrinsics[:, :, self.lens]]
         jacobian = np.concatenate(by_all, axis=2) / self.stated.sticker_px
-        residuals = (self.observed_px - projected.pixels) / self.stated.sticker_px
+        residuals = (self.observed_px - projection.pixels) / self.stated.sticker_px
         columns = self._sticker_columns()
         return [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(residuals))]
 
     def _sticker_columns(self) -> NDArray[np.intp]:
         """[n, 6 + 3 + 6 + f] of mesh, target, view and lens."""
-        own, count = np.arange(6), len(self.target_of)
+        pose_columns, count = np.arange(6), len(self.target_of)
         return np.concatenate(
             [
-                np.tile(own, (count, 1)),
-                self.first_target + 3 * self.target_of[:, None] + own[:3],
-                6 + 6 * self.view_of[:, None] + own,
+                np.tile(pose_columns, (count, 1)),
+                self.first_target + 3 * self.target_of[:, None] + pose_columns[:3],
+                6 + 6 * self.view_of[:, None] + pose_columns,
                 np.tile(self.first_shared + np.arange(len(self.lens)), (count, 1)),
             ],
             axis=1,
@@ -242,16 +246,16 @@ class _Problem:
         """Each view's pose is the reported one, moved by what views share, within the arm's noise. What views
         share is zero within its record's covariance."""
         pose_sigma = np.array([self.stated.robot_mm] * 3 + [np.radians(self.stated.robot_deg)] * 3)
-        shared = self.first_shared + np.arange(len(self.held))
+        shared_columns = self.first_shared + np.arange(len(self.held))
         off_by = between(state.base_from_camera, self.reported) + self.by_shared @ state.shared_step
         blocks = []
         for view in range(len(self.reported)):
             for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
-                columns = np.concatenate([6 + 6 * view + np.arange(6)[part], shared])
+                columns = np.concatenate([6 + 6 * view + np.arange(6)[part], shared_columns])
                 by_both = np.concatenate([np.eye(3), -self.by_shared[view, part]], axis=1)
-                weighted = by_both / pose_sigma[part][:, None]
-                blocks.append(Block(off_by[view, part] / pose_sigma[part], weighted, columns, group))
-        return [*blocks, Block(-self.held @ state.shared_step, self.held, shared, 4)]
+                jacobian = by_both / pose_sigma[part][:, None]
+                blocks.append(Block(off_by[view, part] / pose_sigma[part], jacobian, columns, group))
+        return [*blocks, Block(-self.held @ state.shared_step, self.held, shared_columns, 4)]
 
 
 def _adjust(
@@ -264,7 +268,7 @@ def _adjust(
     prior: CameraPrior | None,
 ) -> Adjusted[_State]:
     """Adjust the mesh's pose from `start` together with the views, the targets and what views share."""
-    reported = np.array([view.base_from_camera for view in views])
+    reported_poses = np.array([view.base_from_camera for view in views])
     groups = (
         Group(STICKERS, estimated=True, rejects=2),
         Group(SCANNER, estimated=False),
@@ -274,21 +278,21 @@ def _adjust(
     )
     lens = np.array([], np.intp)
     if prior is None:
-        held, by_shared = np.eye(6), np.zeros((len(views), 6, 6))
+        whitening, by_shared = np.eye(6), np.zeros((len(views), 6, 6))
     else:
         lens = np.array([optics.NAMES.index(name) for name in prior.free], np.intp)
-        held = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)))
-        by_shared = _by_shared(reported, prior)
+        whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)))
+        by_shared = _by_shared(reported_poses, prior)
     observed_px = np.array(
         [views[v].pixels[p] for point in seen for v, p in zip(point.views, point.places, strict=True)]
     )
     target_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
     view_of = np.concatenate([point.views for point in seen])
     problem = _Problem(
-        intrinsics, stated, reported, targets_mm, observed_px, target_of, view_of, lens, held, by_shared
+        intrinsics, stated, reported_poses, targets_mm, observed_px, target_of, view_of, lens, whitening, by_shared
     )
-    begin = _State(start, reported, targets_mm, np.zeros(len(held)))
-    unknowns = problem.first_shared + len(held)
+    begin = _State(start, reported_poses, targets_mm, np.zeros(len(whitening)))
+    unknowns = problem.first_shared + len(whitening)
     return adjust(begin, problem.evaluate, problem.move, groups, unknowns, what="mesh to robot")
 
 

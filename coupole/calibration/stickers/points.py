@@ -21,8 +21,8 @@ def views_of(
 ) -> list[CameraView]:
     """Views [v] with the middles of ellipses, which are accurate enough to match detections between views."""
     return [
-        CameraView(name, pose, np.array([sticker.middle for sticker in seen]).reshape(-1, 2))
-        for name, pose, seen in zip(names, base_from_camera, stickers, strict=True)
+        CameraView(name, pose, np.array([sticker.middle for sticker in view_stickers]).reshape(-1, 2))
+        for name, pose, view_stickers in zip(names, base_from_camera, stickers, strict=True)
     ]
 
 
@@ -38,10 +38,10 @@ def corrected(
                 for v, p in zip(point.views, point.places, strict=True)
             ]
         )
-        which = _agreed(normals)
-        for v, p, w in zip(point.views, point.places, which.tolist(), strict=True):
+        normal_numbers = _agreed(normals)
+        for v, p, w in zip(point.views, point.places, normal_numbers.tolist(), strict=True):
             pixels[v][p] = stickers[v][p].centres[w]
-    return [replace(view, pixels=moved) for view, moved in zip(views, pixels, strict=True)]
+    return [replace(view, pixels=view_pixels) for view, view_pixels in zip(views, pixels, strict=True)]
 
 
 def _agreed(normals: Floats) -> np.ndarray[tuple[int], np.dtype[np.intp]]:

@@ -74,23 +74,23 @@ def find_all_stickers(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> StickerImages:
     """Find stickers in all images of runs. Raises InputError if the images differ in size or show none."""
-    found: list[tuple[Sticker, ...]] = []
+    stickers_of: list[tuple[Sticker, ...]] = []
     size_px: tuple[int, int] | None = None
-    shown, picture = 0, np.zeros((1, 1))
+    shown_number, picture = 0, np.zeros((1, 1))
     for number, source in enumerate(sources.images):
         image = source.read().plane()
         size = (image.shape[1], image.shape[0])
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")
         size_px = size
-        found.append(tuple(find_stickers(image, lens, diameter_mm=diameter_mm, depth_mm=depth_mm)))
-        if number == 0 or len(found[number]) > len(found[shown]):
-            shown, picture = number, image
+        stickers_of.append(tuple(find_stickers(image, lens, diameter_mm=diameter_mm, depth_mm=depth_mm)))
+        if number == 0 or len(stickers_of[number]) > len(stickers_of[shown_number]):
+            shown_number, picture = number, image
         progress(number + 1, len(sources.images))
-    if size_px is None or not found[shown]:
+    if size_px is None or not stickers_of[shown_number]:
         raise InputError(
             f"stickers of {diameter_mm:g} mm are in none of {len(sources.images)} images. Are the disks lighter "
             "than their borders, and as large as --diameter-mm says?"
         )
     names = tuple(source.name for source in sources.images)
-    return StickerImages(tuple(found), names, size_px, shown, picture)
+    return StickerImages(tuple(stickers_of), names, size_px, shown_number, picture)

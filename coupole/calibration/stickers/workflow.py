@@ -106,8 +106,8 @@ def mesh_from(
         covariance=rows_of(pose.covariance),
         noise=_noise(pose, stated),
         images=tuple(
-            ImageResidual(name=name, corners=used, rejected=rejected, rms_px=rms_px)
-            for name, (used, rejected, rms_px) in zip(images.names, pose.residuals_of, strict=True)
+            ImageResidual(name=name, corners=used_count, rejected=rejected_count, rms_px=rms_px)
+            for name, (used_count, rejected_count, rms_px) in zip(images.names, pose.residuals_of, strict=True)
         ),
         limits=against_limits(MESH, request.limits, _figures(pose, scan, u_mm)),
         remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
@@ -119,7 +119,9 @@ def mesh_from(
 
 def _sigma_px(images: StickerImages) -> float:
     """Typical noise of a sticker's centre along one axis, by the fits of their rims."""
-    variances = [np.trace(sticker.covariance) / 2 for seen in images.stickers for sticker in seen]
+    variances = [
+        np.trace(sticker.covariance) / 2 for image_stickers in images.stickers for sticker in image_stickers
+    ]
     return max(float(np.sqrt(np.median(variances))), _LEAST_SIGMA_PX)
 
 
@@ -130,14 +132,14 @@ def outline_px(found: MeshFound, mesh: Path) -> Floats:
 
     whole = trimesh.load_mesh(mesh, process=False)
     coarse = simplified(np.asarray(whole.vertices), np.asarray(whole.faces), _MOST_FACES)
-    scanned = trimesh.Trimesh(*coarse, process=False)
+    coarse_mesh = trimesh.Trimesh(*coarse, process=False)
     eye_mm = inverse(found.camera_from_mesh)[:3, 3]
-    corners = np.asarray(scanned.triangles)
+    corners = np.asarray(coarse_mesh.triangles)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     faces_eye = np.einsum("ij,ij->i", normals, eye_mm - corners[:, 0]) > 0
-    one, other = np.asarray(scanned.face_adjacency).T
-    edges = np.asarray(scanned.face_adjacency_edges)[faces_eye[one] != faces_eye[other]]
-    ends = np.asarray(scanned.vertices, dtype=np.float64)[edges.reshape(-1)]
+    face, neighbour = np.asarray(coarse_mesh.face_adjacency).T
+    edges = np.asarray(coarse_mesh.face_adjacency_edges)[faces_eye[face] != faces_eye[neighbour]]
+    ends = np.asarray(coarse_mesh.vertices, dtype=np.float64)[edges.reshape(-1)]
     return reprojected(found, ends).reshape(-1, 2, 2)
 
 
@@ -165,7 +167,7 @@ def _parameters(pose: MeshPose) -> tuple[Parameter, ...]:
 
 
 def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
-    said = {
+    stated_sigmas = {
         STICKERS: (stated.sticker_px, "px"),
         POSITION: (stated.robot_mm, "mm"),
         ORIENTATION: (stated.robot_deg, "deg"),
@@ -178,7 +180,7 @@ def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
             found=sigma * pose.noise[name],
             redundancy=float(pose.redundancy[name]),
         )
-        for name, (sigma, unit) in said.items()
+        for name, (sigma, unit) in stated_sigmas.items()
     )
 
 

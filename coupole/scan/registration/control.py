@@ -68,24 +68,28 @@ class Sightings:
     def of_scans(self, scans: Sequence[int]) -> Sightings:
         """Return the sightings of some scans, which are numbered anew in this order."""
         place = {scan: k for k, scan in enumerate(scans)}
-        kept = tuple(replace(one, scan=place[one.scan]) for one in self.seen if one.scan in place)
-        known = {one.name for one in kept} & set(self.control or {})
-        enough = known and not _on_a_line(np.array([(self.control or {})[name].point_mm for name in known]))
-        return Sightings(kept, self.control if enough else None)
+        sightings = tuple(
+            replace(sighting, scan=place[sighting.scan]) for sighting in self.seen if sighting.scan in place
+        )
+        names = {sighting.name for sighting in sightings} & set(self.control or {})
+        enough = names and not _on_a_line(np.array([(self.control or {})[name].point_mm for name in names]))
+        return Sightings(sightings, self.control if enough else None)
 
     def by_name(self) -> dict[str, list[Sighting]]:
-        found = defaultdict(list)
-        for one in self.seen:
-            found[one.name].append(one)
-        return found
+        sightings_of = defaultdict(list)
+        for sighting in self.seen:
+            sightings_of[sighting.name].append(sighting)
+        return sightings_of
 
     def site_from_common(self, poses: Sequence[Floats]) -> Floats:
         """4x4 that brings sightings of control points onto these, by least squares."""
         assert self.control is not None
-        known = [one for one in self.seen if one.name in self.control]
+        control_sightings = [sighting for sighting in self.seen if sighting.name in self.control]
         return motion_of_points(
-            np.array([applied(poses[one.scan], one.point_mm[None])[0] for one in known]),
-            np.array([self.control[one.name].point_mm for one in known]),
+            np.array(
+                [applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in control_sightings]
+            ),
+            np.array([self.control[sighting.name].point_mm for sighting in control_sightings]),
         )
 
     def normal_equations(self, poses: Sequence[Floats], pivots: Floats) -> tuple[Floats, Floats]:
@@ -93,35 +97,35 @@ class Sightings:
         places are eliminated."""
         normal, gradient = np.zeros((6 * len(poses),) * 2), np.zeros(6 * len(poses))
         for name, several in self.by_name().items():
-            known = (self.control or {}).get(name)
-            if known is None and len(several) < 2:
+            control = (self.control or {}).get(name)
+            if control is None and len(several) < 2:
                 continue
-            weights = np.array([one.u_mm**-2 for one in several])
-            places = np.array([applied(poses[one.scan], one.point_mm[None])[0] for one in several])
-            total = float(weights.sum() + (0 if known is None else known.u_mm**-2))
-            middle = weights @ places + (0 if known is None else known.u_mm**-2 * known.point_mm)
+            weights = np.array([sighting.u_mm**-2 for sighting in several])
+            places = np.array([applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several])
+            total = float(weights.sum() + (0 if control is None else control.u_mm**-2))
+            middle = weights @ places + (0 if control is None else control.u_mm**-2 * control.point_mm)
             middle = middle / total
-            summed = np.zeros((3, 6 * len(poses)))
-            for one, weight, place in zip(several, weights, places, strict=True):
-                at = slice(6 * one.scan, 6 * one.scan + 6)
-                rows = _rows(place - pivots[one.scan])
+            summed_rows = np.zeros((3, 6 * len(poses)))
+            for sighting, weight, place in zip(several, weights, places, strict=True):
+                at = slice(6 * sighting.scan, 6 * sighting.scan + 6)
+                rows = _rows(place - pivots[sighting.scan])
                 normal[at, at] += weight * rows.T @ rows
                 gradient[at] += weight * rows.T @ (place - middle)
-                summed[:, at] += weight * rows
-            normal -= summed.T @ summed / total
+                summed_rows[:, at] += weight * rows
+            normal -= summed_rows.T @ summed_rows / total
         return normal, gradient
 
     def left(self, poses: Sequence[Floats]) -> tuple[Sighting, ...]:
         """All sightings with their distances from the targets' adjusted places."""
-        found = []
+        sightings = []
         for name, several in self.by_name().items():
-            known = (self.control or {}).get(name)
-            weights = [one.u_mm**-2 for one in several] + ([] if known is None else [known.u_mm**-2])
-            places = [applied(poses[one.scan], one.point_mm[None])[0] for one in several]
-            middle = np.average(places + ([] if known is None else [known.point_mm]), axis=0, weights=weights)
-            for one, place in zip(several, places, strict=True):
-                found.append(replace(one, left_mm=float(np.linalg.norm(place - middle))))
-        return tuple(found)
+            control = (self.control or {}).get(name)
+            weights = [sighting.u_mm**-2 for sighting in several] + ([] if control is None else [control.u_mm**-2])
+            places = [applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several]
+            middle = np.average(places + ([] if control is None else [control.point_mm]), axis=0, weights=weights)
+            for sighting, place in zip(several, places, strict=True):
+                sightings.append(replace(sighting, left_mm=float(np.linalg.norm(place - middle))))
+        return tuple(sightings)
 
 
 def _rows(arm_mm: Floats) -> Floats:
@@ -136,28 +140,28 @@ def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
     of_scan: dict[int, dict[str, Sighting]] = defaultdict(dict)
     for sighting in sightings.seen:
         of_scan[sighting.scan][sighting.name] = sighting
-    found = []
+    motions = []
     for first, second in combinations(sorted(of_scan), 2):
-        shared = sorted(of_scan[first].keys() & of_scan[second].keys())
-        if len(shared) < LEAST_TARGETS:
+        shared_names = sorted(of_scan[first].keys() & of_scan[second].keys())
+        if len(shared_names) < LEAST_TARGETS:
             continue
-        one = np.array([of_scan[first][name].point_mm for name in shared])
-        other = np.array([of_scan[second][name].point_mm for name in shared])
-        if _on_a_line(one):
+        first_mm = np.array([of_scan[first][name].point_mm for name in shared_names])
+        second_mm = np.array([of_scan[second][name].point_mm for name in shared_names])
+        if _on_a_line(first_mm):
             continue
-        motion = motion_of_points(other, one)
-        off_mm = np.linalg.norm(applied(motion, other) - one, axis=1)
-        u_mm = np.array([np.hypot(of_scan[first][n].u_mm, of_scan[second][n].u_mm) for n in shared])
+        motion = motion_of_points(second_mm, first_mm)
+        off_mm = np.linalg.norm(applied(motion, second_mm) - first_mm, axis=1)
+        u_mm = np.array([np.hypot(of_scan[first][n].u_mm, of_scan[second][n].u_mm) for n in shared_names])
         worst = int(np.argmax(off_mm / u_mm))
         if off_mm[worst] > _SIGMAS * u_mm[worst] * np.sqrt(3):
             raise InputError(
-                f"targets: `{shared[worst]}` is {off_mm[worst]:.3g} mm away from where the other "
-                f"{len(shared) - 1} targets of two scans put it, which state {u_mm[worst]:.2g} mm: another "
+                f"targets: `{shared_names[worst]}` is {off_mm[worst]:.3g} mm away from where the other "
+                f"{len(shared_names) - 1} targets of two scans put it, which state {u_mm[worst]:.2g} mm: another "
                 "target of that name, another unit, or an uncertainty that is too small"
             )
         fit = Fit(1.0, 0.0, float(np.sqrt(np.mean(off_mm**2))), 1_000_000)
-        found.append(PairMotion(first, second, motion, fit, "targets"))
-    return found
+        motions.append(PairMotion(first, second, motion, fit, "targets"))
+    return motions
 
 
 def _on_a_line(points_mm: Floats) -> bool:
@@ -175,28 +179,33 @@ def read_sightings(targets: Path | None, control: Path | None, names: Sequence[s
         return Sightings()
     numbers = {name: k for k, name in enumerate(names)} | {Path(name).stem: k for k, name in enumerate(names)}
     mm = MM_PER_UNIT[unit]
-    seen: list[Sighting] = []
+    sightings: list[Sighting] = []
     for line, words in _rows_of(targets, _TARGET_COLUMNS):
         if words[0] not in numbers:
             raise InputError(f"{targets}:{line}: there is no scan `{words[0]}`; there are {', '.join(names[:8])}")
         point, u_mm = _place(targets, line, words[2:], mm)
-        if any(one.scan == numbers[words[0]] and one.name == words[1] for one in seen):
+        if any(sighting.scan == numbers[words[0]] and sighting.name == words[1] for sighting in sightings):
             raise InputError(f"{targets}:{line}: target `{words[1]}` stands twice for scan `{words[0]}`")
-        seen.append(Sighting(numbers[words[0]], words[1], point, u_mm))
+        sightings.append(Sighting(numbers[words[0]], words[1], point, u_mm))
     if control is None:
-        return Sightings(tuple(seen))
-    known: dict[str, ControlPoint] = {}
+        return Sightings(tuple(sightings))
+    control_points: dict[str, ControlPoint] = {}
     for line, words in _rows_of(control, _CONTROL_COLUMNS):
-        if words[0] in known:
+        if words[0] in control_points:
             raise InputError(f"{control}:{line}: control point `{words[0]}` stands twice")
-        known[words[0]] = ControlPoint(*_place(control, line, words[1:], mm))
-    used = np.array([known[name].point_mm for name in sorted({one.name for one in seen} & known.keys())])
-    if _on_a_line(used.reshape(-1, 3)):
+        control_points[words[0]] = ControlPoint(*_place(control, line, words[1:], mm))
+    common_mm = np.array(
+        [
+            control_points[name].point_mm
+            for name in sorted({sighting.name for sighting in sightings} & control_points.keys())
+        ]
+    )
+    if _on_a_line(common_mm.reshape(-1, 3)):
         raise InputError(
-            f"{control}: {len(used)} of its points are among the targets of the scans; expected "
+            f"{control}: {len(common_mm)} of its points are among the targets of the scans; expected "
             f"{LEAST_TARGETS} or more that are not on a line"
         )
-    return Sightings(tuple(seen), known)
+    return Sightings(tuple(sightings), control_points)
 
 
 def _rows_of(path: Path, columns: Sequence[str]) -> list[tuple[int, list[str]]]:
@@ -207,12 +216,12 @@ def _rows_of(path: Path, columns: Sequence[str]) -> list[tuple[int, list[str]]]:
     rows = []
     separator = next((mark for mark in ";\t," if mark in text), " ")
     for number, words in enumerate(csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True), 1):
-        kept = [word.strip() for word in words if word.strip()]
-        if not kept or kept[0].startswith("#") or [word.lower() for word in kept] == list(columns):
+        fields = [word.strip() for word in words if word.strip()]
+        if not fields or fields[0].startswith("#") or [word.lower() for word in fields] == list(columns):
             continue
-        if len(kept) != len(columns):
-            raise InputError(f"{path}:{number}: expected {', '.join(columns)}; found {len(kept)} columns")
-        rows.append((number, kept))
+        if len(fields) != len(columns):
+            raise InputError(f"{path}:{number}: expected {', '.join(columns)}; found {len(fields)} columns")
+        rows.append((number, fields))
     if not rows:
         raise InputError(f"{path}: expected lines with {', '.join(columns)}; there is none")
     return rows

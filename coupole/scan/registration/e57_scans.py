@@ -40,14 +40,14 @@ def read_e57(source: ScanSource, *, colours: bool) -> ScanContent:
         kind = next((names for names in (_CARTESIAN, _SPHERICAL) if set(names) <= set(fields)), None)
         if kind is None:
             raise InputError(f"{source}: expected Cartesian or spherical points, found {', '.join(fields)}")
-        coloured = colours and set(_COLOURS) <= set(fields)
+        has_colours = colours and set(_COLOURS) <= set(fields)
         marks = [name for name in (*_INVALID, "isColorInvalid") if name in fields]
-        read = _columns(file, header, [*kind, *marks, *(_COLOURS if coloured else ())])
-        places = np.stack([read[name] for name in kind], axis=1)
+        columns = _columns(file, header, [*kind, *marks, *(_COLOURS if has_colours else ())])
+        places = np.stack([columns[name] for name in kind], axis=1)
         valid = np.all(
-            [read[name] == 0 for name in marks if name in _INVALID] or [np.ones(len(places), bool)], axis=0
+            [columns[name] == 0 for name in marks if name in _INVALID] or [np.ones(len(places), bool)], axis=0
         )
-        srgba = _srgba(header, read)[valid] if coloured else None
+        srgba = _srgba(header, columns)[valid] if has_colours else None
         pose = _pose(source, header) if header.has_pose() else None
     points = (places if kind is _CARTESIAN else _cartesian(places))[valid].astype(np.float32)
     expect_finite(source.path, points, f"scan {source.number + 1}, point {{}}")
@@ -70,36 +70,36 @@ def _opened(path: Path) -> Iterator[Any]:
 def _columns(file: Any, header: Any, names: list[str]) -> dict[str, NDArray[np.float64]]:
     from pye57 import libe57
 
-    found = {name: np.empty(header.point_count, np.float64) for name in names}
+    columns = {name: np.empty(header.point_count, np.float64) for name in names}
     buffers = libe57.VectorSourceDestBuffer()
-    for name, values in found.items():
+    for name, values in columns.items():
         buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, len(values), True, True))
-    read = header.points.reader(buffers).read() if header.point_count else 0
-    return {name: values[:read] for name, values in found.items()}
+    record_count = header.points.reader(buffers).read() if header.point_count else 0
+    return {name: values[:record_count] for name, values in columns.items()}
 
 
 def _srgba(header: Any, read: dict[str, NDArray[np.float64]]) -> NDArray[np.uint8]:
     """[n, 4] by the limits that the file states, else of 0 to 255."""
-    shown = []
+    levels = []
     for name in _COLOURS:
         low, high = 0.0, 255.0
         if header.node.isDefined("colorLimits"):
             limits = header.node["colorLimits"]
             low, high = (float(limits[f"{name}{end}"].value()) for end in ("Minimum", "Maximum"))
-        shown.append(np.clip(np.round(255 * (read[name] - low) / max(high - low, 1e-12)), 0, 255))
-    there = read["isColorInvalid"] == 0 if "isColorInvalid" in read else np.ones(len(shown[0]), bool)
-    return np.column_stack([*shown, 255 * there]).astype(np.uint8)
+        levels.append(np.clip(np.round(255 * (read[name] - low) / max(high - low, 1e-12)), 0, 255))
+    there = read["isColorInvalid"] == 0 if "isColorInvalid" in read else np.ones(len(levels[0]), bool)
+    return np.column_stack([*levels, 255 * there]).astype(np.uint8)
 
 
 def _pose(source: ScanSource, header: Any) -> NDArray[np.float64]:
-    stated, pose = header.node["pose"], np.eye(4)
-    if stated.isDefined("rotation"):
-        w, x, y, z = (float(stated["rotation"][name].value()) for name in "wxyz")
+    pose_node, pose = header.node["pose"], np.eye(4)
+    if pose_node.isDefined("rotation"):
+        w, x, y, z = (float(pose_node["rotation"][name].value()) for name in "wxyz")
         if not 0.999 < w * w + x * x + y * y + z * z < 1.001:
             raise InputError(f"{source}: expected a quaternion of length 1 as its pose, found {w}, {x}, {y}, {z}")
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    if stated.isDefined("translation"):
-        pose[:3, 3] = [float(stated["translation"][name].value()) for name in "xyz"]
+    if pose_node.isDefined("translation"):
+        pose[:3, 3] = [float(pose_node["translation"][name].value()) for name in "xyz"]
     return pose
 
 

@@ -42,8 +42,8 @@ class Groups:
 
     def agrees(self, scans: Sequence[PreparedScan], motion: PairMotion) -> bool:
         """Tell whether a motion between two scans of one group agrees with the places that they have already."""
-        predicted = self.predicted(motion.first, motion.second)
-        return predicted is not None and _agree(scans, motion, predicted)
+        predicted_motion = self.predicted(motion.first, motion.second)
+        return predicted_motion is not None and _agree(scans, motion, predicted_motion)
 
 
 def join(scans: Sequence[PreparedScan], motions: Sequence[PairMotion]) -> Groups:
@@ -53,14 +53,14 @@ def join(scans: Sequence[PreparedScan], motions: Sequence[PairMotion]) -> Groups
     waiting = sorted(motions, key=lambda motion: -motion.fit.places * motion.fit.overlap)
     while waiting:
         strongest = waiting[0]
-        one, other = groups.group_of[strongest.first], groups.group_of[strongest.second]
-        pair = {one, other}
+        first_group, second_group = groups.group_of[strongest.first], groups.group_of[strongest.second]
+        pair = {first_group, second_group}
         between = [m for m in waiting if {groups.group_of[m.first], groups.group_of[m.second]} == pair]
         waiting = [m for m in waiting if {groups.group_of[m.first], groups.group_of[m.second]} != pair]
-        if one == other:
+        if first_group == second_group:
             _sort_within(scans, groups, between)
         else:
-            _merge(scans, groups, one, other, between)
+            _merge(scans, groups, first_group, second_group, between)
     return groups
 
 
@@ -105,8 +105,8 @@ def _place(groups: Groups, one: int, motion: PairMotion) -> Floats:
     first, second, first_from_second = motion.first, motion.second, motion.first_from_second
     if groups.group_of[first] != one:
         first, second, first_from_second = second, first, inverse_of(first_from_second)
-    placed = groups.group_from_scan[first] @ first_from_second @ inverse_of(groups.group_from_scan[second])
-    return np.asarray(placed)
+    place = groups.group_from_scan[first] @ first_from_second @ inverse_of(groups.group_from_scan[second])
+    return np.asarray(place)
 
 
 def _between(groups: Groups, one: int, motion: PairMotion, one_from_other: Floats) -> Floats:
@@ -122,8 +122,8 @@ def _contradict(
     """True if a scan of one group lies in the space that a scan of the other saw through."""
     pairs = [(a, b) for a in groups.members[one] for b in groups.members[other]]
     if len(pairs) > _MOST_CROSS_CHECKS:
-        chosen = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
-        pairs = [pairs[k] for k in chosen]
+        picks = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
+        pairs = [pairs[k] for k in picks]
     every = 1 if len(pairs) < _FEW_CHECKS else _EVERY
     slack = 1.0 + len(pairs) ** 0.25  # poses of groups that were not adjusted yet have drifted
     for a, b in pairs:

@@ -128,11 +128,11 @@ class _State:
     inflation_used: float
 
     def step(self) -> Floats:
-        found = np.zeros(len(self.gradient))
-        found[self.free] = -cho_solve(
+        step = np.zeros(len(self.gradient))
+        step[self.free] = -cho_solve(
             cho_factor(self.normal[np.ix_(self.free, self.free)]), self.gradient[self.free]
         )
-        return found
+        return step
 
     def inflation(self) -> float:
         """Root mean ratio of variances of the poses, of sums over cells to those of independent points."""
@@ -163,13 +163,13 @@ class _State:
         cells, number = np.unique(np.concatenate(flat), return_inverse=True)
         rows, columns, values, at = [], [], [], 0
         for overlap in self.overlaps:
-            mine = number[at : at + len(overlap.off_mm)]
+            point_numbers = number[at : at + len(overlap.off_mm)]
             at += len(overlap.off_mm)
             pulls = overlap.derivatives * (_weights(overlap.off_mm, self.noise_mm) * overlap.off_mm)[:, None]
-            own, place = np.unique(mine, return_inverse=True)
-            sums = np.stack([np.bincount(place, column, len(own)) for column in pulls.T], axis=1)
-            rows.append(np.repeat(own, 12))
-            columns.append(np.tile(_columns(overlap), len(own)))
+            distinct, place = np.unique(point_numbers, return_inverse=True)
+            sums = np.stack([np.bincount(place, column, len(distinct)) for column in pulls.T], axis=1)
+            rows.append(np.repeat(distinct, 12))
+            columns.append(np.tile(_columns(overlap), len(distinct)))
             values.append(sums.reshape(-1))
         shape = (len(cells), len(self.gradient))
         pull = sparse.coo_matrix(
@@ -224,9 +224,9 @@ def _state(
     normal, gradient = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
     for overlap in overlaps:
         columns = _columns(overlap)
-        weighted = overlap.derivatives * (_weights(overlap.off_mm, noise_mm) / inflation**2)[:, None]
-        normal[np.ix_(columns, columns)] += weighted.T @ overlap.derivatives
-        gradient[columns] += weighted.T @ overlap.off_mm
+        weighted_derivatives = overlap.derivatives * (_weights(overlap.off_mm, noise_mm) / inflation**2)[:, None]
+        normal[np.ix_(columns, columns)] += weighted_derivatives.T @ overlap.derivatives
+        gradient[columns] += weighted_derivatives.T @ overlap.off_mm
     targets_normal, targets_gradient = sightings.normal_equations(poses, pivots)
     prior = np.concatenate([np.r_[np.full(3, scan.survey.size_mm**-2.0), np.ones(3)] for scan in scans])
     free = np.ones(6 * count, bool)
@@ -260,7 +260,7 @@ def _overlaps(
 ) -> list[Overlap]:
     """The points of each of two scans on the surface of the other."""
     signless = "none" in (scans[one].viewpoint.stand, scans[other].viewpoint.stand)
-    found = []
+    overlaps = []
     for first, second in ((one, other), (other, one)):
         first_from_second = inverse_of(poses[first]) @ poses[second]
         normals, off_mm, points, nearest_mm = distances(
@@ -277,8 +277,8 @@ def _overlaps(
                 ],
                 axis=1,
             )
-            found.append(Overlap(first, second, derivatives, off_mm, points, nearest_mm))
-    return found
+            overlaps.append(Overlap(first, second, derivatives, off_mm, points, nearest_mm))
+    return overlaps
 
 
 def distances(
@@ -286,19 +286,19 @@ def distances(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return for points of the second scan near the first one: normals [n, 3] there, distances along these [n],
     points [n, 3] in the first scan's frame, and distances to its points [n]."""
-    moved = applied(first_from_second, second.points_mm)
-    away_mm, nearest = first.tree.query(moved, distance_upper_bound=reach_mm)
+    moved_mm = applied(first_from_second, second.points_mm)
+    away_mm, nearest = first.tree.query(moved_mm, distance_upper_bound=reach_mm)
     hit = np.flatnonzero(np.isfinite(away_mm))
     facing = np.sum((second.normals[hit] @ first_from_second[:3, :3].T) * first.normals[nearest[hit]], axis=1)
     hit = hit[(np.abs(facing) if signless else facing) > _SAME_SIDE]
-    off_mm = np.sum((moved[hit] - first.points_mm[nearest[hit]]) * first.normals[nearest[hit]], axis=1)
+    off_mm = np.sum((moved_mm[hit] - first.points_mm[nearest[hit]]) * first.normals[nearest[hit]], axis=1)
     beside = away_mm[hit] ** 2 - off_mm**2 < (_BESIDE_PITCHES * first.pitch_mm) ** 2
     steep = np.minimum(first.incidence[nearest[hit]], second.incidence[hit])
-    kept = beside & (steep > _STEEP)
-    if kept.sum() < _LEAST_PAIRS:
-        kept = beside
-    hit, off_mm = hit[kept], off_mm[kept]
-    return first.normals[nearest[hit]], off_mm, moved[hit], away_mm[hit]
+    keep = beside & (steep > _STEEP)
+    if keep.sum() < _LEAST_PAIRS:
+        keep = beside
+    hit, off_mm = hit[keep], off_mm[keep]
+    return first.normals[nearest[hit]], off_mm, moved_mm[hit], away_mm[hit]
 
 
 def _weights(off_mm: Floats, noise_mm: float) -> Floats:

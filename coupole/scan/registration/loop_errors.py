@@ -46,16 +46,18 @@ def pairs_alone(
     scans: Sequence[PreparedScan], pairs: Sequence[tuple[int, int]], fit: JointFit, say: Say
 ) -> list[PairAlone]:
     """Each pair adjusted by itself, from where the joint fit has it."""
-    found = []
-    for done, (first, second) in enumerate(pairs):
-        say("closing loops", done + 1, len(pairs))
+    adjusted_pairs = []
+    for number, (first, second) in enumerate(pairs):
+        say("closing loops", number + 1, len(pairs))
         joint = inverse_of(fit.common_from_scan[first]) @ fit.common_from_scan[second]
-        both = [scans[first], scans[second]]
-        alone = adjust(both, [(0, 1)], [np.eye(4), joint], 0, Sightings(), lambda *_: None)
+        pair_scans = [scans[first], scans[second]]
+        alone = adjust(pair_scans, [(0, 1)], [np.eye(4), joint], 0, Sightings(), lambda *_: None)
         step = step_between(joint, alone.common_from_scan[1], alone.pivots_mm[1])
         surprise = float(step @ np.linalg.solve(alone.covariance[6:, 6:], step))
-        found.append(PairAlone(first, second, alone.common_from_scan[1], min(surprise, 6 * _MOST_SURPRISE)))
-    return found
+        adjusted_pairs.append(
+            PairAlone(first, second, alone.common_from_scan[1], min(surprise, 6 * _MOST_SURPRISE))
+        )
+    return adjusted_pairs
 
 
 def with_loops(fit: JointFit, pairs: Sequence[PairAlone], count: int) -> tuple[JointFit, float]:
@@ -77,20 +79,20 @@ def find_loops(scans: Sequence[PreparedScan], pairs: Sequence[PairAlone]) -> lis
     motions = {(p.first, p.second): p.first_from_second for p in pairs}
     motions |= {(p.second, p.first): inverse_of(p.first_from_second) for p in pairs}
     near: dict[int, list[int]] = {k: [] for k in range(count)}
-    for one, other in map(tuple, in_tree):
-        near[one].append(other)
-        near[other].append(one)
-    found = []
+    for first, second in map(tuple, in_tree):
+        near[first].append(second)
+        near[second].append(first)
+    loops = []
     for pair in pairs:
         if frozenset((pair.first, pair.second)) not in in_tree:
             ring = _path(near, pair.second, pair.first)
             around = pair.first_from_second
-            for one, other in pairwise(ring):
-                around = around @ motions[one, other]
+            for first, second in pairwise(ring):
+                around = around @ motions[first, second]
             points = scans[pair.first].coarse.points_mm
             angle = np.degrees(np.arccos(np.clip((np.trace(around[:3, :3]) - 1) / 2, -1, 1)))
-            found.append(Loop((pair.first, *ring[:-1]), displacement_mm(around, np.eye(4), points), float(angle)))
-    return sorted(found, key=lambda loop: -loop.error_mm)
+            loops.append(Loop((pair.first, *ring[:-1]), displacement_mm(around, np.eye(4), points), float(angle)))
+    return sorted(loops, key=lambda loop: -loop.error_mm)
 
 
 def _path(near: dict[int, list[int]], start: int, end: int) -> list[int]:

@@ -16,8 +16,8 @@ _NEIGHBOURS = 8
 def linear_light(srgba: NDArray[np.uint8]) -> Floats:
     """[n, 4] red, green and blue of 0 to 1 in linear light times the weight, and the weight: 0 where a point has
     no colour (IEC 61966-2-1)."""
-    encoded = srgba[:, :3] / 255.0
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    srgb = srgba[:, :3] / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     weight = (srgba[:, 3:] > 0).astype(np.float64)
     return np.hstack([linear * weight, weight])
 
@@ -26,8 +26,8 @@ def encoded(weighted: Floats) -> NDArray[np.uint8]:
     """[n, 3] sRGB, 8 bit, of sums of weighted linear light [n, 4]."""
     weight = weighted[:, 3:]
     linear = np.clip(weighted[:, :3] / np.where(weight > 0, weight, 1.0), 0.0, 1.0)
-    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.where(weight > 0, np.round(255 * shown), NO_COLOUR).astype(np.uint8)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.where(weight > 0, np.round(255 * srgb), NO_COLOUR).astype(np.uint8)
 
 
 def around(points: Floats, linear: Floats, places: Floats, reach: float, width: float) -> Floats:

@@ -78,37 +78,39 @@ def merge(
     ExtraMissing."""
     blocks = folder / "blocks"
     blocks.mkdir()
-    found = Merged(cell_mm=cell_mm)
-    for done, (scan, pose) in enumerate(zip(scans, common_from_scan, strict=True)):
-        say("distributing points", done, len(scans))
-        found.points += scan.survey.count
+    summary = Merged(cell_mm=cell_mm)
+    for number, (scan, pose) in enumerate(zip(scans, common_from_scan, strict=True)):
+        say("distributing points", number, len(scans))
+        summary.points += scan.survey.count
         records = _records(scan, pose, unit, cell_mm)
-        found.coloured |= bool(records["light"][:, 3].any())
+        summary.coloured |= bool(records["light"][:, 3].any())
         _distribute(records, cell_mm, blocks)
     say("distributing points", len(scans), len(scans))
     clouds = {
-        f"points-{level:g}mm.ply": _Level(level, coloured=found.coloured) for level in levels_mm if level > cell_mm
+        f"points-{level:g}mm.ply": _Level(level, coloured=summary.coloured)
+        for level in levels_mm
+        if level > cell_mm
     }
     files = sorted(blocks.iterdir())
-    with _MeshFile(folder, coloured=found.coloured) as mesh:
-        for done, path in enumerate(files):
-            say("merging blocks", done, len(files))
+    with _MeshFile(folder, coloured=summary.coloured) as mesh:
+        for number, path in enumerate(files):
+            say("merging blocks", number, len(files))
             block = np.array([int(word) for word in path.stem.split("_")])
             records = np.fromfile(path, _RECORD)
             vertices, triangles = _surface(records, block, cell_mm)
             mesh.add(vertices, triangles, block, _shades(records, vertices, block, cell_mm))
-            own = np.all(_block_of(records["point"], cell_mm) == block, axis=1)
+            in_block = np.all(_block_of(records["point"], cell_mm) == block, axis=1)
             for level in clouds.values():
-                level.add(records[own])
+                level.add(records[in_block])
             path.unlink()
         say("merging blocks", len(files), len(files))
-        found.vertices, found.triangles = mesh.write(folder / "mesh.ply", cell_mm)
+        summary.vertices, summary.triangles = mesh.write(folder / "mesh.ply", cell_mm)
     blocks.rmdir()
     for name, level in clouds.items():
-        found.levels[name] = level.write(folder / name)
-    if found.triangles == 0:
+        summary.levels[name] = level.write(folder / name)
+    if summary.triangles == 0:
         raise InputError(f"no surface in cells of {cell_mm:g} mm: choose larger ones with --mesh-mm")
-    return found
+    return summary
 
 
 def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDArray[np.void]:
@@ -122,11 +124,11 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
     small_gicp.estimate_normals(thin, num_neighbors=min(NEIGHBOURS, len(thin.points())))
     points = np.ascontiguousarray(thin.points()[:, :3]) + middle
     normals = np.ascontiguousarray(thin.normals()[:, :3])
-    known = vertex_normals(whole)
+    stored_normals = vertex_normals(whole)
     if scan.viewpoint.stand != "none":
         outward = scan.viewpoint.towards(points)
-    elif known is not None:
-        outward = known[cKDTree(points_mm).query(points)[1]]
+    elif stored_normals is not None:
+        outward = stored_normals[cKDTree(points_mm).query(points)[1]]
     else:
         raise InputError(
             f"{scan.source}: neither triangles nor a viewpoint say which side of its surface is out; state with "
@@ -134,14 +136,14 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
         )
     incidence = np.sum(normals * outward, axis=1)
     normals *= np.where(incidence < 0, -1.0, 1.0)[:, None]
-    kept = np.abs(incidence) > _STEEPEST
-    records = np.empty(int(kept.sum()), _RECORD)
-    records["point"] = applied(pose, points[kept])
-    records["normal"] = normals[kept] @ pose[:3, :3].T
-    records["weight"] = np.abs(incidence[kept])
+    keep = np.abs(incidence) > _STEEPEST
+    records = np.empty(int(keep.sum()), _RECORD)
+    records["point"] = applied(pose, points[keep])
+    records["normal"] = normals[keep] @ pose[:3, :3].T
+    records["weight"] = np.abs(incidence[keep])
     records["light"] = 0.0
     if content.srgba is not None:
-        records["light"] = around(points_mm, linear_light(content.srgba), points[kept], cell_mm, cell_mm / 2)
+        records["light"] = around(points_mm, linear_light(content.srgba), points[keep], cell_mm, cell_mm / 2)
         records["light"] /= np.maximum(records["light"][:, 3:], 1e-12)
     return records
 
@@ -157,19 +159,19 @@ def _distribute(records: NDArray[np.void], cell_mm: float, folder: Path) -> None
     low, high = (np.floor((points + d) / (cell_mm * BLOCK_CELLS)).astype(np.int64) for d in (-margin, margin))
     for choice in range(8):
         ends = np.stack([(high if choice >> axis & 1 else low)[:, axis] for axis in range(3)], axis=1)
-        doubled = np.zeros(len(points), bool)
+        is_double = np.zeros(len(points), bool)
         for axis in range(3):
             if choice >> axis & 1:
-                doubled |= high[:, axis] == low[:, axis]
-        ends, mine = ends[~doubled], records[~doubled]
-        if not len(mine):
+                is_double |= high[:, axis] == low[:, axis]
+        ends, block_records = ends[~is_double], records[~is_double]
+        if not len(block_records):
             continue
         blocks, number = np.unique(ends, axis=0, return_inverse=True)
         order = np.argsort(number.reshape(-1), kind="stable")
         borders = np.searchsorted(number.reshape(-1)[order], np.arange(len(blocks) + 1))
         for k, block in enumerate(blocks):
             with (folder / "{}_{}_{}.bin".format(*block)).open("ab") as file:
-                mine[order[borders[k] : borders[k + 1]]].tofile(file)
+                block_records[order[borders[k] : borders[k + 1]]].tofile(file)
 
 
 def _surface(
@@ -193,24 +195,24 @@ def _surface(
     nearest = np.where(there, nearest, 0)
     weights = np.where(there, records["weight"][nearest] * np.exp(-((reach / _KERNEL_CELLS) ** 2)), 0.0)
     off = np.einsum("nka,nka->nk", corners[:, None] - points[nearest], records["normal"][nearest])
-    known = (reach[:, 0] < _NEAR_CELLS) & (weights.sum(axis=1) > 0)
+    is_known = (reach[:, 0] < _NEAR_CELLS) & (weights.sum(axis=1) > 0)
     field_values = np.full(near.shape, np.nan, np.float32)
-    means = np.sum(weights * off, axis=1)[known] / weights.sum(axis=1)[known]
-    field_values[tuple(corners[known].T)] = means
+    means = np.sum(weights * off, axis=1)[is_known] / weights.sum(axis=1)[is_known]
+    field_values[tuple(corners[is_known].T)] = means
     valid = np.isfinite(field_values)
     cubes = ndimage.minimum_filter(valid.astype(np.uint8), 2, origin=-1)[:-1, :-1, :-1] > 0
     if not cubes.any() or not (np.nanmin(field_values) < 0 < np.nanmax(field_values)):
         return nothing
-    filled = np.where(valid, field_values, np.float32(_REACH_CELLS))
+    filled_field = np.where(valid, field_values, np.float32(_REACH_CELLS))
     draw: Any = measure.marching_cubes
-    vertices, triangles, _, _ = draw(filled, 0.0, gradient_direction="descent")
+    vertices, triangles, _, _ = draw(filled_field, 0.0, gradient_direction="descent")
     inside = np.floor(vertices[triangles].astype(np.float64).mean(axis=1)).astype(np.int64)
     inside = np.clip(inside, 0, BLOCK_CELLS - 1)
     triangles = triangles[cubes[tuple(inside.T)]]
     middles = vertices[triangles].astype(np.float64).mean(axis=1)
     triangles = triangles[np.isfinite(tree.query(middles, distance_upper_bound=_COVERED_CELLS)[0])]
-    used, triangles = np.unique(triangles, return_inverse=True)
-    return vertices[used], triangles.reshape(-1, 3)
+    used_rows, triangles = np.unique(triangles, return_inverse=True)
+    return vertices[used_rows], triangles.reshape(-1, 3)
 
 
 def _shades(
@@ -231,10 +233,10 @@ def _corners_near(points: Floats) -> NDArray[np.bool_]:
     count = BLOCK_CELLS + 1 + 2 * margin
     cells = np.round(points).astype(np.int64) + margin
     cells = cells[np.all((cells >= 0) & (cells < count), axis=1)]
-    marked = np.zeros((count,) * 3, bool)
-    marked[tuple(cells.T)] = True
-    marked = ndimage.maximum_filter(marked, 7)
-    return np.asarray(marked[margin:-margin, margin:-margin, margin:-margin])
+    is_near = np.zeros((count,) * 3, bool)
+    is_near[tuple(cells.T)] = True
+    is_near = ndimage.maximum_filter(is_near, 7)
+    return np.asarray(is_near[margin:-margin, margin:-margin, margin:-margin])
 
 
 class _MeshFile:
@@ -288,31 +290,31 @@ class _MeshFile:
             numbers = np.concatenate(self._numbers)
             _, first, back = np.unique(np.concatenate(self._keys), axis=0, return_index=True, return_inverse=True)
             stands_for[numbers] = numbers[first[back.reshape(-1)]]
-        kept = stands_for == np.arange(self._count)
-        renumbered = (np.cumsum(kept) - 1)[stands_for]
+        keep = stands_for == np.arange(self._count)
+        new_numbers = (np.cumsum(keep) - 1)[stands_for]
         every = np.concatenate(self._shades or [np.zeros((0, 3), np.uint8)])
         with path.open("wb") as file:
             file.write(
                 (
                     "ply\nformat binary_little_endian 1.0\ncomment mm\n"
-                    f"element vertex {int(kept.sum())}\nproperty float x\nproperty float y\nproperty float z\n"
+                    f"element vertex {int(keep.sum())}\nproperty float x\nproperty float y\nproperty float z\n"
                     f"{_COLOURS_HEAD if self._coloured else ''}"
                     f"element face {self._triangles}\nproperty list uchar uint vertex_indices\nend_header\n"
                 ).encode()
             )
             for first_row in range(0, self._count, _CHUNK):
                 part = np.fromfile(self._vertices_path, "<f8", 3 * _CHUNK, offset=24 * first_row).reshape(-1, 3)
-                chosen = kept[first_row : first_row + _CHUNK]
-                shades = every[first_row : first_row + _CHUNK][chosen] if self._coloured else None
-                _write_points(file, part[chosen] * cell_mm, shades)
+                keep_part = keep[first_row : first_row + _CHUNK]
+                shades = every[first_row : first_row + _CHUNK][keep_part] if self._coloured else None
+                _write_points(file, part[keep_part] * cell_mm, shades)
             for first_row in range(0, self._triangles, _CHUNK):
                 corners = np.fromfile(self._faces_path, "<i8", 3 * _CHUNK, offset=24 * first_row).reshape(-1, 3)
                 faces = np.empty(len(corners), _FACE)
-                faces["corners"], faces["indices"] = 3, renumbered[corners]
+                faces["corners"], faces["indices"] = 3, new_numbers[corners]
                 faces.tofile(file)
             file.flush()
             os.fsync(file.fileno())
-        return int(kept.sum()), self._triangles
+        return int(keep.sum()), self._triangles
 
 
 def _write_points(file: BinaryIO, points: Floats, shades: NDArray[np.uint8] | None) -> None:

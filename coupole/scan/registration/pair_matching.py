@@ -67,18 +67,18 @@ def match_by_features(first: Cloud, second: Cloud) -> tuple[Floats, int]:
     _, kiss_matcher = registration_libraries()
     scale = 1.0 / first.pitch_mm  # its noise bounds are made for cells of one unit
     matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel_size=1.0, use_voxel_sampling=False))
-    found = matcher.estimate(
+    estimate = matcher.estimate(
         list((second.points_mm * scale).astype(np.float32)), list((first.points_mm * scale).astype(np.float32))
     )
     motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = found.rotation, np.asarray(found.translation).reshape(3) / scale
+    motion[:3, :3], motion[:3, 3] = estimate.rotation, np.asarray(estimate.translation).reshape(3) / scale
     return motion, int(matcher.get_num_final_inliers())
 
 
 def refined(first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, iterations: int) -> Floats:
     """The motion by generalized ICP, with points as far apart as `reach_mm` at first."""
     small_gicp, _ = registration_libraries()
-    found = small_gicp.align(
+    alignment = small_gicp.align(
         _shared(first),
         _shared(second),
         _tree(first),
@@ -88,17 +88,17 @@ def refined(first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: fl
         rotation_epsilon=1e-4,
         translation_epsilon=1e-2 * first.pitch_mm,
     )
-    return np.asarray(found.T_target_source)
+    return np.asarray(alignment.T_target_source)
 
 
 def _shared(cloud: Cloud) -> Any:
     """The cloud as the library's own, kept beside it."""
     small_gicp, _ = registration_libraries()
     if "_library_cloud" not in cloud.__dict__:
-        made = small_gicp.PointCloud(cloud.points_mm)
-        small_gicp.estimate_covariances(made, num_neighbors=min(12, len(cloud.points_mm)))
-        cloud.__dict__["_library_cloud"] = made
-        cloud.__dict__["_library_tree"] = small_gicp.KdTree(made)
+        library_cloud = small_gicp.PointCloud(cloud.points_mm)
+        small_gicp.estimate_covariances(library_cloud, num_neighbors=min(12, len(cloud.points_mm)))
+        cloud.__dict__["_library_cloud"] = library_cloud
+        cloud.__dict__["_library_tree"] = small_gicp.KdTree(library_cloud)
     return cloud.__dict__["_library_cloud"]
 
 
@@ -109,15 +109,15 @@ def _tree(cloud: Cloud) -> Any:
 
 def fit_of(first: PreparedScan, second: PreparedScan, first_from_second: Floats, near_mm: float) -> Fit:
     """Measure how well two scans lie on each other: points within `near_mm` along the normals count."""
-    moved = second.coarse.points_mm @ first_from_second[:3, :3].T + first_from_second[:3, 3]
-    turned = second.coarse.normals @ first_from_second[:3, :3].T
+    moved_mm = second.coarse.points_mm @ first_from_second[:3, :3].T + first_from_second[:3, 3]
+    turned_normals = second.coarse.normals @ first_from_second[:3, :3].T
     reach_mm = 1.5 * first.coarse.pitch_mm
-    away_mm, nearest = first.coarse.tree.query(moved, distance_upper_bound=reach_mm)
-    found = np.flatnonzero(np.isfinite(away_mm))
-    nearest = nearest[found]
+    away_mm, nearest = first.coarse.tree.query(moved_mm, distance_upper_bound=reach_mm)
+    near_rows = np.flatnonzero(np.isfinite(away_mm))
+    nearest = nearest[near_rows]
     normals = first.coarse.normals[nearest]
-    off_mm = np.sum((moved[found] - first.coarse.points_mm[nearest]) * normals, axis=1)
-    facing = np.sum(turned[found] * normals, axis=1)
+    off_mm = np.sum((moved_mm[near_rows] - first.coarse.points_mm[nearest]) * normals, axis=1)
+    facing = np.sum(turned_normals[near_rows] * normals, axis=1)
     if first.viewpoint.stand == "none" or second.viewpoint.stand == "none":
         facing = np.abs(facing)
     on = (np.abs(off_mm) < near_mm) & (facing > _SAME_SIDE)
@@ -140,14 +140,14 @@ def contradiction(
 def _contradicted(seer: PreparedScan, points_mm: Floats, near_mm: float) -> float:
     if seer.picture is None:
         return 0.0
-    seen, before = seer.picture.in_front(points_mm, 2.0 * near_mm)
-    return float(before.sum() / max(1, seen.sum()))
+    in_view, before = seer.picture.in_front(points_mm, 2.0 * near_mm)
+    return float(before.sum() / max(1, in_view.sum()))
 
 
 def match(number_first: int, number_second: int, first: PreparedScan, second: PreparedScan) -> PairMotion | None:
     """The motion between two scans of which nothing is known, if one is found that holds."""
-    guess, agreed = match_by_features(first.coarse, second.coarse)
-    if agreed < _LEAST_AGREED:
+    guess, agreeing_count = match_by_features(first.coarse, second.coarse)
+    if agreeing_count < _LEAST_AGREED:
         return None
     return improve(number_first, number_second, first, second, guess, "features")
 

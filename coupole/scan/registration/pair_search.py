@@ -32,12 +32,12 @@ class Search:
 
     def run(self, what: str, tasks: Sequence[Task], say: Say) -> list[PairMotion]:
         """The motions that hold, in the order of the tasks."""
-        found = []
-        for done, motion in enumerate(self._each(tasks)):
-            say(what, done + 1, len(tasks))
+        motions = []
+        for number, motion in enumerate(self._each(tasks)):
+            say(what, number + 1, len(tasks))
             if motion is not None:
-                found.append(motion)
-        return found
+                motions.append(motion)
+        return motions
 
     def _each(self, tasks: Sequence[Task]) -> Iterable[PairMotion | None]:
         if self._processes < 2 or (self._pool is None and len(tasks) < _WORTH_PROCESSES):

@@ -97,9 +97,9 @@ def survey(source: ScanSource, unit: str) -> Survey:
     normals, some = vertex_normals(mesh), _sample(len(mesh.vertices))
     places = len(small_gicp.voxelgrid_sampling(mesh.vertices.astype(float), PLACE_SPACINGS * spacing_mm).points())
     thinned_mm = spacing_mm * (len(mesh.vertices) / len(some)) ** 0.5
-    folded = folds(mesh.vertices[some].astype(float), None if normals is None else normals[some], thinned_mm)
+    fold_shares = folds(mesh.vertices[some].astype(float), None if normals is None else normals[some], thinned_mm)
     size_mm = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0).astype(np.float64)))
-    return Survey(len(mesh.vertices), spacing_mm, size_mm, places, folded)
+    return Survey(len(mesh.vertices), spacing_mm, size_mm, places, fold_shares)
 
 
 def _expect_fine_steps(source: ScanSource, mesh: Mesh, spacing_mm: float) -> None:

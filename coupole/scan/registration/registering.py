@@ -87,10 +87,10 @@ def register(
     if trust_poses and not any(scan.stated_pose is not None for scan in scans):
         raise InputError("--trust-poses: no scan states a pose; only PTX and E57 can")
     with search_of(scans, processes) as search:
-        known = motions_by_targets(sightings)
+        motions = motions_by_targets(sightings)
         if trust_poses:
-            known += search.run("testing stated poses", list(_stated(scans)), say)
-        groups = _found(scans, search, known, say, every=not trust_poses)
+            motions += search.run("testing stated poses", list(_stated(scans)), say)
+        groups = _found(scans, search, motions, say, every=not trust_poses)
         main = max(groups.members.values(), key=lambda members: (len(members), -min(members)))
         if len(main) < 2:
             raise InputError(
@@ -98,37 +98,37 @@ def register(
                 f"their shape tells: {', '.join(names[:10])}. Take more scans between these, or name shared "
                 "targets with --targets"
             )
-        placed = sorted(main)
-        _grow(scans, search, groups, placed, say)
-    return _adjusted(names, scans, groups, placed, sightings, say)
+        scan_numbers = sorted(main)
+        _grow(scans, search, groups, scan_numbers, say)
+    return _adjusted(names, scans, groups, scan_numbers, sightings, say)
 
 
 def _prepared(sources: Sequence[ScanSource], unit: str, stand: Stand | None, say: Say) -> list[PreparedScan]:
     surveys = []
-    for done, source in enumerate(sources):
-        say("reading", done, len(sources))
+    for number, source in enumerate(sources):
+        say("reading", number, len(sources))
         surveys.append(survey(source, unit))
     say("reading", len(sources), len(sources))
     _expect_one_unit(sources, surveys)
     if stand is None:
-        viewpoints = choose_viewpoints([one.folded for one in surveys])
+        viewpoints = choose_viewpoints([each_survey.folded for each_survey in surveys])
     else:
         viewpoints = [Viewpoint(stand)] * len(sources)
     fine_mm, coarse_mm = pitches(surveys)
     scans = []
-    for done, (source, known, viewpoint) in enumerate(zip(sources, surveys, viewpoints, strict=True)):
-        say("preparing", done, len(sources))
-        scans.append(prepare(source, unit, known, viewpoint, fine_mm, coarse_mm))
+    for number, (source, scan_survey, viewpoint) in enumerate(zip(sources, surveys, viewpoints, strict=True)):
+        say("preparing", number, len(sources))
+        scans.append(prepare(source, unit, scan_survey, viewpoint, fine_mm, coarse_mm))
     say("preparing", len(sources), len(sources))
     return scans
 
 
 def _expect_one_unit(sources: Sequence[ScanSource], surveys: Sequence[Survey]) -> None:
-    usual_mm = float(np.median([one.size_mm for one in surveys]))
-    for source, one in zip(sources, surveys, strict=True):
-        if not 1 / _ODD_SIZE < one.size_mm / usual_mm < _ODD_SIZE:
+    usual_mm = float(np.median([scan_survey.size_mm for scan_survey in surveys]))
+    for source, scan_survey in zip(sources, surveys, strict=True):
+        if not 1 / _ODD_SIZE < scan_survey.size_mm / usual_mm < _ODD_SIZE:
             raise InputError(
-                f"{source}: mixed units? The scan is {one.size_mm:.3g} mm in size, most are about "
+                f"{source}: mixed units? The scan is {scan_survey.size_mm:.3g} mm in size, most are about "
                 f"{usual_mm:.3g} mm"
             )
 
@@ -136,9 +136,14 @@ def _expect_one_unit(sources: Sequence[ScanSource], surveys: Sequence[Survey]) -
 def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
     """Pitches of the fine and the coarse clouds, mm: the same for all scans."""
     many = len(surveys) > ALL_PAIRS
-    spacing_mm = PLACE_SPACINGS * float(np.median([one.spacing_mm for one in surveys]))
+    spacing_mm = PLACE_SPACINGS * float(np.median([scan_survey.spacing_mm for scan_survey in surveys]))
     places = float(
-        np.median([one.places * (PLACE_SPACINGS * one.spacing_mm / spacing_mm) ** 2 for one in surveys])
+        np.median(
+            [
+                scan_survey.places * (PLACE_SPACINGS * scan_survey.spacing_mm / spacing_mm) ** 2
+                for scan_survey in surveys
+            ]
+        )
     )
     fine_mm = spacing_mm * max(1.0, float(np.sqrt(places / _FINE_PLACES[many])))
     coarse_mm = spacing_mm * max(2.0, float(np.sqrt(places / _COARSE_PLACES[many])))
@@ -148,9 +153,9 @@ def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
 def _stated(scans: Sequence[PreparedScan]) -> Iterator[Task]:
     """Pairs that overlap by the poses of their files, with their motions."""
     for first, second in combinations(range(len(scans)), 2):
-        one, other = scans[first].stated_pose, scans[second].stated_pose
-        if one is not None and other is not None:
-            motion = inverse_of(one) @ other
+        first_pose, second_pose = scans[first].stated_pose, scans[second].stated_pose
+        if first_pose is not None and second_pose is not None:
+            motion = inverse_of(first_pose) @ second_pose
             if _may_overlap(scans, (first, second), motion):
                 yield first, second, motion
 
@@ -159,23 +164,23 @@ def _found(
     scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say, *, every: bool
 ) -> Groups:
     """Groups by features, and by motions that are known; `every` pair is tried, else those of different groups."""
-    known = {(m.first, m.second) for m in by_targets}
-    untried = [pair for pair in combinations(range(len(scans)), 2) if pair not in known]
+    known_pairs = {(m.first, m.second) for m in by_targets}
+    untried_pairs = [pair for pair in combinations(range(len(scans)), 2) if pair not in known_pairs]
     motions = list(by_targets)
     groups = join(scans, motions)
     if not every:
-        untried = [(a, b) for a, b in untried if groups.group_of[a] != groups.group_of[b]]
+        untried_pairs = [(a, b) for a, b in untried_pairs if groups.group_of[a] != groups.group_of[b]]
     round_number = 0
-    while untried:
+    while untried_pairs:
         round_number += 1
         if len(scans) <= ALL_PAIRS:
-            chosen, untried = untried, []
+            batch, untried_pairs = untried_pairs, []
         else:
-            chosen, untried = _some(untried, groups, round_number)
-        what = "matching pairs" + (f", round {round_number}" if len(scans) > ALL_PAIRS else "")
-        motions += search.run(what, [(*pair, None) for pair in chosen], say)
+            batch, untried_pairs = _some(untried_pairs, groups, round_number)
+        label = "matching pairs" + (f", round {round_number}" if len(scans) > ALL_PAIRS else "")
+        motions += search.run(label, [(*pair, None) for pair in batch], say)
         groups = join(scans, motions)
-        untried = [(a, b) for a, b in untried if groups.group_of[a] != groups.group_of[b]]
+        untried_pairs = [(a, b) for a, b in untried_pairs if groups.group_of[a] != groups.group_of[b]]
     return groups
 
 
@@ -184,32 +189,32 @@ def _some(
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Pairs for a round, a few of each scan, drawn from those of different groups; and the others."""
     order = np.random.default_rng(round_number).permutation(len(untried))
-    taken: dict[int, int] = {}
-    chosen, later = [], []
+    partner_counts: dict[int, int] = {}
+    batch, later = [], []
     for k in order:
         first, second = untried[k]
         smaller = min((first, second), key=lambda scan: len(groups.members[groups.group_of[scan]]))
-        if taken.get(smaller, 0) < _PARTNERS:
-            taken[smaller] = taken.get(smaller, 0) + 1
-            chosen.append(untried[k])
+        if partner_counts.get(smaller, 0) < _PARTNERS:
+            partner_counts[smaller] = partner_counts.get(smaller, 0) + 1
+            batch.append(untried[k])
         else:
             later.append(untried[k])
-    return sorted(chosen), later
+    return sorted(batch), later
 
 
 def _grow(scans: Sequence[PreparedScan], search: Search, groups: Groups, placed: Sequence[int], say: Say) -> None:
     """Motions of the pairs that overlap by the poses found, and were not matched yet."""
-    matched = {(m.first, m.second) for m in groups.accepted}
+    matched_pairs = {(m.first, m.second) for m in groups.accepted}
     tasks = []
     every = list(combinations(placed, 2))
-    for done, pair in enumerate(every):
-        say("looking for neighbours", done + 1, len(every))
-        predicted = groups.predicted(*pair)
-        if predicted is not None and pair not in matched and _may_overlap(scans, pair, predicted):
-            tasks.append((*pair, predicted))
-    found = search.run("matching neighbours", tasks, say)
-    groups.accepted += [m for m in found if groups.agrees(scans, m)]
-    groups.rejected += [m for m in found if not groups.agrees(scans, m)]
+    for number, pair in enumerate(every):
+        say("looking for neighbours", number + 1, len(every))
+        motion = groups.predicted(*pair)
+        if motion is not None and pair not in matched_pairs and _may_overlap(scans, pair, motion):
+            tasks.append((*pair, motion))
+    motions = search.run("matching neighbours", tasks, say)
+    groups.accepted += [m for m in motions if groups.agrees(scans, m)]
+    groups.rejected += [m for m in motions if not groups.agrees(scans, m)]
 
 
 def _may_overlap(scans: Sequence[PreparedScan], pair: tuple[int, int], predicted: Floats) -> bool:
@@ -223,13 +228,13 @@ def _overlapping(
     scans: Sequence[PreparedScan], placed: Sequence[int], poses: Sequence[Floats]
 ) -> Iterator[tuple[int, int, float]]:
     """Pairs of the placed scans, by their places in `placed`, with the share that overlaps."""
-    for one, other in combinations(range(len(placed)), 2):
-        first, second = scans[placed[one]], scans[placed[other]]
-        first_from_second = inverse_of(poses[one]) @ poses[other]
+    for first_place, second_place in combinations(range(len(placed)), 2):
+        first, second = scans[placed[first_place]], scans[placed[second_place]]
+        first_from_second = inverse_of(poses[first_place]) @ poses[second_place]
         if spheres_meet(first, second, first_from_second):
             overlap = fit_of(first, second, first_from_second, 0.7 * first.coarse.pitch_mm).overlap
             if overlap >= _LEAST_JOINT_OVERLAP:
-                yield one, other, overlap
+                yield first_place, second_place, overlap
 
 
 def _adjusted(
@@ -240,18 +245,18 @@ def _adjusted(
     sightings: Sightings,
     say: Say,
 ) -> Registered:
-    chosen = [scans[k] for k in placed]
+    placed_scans = [scans[k] for k in placed]
     into_first = inverse_of(groups.group_from_scan[placed[0]])
     poses = [into_first @ groups.group_from_scan[k] for k in placed]
     overlapping = list(_overlapping(scans, placed, poses))
-    seen = sightings.of_scans(placed)
-    fit = adjust(chosen, [pair[:2] for pair in overlapping], poses, 0, seen, say)
-    strong = [(one, other) for one, other, overlap in overlapping if overlap >= LEAST_OVERLAP]
-    alone = pairs_alone(chosen, strong, fit, say)
+    placed_sightings = sightings.of_scans(placed)
+    fit = adjust(placed_scans, [pair[:2] for pair in overlapping], poses, 0, placed_sightings, say)
+    strong = [(first, second) for first, second, overlap in overlapping if overlap >= LEAST_OVERLAP]
+    alone = pairs_alone(placed_scans, strong, fit, say)
     fit, factor = with_loops(fit, alone, len(placed))
     loops = [
         Loop(tuple(placed[k] for k in loop.scans), loop.error_mm, loop.error_deg)
-        for loop in find_loops(chosen, alone)
+        for loop in find_loops(placed_scans, alone)
     ]
     to_first = inverse_of(fit.common_from_scan[0])
     return Registered(
@@ -260,7 +265,7 @@ def _adjusted(
         tuple(placed),
         {number: to_first @ fit.common_from_scan[k] for k, number in enumerate(placed)},
         {number: fit.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k, number in enumerate(placed)},
-        fit.common_from_scan[0] if seen.anchored else None,
+        fit.common_from_scan[0] if placed_sightings.anchored else None,
         tuple(k for k in range(len(scans)) if k not in placed),
         tuple(groups.accepted),
         tuple(groups.rejected),

@@ -38,7 +38,7 @@ PLAUSIBLE_SIZE_MM = (2.0, 1e6)
 def sources_of(paths: Sequence[Path]) -> list[ScanSource]:
     """The scans of files, of which a PTX, PTS or E57 may hold several; their names are paths where two files have
     the same name. Raises InputError with the place of the error, ExtraMissing."""
-    found: list[ScanSource] = []
+    sources: list[ScanSource] = []
     for path in paths:
         suffix = path.suffix.lower()
         if suffix not in SUFFIXES:
@@ -48,14 +48,17 @@ def sources_of(paths: Sequence[Path]) -> list[ScanSource]:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: expected a scan; the file is empty")
         if suffix in HEADED_SUFFIXES:
-            found += headed_sources(path)
+            sources += headed_sources(path)
         elif suffix == ".e57":
-            found += e57_scans.e57_sources(path)
+            sources += e57_scans.e57_sources(path)
         else:
-            found.append(ScanSource(path, path.name))
-    if len({source.name for source in found}) == len(found):
-        return found
-    return [replace(one, name=str(one.path) + one.name[len(one.path.name) :]) for one in found]
+            sources.append(ScanSource(path, path.name))
+    if len({source.name for source in sources}) == len(sources):
+        return sources
+    return [
+        replace(scan_source, name=str(scan_source.path) + scan_source.name[len(scan_source.path.name) :])
+        for scan_source in sources
+    ]
 
 
 def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanContent:
@@ -63,25 +66,25 @@ def read_scan(source: ScanSource, unit: str, *, colours: bool = False) -> ScanCo
     ExtraMissing."""
     suffix = source.path.suffix.lower()
     if suffix == ".e57":
-        found, unit = e57_scans.read_e57(source, colours=colours), e57_scans.UNIT
+        content, unit = e57_scans.read_e57(source, colours=colours), e57_scans.UNIT
     elif suffix in HEADED_SUFFIXES:
-        found = read_headed(source)
+        content = read_headed(source)
     elif suffix in TEXT_SUFFIXES:
-        found = read_plain(source.path)
+        content = read_plain(source.path)
     elif suffix == ".ply":
         mesh = read_ply(MeshFile(source.path))
-        found = ScanContent(mesh, _ply_colours(source.path, len(mesh.vertices)) if colours else None)
+        content = ScanContent(mesh, _ply_colours(source.path, len(mesh.vertices)) if colours else None)
     else:
-        found = ScanContent(read_mesh(source.path))
-    if len(found.mesh.vertices) < LEAST_POINTS:
-        raise InputError(f"{source}: expected {LEAST_POINTS} points or more, found {len(found.mesh.vertices)}")
-    mesh = Mesh(found.mesh.vertices * np.float32(MM_PER_UNIT[unit]), found.mesh.triangles)
+        content = ScanContent(read_mesh(source.path))
+    if len(content.mesh.vertices) < LEAST_POINTS:
+        raise InputError(f"{source}: expected {LEAST_POINTS} points or more, found {len(content.mesh.vertices)}")
+    mesh = Mesh(content.mesh.vertices * np.float32(MM_PER_UNIT[unit]), content.mesh.triangles)
     _expect_plausible(source, mesh, unit)
-    pose = found.stated_pose
+    pose = content.stated_pose
     if pose is not None:
         pose = pose.copy()
         pose[:3, 3] *= MM_PER_UNIT[unit]
-    return ScanContent(mesh, found.srgba, pose)
+    return ScanContent(mesh, content.srgba, pose)
 
 
 def _ply_colours(path: Path, count: int) -> NDArray[np.uint8] | None:
@@ -92,10 +95,10 @@ def _ply_colours(path: Path, count: int) -> NDArray[np.uint8] | None:
         return None
     import trimesh
 
-    loaded: Any = trimesh.load(path, process=False)
-    colours = getattr(loaded, "colors", None)
+    geometry: Any = trimesh.load(path, process=False)
+    colours = getattr(geometry, "colors", None)
     if colours is None:
-        colours = loaded.visual.vertex_colors
+        colours = geometry.visual.vertex_colors
     colours = np.asarray(colours)
     if len(colours) != count or colours.dtype != np.uint8:
         raise InputError(f"{path}: expected colours of {count} vertices, 8 bit; found {len(colours)}")
@@ -117,14 +120,14 @@ def _expect_plausible(source: ScanSource, mesh: Mesh, unit: str) -> None:
 
 def expect_different(paths: Sequence[Path]) -> None:
     """Raise InputError if two files hold the same bytes, or one is named twice."""
-    seen: dict[str, Path] = {}
+    path_of: dict[str, Path] = {}
     for path in paths:
         try:
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
             raise InputError(f"{path}: expected a scan; {reason(error)}") from error
-        if digest in seen:
-            again = "is named twice" if seen[digest] == path else f"holds the same bytes as {seen[digest]}"
+        if digest in path_of:
+            again = "is named twice" if path_of[digest] == path else f"holds the same bytes as {path_of[digest]}"
             raise InputError(f"{path}: {again}; name each scan once")
-        seen[digest] = path
+        path_of[digest] = path

@@ -25,10 +25,10 @@ def applied(motion: Floats, points_mm: Floats) -> Floats:
 def stepped(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
     """A motion [4, 4] after a step [6] that turns about a point of the frame it leads to."""
     turn = Rotation.from_rotvec(step[3:]).as_matrix()
-    moved = np.eye(4)
-    moved[:3, :3] = turn @ motion[:3, :3]
-    moved[:3, 3] = turn @ (motion[:3, 3] - pivot_mm) + pivot_mm + step[:3]
-    return moved
+    new_motion = np.eye(4)
+    new_motion[:3, :3] = turn @ motion[:3, :3]
+    new_motion[:3, 3] = turn @ (motion[:3, 3] - pivot_mm) + pivot_mm + step[:3]
+    return new_motion
 
 
 def step_between(before: Floats, after: Floats, pivot_mm: Floats) -> Floats:

@@ -17,7 +17,7 @@ _CONSPICUOUS = 3.0
 
 def about(found: Registered, merged: Merged | None) -> dict[str, Any]:
     """The content of `registration.json`; lengths in mm, angles in degrees."""
-    told: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "frame": found.names[found.placed[0]],
         "poses": {found.names[k]: found.first_from_scan[k].tolist() for k in found.placed},
         "uncertainties": {found.names[k]: _uncertainty(found, k) for k in found.placed},
@@ -36,30 +36,30 @@ def about(found: Registered, merged: Merged | None) -> dict[str, Any]:
         "viewpoints": {scan.name: scan.viewpoint.stand for scan in found.scans},
     }
     if found.fit.sightings:
-        told["targets"] = [
+        summary["targets"] = [
             {
-                "scan": found.names[found.placed[one.scan]],
-                "name": one.name,
-                "u_mm": one.u_mm,
-                "off_mm": one.left_mm,
+                "scan": found.names[found.placed[sighting.scan]],
+                "name": sighting.name,
+                "u_mm": sighting.u_mm,
+                "off_mm": sighting.left_mm,
             }
-            for one in found.fit.sightings
+            for sighting in found.fit.sightings
         ]
     if found.site_from_first is not None:
-        told["site_from_first"] = found.site_from_first.tolist()
-    stated = stated_poses_off_mm(found)
-    if stated:
-        told["stated_poses_off_mm"] = stated
+        summary["site_from_first"] = found.site_from_first.tolist()
+    off_mm = stated_poses_off_mm(found)
+    if off_mm:
+        summary["stated_poses_off_mm"] = off_mm
     if merged is not None:
-        told["mesh"] = {
+        summary["mesh"] = {
             "vertices": merged.vertices,
             "triangles": merged.triangles,
             "points": merged.points,
             "cell_mm": merged.cell_mm,
             "colours": merged.coloured,
         }
-        told["levels"] = merged.levels
-    return told
+        summary["levels"] = merged.levels
+    return summary
 
 
 def _uncertainty(found: Registered, number: int) -> dict[str, Any]:
@@ -78,21 +78,21 @@ def point_uncertainty_mm(found: Registered, number: int) -> float:
     covariance, points = found.covariance[number], found.scans[number].coarse.points_mm
     arms = points - points.mean(axis=0)
     turn = found.fit.common_from_scan[found.placed.index(number)][:3, :3]
-    spread = (arms @ turn.T).T @ (arms @ turn.T) / len(arms)
-    turning = np.trace(spread) * np.eye(3) - spread
+    arm_moments = (arms @ turn.T).T @ (arms @ turn.T) / len(arms)
+    turning = np.trace(arm_moments) * np.eye(3) - arm_moments
     return float(np.sqrt(np.trace(covariance[:3, :3]) + np.sum(turning * covariance[3:, 3:])))
 
 
 def stated_poses_off_mm(found: Registered) -> dict[str, float]:
     """Root mean square displacement of each scan's points from where the pose that its file states puts them, seen
     from the first placed scan that states one."""
-    stated = {k: pose for k in found.placed if (pose := found.scans[k].stated_pose) is not None}
-    if len(stated) < 2:
+    stated_poses = {k: pose for k in found.placed if (pose := found.scans[k].stated_pose) is not None}
+    if len(stated_poses) < 2:
         return {}
-    first = min(stated)
+    first = min(stated_poses)
     off = {}
-    for k, pose in stated.items():
-        by_file = inverse_of(stated[first]) @ pose
+    for k, pose in stated_poses.items():
+        by_file = inverse_of(stated_poses[first]) @ pose
         by_us = inverse_of(found.first_from_scan[first]) @ found.first_from_scan[k]
         off[found.names[k]] = displacement_mm(by_file, by_us, found.scans[k].coarse.points_mm)
     return off
@@ -127,11 +127,11 @@ def remarks(found: Registered) -> Iterator[str]:
         yield "not placed, as they overlap no other enough: " + ", ".join(names[k] for k in found.unplaced)
     if found.rejected:
         yield f"{len(found.rejected)} pairs were rejected, as others contradict them"
-    if stated := stated_poses_off_mm(found):
-        worst = max(stated, key=lambda name: stated[name])
+    if off_mm := stated_poses_off_mm(found):
+        worst = max(off_mm, key=lambda name: off_mm[name])
         yield (
-            f"poses stated by the files put points {np.median(list(stated.values())):.3g} mm in the median from "
-            f"where they are found, {stated[worst]:.3g} mm at worst ({worst})"
+            f"poses stated by the files put points {np.median(list(off_mm.values())):.3g} mm in the median from "
+            f"where they are found, {off_mm[worst]:.3g} mm at worst ({worst})"
         )
     blind = [scan.name for scan in found.scans if scan.viewpoint.stand == "none"]
     if blind:
@@ -139,9 +139,9 @@ def remarks(found: Registered) -> Iterator[str]:
             "seen from nowhere that is known, so that empty space before them proves nothing (see --seen-from): "
             + ", ".join(blind)
         )
-    for one in found.fit.sightings:
-        if one.left_mm > _CONSPICUOUS * np.sqrt(3) * one.u_mm:
+    for sighting in found.fit.sightings:
+        if sighting.left_mm > _CONSPICUOUS * np.sqrt(3) * sighting.u_mm:
             yield (
-                f"target {one.name} of {names[found.placed[one.scan]]} is {one.left_mm:.3g} mm off, stated are "
-                f"{one.u_mm:.2g} mm"
+                f"target {sighting.name} of {names[found.placed[sighting.scan]]} is {sighting.left_mm:.3g} mm "
+                f"off, stated are {sighting.u_mm:.2g} mm"
             )

@@ -47,8 +47,8 @@ def headed_sources(path: Path) -> Iterator[ScanSource]:
             name = path.name if number == 0 else f"{path.name}#{number + 1}"
             source = ScanSource(path, name, number, at_byte, line)
             count, lines, _ = _header(file, source)
-            skipped = sum(1 for _ in islice(file, count))
-            expect_records(path, f"scan {number + 1}, point", count, skipped)
+            line_count = sum(1 for _ in islice(file, count))
+            expect_records(path, f"scan {number + 1}, point", count, line_count)
             yield source
             number, line = number + 1, line + lines + count
 
@@ -95,8 +95,8 @@ def _header(file: BinaryIO, source: ScanSource) -> tuple[int, int, Floats | None
     rows = []
     for k in range(lines):
         text = file.readline(4096).decode("ascii", "replace")
-        wanted = 1 if k < 2 else 3 if k < 6 else 4
-        rows.append(_numbers(source, source.at_line + k, text, wanted))
+        column_count = 1 if k < 2 else 3 if k < 6 else 4
+        rows.append(_numbers(source, source.at_line + k, text, column_count))
     counts = [row[0] for row in rows[: 2 if lines > 1 else 1]]
     if any(count != round(count) or count < 1 for count in counts):
         raise InputError(f"{source.path}:{source.at_line}: expected a number of points, found {counts[0]:g}")
@@ -107,16 +107,16 @@ def _header(file: BinaryIO, source: ScanSource) -> tuple[int, int, Floats | None
 
 def _numbers(source: ScanSource, line: int, text: str, wanted: int) -> list[float]:
     try:
-        found = [float(word) for word in text.split()]
+        numbers = [float(word) for word in text.split()]
     except ValueError:
-        found = []
-    if len(found) != wanted or not np.all(np.isfinite(found)):
-        shown = text.strip()[:60] or "nothing"
+        numbers = []
+    if len(numbers) != wanted or not np.all(np.isfinite(numbers)):
+        excerpt = text.strip()[:60] or "nothing"
         raise InputError(
             f"{source.path}:{line}: expected {wanted} number{'s' if wanted > 1 else ''} of the header of scan "
-            f"{source.number + 1}, found `{shown}`"
+            f"{source.number + 1}, found `{excerpt}`"
         )
-    return found
+    return numbers
 
 
 def _pose(source: ScanSource, matrix: Floats) -> Floats:
@@ -136,16 +136,16 @@ def _pose(source: ScanSource, matrix: Floats) -> Floats:
 
 def _table(path: Path, lines: Iterator[bytes] | BinaryIO, first_line: int) -> Floats:
     """[n, columns] of lines with as many numbers each. Raises InputError with the line."""
-    read = _Decoded(lines)
+    reader = _Decoded(lines)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # without lines: counted by who asked
-            table = np.loadtxt(read, dtype=np.float64, comments=("#", "//"), ndmin=2)
+            table = np.loadtxt(reader, dtype=np.float64, comments=("#", "//"), ndmin=2)
     except ValueError as error:
-        line = first_line + read.count - 1
+        line = first_line + reader.count - 1
         raise InputError(
             f"{path}:{line}: expected x, y and z first in each line, and as many numbers in all, separated by "
-            f"blanks; found `{read.last.strip()[:60]}`"
+            f"blanks; found `{reader.last.strip()[:60]}`"
         ) from error
     if len(table) and table.shape[1] < 3:
         raise InputError(f"{path}:{first_line}: expected x, y and z in each line, found {table.shape[1]} numbers")

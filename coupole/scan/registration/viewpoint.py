@@ -77,16 +77,16 @@ class DepthPicture:
         np.minimum.at(near.reshape(-1), flat, depths)
         np.maximum.at(far.reshape(-1), flat, depths)
         self._own = near, far
-        filled = np.isfinite(near)
-        around = ndimage.uniform_filter(filled.astype(float), 3, mode="constant") > 0.99
+        is_filled = np.isfinite(near)
+        around = ndimage.uniform_filter(is_filled.astype(float), 3, mode="constant") > 0.99
         nearest = ndimage.minimum_filter(near, 3, mode="nearest")
         self._nearest = np.where(around, nearest, -np.inf).reshape(-1)
 
     def folded(self, step_mm: float) -> float:
         """Share of the cells that hold surfaces farther apart than a step along the ray."""
         near, far = self._own
-        filled = np.isfinite(near)
-        return float(np.mean(far[filled] - near[filled] > step_mm))
+        is_filled = np.isfinite(near)
+        return float(np.mean(far[is_filled] - near[is_filled] > step_mm))
 
     def in_front(self, points_mm: Floats, least_mm: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Tell which points [n, 3] in this scan's frame lie in rays that ended at a surface, and which of these
@@ -94,8 +94,8 @@ class DepthPicture:
         places, depths = self._viewpoint.seen(points_mm @ self._level)
         flat, inside = self._cells(self._turned(places))
         nearest = np.where(inside, self._nearest[flat], -np.inf)
-        seen = np.isfinite(nearest)
-        return seen, seen & (depths < nearest - least_mm)
+        is_seen = np.isfinite(nearest)
+        return is_seen, is_seen & (depths < nearest - least_mm)
 
     def _turned(self, places: Floats) -> Floats:
         if self._viewpoint.stand != "origin":
@@ -105,8 +105,8 @@ class DepthPicture:
     def _cells(self, places: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         cells = np.floor((places - self._low) / self._cell).astype(np.intp)
         inside = np.all((cells >= 0) & (cells < np.array(self._shape)), axis=1)
-        clipped = np.clip(cells, 0, np.array(self._shape) - 1)
-        return clipped[:, 0] * self._shape[1] + clipped[:, 1], inside
+        nearest_cells = np.clip(cells, 0, np.array(self._shape) - 1)
+        return nearest_cells[:, 0] * self._shape[1] + nearest_cells[:, 1], inside
 
 
 def _level(points_mm: Floats) -> Floats:
@@ -133,22 +133,22 @@ def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[
     positive end, as range images have it.
     """
     step_mm = 8 * spacing_mm
-    found: dict[Stand, float] = {}
+    fold_shares: dict[Stand, float] = {}
     ends: tuple[tuple[Stand, Stand], ...] = (("+x", "-x"), ("+y", "-y"), ("+z", "-z"))
     for stand, opposite in ends:
-        folded = DepthPicture(Viewpoint(stand), points_mm, spacing_mm).folded(step_mm)
-        turned = normals is not None and np.mean(normals @ _axis(stand) > 0) < 0.5
-        found[opposite if turned else stand] = folded
+        fold_share = DepthPicture(Viewpoint(stand), points_mm, spacing_mm).folded(step_mm)
+        is_turned = normals is not None and np.mean(normals @ _axis(stand) > 0) < 0.5
+        fold_shares[opposite if is_turned else stand] = fold_share
     if float(np.linalg.norm(points_mm, axis=1).min()) > 20 * spacing_mm:
-        found["origin"] = DepthPicture(Viewpoint("origin"), points_mm, spacing_mm).folded(step_mm)
-    return found
+        fold_shares["origin"] = DepthPicture(Viewpoint("origin"), points_mm, spacing_mm).folded(step_mm)
+    return fold_shares
 
 
 def choose_viewpoints(folded: Sequence[dict[Stand, float]]) -> list[Viewpoint]:
     """One viewpoint for each scan: of all that they could have the one that folds them least, as all come from one
     scanner; the origin if it is as good. `none` for a scan that it does not fit: one that was merged, or moved."""
-    shared = set.intersection(*(set(of_scan) for of_scan in folded))
-    total = {stand: float(np.median([of_scan[stand] for of_scan in folded])) for stand in shared}
+    common_stands = set.intersection(*(set(of_scan) for of_scan in folded))
+    total = {stand: float(np.median([of_scan[stand] for of_scan in folded])) for stand in common_stands}
     best: Stand = min(total, key=lambda stand: (total[stand], stand)) if total else "none"
     if "origin" in total and total["origin"] <= max(_AS_GOOD, total.get(best, 1.0)):
         best = "origin"

@@ -49,9 +49,9 @@ def bench(
 
     console = make_console(quiet=as_json)
     try:
-        what = read_job(object_of, rig) if object_of else read_cell(rig)
-        with borrowed(what if isinstance(what, Cell) else what.cell, "bench"):
-            serve_bench(what, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
+        job_or_cell = read_job(object_of, rig) if object_of else read_cell(rig)
+        with borrowed(job_or_cell if isinstance(job_or_cell, Cell) else job_or_cell.cell, "bench"):
+            serve_bench(job_or_cell, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -91,18 +91,18 @@ def arm(
     try:
         cell = read_cell(rig)
         if is_in_use(cell):
-            found = _driven(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
+            answer = _driven(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
         else:
             lies = object_of or plan
-            what = read_job(lies, rig) if lies else cell
-            with borrowed(cell, "arm"), bench_of(what, console, control, confirm=False) as service:
-                found = _driven(service.ask, goal, control, yes=yes)
+            job_or_cell = read_job(lies, rig) if lies else cell
+            with borrowed(cell, "arm"), bench_of(job_or_cell, console, control, confirm=False) as service:
+                answer = _driven(service.ask, goal, control, yes=yes)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    console.print(f"the arm is at {found['to']}", markup=False)
+    console.print(f"the arm is at {answer['to']}", markup=False)
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(answer))
 
 
 def _say(words: str) -> None:

@@ -48,20 +48,20 @@ def bracket(
             from coupole.exchange.bracket import camera_response, exposure_merging, merged_files
             from coupole.exchange.bracket.photographs import read_photographs
 
-            found = read_photographs(photographs, exposure_s)
+            photos = read_photographs(photographs, exposure_s)
         with console.status("finding the response"):
-            curve = camera_response.found_response(found)
-        used = camera_response.linear_response(curve.noise) if linear or found.raw else curve
+            curve = camera_response.found_response(photos)
+        response = camera_response.linear_response(curve.noise) if linear or photos.raw else curve
         with console.status("merging"):
-            merged = exposure_merging.merged(found, used)
-            first, last = found.exposure_s[[0, -1]]
-            told = f"merged from {len(found.paths)} photographs, {first:g} to {last:g} s"
-            remark = "" if linear or found.raw else camera_response.left_open(found.exposure_s)
-            told = "; ".join(filter(None, (told, remark)))
-            merged_files.write_exr(out, merged, told)
-            drawn = out.with_name(f"{out.stem}-response.png")
-            merged_files.draw_response(drawn, curve, f"Response found from {len(found.paths)} photographs")
-        document = _document(found, curve, merged, out, drawn, is_linear=linear or found.raw)
+            picture = exposure_merging.merged(photos, response)
+            first, last = photos.exposure_s[[0, -1]]
+            description = f"merged from {len(photos.paths)} photographs, {first:g} to {last:g} s"
+            remark = "" if linear or photos.raw else camera_response.left_open(photos.exposure_s)
+            description = "; ".join(filter(None, (description, remark)))
+            merged_files.write_exr(out, picture, description)
+            drawing_path = out.with_name(f"{out.stem}-response.png")
+            merged_files.draw_response(drawing_path, curve, f"Response found from {len(photos.paths)} photographs")
+        document = _document(photos, curve, picture, out, drawing_path, is_linear=linear or photos.raw)
         document["remarks"] = [remark] if remark else []
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -94,9 +94,9 @@ def sphere_brdf(
             from coupole.plan import yamlfile
             from coupole.storage.durable import write_synced
 
-            given = yamlfile.read(sample).validate(fitting.SphereSample)
-            pictures = [read_known(sample.parent / lit.path) for lit in given.photographs]
-            samples = fitting.samples_of(given, pictures)
+            setup = yamlfile.read(sample).validate(fitting.SphereSample)
+            pictures = [read_known(sample.parent / lit.path) for lit in setup.photographs]
+            samples = fitting.samples_of(setup, pictures)
             table = fitting.table_of(samples)
             off = fitting.misses(samples, table)
         with console.status("writing"):
@@ -117,7 +117,7 @@ def _document(
 ) -> dict[str, Any]:
     import numpy as np
 
-    known = np.isfinite(merged.uncertainty)
+    is_finite = np.isfinite(merged.uncertainty)
     steps = slice(0, None, 15)
     sigma = curve.uncertainty[steps]
     return {
@@ -138,7 +138,7 @@ def _document(
         },
         "saturated": float(merged.saturated.any(axis=2).mean()),
         "dark": float(merged.dark.any(axis=2).mean()),
-        "median_uncertainty": float(np.median(merged.uncertainty[known])) if known.any() else None,
+        "median_uncertainty": float(np.median(merged.uncertainty[is_finite])) if is_finite.any() else None,
     }
 
 
@@ -157,9 +157,9 @@ def _lines(document: dict[str, Any]) -> list[str]:
             lines.append(f"{document[state]:.2%} of the pixels are {state} in all photographs: {meaning}")
     lines += document["remarks"]
     lines += [
-        f"{one['path']}: {one['contradicting']:.1%} of its pixels contradict the others and are left out; has "
+        f"{photo['path']}: {photo['contradicting']:.1%} of its pixels contradict the others and are left out; has "
         "something moved, or the light changed?"
-        for one in document["photographs"]
-        if one["contradicting"] > _TOLD_FROM
+        for photo in document["photographs"]
+        if photo["contradicting"] > _TOLD_FROM
     ]
     return lines

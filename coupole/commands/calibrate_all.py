@@ -47,22 +47,22 @@ def calibrate_all(
     from coupole.viewing.terminal import make_console
 
     console, cell = make_console(quiet=as_json), read_cell(rig)
-    known = [step.name for step in STEPS]
-    if unknown := [name for name in only or [] if name not in known]:
-        raise InputError(f"--only {unknown[0]}: expected one of {', '.join(known)}")
-    simulated = in_world(cell.rig, dry_run=False)
-    if not simulated and scan is None:
+    names = [step.name for step in STEPS]
+    if unknown := [name for name in only or [] if name not in names]:
+        raise InputError(f"--only {unknown[0]}: expected one of {', '.join(names)}")
+    is_simulated = in_world(cell.rig, dry_run=False)
+    if not is_simulated and scan is None:
         if MESH in (only or []):
             raise InputError(f"--only {MESH}: needs the object's scan, as `coupole scan` writes it: --scan FOLDER")
-        known.remove(MESH)
+        names.remove(MESH)
         console.print(f"{MESH}: skipped, as no --scan is given")
-    stated, ask = Repeatability(repeatability_mm, repeatability_deg), not yes and not simulated
+    repeatability, ask = Repeatability(repeatability_mm, repeatability_deg), not yes and not is_simulated
     campaign = Campaign(
-        rig, out, scan, stated, simulated=simulated, ask=ask, console=console, valid_days=valid_days
+        rig, out, scan, repeatability, simulated=is_simulated, ask=ask, console=console, valid_days=valid_days
     )
     try:
         with borrowed(cell, "calibrate all"):
-            campaign.do_all(only or known)
+            campaign.do_all(only or names)
     except CoupoleError as error:
         fail(error, as_json=as_json, found={"records": campaign.found()})
         raise

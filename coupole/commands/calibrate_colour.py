@@ -74,10 +74,10 @@ def colour(
         patches = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
         frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
         whites = None if white is None else posed(open_light_frames([white]), known.hand_eye, known.rig, runs)
-        used = known.rig or rig_of(runs[0])
-        cell = read_cell(used)
+        rig_path = known.rig or rig_of(runs[0])
+        cell = read_cell(rig_path)
         by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-        files = (*patches.files, used, known.leds or cell.leds_path, known.hand_eye, known.camera)
+        files = (*patches.files, rig_path, known.leds or cell.leds_path, known.hand_eye, known.camera)
         setting = ChartSetting(
             patches.chart,
             cell.rig.support.base_from_support.matrix(),
@@ -91,9 +91,9 @@ def colour(
             tuple(path for path in files if path is not None),
         )
         with bar(console, "frames of the chart") as progress:
-            seen = see_in_runs(frames, setting, whites, progress)
+            sightings = see_in_runs(frames, setting, whites, progress)
         with bar(console, "patches left out") as progress:
-            return colour_outcome(seen, patches, setting, frames, request, progress)
+            return colour_outcome(sightings, patches, setting, frames, request, progress)
 
     return work
 
@@ -105,9 +105,9 @@ def corners_of(words: str | None) -> Floats | None:
     if words is None:
         return None
     try:
-        found = np.array([[float(number) for number in pair.split(",")] for pair in words.split()])
+        corners_px = np.array([[float(number) for number in pair.split(",")] for pair in words.split()])
     except ValueError:
-        found = np.empty(0)
-    if found.shape != (4, 2) or not np.isfinite(found).all():
+        corners_px = np.empty(0)
+    if corners_px.shape != (4, 2) or not np.isfinite(corners_px).all():
         raise InputError(f'--corners: expected four pairs of pixels "X,Y X,Y X,Y X,Y", found {words!r}')
-    return found
+    return corners_px

@@ -98,13 +98,15 @@ def leds(
             f"{len(images.seen.led)} spots in {len(images.seen.frames)} images of {len(images.views)} views"
         )
         prior = read_posed_camera(hand_eye, camera, images.about, images.size_px)
-        stated = Stated(
+        tolerances = Stated(
             tolerance_mm=tolerance_mm, robot_mm=robot.repeatability_mm, robot_deg=robot.repeatability_deg
         )
         with console.status("adjusting boards, poses, lens and hand-eye"):
             arm = arm_of(cell, hand_eye)
-            found = leds_from(images, table, prior, request, stated=stated, arm=arm, accept_faults=accept_faults)
-        return Outcome(found.record, partial(draw_leds, found), found.files)
+            calibration = leds_from(
+                images, table, prior, request, stated=tolerances, arm=arm, accept_faults=accept_faults
+            )
+        return Outcome(calibration.record, partial(draw_leds, calibration), calibration.files)
 
     return work
 
@@ -134,7 +136,7 @@ def mesh(
     from coupole.calibration.stickers.workflow import mesh_from
 
     def work(console: Console, request: Request) -> Outcome:
-        known, sources = read_scan(scan), open_sources(runs, None)
+        scanned_mesh, sources = read_scan(scan), open_sources(runs, None)
         for made_with in (hand_eye, camera, rig):
             sources = sources.with_file(made_with)
         size_px = sources.images[0].read().size_px
@@ -147,21 +149,21 @@ def mesh(
         console.print(f"{sum(map(len, images.stickers))} stickers in {len(images.names)} images")
         support = _base_from_support(_cell(rig, runs)) if rig is not None else None
         arm = arm_of(_cell(rig, runs), hand_eye) if has_axis_zeros(hand_eye) else None
-        stated = Stated(
+        tolerances = Stated(
             scanner_mm=stickers.scanner_mm, robot_mm=robot.repeatability_mm, robot_deg=robot.repeatability_deg
         )
-        found = mesh_from(
+        calibration = mesh_from(
             images,
             sources,
-            known,
+            scanned_mesh,
             prior,
             request,
-            stated=stated,
+            stated=tolerances,
             depth_mm=depth_mm,
             base_from_support=support,
             arm=arm,
         )
-        return Outcome(found.record, partial(draw_mesh, found))
+        return Outcome(calibration.record, partial(draw_mesh, calibration))
 
     return work
 

@@ -45,8 +45,8 @@ def camera(
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
-        sources, _, found = _look(paths, board, None, console)
-        return _drawn(camera_from(found, sources, model, request)[1])
+        sources, _, sightings = _look(paths, board, None, console)
+        return _drawn(camera_from(sightings, sources, model, request)[1])
 
     return work
 
@@ -63,10 +63,10 @@ def chromatic(
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
-        sources, described, shown = _look(paths, board, None, console)
+        sources, target, sightings = _look(paths, board, None, console)
         with console.status("adjusting a lens for each colour"):
-            found = chromatic_from(shown, sources, described, model, request)
-        return Outcome(found.record, partial(draw_chromatic, found))
+            calibration = chromatic_from(sightings, sources, target, model, request)
+        return Outcome(calibration.record, partial(draw_chromatic, calibration))
 
     return work
 
@@ -115,13 +115,15 @@ def hand_eye(
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         arm = _arm(rig)
-        sources, described, found = _look(paths, board, poses, console)
-        earlier = _earlier_lens(camera_record, sources, found)
+        sources, target, sightings = _look(paths, board, poses, console)
+        earlier = _earlier_lens(camera_record, sources, sightings)
         sources = sources.with_file(camera_record).with_file(rig)
         noise = RobotNoise(robot.repeatability_mm, robot.repeatability_deg, robot.absolute_mm, robot.absolute_deg)
         with console.status("adjusting lens, hand-eye, board and the robot's errors"):
-            shown = hand_eye_from(found, sources, described, model, request, robot=noise, arm=arm, lens=earlier)[2]
-        return _drawn(shown)
+            drawing = hand_eye_from(
+                sightings, sources, target, model, request, robot=noise, arm=arm, lens=earlier
+            )[2]
+        return _drawn(drawing)
 
     return work
 
@@ -151,15 +153,15 @@ def _look(
     beside = paths[0] / BOARD_NAME
     if board is None and not beside.is_file():
         raise InputError(f"expected the board's description: give --board, or put it at {beside}")
-    described = read_board(board or beside)
+    target = read_board(board or beside)
     sources = open_sources(paths, poses).with_file(board or beside)
     with bar(console, "looking for the board") as progress:
-        found = find_board(described, sources, progress)
-    for line in found.left_out:
+        sightings = find_board(target, sources, progress)
+    for line in sightings.left_out:
         console.print(f"[yellow]left out:[/] {line}")
-    corners = sum(len(seen.ids) for seen in found.sightings)
-    console.print(f"{corners} corners in {len(found.sightings)} of {len(sources.images)} images")
-    return sources, described, found
+    corners = sum(len(sighting.ids) for sighting in sightings.sightings)
+    console.print(f"{corners} corners in {len(sightings.sightings)} of {len(sources.images)} images")
+    return sources, target, sightings
 
 
 def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:

@@ -67,10 +67,10 @@ def rig_of(run: Path) -> Path:
     from coupole.storage.durable import sha256
     from coupole.storage.run import Run
 
-    opened = Run(run)
-    path, described = opened.rig_path, opened.about["rig"]
-    unchanged = path.is_file() and ("stored" in described or sha256(path) == described["sha256"])
-    if not unchanged:
+    folder = Run(run)
+    path, rig_entry = folder.rig_path, folder.about["rig"]
+    is_unchanged = path.is_file() and ("stored" in rig_entry or sha256(path) == rig_entry["sha256"])
+    if not is_unchanged:
         raise InputError(f"{run}: its rig {path} is gone or was changed since; name one with --rig")
     return path
 
@@ -115,18 +115,21 @@ def calibration(
 
         @wraps(flat)
         def run(*arguments: Any, **options: Any) -> None:
-            shared = {name: options.pop(name, default) for name, _, default in common}
-            _calibrate(kind, flat(*arguments, **options), limits=limits, **shared)
+            common_options = {name: options.pop(name, default) for name, _, default in common}
+            _calibrate(kind, flat(*arguments, **options), limits=limits, **common_options)
 
-        own = inspect.signature(flat)
-        added = [
+        signature = inspect.signature(flat)
+        common_parameters = [
             inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind_of)
             for name, kind_of, default in common
         ]
-        run.__signature__ = own.replace(  # type: ignore[attr-defined]
-            parameters=[*own.parameters.values(), *added], return_annotation=None
+        run.__signature__ = signature.replace(  # type: ignore[attr-defined]
+            parameters=[*signature.parameters.values(), *common_parameters], return_annotation=None
         )
-        run.__annotations__ = {one.name: one.annotation for one in (*own.parameters.values(), *added)}
+        run.__annotations__ = {
+            parameter.name: parameter.annotation
+            for parameter in (*signature.parameters.values(), *common_parameters)
+        }
         return run
 
     return command

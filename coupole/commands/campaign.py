@@ -85,11 +85,14 @@ class Campaign:
 
         for kind in step.records:
             path = self._record(kind)
-            missed = [limit for limit in read_record(path).limits if not limit.passed] if path.is_file() else []
-            if missed:
+            excesses = [limit for limit in read_record(path).limits if not limit.passed] if path.is_file() else []
+            if excesses:
                 raise CalibrationRefused(
                     [
-                        *(f"{path}: not accepted: {one.what} is {one.found:.3g} {one.unit}" for one in missed),
+                        *(
+                            f"{path}: not accepted: {excess.what} is {excess.found:.3g} {excess.unit}"
+                            for excess in excesses
+                        ),
                         f"Read {path.with_suffix('.html')}; remove the cause, or calibrate by hand with --limit "
                         f"or --accept-faults; remove {path.stem}.*, and call this again",
                     ]
@@ -104,22 +107,24 @@ class Campaign:
         from coupole.storage.run_status import status
 
         plan = self._plan(step)
-        begun = sorted((self._out / "runs").glob(f"*-{step.name}"))
-        resumed = begun[-1] if begun and (begun[-1] / "run.json").is_file() else None
-        if resumed is not None and Run(resumed).about["plan"]["sha256"] != sha256(plan):
-            self._console.print(f"{plan} was changed since {resumed.name}: a new run is acquired")
-            resumed = None
-        if resumed is not None and not status(Run(resumed)).missing:
-            return resumed
+        run_folders = sorted((self._out / "runs").glob(f"*-{step.name}"))
+        resumed_run = run_folders[-1] if run_folders and (run_folders[-1] / "run.json").is_file() else None
+        if resumed_run is not None and Run(resumed_run).about["plan"]["sha256"] != sha256(plan):
+            self._console.print(f"{plan} was changed since {resumed_run.name}: a new run is acquired")
+            resumed_run = None
+        if resumed_run is not None and not status(Run(resumed_run)).missing:
+            return resumed_run
         self._console.rule(f"acquire {step.name}")
         if self._ask:
             self._console.print(f"Place on the support: [bold]{step.stands}[/].")
             if not typer.confirm("Ready?", default=True):
                 raise Interrupted("stopped by the operator; call it again to continue")
-        found: dict[str, Any] = {}
+        summary: dict[str, Any] = {}
         job = read_job(plan)
-        acquire_plan(job, self._console, parent=self._out / "runs", resume=resumed, confirm=self._ask, found=found)
-        return Path(found["run"])
+        acquire_plan(
+            job, self._console, parent=self._out / "runs", resume=resumed_run, confirm=self._ask, found=summary
+        )
+        return Path(summary["run"])
 
     def _plan(self, step: Step) -> Path:
         """The step's plan; an existing one is kept, as it may have been edited."""
@@ -181,7 +186,7 @@ class Campaign:
         dark, response, flat = record("dark"), record("response"), record("flat-field")
         camera, hand_eye = record("camera"), record("hand-eye")
         board, days = self._out / "board.yaml", self._days
-        stated = {"repeatability_mm": self._stated.mm, "repeatability_deg": self._stated.deg}
+        repeatability = {"repeatability_mm": self._stated.mm, "repeatability_deg": self._stated.deg}
         return {
             "dark": lambda run: calibrate_light.dark([run], name="dark", out=out, **days),
             "response": lambda run: calibrate_light.response(
@@ -195,7 +200,7 @@ class Campaign:
                 [run],
                 board=board,
                 rig=self._rig,
-                **stated,
+                **repeatability,
                 name="hand-eye",
                 out=out,
                 **days,
@@ -205,7 +210,7 @@ class Campaign:
                 hand_eye=hand_eye,
                 camera=camera,
                 rig=self._rig,
-                **stated,
+                **repeatability,
                 name="leds",
                 out=out,
                 **days,
@@ -229,7 +234,7 @@ class Campaign:
                 scan=self._scan(),
                 hand_eye=hand_eye,
                 rig=self._rig,
-                **stated,
+                **repeatability,
                 name="mesh",
                 out=out,
                 **days,

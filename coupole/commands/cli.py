@@ -88,12 +88,12 @@ class _OnDemand(Mapping[str, Any]):
 @functools.cache
 def _command(name: str) -> Any:
     module, function = COMMANDS[name].split(".")
-    found = getattr(importlib.import_module(f"coupole.commands.{module}"), function)
+    entry = getattr(importlib.import_module(f"coupole.commands.{module}"), function)
     alone = typer.Typer(callback=lambda: None)
-    if isinstance(found, typer.Typer):
-        alone.add_typer(found, name=name)
+    if isinstance(entry, typer.Typer):
+        alone.add_typer(entry, name=name)
     else:
-        alone.command(name)(found)
+        alone.command(name)(entry)
     return typer.main.get_group(alone).commands[name]
 
 
@@ -148,9 +148,9 @@ def _ended() -> int:
         _say(error)
         code = error.exit_code
     except SignalReceived as received:
-        interrupted = Interrupted("stopped", received.number)
-        _say(interrupted)
-        code = interrupted.exit_code
+        interruption = Interrupted("stopped", received.number)
+        _say(interruption)
+        code = interruption.exit_code
     except typer.Abort:
         code = Interrupted.exit_code
     except Exception as error:  # noqa: BLE001  click's usage errors, which know their own exit code, and defects

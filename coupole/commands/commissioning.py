@@ -57,7 +57,7 @@ def commission(
     from coupole.viewing.terminal import make_console
 
     name = person_named(name, "the person at the cell")
-    step = next((one for one in STEPS if one == only), None)
+    step = next((entry for entry in STEPS if entry == only), None)
     if only is not None and step is None:
         raise InputError(f"--only: expected one of {', '.join(STEPS)}; found {only!r}")
     if board is not None:
@@ -83,9 +83,12 @@ def commission(
     except CoupoleError as error:
         fail(error, as_json=as_json, found=None if isinstance(error, InputError) else _figures(cell))
         raise
-    left = [one for one in STEPS if (result := record.result(one)) is None or not result.passed]
+    remaining_steps = [entry for entry in STEPS if (result := record.result(entry)) is None or not result.passed]
     console.print(f"record  {record_path(cell)}", markup=False)
-    console.print(f"still to be done: {', '.join(left)}" if left else "the cell is commissioned", markup=False)
+    console.print(
+        f"still to be done: {', '.join(remaining_steps)}" if remaining_steps else "the cell is commissioned",
+        markup=False,
+    )
     if as_json:
         print(json.dumps(_figures(cell)))
 

@@ -94,13 +94,13 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
 
 def person_named(name: str, who: str) -> str:
     """A person's name as `--name` gives it, without blanks around it. Raises InputError: none, or no name."""
-    if not (found := name.strip()):
+    if not (person := name.strip()):
         raise InputError(f"--name: expected the name of {who}")
-    if len(found) > LONGEST_NAME:
+    if len(person) > LONGEST_NAME:
         raise InputError(
-            f"--name: expected a person's name of at most {LONGEST_NAME} characters; found {len(found)}"
+            f"--name: expected a person's name of at most {LONGEST_NAME} characters; found {len(person)}"
         )
-    return found
+    return person
 
 
 def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:
@@ -119,11 +119,11 @@ def records_named(named: list[Path]) -> tuple[Path, ...]:
     """Records, and those in folders that are named."""
     from coupole.calibration.record import SEAL
 
-    found: list[Path] = []
+    records: list[Path] = []
     for path in named:
         if path.is_dir():
             files = sorted(path.glob("*.yaml"))
-            found += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
+            records += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
         else:
-            found.append(path)
-    return tuple(found)
+            records.append(path)
+    return tuple(records)

@@ -54,20 +54,20 @@ def compare(
         if out is not None and out.exists():
             raise InputError(f"--out {out}: exists already; name a new folder")
         with step_bars(console) as say:
-            found = compared(before, after, unit, noise_mm, aligned=aligned, say=say)
-            told = about(found)
+            changes = compared(before, after, unit, noise_mm, aligned=aligned, say=say)
+            facts = about(changes)
             if out is not None:
                 say("drawing", 0, 1)
                 with new_scan_folder(out) as folder:
-                    (folder / "comparison.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
-                    comparison_page.write(found, folder)
+                    (folder / "comparison.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+                    comparison_page.write(changes, folder)
                 say("drawing", 1, 1)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    for remark in comparison_page.remarks(found):
+    for remark in comparison_page.remarks(changes):
         console.print(remark)
     if out is not None:
         console.print(f"[bold]{out}[/]: report.html, maps.ply, comparison.json")
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(facts))

@@ -12,7 +12,7 @@ def formats(incomplete: str) -> list[tuple[str, str]]:
     """Formats of `coupole export --to`, with what they are."""
     from coupole.exchange.formats import FORMATS
 
-    return [(name, one.gives) for name, one in sorted(FORMATS.items()) if name.startswith(incomplete)]
+    return [(name, entry.gives) for name, entry in sorted(FORMATS.items()) if name.startswith(incomplete)]
 
 
 def fits(incomplete: str) -> list[tuple[str, str]]:

@@ -98,12 +98,12 @@ def _test_notifications(rig: Path, *, as_json: bool) -> None:
             f"{folder / NAME}: no such file, so nobody is told of anything; docs/reference/console.md says what "
             "is in it"
         )
-    found = send_test(settings, cell.rig.name)
-    for way, trouble in found.items():
+    troubles_by_way = send_test(settings, cell.rig.name)
+    for way, trouble in troubles_by_way.items():
         console.print(f"{way}: {trouble or 'sent'}", markup=False)
     if as_json:
-        print(json.dumps(found))
-    if troubles := [f"{way}: {trouble}" for way, trouble in found.items() if trouble]:
+        print(json.dumps(troubles_by_way))
+    if troubles := [f"{way}: {trouble}" for way, trouble in troubles_by_way.items() if trouble]:
         raise InputError("not sent: " + "; ".join(troubles))
 
 
@@ -149,9 +149,9 @@ def queue(
         call(cell, "DELETE", f"/api/v1/queue/{take_out}")
     if move:
         call(cell, "POST", f"/api/v1/queue/{move}/move", {"before": before})
-    for one in _named(plan or [], resume or [], hold):
+    for request in _named(plan or [], resume or [], hold):
         with console.status("preflight ..."):
-            call(cell, "POST", "/api/v1/queue", {**one, "before": before}, patience_s=PREFLIGHT_S)
+            call(cell, "POST", "/api/v1/queue", {**request, "before": before}, patience_s=PREFLIGHT_S)
     if go_on:
         call(cell, "POST", "/api/v1/queue/go-on")
     if give_control:
@@ -164,8 +164,10 @@ def queue(
 
 def _named(plans: list[Path], resumed: list[Path], hold: str) -> list[dict[str, str]]:
     """List what is to be entered, in order."""
-    found = [{"plan": str(one.resolve())} for one in plans] + [{"resume": str(one.resolve())} for one in resumed]
-    return [*found, *([{"hold": hold}] if hold else [])]
+    requests = [{"plan": str(path.resolve())} for path in plans] + [
+        {"resume": str(path.resolve())} for path in resumed
+    ]
+    return [*requests, *([{"hold": hold}] if hold else [])]
 
 
 def _show_queue(console: RichConsole, state: dict[str, Any]) -> None:
@@ -174,8 +176,8 @@ def _show_queue(console: RichConsole, state: dict[str, Any]) -> None:
     for entry in state["queue"]:
         words = f"hold: {entry['hold']}" if entry["hold"] else entry["plan"]
         words = words or f"resume {entry['resume']}"
-        said = f" ({entry['said']})" if entry["said"] else ""
-        console.print(f"  {entry['id']}  {entry['state']:8}  {words}{said}{_outlook(entry)}", markup=False)
+        note = f" ({entry['said']})" if entry["said"] else ""
+        console.print(f"  {entry['id']}  {entry['state']:8}  {words}{note}{_outlook(entry)}", markup=False)
 
 
 def _outlook(entry: dict[str, Any]) -> str:
@@ -186,8 +188,8 @@ def _outlook(entry: dict[str, Any]) -> str:
         f"{datetime.fromisoformat(entry[key]).astimezone():%a %H:%M}" if entry[key] else ""
         for key in ("expected_begin", "expected_end")
     )
-    found = f"  {begin} to {end or 'not known'}" if begin else ""
+    text = f"  {begin} to {end or 'not known'}" if begin else ""
     if (needs := entry["needs"]) is not None and entry["state"] in ("waiting", "running"):
         size = f"{duration_text(needs['duration_s'])}, {bytes_text(needs['bytes'])}"
-        found += f"  {size}, {needs['dose_lux_h']:.3f} lux.h"
-    return found
+        text += f"  {size}, {needs['dose_lux_h']:.3f} lux.h"
+    return text

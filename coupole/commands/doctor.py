@@ -44,22 +44,22 @@ def doctor(
             f"{cell.document.path}: `{driver}` does not answer its controller in every cycle: there is nothing to "
             "measure"
         )
-    measured, settings = load_class(ANSWER_JITTER[driver]), robot_settings_here(cell.rig)
+    measure, settings = load_class(ANSWER_JITTER[driver]), robot_settings_here(cell.rig)
     console = make_console(quiet=as_json)
-    found: list[Any] = []
+    jitters: list[Any] = []
     with Progress(*Progress.get_default_columns()[:3], TimeRemainingColumn(), console=console) as bars:
         for cycle_ms in (settings.cycle_ms, SLOWER_MS):
-            if not found or (cycle_ms != settings.cycle_ms and not found[0].holds):
+            if not jitters or (cycle_ms != settings.cycle_ms and not jitters[0].holds):
                 bar = bars.add_task(f"answers in a cycle of {cycle_ms} ms", total=seconds)
-                tried = settings.model_copy(update={"cycle_ms": cycle_ms})
-                found.append(measured(tried, seconds, lambda s, bar=bar: bars.update(bar, completed=s)))
-    for jitter in found:
+                cycle_settings = settings.model_copy(update={"cycle_ms": cycle_ms})
+                jitters.append(measure(cycle_settings, seconds, lambda s, bar=bar: bars.update(bar, completed=s)))
+    for jitter in jitters:
         console.print(words_of(jitter))
-    advice = advice_of(found, cell.document.path)
+    advice = advice_of(jitters, cell.document.path)
     if as_json:
-        documents = [{**jitter._asdict(), "holds": jitter.holds} for jitter in found]
-        print(json.dumps({"holds": found[0].holds, "measured": documents, "advice": advice}))
-    if not found[0].holds:
+        documents = [{**jitter._asdict(), "holds": jitter.holds} for jitter in jitters]
+        print(json.dumps({"holds": jitters[0].holds, "measured": documents, "advice": advice}))
+    if not jitters[0].holds:
         raise PreflightRefused([advice])
     console.print(advice)
 
@@ -76,12 +76,12 @@ def words_of(jitter: Any) -> str:
 
 def advice_of(found: list[Any], rig: Path) -> str:
     """Say what to do; `found` is the rig's cycle, and the longer one where that was not held."""
-    asked, last = found[0], found[-1]
-    if asked.holds:
-        return f"{rig}: this machine holds a cycle of {asked.cycle_ms} ms, as far as was measured"
-    why = f"{rig}: this machine cannot hold a cycle of {asked.cycle_ms} ms: {100 * asked.late_share:.3g} % of its "
-    why += "answers were late. " if not asked.realtime else "answers were late: "
-    if not asked.realtime:
+    first, last = found[0], found[-1]
+    if first.holds:
+        return f"{rig}: this machine holds a cycle of {first.cycle_ms} ms, as far as was measured"
+    why = f"{rig}: this machine cannot hold a cycle of {first.cycle_ms} ms: {100 * first.late_share:.3g} % of its "
+    why += "answers were late. " if not first.realtime else "answers were late: "
+    if not first.realtime:
         why += "Give it the right to real-time priority (docs/how-to/kuka-controller.md) and measure again. Or "
     if last.holds:
         return why + f"set `cycle_ms: {last.cycle_ms}` among the robot's settings, with #IPO in the RSI program"

@@ -61,14 +61,14 @@ def dose(
         ledger.enter(add, note.strip())
     if warn_above is not None and not _sent(cell, object_id, "warning", {"above_lux_h": warn_above}):
         ledger.warn_above(warn_above)
-    who = person_named(name, "who says so") if budget is not None else ""
-    said = {"dose_lux_h": budget, "name": who, "reason": reason.strip()}
-    if budget is not None and not _sent(cell, object_id, "budget", said):
-        ledger.set_budget(budget, who, reason)
-    history, others = ledger.read(), similar_ids(ledger.folder, object_id)
-    show_dose(make_console(quiet=as_json), ledger, history, others)
+    person = person_named(name, "who says so") if budget is not None else ""
+    request = {"dose_lux_h": budget, "name": person, "reason": reason.strip()}
+    if budget is not None and not _sent(cell, object_id, "budget", request):
+        ledger.set_budget(budget, person, reason)
+    history, similar_objects = ledger.read(), similar_ids(ledger.folder, object_id)
+    show_dose(make_console(quiet=as_json), ledger, history, similar_objects)
     if as_json:
-        print(json.dumps(document(ledger, history, others)))
+        print(json.dumps(document(ledger, history, similar_objects)))
 
 
 def _sent(cell: Cell | None, object_id: str, what: str, asked: dict[str, Any]) -> bool:

@@ -35,21 +35,21 @@ class Asked:
 
     def refuse(self, names: tuple[str, ...], why: str) -> None:
         """Raise InputError if one of these options was given; `why` is what they are for."""
-        if given := [f"--{name}" for name in names if name in self.options]:
-            raise InputError(f"{', '.join(given)}: {'is' if len(given) == 1 else 'are'} {why}")
+        if option_names := [f"--{name}" for name in names if name in self.options]:
+            raise InputError(f"{', '.join(option_names)}: {'is' if len(option_names) == 1 else 'are'} {why}")
 
     def texts(self, name: str) -> list[str]:
-        found = self.options.get(name, [])
-        assert isinstance(found, list)
-        return list(map(str, found))
+        texts = self.options.get(name, [])
+        assert isinstance(texts, list)
+        return list(map(str, texts))
 
     def text(self, name: str) -> str | None:
-        found = self.options.get(name)
-        return None if found is None else str(found)
+        option = self.options.get(name)
+        return None if option is None else str(option)
 
     def path(self, name: str) -> Path | None:
-        found = self.options.get(name)
-        return found if isinstance(found, Path) else None
+        option = self.options.get(name)
+        return option if isinstance(option, Path) else None
 
     @property
     def records(self) -> tuple[Path, ...]:
@@ -81,27 +81,27 @@ def export(
     from coupole.viewing.terminal import bytes_text, make_console
 
     folder = source if options.in_place else out or source / "export"
-    asked = Asked(source, to, folder, overwrite, options.given())
+    request = Asked(source, to, folder, overwrite, options.given())
     console = make_console(quiet=as_json)
     try:
         if options.in_place and out is not None:
             raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
-        found = _written(asked, console)
+        summary = _written(request, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    console.print(f"{found.files} files, {bytes_text(found.bytes)}, in {folder}")
-    for view, missed in found.misses_dn.items():
-        console.print(f"{view}: its own pictures are missed by {missed:.1f} of 255, rms")
+    console.print(f"{summary.files} files, {bytes_text(summary.bytes)}, in {folder}")
+    for view, miss_dn in summary.misses_dn.items():
+        console.print(f"{view}: its own pictures are missed by {miss_dn:.1f} of 255, rms")
     if as_json:
-        told = {"out": str(folder.resolve()), "files": found.files, "bytes": found.bytes}
-        print(json.dumps({**told, **({"misses_dn": found.misses_dn} if found.misses_dn else {})}))
+        document = {"out": str(folder.resolve()), "files": summary.files, "bytes": summary.bytes}
+        print(json.dumps({**document, **({"misses_dn": summary.misses_dn} if summary.misses_dn else {})}))
 
 
 def _written(asked: Asked, console: Console) -> Found:
-    chosen = format_named(asked.to, source_of(asked.source))
+    export_format = format_named(asked.to, source_of(asked.source))
     _refuse_empty(asked)
-    refuse_others_options(chosen, list(asked.options))
+    refuse_others_options(export_format, list(asked.options))
     writers = {
         Writer.FRAMES: _export_frames,
         Writer.VIEWS: _export_views,
@@ -109,7 +109,7 @@ def _written(asked: Asked, console: Console) -> Found:
         Writer.RESULT: _export_result,
         Writer.CRATE: _export_crate,
     }
-    return writers[chosen.writer](asked, console)
+    return writers[export_format.writer](asked, console)
 
 
 def _refuse_empty(asked: Asked) -> None:
@@ -152,12 +152,12 @@ def _export_views(asked: Asked, console: Console) -> Found:
     from coupole.viewing.terminal import step_bars
 
     _refuse_unknown_planes(asked)
-    given = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
-    how = HowShown(**{name: value for name, value in given.items() if value is not None})  # type: ignore[arg-type]
+    options = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
+    how = HowShown(**{name: value for name, value in options.items() if value is not None})  # type: ignore[arg-type]
     views = asked.texts("views")
     with step_bars(console) as say:
-        made = export_views(asked.source, asked.to, asked.out, views, how, overwrite=asked.overwrite, say=say)
-    return replace(_sizes(made.paths), misses_dn=made.misses_dn)
+        files = export_views(asked.source, asked.to, asked.out, views, how, overwrite=asked.overwrite, say=say)
+    return replace(_sizes(files.paths), misses_dn=files.misses_dn)
 
 
 def _export_colmap(asked: Asked, console: Console) -> Found:
@@ -207,7 +207,7 @@ def _export_frames(asked: Asked, console: Console) -> Found:
 
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("export")
-        found = export_run(
+        files = export_run(
             Run(asked.source),
             asked.to,
             asked.out,
@@ -218,7 +218,7 @@ def _export_frames(asked: Asked, console: Console) -> Found:
             overwrite=asked.overwrite,
             progress=lambda done, total: bars.update(bar, completed=done, total=total),
         )
-    return Found(found.files, found.bytes)
+    return Found(files.files, files.bytes)
 
 
 def _colour_of(asked: Asked) -> ColourWanted | None:

@@ -99,31 +99,31 @@ def identify(
 
     console = make_console(quiet=as_json)
     try:
-        asked = asked_spot(spot.result, spot.at, spot.sensor_spectra, spot.led_spectrum)
-        if (asked is None) == (not spectra):
+        spot_of_result = asked_spot(spot.result, spot.at, spot.sensor_spectra, spot.led_spectrum)
+        if (spot_of_result is None) == (not spectra):
             raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
-        if asked is not None:
-            told = identify_spot(asked, _references(library, classes))
-            console.print(f"{told['name']}: {told['verdict']}; {told['reason']}", markup=False)
+        if spot_of_result is not None:
+            document = identify_spot(spot_of_result, _references(library, classes))
+            console.print(f"{document['name']}: {document['verdict']}; {document['reason']}", markup=False)
             if as_json:
-                print(json.dumps(told))
+                print(json.dumps(document))
             return
         assert spectra is not None
-        found = _found(console, spectra, library, classes, unit)
+        findings = _found(console, spectra, library, classes, unit)
         page = None
         if report is not None:
             from coupole.viewing.identification_page import write
 
-            page = write(report, [finding for _, finding in found], str(library))
+            page = write(report, [finding for _, finding in findings], str(library))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    _show(console, [finding for _, finding in found])
+    _show(console, [finding for _, finding in findings])
     if page is not None:
         console.print(f"page: {page}", markup=False)
     if as_json:
-        each = [_told(spectrum, finding, page) for spectrum, finding in found]
-        print(json.dumps(each[0] if len(each) == 1 else each))
+        documents = [_told(spectrum, finding, page) for spectrum, finding in findings]
+        print(json.dumps(documents[0] if len(documents) == 1 else documents))
 
 
 def _found(
@@ -138,13 +138,13 @@ def _found(
     references = _references(library, classes)
     for remark in references.remarks:
         console.print(remark, markup=False)
-    found = []
+    findings = []
     with step_bars(console) as say:
-        for done, spectrum in enumerate(spectra):
-            say("identify", done, len(spectra))
-            found.append((spectrum, identification.identify(measured(spectrum), references)))
+        for count, spectrum in enumerate(spectra):
+            say("identify", count, len(spectra))
+            findings.append((spectrum, identification.identify(measured(spectrum), references)))
         say("identify", len(spectra), len(spectra))
-    return found
+    return findings
 
 
 def _references(library: Path, classes: Path | None) -> References:
@@ -167,7 +167,9 @@ def _show(console: Console, found: list[Finding]) -> None:
 
     table = Table("spectrum", "verdict", "class", "probability", "not in library", box=None)
     for finding in found:
-        rows = [(one.class_name, f"{one.probability:.0%}") for one in finding.candidates[:_SHOWN]]
+        rows = [
+            (candidate.class_name, f"{candidate.probability:.0%}") for candidate in finding.candidates[:_SHOWN]
+        ]
         if finding.parts:
             rows = [(part.class_name, f"{part.share:.0%} of K/S") for part in finding.parts]
         for number, (class_name, probability) in enumerate(rows):
@@ -198,11 +200,14 @@ def _told(spectrum: LibrarySpectrum, finding: Finding, page: Path | None) -> dic
         "verdict": finding.verdict,
         "class": finding.class_name,
         "candidates": [
-            {"name": one.name, "class": one.class_name, "probability": one.probability}
-            for one in finding.candidates
+            {"name": candidate.name, "class": candidate.class_name, "probability": candidate.probability}
+            for candidate in finding.candidates
         ],
         "not_in_library": finding.not_in_library,
-        "mixture": [{"name": one.name, "class": one.class_name, "share": one.share} for one in finding.parts],
+        "mixture": [
+            {"name": candidate.name, "class": candidate.class_name, "share": candidate.share}
+            for candidate in finding.parts
+        ],
         "reason": finding.reason,
         "remarks": list(finding.remarks),
         "evidence": {

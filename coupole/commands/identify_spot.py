@@ -32,11 +32,11 @@ class Spot:
 
 def asked_spot(result: Path | None, at: str | None, sensor: Path | None, leds: Path | None) -> Spot | None:
     """The spot that the options name, if they do. Raises InputError if one of them is missing."""
-    given = {"--result": result, "--at": at, "--sensor-spectra": sensor, "--led-spectrum": leds}
-    if all(value is None for value in given.values()):
+    options = {"--result": result, "--at": at, "--sensor-spectra": sensor, "--led-spectrum": leds}
+    if all(value is None for value in options.values()):
         return None
-    if missing := [name for name, value in given.items() if value is None]:
-        raise InputError(f"{', '.join(missing)}: a spot of a result needs {', '.join(given)}")
+    if missing := [name for name, value in options.items() if value is None]:
+        raise InputError(f"{', '.join(missing)}: a spot of a result needs {', '.join(options)}")
     assert result is not None
     assert at is not None
     assert sensor is not None
@@ -53,21 +53,22 @@ def identify_spot(spot: Spot, references: References) -> dict[str, Any]:
     from coupole.heritage.analysis.channel_classes import classes_of_channels
 
     reflectance, u_reflectance = _channels_at(spot)
-    found = classes_of_channels(
+    answer = classes_of_channels(
         reflectance,
         u_reflectance,
         read_spectrum(spot.leds, unit="power"),
         [read_spectrum(spot.sensor, unit="power", column=column) for column in (1, 2, 3)],
         references,
     )
-    apart = found.not_told_apart
-    many = f"{len(apart)} of {len(found.candidates)} classes of the library have its colour at some concentration"
+    apart = answer.not_told_apart
+    many = f"{len(apart)} of {len(answer.candidates)} classes of the library have its colour at some concentration"
     return {
         "name": f"{spot.result.resolve().name} at {spot.at}",
         "verdict": "ambiguous" if apart else "unknown",
-        "class": found.candidates[0].class_name,
+        "class": answer.candidates[0].class_name,
         "candidates": [
-            {"name": one.name, "class": one.class_name, "probability": one.probability} for one in found.candidates
+            {"name": candidate.name, "class": candidate.class_name, "probability": candidate.probability}
+            for candidate in answer.candidates
         ],
         "not_told_apart": list(apart),
         "reflectance": reflectance.tolist(),

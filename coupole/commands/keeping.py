@@ -35,10 +35,10 @@ def status(
     console = make_console(quiet=as_json)
     if run is None or (following and Run(run).in_use):
         run = follow(run, console) if following else Path(running_run(run)["run"])
-    found = status_of(Run(run))
-    show_status(console, found)
+    progress = status_of(Run(run))
+    show_status(console, progress)
     if as_json:
-        print(json.dumps(found.figures()))
+        print(json.dumps(progress.figures()))
 
 
 def report(
@@ -55,10 +55,10 @@ def report(
     from coupole.viewing import report as page
     from coupole.viewing.terminal import make_console
 
-    written = page.write(Run(run), out) if out else renew_report(Run(run))
-    make_console(quiet=as_json).print(f"report {written}")
+    path = page.write(Run(run), out) if out else renew_report(Run(run))
+    make_console(quiet=as_json).print(f"report {path}")
     if as_json:
-        print(json.dumps({"report": str(written.resolve())}))
+        print(json.dumps({"report": str(path.resolve())}))
 
 
 def verify(
@@ -78,41 +78,41 @@ def verify(
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
-    opened = Run(run)
+    folder = Run(run)
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("reading back")
 
         def show(done: int, total: int) -> None:
             bars.update(bar, completed=done, total=total)
 
-        found = verify_run(opened, show)
-        if with_manifest and not found.bad:
-            with opened.locked():
-                manifest.enter(opened.folder, manifest.unlisted(opened.folder), show)
-            found.unlisted = []
-    _show_verified(console, opened, found)
+        check = verify_run(folder, show)
+        if with_manifest and not check.bad:
+            with folder.locked():
+                manifest.enter(folder.folder, manifest.unlisted(folder.folder), show)
+            check.unlisted = []
+    _show_verified(console, folder, check)
     if as_json:
-        document = {"ok": found.ok, "proof": opened.proof, "frames": found.frames, "listed": found.listed}
+        document = {"ok": check.ok, "proof": folder.proof, "frames": check.frames, "listed": check.listed}
         print(
             json.dumps(
                 {
                     **document,
-                    **{key: getattr(found, key) for key in ("bad", "missing", "unlisted", "not_compared")},
+                    **{key: getattr(check, key) for key in ("bad", "missing", "unlisted", "not_compared")},
                 }
             )
         )
-    if found.bad:
-        counted = "1 thing is" if len(found.bad) == 1 else f"{len(found.bad)} things are"
+    if check.bad:
+        subject = "1 thing is" if len(check.bad) == 1 else f"{len(check.bad)} things are"
         raise ChecksumMismatch(
-            f"{counted} not right (above); read back were {found.frames} frames, and {found.listed} files that "
+            f"{subject} not right (above); read back were {check.frames} frames, and {check.listed} files that "
             "the manifest lists"
         )
-    if found.missing:
-        goes_on = f"go on with `{opened.go_on_command}`"
-        if opened.in_use:
-            at_work = f"process {opened.holder}" if opened.holder else "another process"
+    if check.missing:
+        goes_on = f"go on with `{folder.go_on_command}`"
+        if folder.in_use:
+            at_work = f"process {folder.holder}" if folder.holder else "another process"
             goes_on = f"{at_work} is at work on this run: verify it again when that has ended"
-        raise UnprovenError(f"{len(found.missing)} frames of the plan are missing; {goes_on}")
+        raise UnprovenError(f"{len(check.missing)} frames of the plan are missing; {goes_on}")
 
 
 def _show_verified(console: Console, run: Run, found: Verification) -> None:
@@ -153,7 +153,7 @@ def archive(
     try:
         with Progress(console=console, disable=not console.is_terminal) as bars:
             bar = bars.add_task("archive")
-            found = archive_run(
+            summary = archive_run(
                 Run(run),
                 codec_of(codec),
                 keep=keep,
@@ -167,10 +167,10 @@ def archive(
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    total = found.figures()
-    if found.views:
+    total = summary.figures()
+    if summary.views:
         console.print(f"ratio {total['ratio']:.2f} at {total['mb_s']:.0f} MB/s, reading back included")
-    for views, how in ((found.already, "archived already"), (found.incomplete, "not complete, left as it is")):
+    for views, how in ((summary.already, "archived already"), (summary.incomplete, "not complete, left as it is")):
         for view in views:
             console.print(f"{view}: {how}")
     if as_json:
@@ -195,12 +195,12 @@ def scan(
     from coupole.viewing.scan_sheet import import_scan
     from coupole.viewing.terminal import make_console
 
-    for option, given in (("--unit", unit), ("--targets-unit", targets_unit)):
-        if given is not None and given not in UNITS:
-            raise InputError(f"{option} {given}: expected one of {', '.join(UNITS)}")
+    for option, unit_name in (("--unit", unit), ("--targets-unit", targets_unit)):
+        if unit_name is not None and unit_name not in UNITS:
+            raise InputError(f"{option} {unit_name}: expected one of {', '.join(UNITS)}")
     console = make_console(quiet=as_json)
     with console.status("reading the mesh") as status:
-        found = import_scan(
+        facts = import_scan(
             mesh,
             targets,
             out,
@@ -210,11 +210,11 @@ def scan(
             progress=status.update,
         )
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(facts))
         return
-    size_mm = " x ".join(f"{value:.1f}" for value in found["size_mm"])
-    console.print(f"{found['triangles']:,} triangles, {found['vertices']:,} vertices, {size_mm} mm")
-    console.print(f"median edge {found['median_edge_mm']} mm, {found['open_edges']:,} open edges")
+    size_mm = " x ".join(f"{value:.1f}" for value in facts["size_mm"])
+    console.print(f"{facts['triangles']:,} triangles, {facts['vertices']:,} vertices, {size_mm} mm")
+    console.print(f"median edge {facts['median_edge_mm']} mm, {facts['open_edges']:,} open edges")
     if targets:
-        console.print(f"{found['targets']} targets")
+        console.print(f"{facts['targets']} targets")
     console.print(f"[bold]{out}[/]: mesh.ply, scan.json, scan.png" + (", targets.csv" if targets else ""))

@@ -36,18 +36,18 @@ class FilmSpectra:
 
     def are_named(self) -> bool:
         """Tell whether any was given."""
-        named = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
-        return any(one is not None for one in named)
+        options = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
+        return any(option is not None for option in options)
 
     def listed(self) -> list[dict[str, Any]]:
         """List them as `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
         films: list[dict[str, Any]] = []
         for film, ground, kind in ((self.over_black, self.black, "black"), (self.over_white, self.white, "white")):
             if (film is None) != (ground is None):
-                given, missing = (
+                option, missing = (
                     (f"--over-{kind}", f"--{kind}") if ground is None else (f"--{kind}", f"--over-{kind}")
                 )
-                raise InputError(f"{given}: needs {missing}, too: the film and the ground that it lies on")
+                raise InputError(f"{option}: needs {missing}, too: the film and the ground that it lies on")
             if film is not None:
                 films.append({"spectrum": film, "over": ground, "thickness_um": self.thickness_um})
                 films[-1]["u_thickness_um"] = self.u_thickness_um
@@ -78,10 +78,10 @@ class Instrument:
 
         from coupole.appearance.matter.glossy_face import Geometry
 
-        found: Geometry | None = next((one for one in get_args(Geometry) if one == self.geometry), None)
-        if found is None:
+        geometry: Geometry | None = next((name for name in get_args(Geometry) if name == self.geometry), None)
+        if geometry is None:
             raise InputError(f"--geometry: expected {', '.join(get_args(Geometry))}; found {self.geometry!r}")
-        return found
+        return geometry
 
 
 @flattened
@@ -118,12 +118,12 @@ def layer(
     console = make_console(quiet=as_json)
     try:
         if samples is None:
-            given, folder = _given(films.listed(), name or "paint", noise, instrument, bare_grounds), Path()
+            description, folder = _given(films.listed(), name or "paint", noise, instrument, bare_grounds), Path()
         else:
             if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
-            given, folder = read_films(samples)
-        document = _solved(given, folder, other_grinding, out)
+            description, folder = read_films(samples)
+        document = _solved(description, folder, other_grinding, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -165,10 +165,10 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
     from coupole.heritage.analysis.layer_samples import paint_file, read_samples
 
     samples = read_samples(given, folder)
-    found = layer_fit.fit(samples.films, samples.face, given.noise)
+    fit = layer_fit.fit(samples.films, samples.face, given.noise)
     four = None
     if samples.directional is None:
-        model = layer_model.deserved(found, samples.films, samples.face, given.noise)
+        model = layer_model.deserved(fit, samples.films, samples.face, given.noise)
     else:
         black, white = samples.films
         four = four_flux_fit.fit(black, white, samples.directional, samples.face, given.noise)
@@ -176,7 +176,7 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
         model = layer_model.deserved_by_measurement(
             (black.seen, white.seen), (light.over_black, light.over_white), light.transmittance, given.noise
         )
-    paint = paint_file(given, samples, found, four)
+    paint = paint_file(given, samples, fit, four)
     document: dict[str, Any] = {
         "name": given.name,
         "unit": paint.unit,
@@ -188,13 +188,13 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
         },
         "coverage": 0.95,
         "wavelength_nm": samples.wavelengths_nm.tolist(),
-        "K": found.absorption.tolist(),
-        "S": found.scattering.tolist(),
-        "half_width_K": (layer_fit.COVERAGE_FACTOR * found.u_absorption).tolist(),
-        "half_width_S": (layer_fit.COVERAGE_FACTOR * found.u_scattering).tolist(),
-        "determined": found.determined.tolist(),
-        "spectra": found.spectra,
-        "misfit": _misfit(found),
+        "K": fit.absorption.tolist(),
+        "S": fit.scattering.tolist(),
+        "half_width_K": (layer_fit.COVERAGE_FACTOR * fit.u_absorption).tolist(),
+        "half_width_S": (layer_fit.COVERAGE_FACTOR * fit.u_scattering).tolist(),
+        "determined": fit.determined.tolist(),
+        "spectra": fit.spectra,
+        "misfit": _misfit(fit),
     }
     if four is not None:
         document["four_fluxes"] = {
@@ -214,7 +214,7 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
         stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in given.name)
         files = {
             f"{stem}{ENDING}": encode(paint),
-            f"{stem}.html": layer_page(given, samples, found, model, four),
+            f"{stem}.html": layer_page(given, samples, fit, model, four),
         }
         document["files"] = _written(out, files)
     return document
@@ -232,17 +232,24 @@ def _grains(paint: Any, other: Path) -> dict[str, Any]:
     from coupole.appearance.matter.paint_file import read_paint
     from coupole.heritage.analysis.layer_model import grain_ratio
 
-    theirs = read_paint(other)
-    if theirs.unit != "per mm" or paint.unit != "per mm":
+    other_paint = read_paint(other)
+    if other_paint.unit != "per mm" or paint.unit != "per mm":
         raise InputError(
-            f"{other}: sizes of grains need K and S per mm of both grindings; found {theirs.unit} and "
+            f"{other}: sizes of grains need K and S per mm of both grindings; found {other_paint.unit} and "
             f"{paint.unit}: give --thickness-um"
         )
-    nm = theirs.wavelengths_nm
+    nm = other_paint.wavelengths_nm
     inside = (nm >= paint.wavelengths_nm[0]) & (nm <= paint.wavelengths_nm[-1])
-    mine = [np.interp(nm[inside], paint.wavelengths_nm, v) for v in (paint.scattering, paint.u_scattering)]
-    found = grain_ratio((mine[0], mine[1]), (theirs.scattering[inside], theirs.u_scattering[inside]))
-    return {"than": theirs.name, "ratio": found.ratio, "u_ratio": found.u_ratio, "bands": found.bands}
+    paint_values = [np.interp(nm[inside], paint.wavelengths_nm, v) for v in (paint.scattering, paint.u_scattering)]
+    estimate = grain_ratio(
+        (paint_values[0], paint_values[1]), (other_paint.scattering[inside], other_paint.u_scattering[inside])
+    )
+    return {
+        "than": other_paint.name,
+        "ratio": estimate.ratio,
+        "u_ratio": estimate.u_ratio,
+        "bands": estimate.bands,
+    }
 
 
 def _written(folder: Path, files: dict[str, str]) -> list[str]:
@@ -266,8 +273,8 @@ def _say(document: dict[str, Any], console: Console) -> None:
         )
     )
     for nm, k, wide_k, s, wide_s, sure in rows[:: max(1, len(rows) // 9)]:
-        told = [f"{value:.3g}" for value in (k, wide_k, s, wide_s)] if sure else ["hides", "", "", ""]
-        table.add_row(f"{nm:g}", *told)
+        cells = [f"{value:.3g}" for value in (k, wide_k, s, wide_s)] if sure else ["hides", "", "", ""]
+        table.add_row(f"{nm:g}", *cells)
     console.print(f"{document['name']}: K and S {document['unit']}", markup=False)
     console.print(table)
     console.print(f"{document['model']['deserved']}: {document['model']['because']}", markup=False)

@@ -67,20 +67,20 @@ def makie(
         picture = _linear_values(photograph, linear=linear)
         colour = _colour_at(picture, metal, "--metal")
         bare = [_colour_at(picture, place, "--lacquer") for place in lacquer]
-        found = decompose(picture, colour, bare, region="inside" if inside else "anywhere")
-        _write(out, found)
+        parts = decompose(picture, colour, bare, region="inside" if inside else "anywhere")
+        _write(out, parts)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
-        lacquers = [one.tolist() for one in bare]
-        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers, "clamped": found.clamped}
+        lacquers = [rgb.tolist() for rgb in bare]
+        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers, "clamped": parts.clamped}
         print(json.dumps(document))
         return
-    console.print(f"{out}: {float(found.alpha.mean()):.1%} of the picture is metal", markup=False)
-    if found.clamped > _TOLD_FROM:
+    console.print(f"{out}: {float(parts.alpha.mean()):.1%} of the picture is metal", markup=False)
+    if parts.clamped > _TOLD_FROM:
         console.print(
-            f"of {found.clamped:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: noise, "
+            f"of {parts.clamped:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: noise, "
             "shadow, or a colour that --metal or --lacquer do not name",
             markup=False,
         )
@@ -92,8 +92,8 @@ def _linear_values(path: Path, *, linear: bool) -> NDArray[np.float64]:
 
     from coupole.reflectance.picture_set import linear_of_srgb, read_picture
 
-    stored = read_picture(path)
-    values = stored if linear else linear_of_srgb(stored)
+    pixels = read_picture(path)
+    values = pixels if linear else linear_of_srgb(pixels)
     return np.asarray(values / float(np.iinfo(values.dtype).max))
 
 
@@ -118,6 +118,6 @@ def _write(path: Path, found: Makie) -> None:
     from coupole.storage.durable import write_synced
 
     channels: Any = np.concatenate([srgb(found.residual), found.alpha[..., None]], axis=2)
-    encoded = io.BytesIO()
-    Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(encoded, "PNG")
-    write_synced(path, encoded.getvalue())
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(buffer, "PNG")
+    write_synced(path, buffer.getvalue())

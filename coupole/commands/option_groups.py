@@ -16,26 +16,28 @@ def flattened(command: Callable[..., R]) -> Callable[..., R]:
 
     Fields are annotated as typer's parameters are, and have defaults. Their names are unique in the command.
     """
-    own = inspect.signature(command, eval_str=True)
+    signature = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {
-        name: one.annotation for name, one in own.parameters.items() if is_dataclass(one.annotation)
+        name: parameter.annotation
+        for name, parameter in signature.parameters.items()
+        if is_dataclass(parameter.annotation)
     }
 
     parameters: list[inspect.Parameter] = []
-    for name, one in own.parameters.items():
-        parameters += _of_fields(groups[name]) if name in groups else [one.replace(kind=_KEYWORD)]
-    names = [one.name for one in parameters]
+    for name, parameter in signature.parameters.items():
+        parameters += _of_fields(groups[name]) if name in groups else [parameter.replace(kind=_KEYWORD)]
+    names = [parameter.name for parameter in parameters]
 
     @wraps(command)
     def run(*arguments: Any, **options: Any) -> R:
-        given = dict(zip(names, arguments, strict=False)) | options
+        values = dict(zip(names, arguments, strict=False)) | options
         for name, group in groups.items():
-            named = [field.name for field in fields(group) if field.name in given]
-            given[name] = group(**{field: given.pop(field) for field in named})
-        return command(**given)
+            field_names = [field.name for field in fields(group) if field.name in values]
+            values[name] = group(**{field: values.pop(field) for field in field_names})
+        return command(**values)
 
-    run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
 
 

@@ -119,7 +119,7 @@ def simulate(
     console = make_console(quiet=as_json)
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("rendering")
-        made = render(
+        stills = render(
             job,
             out,
             frames,
@@ -127,9 +127,11 @@ def simulate(
             progress=lambda done, total: bars.update(bar, completed=done, total=total),
         )
     if as_json:
-        print(json.dumps({"folder": str(out), "sheet": "sheet.png", "frames": [asdict(still) for still in made]}))
+        print(
+            json.dumps({"folder": str(out), "sheet": "sheet.png", "frames": [asdict(still) for still in stills]})
+        )
         return
-    for still in made:
+    for still in stills:
         over = f", [red]{still.saturated:.2%} saturated[/]" if still.saturated > 1e-3 else ""
         console.print(f"{still.file}: brightest {still.brightest:.0%}{over}")
     console.print(f"[bold]{out / 'sheet.png'}[/]")
@@ -177,10 +179,10 @@ def plan_new(
     from coupole.plan.templates import LEDS, TEMPLATES
     from coupole.viewing.terminal import make_console
 
-    known = sorted([*TEMPLATES, LEDS])
-    template = template or (name if name in known else "views")
-    if template not in known:
-        raise typer.BadParameter(f"expected one of {', '.join(known)}; found {template}")
+    template_names = sorted([*TEMPLATES, LEDS])
+    template = template or (name if name in template_names else "views")
+    if template not in template_names:
+        raise typer.BadParameter(f"expected one of {', '.join(template_names)}; found {template}")
     if not re.fullmatch(NAME_PATTERN, name):
         raise InputError(
             f"{name!r}: expected a name of letters, digits, dots, hyphens and underscores that begins with a "
@@ -215,10 +217,10 @@ def _on_the_support(template: str, rig: Path, name: str) -> Path:
     step = next((step for step in STEPS if step.name == template and step.things), None)
     if step is None or not in_world(read_cell(rig).rig, dry_run=False):
         return rig
-    made = place_for(template, step.things, rig, name)
+    paths = place_for(template, step.things, rig, name)
     make_console(quiet=False).print(
-        f"this cell is simulated: {made[0]} has on its support {step.stands}"
-        + "".join(f"; {described} describes it" for described in made[1:]),
+        f"this cell is simulated: {paths[0]} has on its support {step.stands}"
+        + "".join(f"; {description} describes it" for description in paths[1:]),
         markup=False,
     )
-    return made[0]
+    return paths[0]

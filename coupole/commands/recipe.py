@@ -64,12 +64,12 @@ def recipe(
             raise InputError("--light: expected names of lights, such as D65,A; found none")
         geometry, seen_by = instrument.known_geometry(), _known_observer(observer)
         with console.status("mixing"):
-            found, matches = _found(
+            search, matches = _found(
                 target, palette, names, at_most, noise, face(instrument.binder_index, geometry), seen_by
             )
-        document = _document(found, matches)
+        document = _document(search, matches)
         if out is not None:
-            _write(out, target.stem, found, matches)
+            _write(out, target.stem, search, matches)
             document["page"] = str(out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -77,7 +77,7 @@ def recipe(
     if as_json:
         print(json.dumps(document))
     else:
-        _say(found, matches, console)
+        _say(search, matches, console)
         if out is not None:
             console.print(str(out), markup=False)
 
@@ -90,10 +90,10 @@ def _known_observer(name: str) -> Observer:
 
     from coupole.appearance.spectra.light import Observer
 
-    found: Observer | None = next((one for one in get_args(Observer) if one == name), None)
-    if found is None:
+    standard_observer: Observer | None = next((choice for choice in get_args(Observer) if choice == name), None)
+    if standard_observer is None:
         raise InputError(f"--observer: expected {', '.join(get_args(Observer))}; found {name!r}")
-    return found
+    return standard_observer
 
 
 def _found(
@@ -112,10 +112,10 @@ def _found(
 
     paints = read_palette(palette)
     try:
-        found = find(spectrum_on_grid(target), paints, face, noise, at_most)
+        search = find(spectrum_on_grid(target), paints, face, noise, at_most)
     except InputError as error:
         raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
-    return found, [matches(found.target, one.seen, lights, observer) for one in found.recipes]
+    return search, [matches(search.target, mixture.seen, lights, observer) for mixture in search.recipes]
 
 
 def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:
@@ -127,7 +127,7 @@ def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any
         "bands": int(found.bands.sum()),
         "told_within": {name: found.told_within(name) for name in found.best.shares},
         "rivals": list(found.rivals),
-        "recipes": [_told(one, under) for one, under in zip(found.recipes, matches, strict=True)],
+        "recipes": [_told(mixture, under) for mixture, under in zip(found.recipes, matches, strict=True)],
     }
 
 
@@ -172,18 +172,18 @@ def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> 
     )
     for name, share in sorted(best.shares.items(), key=lambda item: -item[1]):
         within = found.told_within(name)
-        told = "yes" if within <= TOLD_WITHIN else f"no, {100 * within:.0f} %"
-        table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %", told)
+        words = "yes" if within <= TOLD_WITHIN else f"no, {100 * within:.0f} %"
+        table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %", words)
     console.print(table)
     for match in matches[found.chosen]:
-        left = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
-        console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{left}", markup=False)
+        metamerism = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
+        console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{metamerism}", markup=False)
     console.print(f"{found.verdict()}.", markup=False)
     for rival in found.rivals[:_FEWER]:
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
         console.print(f"not told from it at a noise of {found.noise:g}: {shares}", markup=False)
     for number in range(found.chosen - 1, max(-1, found.chosen - _FEWER), -1):
         fewer = found.recipes[number]
-        told = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())
+        words = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())
         costs = ", ".join(f"{match.delta_e00:.2f} under {match.light}" for match in matches[number])
-        console.print(f"with {number + 1}: {told}; dE00 {costs}", markup=False)
+        console.print(f"with {number + 1}: {words}; dE00 {costs}", markup=False)

@@ -83,16 +83,16 @@ def from_runs_or_pictures(
         left_out = _numbers(leave_out)
         with step_bars(console) as say:
             if without.uncalibrated and runs:
-                made = _of_uncalibrated(runs[0], without.view, left_out, out, say)
+                outcome = _of_uncalibrated(runs[0], without.view, left_out, out, say)
             elif without.pictures is not None:
-                made = _of_pictures(without.pictures, without, left_out, out, say)
+                outcome = _of_pictures(without.pictures, without, left_out, out, say)
             else:
                 request = replace(samples.request(runs or [], left_out), memory_bytes=workers.memory_bytes)
-                made = _of_runs(request, out, workers.scheduler, say)
+                outcome = _of_runs(request, out, workers.scheduler, say)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
-    about, remarks, page = made
+    about, remarks, page = outcome
     for remark in remarks:
         console.print(remark)
     console.print(f"report {page}")
@@ -107,8 +107,10 @@ def _of_pictures(pictures: Path, given: PicturesWithoutRecords, left_out: list[i
 
     if given.lights is None:
         raise InputError("--lights: expected the file of the lights' directions")
-    read = read_pictures(pictures, given.lights, intensities=given.intensities, mask=given.mask, srgb=given.srgb)
-    about = fit_pictures(read, out, left_out=left_out, say=say)
+    picture_set = read_pictures(
+        pictures, given.lights, intensities=given.intensities, mask=given.mask, srgb=given.srgb
+    )
+    about = fit_pictures(picture_set, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
@@ -116,10 +118,10 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
     """Raise InputError for options that do not go together."""
     if bool(runs) == (without.pictures is not None):
         raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
-    uncalibrated = without.uncalibrated
-    if (uncalibrated and (samples.calibrations or len(runs) != 1)) or (without.view and not uncalibrated):
+    is_uncalibrated = without.uncalibrated
+    if (is_uncalibrated and (samples.calibrations or len(runs) != 1)) or (without.view and not is_uncalibrated):
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
-    if (samples.refined or samples.poses) and (uncalibrated or without.pictures is not None):
+    if (samples.refined or samples.poses) and (is_uncalibrated or without.pictures is not None):
         raise InputError("--refined, --poses: are for calibrated runs")
     if without.pictures is None and any((without.lights, without.srgb, without.intensities, without.mask)):
         raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
@@ -132,13 +134,13 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.viewing import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
-    taken = uncalibrated.write_pictures(run, view, folder, say)
-    if wrong := sorted(set(left_out) - set(taken.leds)):
+    view_pictures = uncalibrated.write_pictures(run, view, folder, say)
+    if wrong := sorted(set(left_out) - set(view_pictures.leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
-    given = read_pictures(folder, lights, intensities=intensities, mask=mask)
-    given = replace(given, uncalibrated_run=run.resolve().name, simulated=taken.simulated)
-    about = fit_pictures(given, out, left_out=[taken.leds.index(led) for led in left_out], say=say)
+    picture_set = read_pictures(folder, lights, intensities=intensities, mask=mask)
+    picture_set = replace(picture_set, uncalibrated_run=run.resolve().name, simulated=view_pictures.simulated)
+    about = fit_pictures(picture_set, out, left_out=[view_pictures.leds.index(led) for led in left_out], say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
@@ -222,8 +224,8 @@ def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
         from coupole.reflectance.run_ablation import ablate_result
         from coupole.viewing import ablation_page
 
-        told = ablate_result(result, say=say)
-        return {**told, "report": str(ablation_page.write(result, told))}
+        document = ablate_result(result, say=say)
+        return {**document, "report": str(ablation_page.write(result, document))}
 
     _do(step, as_json=as_json)
 
@@ -259,10 +261,10 @@ def cluster(
         from coupole.reflectance.run_clusters import cluster_result
         from coupole.viewing import cluster_page
 
-        told = cluster_result(
+        document = cluster_result(
             result, clusters, bytes_of(memory), degrees=degrees, without_view=without_view, say=say
         )
-        return {**told, "report": str(cluster_page.write(result, told))}
+        return {**document, "report": str(cluster_page.write(result, document))}
 
     _do(step, as_json=as_json)
 
@@ -273,14 +275,14 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
 
     try:
         with step_bars(make_console(quiet=as_json)) as say:
-            told = step(say)
+            document = step(say)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
     if as_json:
-        print(json.dumps(told))
-    elif "report" in told:
-        print(f"report {told['report']}")
+        print(json.dumps(document))
+    elif "report" in document:
+        print(f"report {document['report']}")
 
 
 reflectance_app.command()(refine)

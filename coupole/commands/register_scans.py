@@ -86,23 +86,23 @@ def register(
             raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
         levels_mm = _levels(levels)
         with new_scan_folder(out) as folder, step_bars(console) as say:
-            found = registered(
+            registration = registered(
                 scans, unit, stand=stand, targets=targets, control=control, trust_poses=trust_poses, say=say
             )
-            merged = None if no_mesh else _merged(found, unit, mesh_mm, levels_mm, folder, say)
-            told = about(found, merged)
-            (folder / "registration.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+            mesh = None if no_mesh else _merged(registration, unit, mesh_mm, levels_mm, folder, say)
+            document = about(registration, mesh)
+            (folder / "registration.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
             say("drawing", 0, 1)
-            registration_page.write(found, merged, folder)
+            registration_page.write(registration, mesh, folder)
             say("drawing", 1, 1)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    for remark in remarks(found):
+    for remark in remarks(registration):
         console.print(remark)
     console.print(f"[bold]{out}[/]: report.html, registration.json" + ("" if no_mesh else ", mesh.ply"))
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(document))
 
 
 def _unit(stated: str | None, scans: list[Path]) -> str:
@@ -122,10 +122,10 @@ def _unit(stated: str | None, scans: list[Path]) -> str:
 def _stand(seen_from: str | None) -> Stand | None:
     from coupole.scan.registration.viewpoint import STANDS
 
-    found = next((known for known in STANDS if known == seen_from), None)
-    if seen_from is not None and found is None:
+    stand = next((candidate for candidate in STANDS if candidate == seen_from), None)
+    if seen_from is not None and stand is None:
         raise InputError(f"--seen-from {seen_from}: expected one of {', '.join(STANDS)}")
-    return found
+    return stand
 
 
 def _merged(
@@ -133,16 +133,16 @@ def _merged(
 ) -> Merged:
     from coupole.scan.registration.merging import default_cell_mm, merge
 
-    placed = [found.scans[k] for k in found.placed]
+    scans = [found.scans[k] for k in found.placed]
     poses = [found.first_from_scan[k] for k in found.placed]
-    return merge(placed, poses, unit, mesh_mm or default_cell_mm(placed), levels_mm, folder, say)
+    return merge(scans, poses, unit, mesh_mm or default_cell_mm(scans), levels_mm, folder, say)
 
 
 def _levels(text: str) -> list[float]:
     try:
-        found = [float(word) for word in text.split(",") if word.strip()]
+        levels_mm = [float(word) for word in text.split(",") if word.strip()]
     except ValueError:
-        found = [-1.0]
-    if any(not 0 < level < 1e6 for level in found):
+        levels_mm = [-1.0]
+    if any(not 0 < level < 1e6 for level in levels_mm):
         raise InputError(f"--levels {text}: expected pitches in mm, separated by commas, such as 5,10,50,250")
-    return found
+    return levels_mm

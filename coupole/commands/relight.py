@@ -129,17 +129,19 @@ class Lighting:
         """Raises InputError for a light that is none, and if there is none."""
         from coupole.reflectance.new_light import light_kinds as kinds
 
-        found: list[AnyLight] = [] if self.lights is None else kinds.read_lights(self.lights)
-        found += [kinds.DistantLight(towards=kinds.way_of(one, "--direction")) for one in self.direction or []]
-        found += [kinds.LedLight(number=one) for one in self.led or []]
-        found += [kinds.PointLight(at_mm=kinds.place_of(one, "--light-at")) for one in self.light_at or []]
-        found += [kinds.area_of(one) for one in self.area or []]
-        found += [kinds.EnvironmentLight(file=one) for one in self.environment or []]
-        if not found:
+        lights: list[AnyLight] = [] if self.lights is None else kinds.read_lights(self.lights)
+        lights += [
+            kinds.DistantLight(towards=kinds.way_of(option, "--direction")) for option in self.direction or []
+        ]
+        lights += [kinds.LedLight(number=option) for option in self.led or []]
+        lights += [kinds.PointLight(at_mm=kinds.place_of(option, "--light-at")) for option in self.light_at or []]
+        lights += [kinds.area_of(option) for option in self.area or []]
+        lights += [kinds.EnvironmentLight(file=option) for option in self.environment or []]
+        if not lights:
             raise InputError(
                 "expected a light: --direction, --led, --light-at, --area, --environment, or --lights with a file"
             )
-        return found
+        return lights
 
 
 @dataclass(frozen=True)
@@ -179,25 +181,25 @@ def relight(
     console = make_console(quiet=as_json)
     try:
         _refuse_target(to, more, for_the_eye=colours.for_the_eye)
-        colour, wanted = colours.read(), lighting.read()
+        colour, lights = colours.read(), lighting.read()
         camera = _camera(viewpoint)
         with step_bars(console) as bars:
             bars("read", 0, 1)
             uncertain = more.uncertainty is not None
             relit = opened(result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain)
             if colour is not None:
-                said = write_relit_for_the_eye(relit, wanted, to, colour, more.white, bars)
+                document = write_relit_for_the_eye(relit, lights, to, colour, more.white, bars)
             else:
-                said = _write(relit, wanted, to, more.turn, more.white, bars)
+                document = _write(relit, lights, to, more.turn, more.white, bars)
             if more.uncertainty is not None:
-                said |= _write_uncertainty(relit, wanted, more.uncertainty, bars)
+                document |= _write_uncertainty(relit, lights, more.uncertainty, bars)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    if "white" in said:
-        console.print(f"white is {said['white']:.4g}")
+    if "white" in document:
+        console.print(f"white is {document['white']:.4g}")
     if as_json:
-        print(json.dumps(said))
+        print(json.dumps(document))
 
 
 def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
@@ -273,9 +275,9 @@ def _write(
     if white is None:
         numbers = sorted({number * turn // _LOOKED_AT for number in range(_LOOKED_AT)})
         peaks = []
-        for done, number in enumerate(numbers):
+        for count, number in enumerate(numbers):
             peaks.append(np.quantile(bright(frame(number)), PEAK_QUANTILE))
-            bars("exposure", done + 1, len(numbers))
+            bars("exposure", count + 1, len(numbers))
         white = float(np.mean(peaks)) or 1.0
 
     def frames() -> Iterator[NDArray[np.float32]]:
@@ -283,9 +285,9 @@ def _write(
             yield frame(number)
             bars("frames", number + 1, turn)
 
-    marked = "of a simulated object" if relit.about.get("simulated") else "of a measured object"
+    origin = "of a simulated object" if relit.about.get("simulated") else "of a measured object"
     write_video(
-        to, frames(), white=white, about=f"computed by coupole reflectance relight, {marked}; white {white:.4g}"
+        to, frames(), white=white, about=f"computed by coupole reflectance relight, {origin}; white {white:.4g}"
     )
     return {"video": str(to.resolve()), "frames": turn, "white": white, **relit.about}
 

@@ -59,14 +59,14 @@ class EyeColours:
         from coupole.exchange.camera_colour import camera_colour, colour_of_record
 
         tables = {"--sensor-spectra": self.sensor_spectra, "--led-spectrum": self.led_spectrum}
-        given = [name for name, path in tables.items() if path is not None]
+        option_names = [name for name, path in tables.items() if path is not None]
         if self.colour_record is not None:
-            if not self.for_the_eye or given:
+            if not self.for_the_eye or option_names:
                 raise InputError("--colour: is for --for-the-eye, in place of --sensor-spectra and --led-spectrum")
             return colour_of_record(self.colour_record)
         if not self.for_the_eye:
-            if given:
-                raise InputError(f"{', '.join(given)}: is for --for-the-eye")
+            if option_names:
+                raise InputError(f"{', '.join(option_names)}: is for --for-the-eye")
             return None
         if self.sensor_spectra is None or self.led_spectrum is None:
             missing = ", ".join(name for name, path in tables.items() if path is None)

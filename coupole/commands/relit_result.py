@@ -45,8 +45,8 @@ def opened(
             fit = fit or run_relighting.best_fit(run_result.RunResult(result), fits.MATERIALS)
             relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
         return _of_runs(result, view, fit, camera, samples)
-    given = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
-    for option, value in given:
+    options = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
+    for option, value in options:
         if value is not None:
             raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
     return _of_pictures(result, samples)
@@ -59,7 +59,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
 
     if camera is not None and view is not None:
         raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
-    simulated = bool(run_result.read_about(result)["simulated"])
+    is_simulated = bool(run_result.read_about(result)["simulated"])
     folder = run_result.RunResult(result)
     if camera is None:
         scene = run_relighting.scene_of_view(folder, view, fit)
@@ -71,7 +71,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
 
     return Relit(
         lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
-        {"fit": scene.fit, "simulated": simulated},
+        {"fit": scene.fit, "simulated": is_simulated},
         lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
         has_colours=folder.channels == 3,
     )
@@ -80,11 +80,11 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
 def _of_pictures(result: Path, samples: int) -> Relit:
     from coupole.reflectance import picture_result, relighting
 
-    made = picture_result.PictureResult(result)
-    made.about  # noqa: B018  refuses what is no result
+    picture_folder = picture_result.PictureResult(result)
+    picture_folder.about  # noqa: B018  refuses what is no result
     interpolation = relighting.read_interpolation(result)
 
     def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
-        return relighting.relit_by(made, interpolation, lights, samples, say=say)
+        return relighting.relit_by(picture_folder, interpolation, lights, samples, say=say)
 
     return Relit(picture, {})

@@ -49,9 +49,9 @@ def render(
     try:
         if step not in {None, 5, 10, 20, 40}:
             raise InputError(f"--step: expected 5, 10, 20 or 40, found {step}; choose one of them")
-        document, wanted = read_scene(scene)
-        wanted = studio.reduced(wanted, samples=samples, width_px=width, step_nm=step, noise=noise)
-        console.print(f"{wanted.name}: Mitsuba, {studio.variant_of(wanted)}")
+        document, settings = read_scene(scene)
+        settings = studio.reduced(settings, samples=samples, width_px=width, step_nm=step, noise=noise)
+        console.print(f"{settings.name}: Mitsuba, {studio.variant_of(settings)}")
         with Progress(console=console, disable=not console.is_terminal) as bars:
             tasks: dict[str, TaskID] = {}
 
@@ -60,7 +60,7 @@ def render(
                     tasks[name] = bars.add_task(name, total=total)
                 bars.update(tasks[name], completed=done)
 
-            summary = render_scene(document, wanted, out, show)
+            summary = render_scene(document, settings, out, show)
     except InputError as error:
         fail(error, as_json=as_json)
         raise
@@ -69,9 +69,9 @@ def render(
         return
     for remark in summary["remarks"]:
         console.print(remark, markup=False)
-    for seen in summary["cameras"].values():
-        made = seen["files"].get("film") or seen["files"]["png"]
-        console.print(f"{out / made}: white {seen['white_cd_m2']:.4g} cd/m2{_noise(seen)}, simulated")
+    for camera in summary["cameras"].values():
+        file_name = camera["files"].get("film") or camera["files"]["png"]
+        console.print(f"{out / file_name}: white {camera['white_cd_m2']:.4g} cd/m2{_noise(camera)}, simulated")
 
 
 def _noise(seen: dict[str, Any]) -> str:
@@ -87,9 +87,9 @@ def read_scene(path: Path) -> tuple[Document, Scene]:
     document = yamlfile.read(path)
     scene = document.validate(Scene)
     missing = [
-        document.problem(at, f"no such file: {document.resolve(named)}")
-        for at, named in files(scene)
-        if not (document.resolve(named).is_file() or (document.resolve(named) / "result.json").is_file())
+        document.problem(at, f"no such file: {document.resolve(file_name)}")
+        for at, file_name in files(scene)
+        if not (document.resolve(file_name).is_file() or (document.resolve(file_name) / "result.json").is_file())
     ]
     if missing:
         raise InputError(missing)

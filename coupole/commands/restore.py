@@ -81,9 +81,9 @@ def restore(
         if out.exists() and not out.is_dir():
             raise InputError(f"--out {out}: expected a folder, found a file; name another one")
         with step_bars(console) as say:
-            wanted = read(mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say)
-            made = render_all(wanted, out, say)
-            result = show_all(wanted, made, out, say)
+            restoration = read(mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say)
+            pictures = render_all(restoration, out, say)
+            result = show_all(restoration, pictures, out, say)
             _write_page(restoration_page, result, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -108,17 +108,17 @@ def read(
     from coupole.heritage.restoration.painted_mesh import read_painted
     from coupole.heritage.restoration.restoring import Restoration
 
-    document, given = restoration_file.read_restoration(materials)
-    given = restoration_file.reduced(given, *reduced)
-    hypotheses = restoration_file.chosen(document, given, names)
+    document, materials_file = restoration_file.read_restoration(materials)
+    materials_file = restoration_file.reduced(materials_file, *reduced)
+    hypotheses = restoration_file.chosen(document, materials_file, names)
     rules_document, rules = parts_file.read_parts(parts)
     say("reading the mesh", 0, 2)
-    painted = read_painted(mesh, unit)
+    painted_mesh = read_painted(mesh, unit)
     say("reading the mesh", 1, 2)
-    found = part_labels.parts_of(painted, rules_document, rules)
+    labels = part_labels.parts_of(painted_mesh, rules_document, rules)
     say("reading the mesh", 2, 2)
-    restoration_file.expect_parts(document, given, found.names, parts)
-    return Restoration(painted, found, document, given, hypotheses)
+    restoration_file.expect_parts(document, materials_file, labels.names, parts)
+    return Restoration(painted_mesh, labels, document, materials_file, hypotheses)
 
 
 @restore_app.command()
@@ -136,16 +136,24 @@ def pick(
     console = make_console(quiet=as_json)
     try:
         with console.status("reading the mesh"):
-            found = read_painted(mesh, unit)
-            triangles = write_pick_page(found.vertices_mm, found.triangles, mesh.name, out)
+            painted_mesh = read_painted(mesh, unit)
+            triangles = write_pick_page(painted_mesh.vertices_mm, painted_mesh.triangles, mesh.name, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
-    told = {"page": str(out), "triangles_of_the_mesh": len(found.triangles), "triangles_of_the_page": triangles}
+    document = {
+        "page": str(out),
+        "triangles_of_the_mesh": len(painted_mesh.triangles),
+        "triangles_of_the_page": triangles,
+    }
     if as_json:
-        print(json.dumps(told))
+        print(json.dumps(document))
     else:
-        fewer = "" if triangles == len(found.triangles) else f", simplified from {len(found.triangles):,}"
+        fewer = (
+            ""
+            if triangles == len(painted_mesh.triangles)
+            else f", simplified from {len(painted_mesh.triangles):,}"
+        )
         console.print(f"{out}: {triangles:,} triangles{fewer}; open it in a browser", markup=False)
 
 
@@ -162,10 +170,10 @@ def _write_page(page: Any, result: dict[str, Any], out: Path) -> None:
 def _say(result: dict[str, Any], out: Path, console: Console) -> None:
     for remark in result["remarks"]:
         console.print(remark, markup=False)
-    kept = result["taken_as_they_were"]
-    told = f"; {kept} were there already" if kept else ""
+    count = result["taken_as_they_were"]
+    note = f"; {count} were there already" if count else ""
     console.print(
-        f"{out}: {result['made_anew']} pictures rendered{told}; "
+        f"{out}: {result['made_anew']} pictures rendered{note}; "
         f"white {result['white_cd_m2']:.4g} cd/m2, simulated",
         markup=False,
     )

@@ -51,30 +51,30 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
-    sent = _sent(run, "stop")  # before the imports that only its outcome wants
+    reply = _sent(run, "stop")  # before the imports that only its outcome wants
 
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
     from coupole.viewing.terminal import alarm, make_console, show_status
 
-    for trouble in sent["trouble"]:
+    for trouble in reply["trouble"]:
         alarm(trouble)
-    stopped = Run(Path(sent["run"]))
+    folder = Run(Path(reply["run"]))
     end_s = time.monotonic() + _ENDS_WITHIN_S
-    while stopped.in_use:
+    while folder.in_use:
         if time.monotonic() > end_s:
             raise DeviceError(
                 "cell",
-                expected=f"the process {sent['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
+                expected=f"the process {reply['pid']} to end within {_ENDS_WITHIN_S:g} s of its stop",
                 happened="it still acquires into the run",
                 remedy="Look at the cell, then end the process (`kill -9`); the run can be resumed.",
             )
         time.sleep(_LOOK_EVERY_S)
-    found = status(stopped)
+    progress = status(folder)
     if as_json:
-        print(json.dumps(found.figures()))
-    show_status(make_console(quiet=as_json), found)
-    if unsafe := _unsafe(stopped):
+        print(json.dumps(progress.figures()))
+    show_status(make_console(quiet=as_json), progress)
+    if unsafe := _unsafe(folder):
         raise DeviceError(
             "cell",
             expected="lights off, the arm at rest and the camera disarmed",
@@ -89,26 +89,26 @@ def _unsafe(run: Run) -> list[str]:
     from coupole.storage import journal
     from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 
-    found = ["the session has no end in its journal: its process was killed, or could not write it"]
-    ended = False
+    reasons = ["the session has no end in its journal: its process was killed, or could not write it"]
+    has_end = False
     for event in journal.read(run.journal_path):
         if isinstance(event, SessionStarted | SessionResumed):
-            found, ended = found[:1], False
+            reasons, has_end = reasons[:1], False
         elif isinstance(event, FaultNoted) and event.kind == "unsafe":
-            found.append(event.message)
+            reasons.append(event.message)
         elif isinstance(event, SessionStopped):
-            ended = True
-    return found[1:] if ended else found
+            has_end = True
+    return reasons[1:] if has_end else reasons
 
 
 def follow(run: Path | None, console: Console) -> Path:
     """Show a running acquisition until it ends, a line whenever there is something new; its folder."""
-    said_s, said = 0.0, ""
+    said_s, last_state = 0.0, ""
     folder = run or Path(running_run(run)["run"])
     for state in _states(folder):
-        changed = state["state"] != said
-        if changed or console.is_terminal or time.monotonic() - said_s > _PLAIN_LINE_EVERY_S:
-            said_s, said = time.monotonic(), state["state"]
+        is_new = state["state"] != last_state
+        if is_new or console.is_terminal or time.monotonic() - said_s > _PLAIN_LINE_EVERY_S:
+            said_s, last_state = time.monotonic(), state["state"]
             console.print(_line(state), end="\r" if console.is_terminal else "\n", markup=False)
     if console.is_terminal:
         console.print()
@@ -134,16 +134,16 @@ def running_run(run: Path | None) -> State:
     if run is not None:
         return ask(run, "state")
     answers = running()
-    found = [state for state in answers if state["run"]]
-    if not found:
+    states = [state for state in answers if state["run"]]
+    if not states:
         silent = [why for state in answers for why in state.get("trouble", ())]
         raise InputError(
             "; ".join(["no run is being acquired by this user on this machine that answers", *silent])
         )
-    if len(found) > 1:
-        folders = "\n".join(f"  {state['run']}" for state in found)
+    if len(states) > 1:
+        folders = "\n".join(f"  {state['run']}" for state in states)
         raise InputError(f"several runs are being acquired; name one of\n{folders}")
-    return found[0]
+    return states[0]
 
 
 def _sent(run: Path | None, command: Command, *, until: str = "") -> State:

@@ -57,27 +57,29 @@ def acquire(
     if resume and output:
         raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
     console = make_console(quiet=as_json and not begun_by_console)
-    found: dict[str, Any] = {}
+    summary: dict[str, Any] = {}
     try:
-        served = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
-        if served is not None:
+        console_cell = None if dry_run or begun_by_console else served_cell(plan, rig, resume)
+        if console_cell is not None:
             from coupole.console.command_line.following import acquire_by_console
 
-            named = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
-            asked = {key: str(path.resolve()) for key, path in named.items() if path is not None}
-            acquire_by_console(served, console, {**asked, "with_mesh": with_mesh}, confirm=not yes, found=found)
+            paths = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
+            request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
+            acquire_by_console(
+                console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, found=summary
+            )
         elif dry_run:
-            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, found=found)
+            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, found=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
             acquire_plan(
-                job, console, parent=output, resume=resume, confirm=not yes, found=found, with_mesh=with_mesh
+                job, console, parent=output, resume=resume, confirm=not yes, found=summary, with_mesh=with_mesh
             )
     except CoupoleError as error:
-        fail(error, as_json=as_json, found=found)
+        fail(error, as_json=as_json, found=summary)
         raise
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(summary))
 
 
 def devices(
@@ -98,21 +100,21 @@ def devices(
 
     console = make_console(quiet=as_json)
     cell = read_cell(rig or shipped_rig())
-    found: dict[str, Any] = {}
+    document: dict[str, Any] = {}
     table = Table("device", "identity", "self-test", box=None)
-    with borrowed(cell, "devices"), open_cell(cell) as opened:
+    with borrowed(cell, "devices"), open_cell(cell) as open_devices:
         for kind in ("ledbox", "camera", "robot"):
-            identity, tested = opened.identities[kind], bounded(getattr(opened, kind).self_test)
-            found[kind] = {**vars(identity), "self_test": dict(tested)}
-            who = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
+            identity, self_test = open_devices.identities[kind], bounded(getattr(open_devices, kind).self_test)
+            document[kind] = {**vars(identity), "self_test": dict(self_test)}
+            identity_text = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
             table.add_row(
                 kind,
-                who + (" [dim]simulated[/]" if identity.simulated else ""),
-                ", ".join(f"{key} {value}" for key, value in tested.items()),
+                identity_text + (" [dim]simulated[/]" if identity.simulated else ""),
+                ", ".join(f"{key} {value}" for key, value in self_test.items()),
             )
     console.print(table)
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(document))
 
 
 def meter(

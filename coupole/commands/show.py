@@ -76,18 +76,18 @@ def show(
         raise
     size_bytes = sum(file.stat().st_size for file in files)
     if as_json:
-        said = {"page": str(files[0].resolve()), "files": len(files), "bytes": size_bytes, "about": look.about}
-        print(json.dumps(said))
+        document = {"page": str(files[0].resolve()), "files": len(files), "bytes": size_bytes, "about": look.about}
+        print(json.dumps(document))
     else:
         console.print(f"{files[0]}: {size_bytes / 1e6:.1f} MB in {len(files)} files; open it in a browser")
         for remark in look.about.get("remarks", ()):
             console.print(remark, markup=False)
-        if told := look.about.get("residual"):
-            names = {name for view in told["views"] for name in view["blocks"]}
+        if residual := look.about.get("residual"):
+            names = {name for view in residual["views"] for name in view["blocks"]}
             beside = sum(file.stem in names for file in files[1:])
             where = f"; {beside} of {len(names)} files of it lie beside the page" if beside else ""
-            kept = f"{told['planes']} planes have {100 * told['kept']:.4g} % of its energy"
-            console.print(f"residual: {kept}{where}")
+            share_text = f"{residual['planes']} planes have {100 * residual['kept']:.4g} % of its energy"
+            console.print(f"residual: {share_text}{where}")
 
 
 def _look(
@@ -142,5 +142,5 @@ def _look_of_scene(path: Path) -> Look:
 
 
 def _refuse(options: dict[str, object], because: str) -> None:
-    if given := [name for name, value in options.items() if value]:
-        raise InputError(f"{', '.join(given)}: would do nothing, as {because}; leave it out")
+    if option_names := [name for name, value in options.items() if value]:
+        raise InputError(f"{', '.join(option_names)}: would do nothing, as {because}; leave it out")

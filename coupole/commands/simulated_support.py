@@ -39,8 +39,8 @@ def with_things(rig_path: Path, things: Sequence[Mapping[str, Any]], path: Path,
     from coupole.plan.rig import Rig
 
     document = yamlfile.read(rig_path)
-    written = [(at, value) for at, value in named_paths(document.validate(Rig)) if at in document.value_places]
-    changes = {at: str(document.resolve(value)) for at, value in written}
+    entries = [(at, value) for at, value in named_paths(document.validate(Rig)) if at in document.value_places]
+    changes = {at: str(document.resolve(value)) for at, value in entries}
     yaml = YAML()
     yaml.width = 4096
     content = yaml.load(rewritten(document, document.text, changes))
@@ -58,12 +58,12 @@ def with_things(rig_path: Path, things: Sequence[Mapping[str, Any]], path: Path,
 def place_for(template: str, things: Sequence[Mapping[str, Any]], rig: Path, name: str) -> list[Path]:
     """Write NAME-rig.yaml, the rig with the things that a template's plan photographs, and their description for
     `coupole calibrate`. Returns what was written. Raises InputError if one of them exists."""
-    made = [Path(f"{name}-rig.yaml")]
-    with_things(rig, things, made[0])
+    paths = [Path(f"{name}-rig.yaml")]
+    with_things(rig, things, paths[0])
     if template in _DESCRIPTIONS:
-        what, text = _DESCRIPTIONS[template]
-        made.append(Path(f"{name}-{what}.yaml"))
-        if made[-1].exists():
-            raise InputError(f"{made[-1]}: exists already; choose another name")
-        made[-1].write_text(text, encoding="utf-8")
-    return made
+        kind, text = _DESCRIPTIONS[template]
+        paths.append(Path(f"{name}-{kind}.yaml"))
+        if paths[-1].exists():
+            raise InputError(f"{paths[-1]}: exists already; choose another name")
+        paths[-1].write_text(text, encoding="utf-8")
+    return paths

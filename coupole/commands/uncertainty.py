@@ -102,10 +102,10 @@ def budget(
     try:
         if out is not None:
             _refuse_target(out)
-        given = _with_plan(read_records(records or []), plan)
+        all_records = _with_plan(read_records(records or []), plan)
         with console.status("propagating distributions"):
             result = _propagated(
-                given, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
+                all_records, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
             )
         if out is not None:
             _write_report(out, result)
@@ -153,17 +153,17 @@ def _propagated(
     from coupole.calibration.budget.records import doubts, known_from, read_records
     from coupole.calibration.budget.report import as_json as figures_of
 
-    known = known_from(ours, start)
-    found = budget_of(known, geometry, emission=emission_of(emission), coverages=coverages)
-    spread = _spread(known)
-    cases = [Case(_folder(ours), ours, spread)]
+    figures = known_from(ours, start)
+    our_budget = budget_of(figures, geometry, emission=emission_of(emission), coverages=coverages)
+    our_spread = _spread(figures)
+    cases = [Case(_folder(ours), ours, our_spread)]
     if beside:
-        others = read_records(beside)
-        cases.append(Case(_folder(others), others, _spread(known_from(others, start))))
+        their_records = read_records(beside)
+        cases.append(Case(_folder(their_records), their_records, _spread(known_from(their_records, start))))
     table = accuracies(cases)
-    doubted = doubts([item for case in cases for item in case.records], datetime.now(UTC))
-    document = figures_of(found, spread, cases, table) | {"doubts": doubted}
-    return _Result(found, spread, cases, table, doubted, document)
+    doubts_of_records = doubts([item for case in cases for item in case.records], datetime.now(UTC))
+    document = figures_of(our_budget, our_spread, cases, table) | {"doubts": doubts_of_records}
+    return _Result(our_budget, our_spread, cases, table, doubts_of_records, document)
 
 
 def _write_report(out: Path, result: _Result) -> None:

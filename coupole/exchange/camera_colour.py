@@ -46,8 +46,8 @@ class CameraColour:
 
 def unknown_colour() -> CameraColour:
     """Return the colours of a camera of which nothing is known."""
-    told = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
-    return CameraColour(None, lambda led: np.ones(3), told)
+    origin = "not calibrated: ColorMatrix1 is the identity, AsShotNeutral is 1 1 1"
+    return CameraColour(None, lambda led: np.ones(3), origin)
 
 
 def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None) -> CameraColour:
@@ -75,17 +75,17 @@ def camera_colour(sensor: Path, leds: Path, white_of_leds: Neutral | None = None
     towards = functions * daylight / (functions[1] @ daylight)
     apart = (WAVELENGTHS_NM[:, None] - WAVELENGTHS_NM) / _CORRELATED_NM
     covariance = np.exp(-0.5 * apart**2) + 1.0
-    balanced = signals / white[:, None]
-    if np.linalg.cond(balanced @ covariance @ balanced.T) > _LARGEST_CONDITION:
+    white_balance = signals / white[:, None]
+    if np.linalg.cond(white_balance @ covariance @ white_balance.T) > _LARGEST_CONDITION:
         raise InputError(
             f"{sensor}: its channels are too much alike under the light of {leds} to tell colours apart; expected "
             "sensitivities of red, green and blue that differ in shape"
         )
-    matrix = _least_missing(balanced, towards, covariance)
+    matrix = _least_missing(white_balance, towards, covariance)
     neutral = white / white.max()
-    known = "measured by the record of the LEDs' power" if white_of_leds is not None else "by the spectra"
-    told = f"XYZ under D65, 1931 observer, by the spectra {sensor.name} and {leds.name}; white {known}"
-    return CameraColour(matrix, white_of_leds or (lambda led: neutral), told)
+    source = "measured by the record of the LEDs' power" if white_of_leds is not None else "by the spectra"
+    origin = f"XYZ under D65, 1931 observer, by the spectra {sensor.name} and {leds.name}; white {source}"
+    return CameraColour(matrix, white_of_leds or (lambda led: neutral), origin)
 
 
 def _least_missing(signals: Floats, towards: Floats, covariance: Floats) -> Floats:
@@ -94,8 +94,8 @@ def _least_missing(signals: Floats, towards: Floats, covariance: Floats) -> Floa
     free = np.linalg.solve(within, signals @ covariance @ towards.T).T
     white = signals.sum(axis=1)
     direction = np.linalg.solve(within, white)
-    missed = towards.sum(axis=1) - free @ white
-    return np.asarray(free + np.outer(missed, direction) / (direction @ white))
+    white_error = towards.sum(axis=1) - free @ white
+    return np.asarray(free + np.outer(white_error, direction) / (direction @ white))
 
 
 def _spectrum(path: Path, column: int) -> Floats:
@@ -104,10 +104,10 @@ def _spectrum(path: Path, column: int) -> Floats:
     from coupole.appearance.spectra.resampling import on_grid
 
     try:
-        found = on_grid(read_spectrum(path, unit="power", column=column)).values
+        spectrum = on_grid(read_spectrum(path, unit="power", column=column)).values
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot read the table of spectra: {reason(error)}") from error
-    values: Floats = np.nan_to_num(found)
+    values: Floats = np.nan_to_num(spectrum)
     if values.min() < -_NOISE * values.max():
         raise InputError(f"{path}: column {column} goes below 0; expected relative sensitivities or power")
     return np.maximum(values, 0.0)
@@ -125,5 +125,5 @@ def colour_of_record(path: Path) -> CameraColour:
     record = read_accepted(path, "colour")
     matrix = np.array([[record.value(f"{MATRIX}{axis}{channel}") for channel in "rgb"] for axis in "XYZ"])
     neutral = np.array([record.value(f"neutral.{channel}") for channel in "RGB"])
-    told = f"XYZ under D65 by the chart of the record {record.name} ({record.sha256[:12]}); white by the chart"
-    return CameraColour(d65_from_d50() @ matrix, lambda led: neutral, told)
+    origin = f"XYZ under D65 by the chart of the record {record.name} ({record.sha256[:12]}); white by the chart"
+    return CameraColour(d65_from_d50() @ matrix, lambda led: neutral, origin)

@@ -69,28 +69,30 @@ def export_colmap(
 
     Raises InputError: records or mesh are missing, files stand there already (unless `overwrite`); StorageError.
     """
-    measured = read_measured_run(folder, records=records)
+    measured_run = read_measured_run(folder, records=records)
     if refined is not None:
-        measured = read_refined(refined).of(measured)
+        measured_run = read_refined(refined).of(measured_run)
     model = out / MODEL
-    pictures = [out / PICTURES / f"{view.name}.png" for view in measured.views]
+    pictures = [out / PICTURES / f"{view.name}.png" for view in measured_run.views]
     texts = [model / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
     if not overwrite:
         refuse_standing([*texts, *pictures])
-    mesh = PacketMesh(measured.corners_mm)
-    posed = []
+    mesh = PacketMesh(measured_run.corners_mm)
+    views = []
     with writing_into(model), writing_into(out / PICTURES):
-        for number, (view, path) in enumerate(zip(measured.views, pictures, strict=True)):
-            posed.append(_posed(measured, view, mesh))
-            write_synced(path, cv2.imencode(".png", posed[-1].codes)[1].tobytes())
+        for number, (view, path) in enumerate(zip(measured_run.views, pictures, strict=True)):
+            views.append(_posed(measured_run, view, mesh))
+            write_synced(path, cv2.imencode(".png", views[-1].codes)[1].tobytes())
             say("views", number + 1, len(pictures))
-        centres_mm = apply(inverse(measured.base_from_support), measured.corners_mm.mean(axis=1))
-        told = "refined by overlapping views" if refined is not None else "by the run's calibrations"
-        source = "simulated" if measured.run.simulated else "measured"
-        head = f"# Coupole {coupole.__version__}: {measured.run.folder.name}, {source}; {told}; world in mm\n"
+        centres_mm = apply(inverse(measured_run.base_from_support), measured_run.corners_mm.mean(axis=1))
+        origin = "refined by overlapping views" if refined is not None else "by the run's calibrations"
+        source = "simulated" if measured_run.run.simulated else "measured"
+        head = (
+            f"# Coupole {coupole.__version__}: {measured_run.run.folder.name}, {source}; {origin}; world in mm\n"
+        )
         contents = (
-            camera_text(measured.lens, measured.frames.size_px),
-            *texts_of(posed, centres_mm, measured.lens),
+            camera_text(measured_run.lens, measured_run.frames.size_px),
+            *texts_of(views, centres_mm, measured_run.lens),
         )
         for path, text in zip(texts, contents, strict=True):
             write_synced(path, head + text)
@@ -110,21 +112,23 @@ def camera_text(lens: Intrinsics, size_px: tuple[int, int]) -> str:
 
 def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics) -> tuple[str, str]:
     """images.txt and points3D.txt; `centres_mm` [m, 3] of all triangles, support frame."""
-    seen, times = np.unique(np.concatenate([picture.triangles for picture in posed]), return_counts=True)
+    triangles, times = np.unique(np.concatenate([picture.triangles for picture in posed]), return_counts=True)
     if (times > 1).any():  # COLMAP's bundle adjustment ends at a point of one image
-        seen = seen[times > 1]
-    chosen = seen[np.unique(np.linspace(0, len(seen) - 1, min(len(seen), MOST_POINTS)).astype(np.int64))]
-    tracks: list[list[int]] = [[] for _ in chosen]
-    colours = np.zeros((len(chosen), 3))
+        triangles = triangles[times > 1]
+    point_triangles = triangles[
+        np.unique(np.linspace(0, len(triangles) - 1, min(len(triangles), MOST_POINTS)).astype(np.int64))
+    ]
+    tracks: list[list[int]] = [[] for _ in point_triangles]
+    colours = np.zeros((len(point_triangles), 3))
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for number, picture in enumerate(posed, start=1):
         camera_from_support = inverse(picture.support_from_camera)
         x, y, z, w = Rotation.from_matrix(camera_from_support[:3, :3]).as_quat(canonical=True)
         pose = _row([w, x, y, z, *camera_from_support[:3, 3]])
         images.append(f"{number} {pose} 1 {picture.name}")
-        mine = np.isin(picture.triangles, chosen, assume_unique=True)
-        points = np.searchsorted(chosen, picture.triangles[mine])
-        pixels = picture.pixels[mine]
+        is_chosen = np.isin(picture.triangles, point_triangles, assume_unique=True)
+        points = np.searchsorted(point_triangles, picture.triangles[is_chosen])
+        pixels = picture.pixels[is_chosen]
         column, row = np.rint(pixels).astype(int).T
         colours[points] += picture.codes[row, column, ::-1]
         for place, point in enumerate(points.tolist()):
@@ -133,7 +137,7 @@ def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics
         images.append(" ".join(f"{u:.6f} {v:.6f} {n + 1}" for (u, v), n in zip(at, points.tolist(), strict=True)))
     points_lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     for number, (place, colour, track) in enumerate(
-        zip(centres_mm[chosen], colours, tracks, strict=True), start=1
+        zip(centres_mm[point_triangles], colours, tracks, strict=True), start=1
     ):
         red, green, blue = np.rint(colour / (len(track) // 2)).astype(int)
         points_lines.append(f"{number} {_row(place)} {red} {green} {blue} 0 {' '.join(map(str, track))}")
@@ -145,28 +149,28 @@ def _posed(measured: MeasuredRun, view: MeasuredView, mesh: PacketMesh) -> Posed
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     width, height = measured.frames.size_px
-    seen = seen_surface(mesh, normals, measured.lens, view.base_from_camera, (width, height))
-    centres_mm = apply(inverse(view.base_from_camera), corners[seen.triangles].mean(axis=1))
+    surface = seen_surface(mesh, normals, measured.lens, view.base_from_camera, (width, height))
+    centres_mm = apply(inverse(view.base_from_camera), corners[surface.triangles].mean(axis=1))
     pixels = project(centres_mm, measured.lens.vector()).pixels
     column, row = np.rint(pixels).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    shown = np.zeros(len(pixels), np.bool_)
-    shown[inside] = seen.places[row[inside], column[inside]] == np.flatnonzero(inside)
+    is_visible = np.zeros(len(pixels), np.bool_)
+    is_visible[inside] = surface.places[row[inside], column[inside]] == np.flatnonzero(inside)
     return PosedPicture(
         f"{view.name}.png",
         inverse(measured.base_from_support) @ view.base_from_camera,
-        seen.triangles[shown],
-        pixels[shown],
+        surface.triangles[is_visible],
+        pixels[is_visible],
         _picture(measured, view),
     )
 
 
 def _picture(measured: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]:
     """[h, w, 3] sRGB, blue first, of the mean of frames of LEDs all round."""
-    frames = [mine[0] for mine in view.by_led.values()]
-    chosen = frames[:: -(-len(frames) // _MOST_FRAMES)]
-    total = np.zeros(chosen[0].read().shape)
-    for frame in chosen:
+    frames = [led_frames[0] for led_frames in view.by_led.values()]
+    samples = frames[:: -(-len(frames) // _MOST_FRAMES)]
+    total = np.zeros(samples[0].read().shape)
+    for frame in samples:
         total += np.maximum(frame.read().astype(np.float64) - measured.frames.black_dn, 0.0)
     white = float(np.quantile(total, _WHITE_QUANTILE)) or 1.0
     mosaic = np.rint(65535.0 * np.clip(total / white, 0.0, 1.0)).astype(np.uint16)

@@ -46,11 +46,11 @@ def encode(picture: Picture, colour: CameraColour | None = None) -> bytes:
     height, width = picture.pixels.shape
     twelve = width % 2 == 0 and max(picture.white_dn, int(picture.pixels.max())) < 4096
     strip = pack12(picture.pixels, "msb").tobytes() if twelve else picture.pixels.astype("<u2").tobytes()
-    known = colour or unknown_colour()
+    camera_colour = colour or unknown_colour()
     tags = [
         *_image_tags(height, width, bits=12 if twelve else 16, strip_bytes=len(strip)),
-        *_camera_tags(picture, known),
-        *(_colour_tags(picture, known) if picture.pattern != "MONO" else [_short(262, _LINEAR_RAW)]),
+        *_camera_tags(picture, camera_colour),
+        *(_colour_tags(picture, camera_colour) if picture.pattern != "MONO" else [_short(262, _LINEAR_RAW)]),
     ]
     exif_at = _HEADER_BYTES + _size(tags)
     exif = _exif_tags(picture)
@@ -79,8 +79,8 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
 
 
 def _camera_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
-    told = "none: the sensor has no filters" if picture.pattern == "MONO" else colour.told
-    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": told}
+    origin = "none: the sensor has no filters" if picture.pattern == "MONO" else colour.told
+    about = {**picture.about, "bayer_pattern": picture.pattern, "colour": origin}
     camera = str(about.get("camera", "unknown camera")) + (" (simulated)" if about["simulated"] else "")
     return [
         _ascii(270, json.dumps(about)),  # ImageDescription

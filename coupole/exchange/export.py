@@ -62,12 +62,12 @@ def export_run(
     paths = {str(frame.shot): folder / f"{str(frame.shot).replace('/', '_')}.{to}" for frame in frames}
     if not overwrite:
         refuse_standing(list(paths.values()))
-    written = 0
+    total_bytes = 0
     with writing_into(folder):
-        for done, picture in enumerate(_pictures(run, frames), start=1):
-            written += _write(paths[picture.about["shot"]], encode(picture))
-            progress(done, len(frames))
-    return Exported(len(frames), written)
+        for count, picture in enumerate(_pictures(run, frames), start=1):
+            total_bytes += _write(paths[picture.about["shot"]], encode(picture))
+            progress(count, len(frames))
+    return Exported(len(frames), total_bytes)
 
 
 def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) -> Callable[[Picture], bytes]:
@@ -75,10 +75,10 @@ def _encoder(to: str, run: Run, colour: ColourWanted | None, *, linear: bool) ->
     if colour is None:
         encode: Callable[[Picture], bytes] = importlib.import_module(f"coupole.exchange.{to}").encode
         return encode
-    known = colour_of_run(run, colour)
+    camera_colour = colour_of_run(run, colour)
     if to == "dng":
-        return partial(dng.encode, colour=known)
-    return partial(tiff_for_the_eye.encode, colour=known, linear=linear)
+        return partial(dng.encode, colour=camera_colour)
+    return partial(tiff_for_the_eye.encode, colour=camera_colour, linear=linear)
 
 
 def _matches(name: str, patterns: list[str]) -> bool:
@@ -90,11 +90,11 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
     by_file: dict[str, list[FrameProven]] = {}
     for frame in sorted(frames, key=lambda f: (f.file, f.index)):
         by_file.setdefault(frame.file, []).append(frame)
-    for name, mine in by_file.items():
+    for name, file_frames in by_file.items():
         path = run.folder / name
-        file = read_view(path, mine)
+        file = read_view(path, file_frames)
         attributes = _plain(file.attributes)
-        for frame in mine:
+        for frame in file_frames:
             pixels = file.proven_pixels(frame)
             record = file.records[frame.index]
             pose = file.poses[record["pose"]]
@@ -124,8 +124,8 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
 
 def _plain(attributes: dict[str, Any]) -> dict[str, Any]:
     """Attributes of a view's file (object, lens, gain) in JSON types."""
-    own = {key: value for key, value in attributes.items() if key not in ("NX_class", "default")}
-    return {key: np.asarray(value).tolist() for key, value in own.items()}
+    entries = {key: value for key, value in attributes.items() if key not in ("NX_class", "default")}
+    return {key: np.asarray(value).tolist() for key, value in entries.items()}
 
 
 def _write(path: Path, content: bytes) -> int:

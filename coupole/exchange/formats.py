@@ -97,23 +97,25 @@ def source_of(folder: Path) -> Source:
 def formats_of(source: Source, writer: Writer | None = None) -> list[str]:
     """Names of the formats of a kind of source, of one writer or of all."""
     return [
-        one.name for one in FORMATS.values() if source in one.sources and (writer is None or writer is one.writer)
+        entry.name
+        for entry in FORMATS.values()
+        if source in entry.sources and (writer is None or writer is entry.writer)
     ]
 
 
 def format_named(name: str, source: Source, writer: Writer | None = None) -> Format:
     """Raises InputError if there is none of this name for the source (and the writer)."""
-    known = formats_of(source, writer)
-    if name not in known:
-        others = [kind.value for kind in FORMATS[name].sources] if name in FORMATS else []
-        why = f"; {name} is for {' or '.join(others)}" if others and source.value not in others else ""
-        raise InputError(f"--to: expected one of {', '.join(known)} for {source.value}; found {name}{why}")
+    names = formats_of(source, writer)
+    if name not in names:
+        sources = [kind.value for kind in FORMATS[name].sources] if name in FORMATS else []
+        why = f"; {name} is for {' or '.join(sources)}" if sources and source.value not in sources else ""
+        raise InputError(f"--to: expected one of {', '.join(names)} for {source.value}; found {name}{why}")
     return FORMATS[name]
 
 
 def refuse_others_options(one: Format, given: list[str]) -> None:
     """Raise InputError for the first of these options (names without dashes) that only other formats have."""
     for option in given:
-        takers = [other.name for other in FORMATS.values() if option in other.options]
+        takers = [entry.name for entry in FORMATS.values() if option in entry.options]
         if takers and one.name not in takers:
             raise InputError(f"--{option}: is for --to {', '.join(takers)}; found --to {one.name}")

@@ -27,7 +27,7 @@ def standard_uncertainties(path: Path) -> dict[str, Floats]:
         refuse_without_uncertainty(path, file)
         lower = file["covariance"][()].astype(np.float64)
         same = np.hypot(file["u_triangle"][()], float(file["u_shared"][()]))
-        found = {key: np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks")}
-    found["u_normal"] = np.sqrt(lower[:, _FIRST_TILT] + lower[:, _SECOND_TILT])
-    found["u_alpha"] = np.sqrt(lower[:, _ALPHA])
-    return {key: values.astype(np.float64) for key, values in found.items()}
+        uncertainties = {key: np.sqrt(np.mean(file[key][()] ** 2, axis=1) + same**2) for key in ("u_kd", "u_ks")}
+    uncertainties["u_normal"] = np.sqrt(lower[:, _FIRST_TILT] + lower[:, _SECOND_TILT])
+    uncertainties["u_alpha"] = np.sqrt(lower[:, _ALPHA])
+    return {key: values.astype(np.float64) for key, values in uncertainties.items()}

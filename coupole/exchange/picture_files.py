@@ -38,8 +38,8 @@ def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
                 header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
                 OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(part))
             case _:
-                scaled = np.rint(np.clip(picture, 0.0, 1.0) * _PNG_WHITE).astype(np.uint16)
-                part.write_bytes(cv2.imencode(".png", scaled[..., ::-1])[1].tobytes())
+                codes = np.rint(np.clip(picture, 0.0, 1.0) * _PNG_WHITE).astype(np.uint16)
+                part.write_bytes(cv2.imencode(".png", codes[..., ::-1])[1].tobytes())
         part.replace(path)
     except (OSError, RuntimeError) as error:
         raise StorageError(f"{path}: {reason(error)}") from error

@@ -44,11 +44,11 @@ def write_for_the_eye(path: Path, linear: NDArray[np.float64], white: float, abo
     Raises InputError for another kind of file, StorageError if it cannot be written.
     """
     refuse_unknown(path)
-    shown, profile = srgb(linear / white), srgb_profile()
+    encoding, profile = srgb(linear / white), srgb_profile()
     if path.suffix.lower() == ".png":
-        content = _png(np.rint(255.0 * shown).astype(np.uint8), about, profile)
+        content = _png(np.rint(255.0 * encoding).astype(np.uint8), about, profile)
     else:
-        content = tiff_of(np.rint(65535.0 * shown).astype(np.uint16), about, profile)
+        content = tiff_of(np.rint(65535.0 * encoding).astype(np.uint16), about, profile)
     try:
         write_synced(path, content)
     except OSError as error:
@@ -59,8 +59,8 @@ def _png(codes: NDArray[np.uint8], about: dict[str, Any], profile: bytes) -> byt
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    told = PngInfo()
-    told.add_text("Description", json.dumps(about))
+    info = PngInfo()
+    info.add_text("Description", json.dumps(about))
     buffer = io.BytesIO()
-    Image.fromarray(codes).save(buffer, "PNG", icc_profile=profile, pnginfo=told)
+    Image.fromarray(codes).save(buffer, "PNG", icc_profile=profile, pnginfo=info)
     return buffer.getvalue()

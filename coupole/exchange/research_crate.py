@@ -68,8 +68,8 @@ def write_crate(
     Raises InputError: no licence or author is known, or one is named twice, a run that is being acquired, an `out`
     that holds the source, or has files (unless `overwrite`); DiskFull or StorageError.
     """
-    described = _described(source)
-    licence = facts.licence or described.get("licence")
+    origin = _described(source)
+    licence = facts.licence or origin.get("licence")
     if not licence:
         raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
     if not facts.authors:
@@ -86,7 +86,7 @@ def write_crate(
         )
     inside = "" if in_place else f"{DATA}/"
     paths = sorted(_files(source, without=None if in_place else root))
-    files, written = [], []
+    files, links = [], []
     with writing_into(root):
         if not in_place and (root / DATA).exists():
             shutil.rmtree(root / DATA)
@@ -94,24 +94,24 @@ def write_crate(
             inner = path.relative_to(source).as_posix()
             files.append(_file_entity(path, f"{inside}{inner}"))
             if not in_place:
-                written.append(root / DATA / inner)
-                _link(path, written[-1])
+                links.append(root / DATA / inner)
+                _link(path, links[-1])
             say("files", number + 1, len(paths))
-        graph = [*_entities(source, described, licence, facts, people, files)]
+        graph = [*_entities(source, origin, licence, facts, people, files)]
         document = {"@context": f"{_SPECIFICATION}/context", "@graph": graph}
         write_synced(root / METADATA, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-    return [root / METADATA, *written]
+    return [root / METADATA, *links]
 
 
 def _described(source: Path) -> dict[str, Any]:
     """Kind, time, software and inputs of the source."""
     if (source / ABOUT).exists():
         about = read_about(source)
-        made = datetime.fromtimestamp((source / ABOUT).stat().st_mtime, UTC).isoformat(timespec="seconds")
+        timestamp = datetime.fromtimestamp((source / ABOUT).stat().st_mtime, UTC).isoformat(timespec="seconds")
         runs = about["runs"]
         return {
             "kind": "result",
-            "ended": made,
+            "ended": timestamp,
             "simulated": bool(about.get("simulated")),
             "software": about["software"],
             "inputs": {name: digest for files in runs.values() for name, digest in files.items()},
@@ -136,8 +136,8 @@ def _described(source: Path) -> dict[str, Any]:
 def _files(source: Path, without: Path | None) -> Iterator[Path]:
     for path in source.rglob("*"):
         inner = path.relative_to(source)
-        hidden = any(part.startswith(".") for part in inner.parts)
-        if not path.is_file() or hidden or inner.as_posix() == METADATA:
+        is_hidden = any(part.startswith(".") for part in inner.parts)
+        if not path.is_file() or is_hidden or inner.as_posix() == METADATA:
             continue
         if without is None or not path.resolve().is_relative_to(without.resolve()):
             yield path
@@ -206,12 +206,12 @@ def _entities(
 
 
 def _file_entity(path: Path, inner: str) -> Entity:
-    known = _TOLD.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+    media_type = _TOLD.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     return {
         "@id": quote(inner),
         "@type": "File",
         "name": Path(inner).name,
-        "encodingFormat": "application/x-hdf5" if known == "HDF5" else known,
+        "encodingFormat": "application/x-hdf5" if media_type == "HDF5" else media_type,
         "contentSize": str(path.stat().st_size),
         "identifier": f"sha256:{sha256(path)}",
     }
@@ -220,15 +220,15 @@ def _file_entity(path: Path, inner: str) -> Entity:
 def _people(texts: Sequence[str]) -> list[tuple[Entity, Entity | None]]:
     people = [_person(text) for text in texts]
     ids = [person["@id"] for person, _ in people]
-    if twice := [one for one in ids if ids.count(one) > 1]:
+    if twice := [identifier for identifier in ids if ids.count(identifier) > 1]:
         raise InputError(f"--author: {twice[0]} is named twice; give an ORCID where names are alike")
     return people
 
 
 def _person(text: str) -> tuple[Entity, Entity | None]:
     """An author and the house they belong to."""
-    own, _, house = map(str.strip, text.partition(" at "))
-    name, _, within = map(str.strip, own.partition("<"))
+    author, _, house = map(str.strip, text.partition(" at "))
+    name, _, within = map(str.strip, author.partition("<"))
     url = within.removesuffix(">")
     if not name or (within and not _ORCID.fullmatch(url)):
         raise InputError(
@@ -258,8 +258,8 @@ def _licence(text: str) -> Entity:
 
 
 def _software(name: str, version: str) -> Entity:
-    own = f"#software-{_part_of_id(name)}"
-    return {"@id": own, "@type": "SoftwareApplication", "name": name, "version": version}
+    identifier = f"#software-{_part_of_id(name)}"
+    return {"@id": identifier, "@type": "SoftwareApplication", "name": name, "version": version}
 
 
 def _to(entity: Entity) -> Entity:

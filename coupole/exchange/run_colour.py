@@ -33,23 +33,23 @@ class ColourWanted:
 def colour_of_run(run: Run, wanted: ColourWanted) -> CameraColour:
     """Raises InputError: no table of the LEDs' spectrum, tables that are wrong, no colour-science."""
     files = read_plan(run.plan_path, run.rig_path)
-    leds, given = wanted.leds, files.cell.rig.dome.spectrum
-    if leds is None and given is None:
+    leds, rig_spectrum = wanted.leds, files.cell.rig.dome.spectrum
+    if leds is None and rig_spectrum is None:
         raise InputError(f"{run.folder}: its rig names no spectrum of the LEDs; {_HOW}")
-    if leds is None and given is not None:
-        leds = files.cell.document.resolve(given)
+    if leds is None and rig_spectrum is not None:
+        leds = files.cell.document.resolve(rig_spectrum)
     assert leds is not None
     return camera_colour(wanted.sensor, leds, _measured_white(wanted.records or files.record_paths or ()))
 
 
 def _measured_white(records: Sequence[Path]) -> Neutral | None:
     """Return white by the record of the LEDs' power, if one is named."""
-    named = [path for path in records if read_record(path).kind == "led-power"]
-    if not named:
+    power_records = [path for path in records if read_record(path).kind == "led-power"]
+    if not power_records:
         return None
-    powers = read_powers(named[0], ("R", "G", "B"))
-    known = powers.power[(powers.power > 0.0).all(axis=1)]
-    usual: Floats = np.median(known / known.max(axis=1, keepdims=True), axis=0)
+    powers = read_powers(power_records[0], ("R", "G", "B"))
+    lit_powers = powers.power[(powers.power > 0.0).all(axis=1)]
+    usual: Floats = np.median(lit_powers / lit_powers.max(axis=1, keepdims=True), axis=0)
 
     def neutral(led: int | None) -> Floats:
         if led is None or led not in powers.ids:

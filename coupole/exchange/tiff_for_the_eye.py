@@ -41,9 +41,9 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     top = float(picture.white_dn - picture.black_dn)
     mosaic = np.rint(np.clip(signal / top, 0.0, 1.0) * 65535).astype(np.uint16)
     channels = cv2.cvtColor(mosaic, DEMOSAIC[picture.pattern]).astype(np.float64) / 65535.0
-    balanced = np.minimum(channels / colour.neutral(picture.about.get("led")), 1.0)
-    shown = np.clip(linear_srgb(balanced @ colour.xyz_from_balanced.T), 0.0, 1.0)
-    codes = np.rint(65535.0 * (shown if linear else srgb(shown))).astype(np.uint16)
+    white_balance = np.minimum(channels / colour.neutral(picture.about.get("led")), 1.0)
+    rgb = np.clip(linear_srgb(white_balance @ colour.xyz_from_balanced.T), 0.0, 1.0)
+    codes = np.rint(65535.0 * (rgb if linear else srgb(rgb))).astype(np.uint16)
     about = {**picture.about, "colour": colour.told, "linear": linear}
     return tiff_of(codes, about, linear_profile() if linear else srgb_profile())
 

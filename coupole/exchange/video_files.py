@@ -53,12 +53,12 @@ def write_video(path: Path, pictures: Iterable[NDArray[np.float32]], *, white: f
             height, width = (2 * (size // 2) for size in picture.shape[:2])
             if not context.is_open:
                 stream.width, stream.height = width, height
-            shown = np.rint(255.0 * srgb(picture[:height, :width] / white)).astype(np.uint8)
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(shown), format="rgb24")
-            coded = frame.reformat(
+            pixels = np.rint(255.0 * srgb(picture[:height, :width] / white)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+            yuv_frame = frame.reformat(
                 format="yuv420p", src_colorspace=_BT709, dst_colorspace=_BT709, dst_color_range=_LIMITED
             )
-            video.mux(stream.encode(coded))
+            video.mux(stream.encode(yuv_frame))
         video.mux(stream.encode(None))
     try:
         write_synced(path, whole.getvalue())

@@ -60,8 +60,8 @@ def _drawn(mae: dict[str, Any]) -> bytes:
     FigureCanvasAgg(figure)
     for ax, (setting, steps) in zip(figure.subplots(1, len(mae), sharey=True), mae.items(), strict=True):
         for name, fit in FITS.items():
-            known = [(value, 100 * of[name]) for value, of in steps if of[name] is not None]
-            places = zip(*known, strict=True) if known else ([], [])
+            errors = [(value, 100 * of[name]) for value, of in steps if of[name] is not None]
+            places = zip(*errors, strict=True) if errors else ([], [])
             ax.plot(*places, marker="o", label=fit.title, color=fit.colour)
         ax.set_xlabel(setting)
         ax.set_yscale("log")

@@ -47,9 +47,9 @@ def _page(folder: Path, told: dict[str, Any]) -> Iterator[str]:
     yield "</table>"
     if told["without_view"] is not None:
         kinds = ((text, told["mae_of_view"][name]) for name, text in _TOLD.items())
-        each = (f"{text} {100 * mae:.3f} %" for text, mae in kinds if mae is not None)
+        errors = (f"{text} {100 * mae:.3f} %" for text, mae in kinds if mae is not None)
         yield f"<p>From the view {html.escape(told['without_view'])}, of which clusters had no samples: "
-        yield f"{', '.join(each)} (their own materials had them)."
+        yield f"{', '.join(errors)} (their own materials had them)."
     if told["mae_ratio"] is not None:
         yield f"<p>Ratio {told['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics)."
     result = RunResult(folder)
@@ -58,10 +58,10 @@ def _page(folder: Path, told: dict[str, Any]) -> Iterator[str]:
     diffuse = clusters.kd if clusters.kd.shape[1] == 3 else np.repeat(clusters.kd, 3, axis=1)
     for view in result.views:
         with h5py.File(view.path, "r") as file:
-            seen = file["seen"][()]
+            rows = file["seen"][()]
         number = clusters.cluster[np.searchsorted(result.triangles, view.triangles)]
-        shown = np.where(seen >= 0, number[seen], -1)
+        numbers = np.where(rows >= 0, number[rows], -1)
         yield f"<h2>View {html.escape(view.path.stem)}</h2>"
         for caption, values in (("clusters, any colours", colours), ("their diffuse part", diffuse)):
-            picture = np.where(shown[..., None] >= 0, values[shown], 0.0).astype(np.float32)
+            picture = np.where(numbers[..., None] >= 0, values[numbers], 0.0).astype(np.float32)
             yield figure(caption, picture if values is colours else display(picture))

@@ -24,27 +24,28 @@ def page(record: CommissioningRecord) -> str:
     """The page as HTML."""
     name = html.escape(f"Commissioning of {record.rig}")
     verdict = "<p class=ok><b>Passed.</b>" if record.passed else "<p class=bad><b>Not passed.</b>"
-    simulated = "<p>Simulated: no real cell." if record.simulated else ""
+    remark = "<p>Simulated: no real cell." if record.simulated else ""
     parts = []
     for step in STEPS:
         result = record.result(step)
         parts.append(f"<h2>{step}</h2><p class=bad>Not done." if result is None else _step(result))
     return (
         f"{HEAD}<title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
-        f"{verdict}{simulated}{''.join(parts)}<p>Made by {html.escape(record.software)}; record "
+        f"{verdict}{remark}{''.join(parts)}<p>Made by {html.escape(record.software)}; record "
         f"<code>{record.sha256}</code>"
     )
 
 
 def _step(result: StepResult) -> str:
     limits = [
-        f"<td>{html.escape(one.what)}<td class=n>{one.found:.4g}<td "
-        f"class=n>{one.limit:.4g}<td>{html.escape(one.unit)}"
-        f"<td class={'ok>met' if one.passed else 'bad>missed'}"
-        for one in result.limits
+        f"<td>{html.escape(entry.what)}<td class=n>{entry.found:.4g}<td "
+        f"class=n>{entry.limit:.4g}<td>{html.escape(entry.unit)}"
+        f"<td class={'ok>met' if entry.passed else 'bad>missed'}"
+        for entry in result.limits
     ]
     answers = [
-        f"<td>{html.escape(one.question)}<td class={'ok>yes' if one.yes else 'bad>no'}" for one in result.answers
+        f"<td>{html.escape(entry.question)}<td class={'ok>yes' if entry.yes else 'bad>no'}"
+        for entry in result.answers
     ]
     remarks = "".join(f"<li>{html.escape(remark)}" for remark in result.remarks)
     settings = [

@@ -43,9 +43,9 @@ def write(found: Comparison, folder: Path) -> None:
 
 def remarks(found: Comparison) -> Iterator[str]:
     """Yield what the reader of the report must know, one sentence each."""
-    known = np.isfinite(found.distance_mm)
+    is_finite = np.isfinite(found.distance_mm)
     yield (
-        f"shape: {int(found.moved.sum()):,} of {int(known.sum()):,} points changed significantly, in "
+        f"shape: {int(found.moved.sum()):,} of {int(is_finite.sum()):,} points changed significantly, in "
         f"{len(found.shape_regions)} regions; standard uncertainty {np.nanmedian(found.u_mm):.2g} mm in the median"
     )
     if found.de00 is None or found.recoloured is None:
@@ -55,8 +55,8 @@ def remarks(found: Comparison) -> Iterator[str]:
             f"colour: {int(found.recoloured.sum()):,} points changed significantly, in "
             f"{len(found.colour_regions)} regions; dE00 {np.nanmedian(found.de00):.2f} in the median, with noise"
         )
-    if (~known).any():
-        yield f"{int((~known).sum()):,} points have no surface of the other state near them: not compared"
+    if (~is_finite).any():
+        yield f"{int((~is_finite).sum()):,} points have no surface of the other state near them: not compared"
     if found.noise_factor > 1.5 or found.colour_factor > 1.5:
         yield (
             f"differences scatter {max(found.noise_factor, found.colour_factor):.1f} times more than points about "
@@ -67,22 +67,22 @@ def remarks(found: Comparison) -> Iterator[str]:
 
 
 def _scale(distance_mm: Points, u_mm: Points) -> float:
-    known = np.abs(distance_mm[np.isfinite(distance_mm)])
-    return max(float(np.quantile(known, _SHOWN_QUANTILE)), 3 * float(np.nanmedian(u_mm)))
+    sizes_mm = np.abs(distance_mm[np.isfinite(distance_mm)])
+    return max(float(np.quantile(sizes_mm, _SHOWN_QUANTILE)), 3 * float(np.nanmedian(u_mm)))
 
 
 def distance_colours(distance_mm: Points, scale_mm: float) -> Points:
     """[n, 3] of distances, full at `scale_mm`; grey where there is none."""
     share = np.clip(np.nan_to_num(distance_mm / scale_mm), -1, 1)[:, None]
     inward, none, outward = _ENDS
-    found = none + np.where(share < 0, -share * (inward - none), share * (outward - none))
-    return np.where(np.isfinite(distance_mm)[:, None], found, _UNKNOWN)
+    colours = none + np.where(share < 0, -share * (inward - none), share * (outward - none))
+    return np.where(np.isfinite(distance_mm)[:, None], colours, _UNKNOWN)
 
 
 def _shape(found: Comparison, colours: Points, scale_mm: float) -> str:
-    told = _image(found, colours, f"Distances: blue {scale_mm:.3g} mm inwards, orange as much outwards")
-    told += _image(found, _marks(found.moved), "Points whose shape changed significantly")
-    return told + _regions("Regions that changed in shape", found.shape_regions)
+    figures = _image(found, colours, f"Distances: blue {scale_mm:.3g} mm inwards, orange as much outwards")
+    figures += _image(found, _marks(found.moved), "Points whose shape changed significantly")
+    return figures + _regions("Regions that changed in shape", found.shape_regions)
 
 
 def _colour(found: Comparison) -> str:
@@ -91,9 +91,9 @@ def _colour(found: Comparison) -> str:
     most = max(3.0, float(np.nanquantile(found.de00, _SHOWN_QUANTILE)))
     share = np.clip(np.nan_to_num(found.de00 / most), 0, 1)[:, None]
     colours = np.where(np.isfinite(found.de00)[:, None], _ENDS[1] + share * (_STRONG - _ENDS[1]), _UNKNOWN)
-    told = _image(found, colours, f"Colour differences, dE00 under D65: 0 light, {most:.2g} dark")
-    told += _image(found, _marks(found.recoloured), "Points whose colour changed significantly")
-    return told + _regions("Regions that changed in colour", found.colour_regions)
+    figures = _image(found, colours, f"Colour differences, dE00 under D65: 0 light, {most:.2g} dark")
+    figures += _image(found, _marks(found.recoloured), "Points whose colour changed significantly")
+    return figures + _regions("Regions that changed in colour", found.colour_regions)
 
 
 def _marks(marked: NDArray[np.bool_]) -> Points:
@@ -118,13 +118,13 @@ def _image(found: Comparison, colours: Points, caption: str) -> str:
 def _regions(caption: str, regions: Sequence[Region]) -> str:
     rows = [
         (
-            ", ".join(f"{value:.1f}" for value in one.middle_mm),
-            f"{one.points:,}",
-            f"{one.across_mm:.1f}",
-            f"{one.distance_mm:+.3f}",
-            "" if np.isnan(one.de00) else f"{one.de00:.1f}",
+            ", ".join(f"{value:.1f}" for value in region.middle_mm),
+            f"{region.points:,}",
+            f"{region.across_mm:.1f}",
+            f"{region.distance_mm:+.3f}",
+            "" if np.isnan(region.de00) else f"{region.de00:.1f}",
         )
-        for one in regions[:_REGIONS_SHOWN]
+        for region in regions[:_REGIONS_SHOWN]
     ]
     return table(caption, ("middle x, y, z, mm", "points", "across, mm", "mean distance, mm", "mean dE00"), rows)
 

@@ -30,11 +30,11 @@ def show_dose(console: Console, ledger: Ledger, history: History, others: list[s
         )
     table.add_row("[bold]total[/]", "", f"[bold]{history.total_lux_h:.3f}[/]", _damage(history), "")
     console.print(table)
-    for number, one in enumerate(history.budgets):
+    for number, budget in enumerate(history.budgets):
         earlier = "" if number + 1 == len(history.budgets) else "earlier "
-        because = f": {one.reason}" if one.reason else ""
+        because = f": {budget.reason}" if budget.reason else ""
         console.print(
-            f"  {earlier}budget {one.dose_lux_h:g} lux.h, by {one.name}, {one.t}{because}",
+            f"  {earlier}budget {budget.dose_lux_h:g} lux.h, by {budget.name}, {budget.t}{because}",
             markup=False,
             soft_wrap=True,
         )
@@ -43,8 +43,8 @@ def show_dose(console: Console, ledger: Ledger, history: History, others: list[s
     limit_lux_h = history.warn_above_lux_h
     if limit_lux_h is not None and history.total_lux_h > limit_lux_h:
         console.print(f"[yellow]note:[/] the total is above {limit_lux_h:g} lux.h")
-    for other in others:
-        console.print(f"[yellow]note:[/] there is also a ledger of `{other}`: is it the same object?")
+    for similar_id in others:
+        console.print(f"[yellow]note:[/] there is also a ledger of `{similar_id}`: is it the same object?")
     if history.unreadable:
         console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
     console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
@@ -57,7 +57,9 @@ def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, A
         "ledger": str(ledger.path),
         **_sums(history),
         "budget_lux_h": history.budget_lux_h,
-        "budgets": [one.model_dump(include={"t", "dose_lux_h", "name", "reason"}) for one in history.budgets],
+        "budgets": [
+            budget.model_dump(include={"t", "dose_lux_h", "name", "reason"}) for budget in history.budgets
+        ],
         "warn_above_lux_h": history.warn_above_lux_h,
         "above_warning": history.warn_above_lux_h is not None and history.total_lux_h > history.warn_above_lux_h,
         "similar_ids": others,
@@ -82,5 +84,5 @@ def _damage(history: History) -> str:
     unknown_lux_h = history.of_unknown_spectrum_lux_h
     if unknown_lux_h and unknown_lux_h == history.total_lux_h:
         return NOT_KNOWN
-    known = f"{1e3 * history.damage_wh_m2:.4f}"
-    return f"{known}, and {unknown_lux_h:.3f} lux.h {NOT_KNOWN}" if unknown_lux_h else known
+    exposure = f"{1e3 * history.damage_wh_m2:.4f}"
+    return f"{exposure}, and {unknown_lux_h:.3f} lux.h {NOT_KNOWN}" if unknown_lux_h else exposure

@@ -23,7 +23,7 @@ _SIGNS = {"match": "ok", "mixture": "ok", "ambiguous": "stopped", "unknown": "st
 def write(folder: Path, found: list[Finding], library: str) -> Path:
     """Write the page of findings that share a library. Raises StorageError."""
     path = folder / PAGE
-    parts = [section(f"s{number}", text(one.name), _of_one(one)) for number, one in enumerate(found)]
+    parts = [section(f"s{number}", text(finding.name), _of_one(finding)) for number, finding in enumerate(found)]
     heading = "Identification of pigments"
     body = f"<h1>{heading}</h1><p>Library: <code>{text(library)}</code></p>"
     if len(found) > 1:
@@ -31,8 +31,13 @@ def write(folder: Path, found: list[Finding], library: str) -> Path:
             "Spectra",
             ("spectrum", "verdict", "class", "probability"),
             [
-                (f'<a href="#s{number}">{text(one.name)}</a>', _verdict(one), text(one.class_name), _percent(one))
-                for number, one in enumerate(found)
+                (
+                    f'<a href="#s{number}">{text(finding.name)}</a>',
+                    _verdict(finding),
+                    text(finding.class_name),
+                    _percent(finding),
+                )
+                for number, finding in enumerate(found)
             ],
         )
     body += "".join(parts) + section("library", "What the verdicts are worth", _worth(found[-1].rates))
@@ -48,12 +53,12 @@ def _of_one(found: Finding) -> str:
     nm = found.evidence.wavelengths_nm
     second = found.candidates[1].class_name
     best = found.candidates[0]
-    compared = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if found.near_infrared else ''}"
+    extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if found.near_infrared else ''}"
     body = facts(
         {
             "verdict": _verdict(found),
             "why": text(found.reason),
-            "compared": "; ".join(map(text, (compared, *found.remarks))),
+            "compared": "; ".join(map(text, (extent, *found.remarks))),
             "not in the library": f"{found.not_in_library:.0%}",
         }
     )
@@ -66,8 +71,8 @@ def _of_one(found: Finding) -> str:
         "Most probable classes",
         ("class", "probability", "nearest reference"),
         [
-            (text(one.class_name), f"{one.probability:.1%}", text(one.name))
-            for one in found.candidates[:_CANDIDATES]
+            (text(candidate.class_name), f"{candidate.probability:.1%}", text(candidate.name))
+            for candidate in found.candidates[:_CANDIDATES]
         ],
     )
     return body + (

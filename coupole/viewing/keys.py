@@ -31,8 +31,8 @@ def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
     terminal = sys.stdin.fileno()
     modes = termios.tcgetattr(terminal)
     handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
-    ended, end = os.pipe()
-    thread = threading.Thread(target=_read, args=(terminal, ended, actions), name="keys", daemon=True)
+    end_reader, end = os.pipe()
+    thread = threading.Thread(target=_read, args=(terminal, end_reader, actions), name="keys", daemon=True)
     try:
         tty.setcbreak(terminal, termios.TCSANOW)
         thread.start()
@@ -41,7 +41,7 @@ def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
         os.close(end)
         if thread.ident is not None:
             thread.join()
-        os.close(ended)
+        os.close(end_reader)
         if _is_ours():
             with contextlib.suppress(termios.error):  # the terminal may be gone
                 termios.tcsetattr(terminal, termios.TCSANOW, modes)
@@ -55,14 +55,14 @@ def _read(terminal: int, ended: int, actions: Mapping[str, Callable[[], object]]
         if ended in ready:
             return
         try:
-            pressed = os.read(terminal, _MOST_BYTES)
+            typing = os.read(terminal, _MOST_BYTES)
         except OSError:  # in the background, or the terminal is gone
             if select.select([ended], [], [], _NAP_S)[0]:
                 return
             continue
-        if not pressed:
+        if not typing:
             return
-        key = pressed.rstrip(b"\r\n").decode(errors="replace").lower()
+        key = typing.rstrip(b"\r\n").decode(errors="replace").lower()
         if key in actions:
             actions[key]()
 

@@ -28,18 +28,18 @@ def layer_page(
     }
     body = f"<h1>{text(given.name)}: absorption and scattering</h1>{facts(head)}"
     if sure.sum() > 1:
-        told = nm[sure]
+        sure_nm = nm[sure]
         curves = [
             _with_band("K", found.absorption[sure], found.u_absorption[sure]),
             _with_band("S", found.scattering[sure], found.u_scattering[sure]),
         ]
-        body += section("coefficients", "K and S", chart(f"K and S {unit}, with 95 % bands", told, curves))
+        body += section("coefficients", "K and S", chart(f"K and S {unit}, with 95 % bands", sure_nm, curves))
     fits = []
     for film, told_film in zip(samples.films, given.films, strict=True):
-        shown = layer_fit.predict(found, samples.face, film.thickness_mm, film.ground)
+        prediction = layer_fit.predict(found, samples.face, film.thickness_mm, film.ground)
         fits += [
             Curve(f"{told_film.spectrum.name}, measured", film.seen),
-            Curve(f"{told_film.spectrum.name}, fitted", shown.seen, dashed=True),
+            Curve(f"{told_film.spectrum.name}, fitted", prediction.seen, dashed=True),
         ]
     body += section("fit", "Measured and fitted", chart("Reflectance in air", nm, fits))
     if four is not None:

@@ -137,16 +137,16 @@ class RunSource:
         pace, number = FrameRate(), 0
         newest: FrameProven | None = None
         while not studio.closing.is_set():
-            changed = self._ask_status(studio)
-            last, shown = self._newest(), studio.shown
+            is_changed = self._ask_status(studio)
+            last, display = self._newest(), studio.shown
             if last is not None and last != newest:
                 newest = last
                 number += 1
-                shown = replace(self._read(last, number), frames_per_s=pace.beat())
-                studio.show(self._with_status(shown))
-            elif changed and shown is not None:
+                display = replace(self._read(last, number), frames_per_s=pace.beat())
+                studio.show(self._with_status(display))
+            elif is_changed and display is not None:
                 number += 1
-                studio.show(self._with_status(replace(shown, number=number)))
+                studio.show(self._with_status(replace(display, number=number)))
             studio.closing.wait(_POLL_S)
 
     def _ask_status(self, studio: Studio) -> bool:
@@ -165,23 +165,23 @@ class RunSource:
 
     def _with_status(self, shown: Shown) -> Shown:
         now = self._status
-        said = f"{now.state}, {now.proven} of {now.shots} shots proven"
-        return replace(shown, run=said, dose_lux_h=now.dose_lux_h)
+        progress = f"{now.state}, {now.proven} of {now.shots} shots proven"
+        return replace(shown, run=progress, dose_lux_h=now.dose_lux_h)
 
     def _newest(self) -> FrameProven | None:
-        found = None
+        frame = None
         for event in journal.tail(self._run.journal_path, 64 * 1024):
             if isinstance(event, FrameProven) and isinstance(event.shot.light, Led):
-                found = event
-        return found
+                frame = event
+        return frame
 
     def _read(self, event: FrameProven, number: int) -> Shown:
         file = read_view(self._run.folder / event.file, [event])
         raw, record = file.pixels(event.index), file.records[event.index]
         coding = Coding(file.pattern, file.black_dn, file.white_dn)
-        seen = figures(raw, coding)
+        figures_of_frame = figures(raw, coding)
         exposure_us, led = int(record["exposure_us"]), int(record["led"])
-        return Shown(number, str(event.shot), raw, coding, exposure_us, led, seen, 0.0, 0.0)
+        return Shown(number, str(event.shot), raw, coding, exposure_us, led, figures_of_frame, 0.0, 0.0)
 
 
 class Wanted(BaseModel):
@@ -198,11 +198,11 @@ def read_wanted(posted: bytes) -> Wanted:
     try:
         return Wanted.model_validate_json(posted)
     except ValidationError as error:
-        what = error.errors()[0]
-        if not what["loc"]:
-            raise InputError(f'expected an object, like {{"led": 417}}: {what["msg"]}') from error
-        where = ".".join(map(str, what["loc"]))
-        raise InputError(f"{where}: expected a whole number: {what['msg']}") from error
+        problem = error.errors()[0]
+        if not problem["loc"]:
+            raise InputError(f'expected an object, like {{"led": 417}}: {problem["msg"]}') from error
+        where = ".".join(map(str, problem["loc"]))
+        raise InputError(f"{where}: expected a whole number: {problem['msg']}") from error
 
 
 def choice_from(wanted: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:

@@ -78,12 +78,12 @@ class _Page:
         if path == "figures":
             self.studio.asked()
             return Answer("application/json", self._figures())
-        shown = self.studio.shown
-        if path == "picture" and shown is not None:
+        frame = self.studio.shown
+        if path == "picture" and frame is not None:
             self.studio.asked()
             marks = parse_qs(query).get("mark", [""])[0].split(",")
             picture = look(
-                shown.raw, shown.coding, _WIDTH_PX, saturation="saturation" in marks, focus="focus" in marks
+                frame.raw, frame.coding, _WIDTH_PX, saturation="saturation" in marks, focus="focus" in marks
             )
             return Answer("image/jpeg", picture)
         raise Refused(HTTPStatus.NOT_FOUND, "nothing here yet")
@@ -181,13 +181,13 @@ class _Viewer(BaseHTTPRequestHandler):
     def _answer_with(self, work: Callable[[], Answer]) -> None:
         try:
             self._refuse_others()
-            found = work()
+            answer = work()
         except Refused as refused:
             self._send(refused.status, Answer("text/plain; charset=utf-8", str(refused).encode()))
         except InputError as error:
             self._send(HTTPStatus.BAD_REQUEST, Answer("text/plain; charset=utf-8", str(error).encode()))
         else:
-            self._send(HTTPStatus.OK, found)
+            self._send(HTTPStatus.OK, answer)
 
     def _refuse_others(self) -> None:
         """Refuse a request to another name than this machine's own: another site may have sent it."""
@@ -269,21 +269,21 @@ def _hang_up(connection: socket.socket) -> None:
 
 
 def _figures(studio: Studio, leds: tuple[int, ...]) -> dict[str, Any]:
-    shown, choice = studio.shown, studio.choice
-    seen = {}
-    if shown is not None:
-        seen = {
-            "number": shown.number,
-            "title": shown.title,
-            "led": shown.led,
-            "exposure_us": shown.exposure_us,
-            "frames_per_s": round(shown.frames_per_s, 2),
-            "dose_lux_h": shown.dose_lux_h,
-            "run": shown.run,
-            **asdict(shown.figures),
+    frame, choice = studio.shown, studio.choice
+    document = {}
+    if frame is not None:
+        document = {
+            "number": frame.number,
+            "title": frame.title,
+            "led": frame.led,
+            "exposure_us": frame.exposure_us,
+            "frames_per_s": round(frame.frames_per_s, 2),
+            "dose_lux_h": frame.dose_lux_h,
+            "run": frame.run,
+            **asdict(frame.figures),
         }
     return {
-        "shown": seen,
+        "shown": document,
         "choice": asdict(choice),
         "leds": len(leds) and [min(leds), max(leds)],
         "remark": studio.remark,

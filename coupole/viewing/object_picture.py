@@ -28,7 +28,7 @@ def write_object_picture(job: Job, path: Path) -> None:
 
     if not len(job.shape.corners_mm):
         raise InputError("the plan names no mesh of its object")
-    measured = measured_solid(job)
+    solid = measured_solid(job)
     support = disk("support", job.cell.rig.support.diameter_mm / 2, _THICKNESS_MM)
     low, high = job.shape.corners_mm.min(axis=(0, 1)), job.shape.corners_mm.max(axis=(0, 1))
     sheet = Image.new("RGB", (2 * _WIDTH_PX, _HEIGHT_PX + _STRIP_PX), "white")
@@ -38,7 +38,7 @@ def write_object_picture(job: Job, path: Path) -> None:
         ((True, f"from above: x {x} mm, y {y} mm"), (False, f"from the front (-y): x {x} mm, z {z} mm"))
     ):
         lookout = _lookout(low, high, above=above)
-        sheet.paste(_seen(lookout, support, measured), (k * _WIDTH_PX, _STRIP_PX))
+        sheet.paste(_seen(lookout, support, solid), (k * _WIDTH_PX, _STRIP_PX))
         pen.text((k * _WIDTH_PX + 10, 6), words, fill=_ink())
         _scale_bar(pen, lookout, k * _WIDTH_PX)
     sheet.save(path, optimize=True)

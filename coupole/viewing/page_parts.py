@@ -51,8 +51,8 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> s
 
 def picture(kind: str, data: bytes, alternative: str) -> str:
     """An image of the page itself; `kind` is `png` or `jpeg`."""
-    encoded = base64.b64encode(data).decode()
-    return f'<img src="data:image/{kind};base64,{encoded}" alt="{text(alternative)}">'
+    content = base64.b64encode(data).decode()
+    return f'<img src="data:image/{kind};base64,{content}" alt="{text(alternative)}">'
 
 
 def moment(utc: str) -> str:

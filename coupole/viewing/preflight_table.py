@@ -53,10 +53,10 @@ def show_views(console: Console, report: Report) -> None:
     console.print(table)
     if report.object_check is None:
         return
-    framed = {seen.view: seen for seen in report.object_check.views}
+    framings = {framing.view: framing for framing in report.object_check.views}
     table = Table("view", "object in field", "of the field", "mm away", "sharp", "px per mm", box=None)
     for view in report.views:
-        table.add_row(view.name, *_framed(framed[view.name]))
+        table.add_row(view.name, *_framed(framings[view.name]))
     console.print(table)
     nearest, farthest = (_distance(mm) for mm in report.object_check.sharp_mm)
     console.print(f"sharp (blurred over at most {SHARP_PX:g} pixels) is {nearest} to {farthest}")
@@ -86,11 +86,11 @@ def document_of(report: Report) -> dict[str, Any]:
 
 
 def _object_figures(report: Report) -> dict[str, Any] | None:
-    found = report.object_check
-    if found is None:
+    check = report.object_check
+    if check is None:
         return None
-    views = [{name: _finite(value) for name, value in asdict(seen).items()} for seen in found.views]
-    return {**asdict(found.placement), "sharp_mm": _finite(found.sharp_mm), "views": views}
+    views = [{name: _finite(value) for name, value in asdict(framing).items()} for framing in check.views]
+    return {**asdict(check.placement), "sharp_mm": _finite(check.sharp_mm), "views": views}
 
 
 def _finite(value: Any) -> Any:
@@ -101,10 +101,10 @@ def _finite(value: Any) -> Any:
 
 
 def _dose(report: Report) -> str:
-    given = f"{report.dose_lux_h:.3f} lux.h"
-    given += f" left of {report.whole.dose_lux_h:.3f}" if report.whole else ""
-    given += f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
-    return given + ("" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed")
+    line = f"{report.dose_lux_h:.3f} lux.h"
+    line += f" left of {report.whole.dose_lux_h:.3f}" if report.whole else ""
+    line += f" after {report.dose_before_lux_h:.3f} before" if report.dose_before_lux_h else ""
+    return line + ("" if report.dose_budget_lux_h is None else f" of {report.dose_budget_lux_h:g} allowed")
 
 
 def _pace(timing: BurstTiming) -> str:

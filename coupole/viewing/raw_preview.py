@@ -59,17 +59,17 @@ def develop(
 ) -> NDArray[np.uint8]:
     """A preview [h/2, w/2, 3] of a RAW frame: one pixel for each Bayer cell, times `gains` of R, G, B; gamma
     2.2."""
-    scaled = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
-    cell = [scaled[0::2, 0::2], scaled[0::2, 1::2], scaled[1::2, 0::2], scaled[1::2, 1::2]]
+    shares = np.clip((raw.astype(np.float32) - black_dn) / (white_dn - black_dn), 0, 1)
+    cell = [shares[0::2, 0::2], shares[0::2, 1::2], shares[1::2, 0::2], shares[1::2, 1::2]]
     letters = pattern if pattern != "MONO" else "GGGG"
     planes = []
     for colour, gain in zip("RGB", gains, strict=True):
-        mine = [
+        samples = [
             plane
             for plane, letter in zip(cell, letters, strict=True)
             if letter in (colour, "G" * (pattern == "MONO"))
         ]
-        planes.append(np.minimum(gain * np.mean(mine, axis=0), 1.0))
+        planes.append(np.minimum(gain * np.mean(samples, axis=0), 1.0))
     picture: NDArray[np.uint8] = (255 * np.stack(planes, axis=-1) ** _GAMMA + 0.5).astype(np.uint8)
     return picture
 
@@ -147,9 +147,9 @@ def loupe(raw: NDArray[np.uint16], coding: Coding, gains: Sequence[float] = (1.0
         at = np.s_[place // 2 :: 2, place % 2 :: 2]
         channel = "RGB".index(letter)
         share = np.clip((raw[at].astype(np.float32) - coding.black_dn) / (coding.white_dn - coding.black_dn), 0, 1)
-        own = (255 * np.minimum(gains[channel] * share, 1.0) ** _GAMMA + 0.5).astype(np.uint8)
+        codes = (255 * np.minimum(gains[channel] * share, 1.0) ** _GAMMA + 0.5).astype(np.uint8)
         for colour in range(3) if coding.pattern == "MONO" else (channel,):
-            picture[(*at, colour)] = own
+            picture[(*at, colour)] = codes
     return png(picture)
 
 
@@ -184,9 +184,11 @@ def look(
 def _two_greens(raw: NDArray[np.uint16], coding: Coding) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """[h/2, w/2] both greens of each cell (of MONO the pixels of a diagonal) above black, share of the range."""
     planes = channels(raw, coding.pattern)
-    one, other = (planes["G1"], planes["G2"]) if "G1" in planes else (raw[::2, ::2], raw[1::2, 1::2])
+    first, second = (planes["G1"], planes["G2"]) if "G1" in planes else (raw[::2, ::2], raw[1::2, 1::2])
     span = np.float32(coding.white_dn - coding.black_dn)
-    return (one.astype(np.float32) - coding.black_dn) / span, (other.astype(np.float32) - coding.black_dn) / span
+    return (first.astype(np.float32) - coding.black_dn) / span, (
+        second.astype(np.float32) - coding.black_dn
+    ) / span
 
 
 def _in_focus(green: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -23,32 +23,32 @@ def recipe_page(name: str, found: Found, matches: Sequence[Sequence[Match]]) -> 
         for paint, share in sorted(best.shares.items(), key=lambda item: -item[1])
     ]
     body += section("shares", "Shares", table("of the paint's amount", ("paint", "share", "+- 95 %"), shares))
-    shown = [
+    patch_pairs = [
         (
             f"{m.light}, dE00 {m.delta_e00:.2f}",
             [("target", _srgb(m.target_xyz, m)), ("recipe", _srgb(m.recipe_xyz, m))],
         )
         for m in under
     ]
-    told = "Adapted to the screen's white (CAT16); colours outside its gamut are nearest ones."
-    body += section("colours", "Side by side", f'{patches(shown)}<p class="note">{told}</p>')
+    note = "Adapted to the screen's white (CAT16); colours outside its gamut are nearest ones."
+    body += section("colours", "Side by side", f'{patches(patch_pairs)}<p class="note">{note}</p>')
     bands = found.bands
     curves = [Curve("target", found.target[bands]), Curve("recipe", best.seen[bands], dashed=True)]
     body += section("spectra", "Spectra", chart("Reflectance in air", WAVELENGTHS_NM[bands], curves))
     lights = [m.light for m in under]
-    rows = [_row(one, of_one) for one, of_one in zip(found.recipes, matches, strict=True)]
+    rows = [_row(mixture, of_one) for mixture, of_one in zip(found.recipes, matches, strict=True)]
     head = ("paints", "root mean square", *(f"dE00 {light}" for light in lights), "shares")
     body += section("fewer", "With fewer paints", table("best recipes by number of paints", head, rows))
     return page(f"{name}: recipe", body)
 
 
 def _row(recipe: Recipe, under: Sequence[Match]) -> list[str]:
-    told = ", ".join(f"{100 * share:.0f} % {text(paint)}" for paint, share in recipe.shares.items())
-    return [str(len(recipe.shares)), f"{recipe.rms:.4f}", *(f"{m.delta_e00:.2f}" for m in under), told]
+    shares = ", ".join(f"{100 * share:.0f} % {text(paint)}" for paint, share in recipe.shares.items())
+    return [str(len(recipe.shares)), f"{recipe.rms:.4f}", *(f"{m.delta_e00:.2f}" for m in under), shares]
 
 
 def _srgb(xyz: Array, match: Match) -> tuple[int, int, int]:
-    adapted = colour.adapted(xyz, match.white_xyz, "CAT16")
-    pixels, _ = colour.displayed(np.asarray(adapted)[None, None])
+    screen_xyz = colour.adapted(xyz, match.white_xyz, "CAT16")
+    pixels, _ = colour.displayed(np.asarray(screen_xyz)[None, None])
     red, green, blue = (int(value) for value in pixels[0, 0])
     return red, green, blue

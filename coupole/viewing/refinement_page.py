@@ -45,11 +45,11 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
     """Yield what the maker of the refinement must know, one sentence each."""
     if about["simulated"]:
         yield "frames of a simulated cell"
-    for when, told in (("before", "views disagree by"), ("after", "after refinement by")):
-        found = about["disagreement"][when]
+    for when, words in (("before", "views disagree by"), ("after", "after refinement by")):
+        gaps = about["disagreement"][when]
         yield (
-            f"{told} {found['median_mm']:.3f} mm in the median, {found['percentile_95_mm']:.3f} mm in 95 % of "
-            f"{found['matches']} matches; {found['median_px']:.2f} px, {found['median_edges']:.1f} edges of "
+            f"{words} {gaps['median_mm']:.3f} mm in the median, {gaps['percentile_95_mm']:.3f} mm in 95 % of "
+            f"{gaps['matches']} matches; {gaps['median_px']:.2f} px, {gaps['median_edges']:.1f} edges of "
             "triangles"
         )
     if surprising(about):
@@ -62,8 +62,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
 
 def surprising(about: dict[str, Any]) -> bool:
     """Tell whether the steps are larger than the stated uncertainties explain."""
-    expected = about["determined"]
-    return bool(about["chi2_of_steps"] > expected + SURPRISING * np.sqrt(2 * expected))
+    freedom = about["determined"]
+    return bool(about["chi2_of_steps"] > freedom + SURPRISING * np.sqrt(2 * freedom))
 
 
 def _page(folder: Path, about: dict[str, Any]) -> Iterator[str]:
@@ -95,14 +95,14 @@ def _arrows(file: h5py.File, number: int, when: str) -> str:
     data = file[f"pictures/{number}"]
     small, blocks = data[()], data.attrs["blocks"]
     height, width = small.shape
-    mine = file[f"{when}/reference"][()] == number
+    is_own = file[f"{when}/reference"][()] == number
     camera, lens = file["base_from_camera"][number], file["lens"][()]
-    starts = file[f"{when}/points_mm"][()][mine]
-    ends = starts + file[f"{when}/shifts_mm"][()][mine]
+    starts = file[f"{when}/points_mm"][()][is_own]
+    ends = starts + file[f"{when}/shifts_mm"][()][is_own]
     pinhole = lens[:2] / 2 * (width / blocks[1])
-    turned = [((points - camera[:3, 3]) @ camera[:3, :3]) for points in (starts, ends)]
-    there, here = (pinhole * one[:, :2] / one[:, 2:] for one in reversed(turned))
-    at = file[f"{when}/blocks"][()][mine] * (width / blocks[1])
+    ends_camera = [((points - camera[:3, 3]) @ camera[:3, :3]) for points in (starts, ends)]
+    there, here = (pinhole * end[:, :2] / end[:, 2:] for end in reversed(ends_camera))
+    at = file[f"{when}/blocks"][()][is_own] * (width / blocks[1])
     lines = "".join(
         f"<line x1={x:.1f} y1={y:.1f} x2={x + LONGER * dx:.1f} y2={y + LONGER * dy:.1f} />"
         f"<circle cx={x:.1f} cy={y:.1f} r=2 />"
@@ -142,6 +142,6 @@ def _cells(six: dict[str, list[float]]) -> str:
 
 def _lens(about: dict[str, Any]) -> Iterator[str]:
     yield "<h2>Lens</h2><table><tr><th><th>moved<th>u<th>stated u"
-    for name, found in about["lens"].items():
-        yield f"<tr><th>{name}<td>{found['moved']:.3g}<td>{found['u']:.2g}<td>{found['stated_u']:.2g}"
+    for name, parameter in about["lens"].items():
+        yield f"<tr><th>{name}<td>{parameter['moved']:.3g}<td>{parameter['u']:.2g}<td>{parameter['stated_u']:.2g}"
     yield "</table>"

@@ -62,8 +62,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
             "pictures linear, are the lights in the order of the pictures?"
         )
     if about["suspect_pictures"]:
-        told = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())
-        yield f"pictures brighter or darker than all others say they should be: {told}"
+        names = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())
+        yield f"pictures brighter or darker than all others say they should be: {names}"
     if about["held_out_psnr_db"] is not None:
         yield f"left-out lights are made with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, inside the mask)"
 
@@ -90,8 +90,8 @@ def _page(result: PictureResult) -> Iterator[str]:
     yield f"<tr><th>kernel<td>{html.escape(about['kernel'])}"
     for kernel, rms in about["left_out_rms"].items():
         yield f"<tr><th>{html.escape(kernel)}: rms at lights left out<td>{rms:.5f} of full scale"
-    for one in about["held_out"]:
-        yield f"<tr><th>light {one['light']}<td>{one['psnr_db']:.2f} dB, mean absolute error {one['mae']:.5f}"
+    for row in about["held_out"]:
+        yield f"<tr><th>light {row['light']}<td>{row['psnr_db']:.2f} dB, mean absolute error {row['mae']:.5f}"
     yield f"<tr><th>time<td>{about['seconds']:.1f} s</table>"
     yield "<p>No uncertainty is stated for these normals and materials yet."
 
@@ -100,23 +100,23 @@ def _checks(result: PictureResult) -> Iterator[str]:
     interpolation = read_interpolation(result.folder)
     left_out = np.asarray(result.about["left_out"])
     for light in left_out[:: 1 + len(left_out) // MOST_CHECKS]:
-        measured = result.picture(result.values(np.array([light]))[0])
-        made = relit(result, interpolation, result.directions[light])
-        white = float(np.quantile(measured[result.mask], PEAK_QUANTILE))
+        photo = result.picture(result.values(np.array([light]))[0])
+        model = relit(result, interpolation, result.directions[light])
+        white = float(np.quantile(photo[result.mask], PEAK_QUANTILE))
         yield "<div>"
-        yield figure(f"light {light}, measured", display(measured, white))
-        yield figure("made", display(made, white))
-        yield figure("difference", np.clip(np.abs(made - measured) / (0.05 * white), 0, 1))
+        yield figure(f"light {light}, measured", display(photo, white))
+        yield figure("made", display(model, white))
+        yield figure("difference", np.clip(np.abs(model - photo) / (0.05 * white), 0, 1))
         yield "</div>"
 
 
 def display(picture: NDArray[np.float32], white: float = 0.0) -> NDArray[np.float32]:
     """[h, w, 3] for the eye: gamma 2.2, the brightest thousandth white."""
-    known = np.nan_to_num(picture)
-    shown: NDArray[np.float32] = np.clip(
-        known / (white or max(float(np.quantile(known, PEAK_QUANTILE)), 1e-12)), 0, 1
+    finite = np.nan_to_num(picture)
+    shares: NDArray[np.float32] = np.clip(
+        finite / (white or max(float(np.quantile(finite, PEAK_QUANTILE)), 1e-12)), 0, 1
     )
-    return shown ** np.float32(1 / 2.2)
+    return shares ** np.float32(1 / 2.2)
 
 
 def grey(picture: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -124,8 +124,8 @@ def grey(picture: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def figure(caption: str, picture: NDArray[np.float32]) -> str:
-    shown = (255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
-    width = min(WIDTH_PX, shown.shape[1])
-    data = base64.b64encode(png(shown, width)).decode()
+    codes = (255 * np.clip(np.nan_to_num(picture), 0, 1)).astype(np.uint8)
+    width = min(WIDTH_PX, codes.shape[1])
+    data = base64.b64encode(png(codes, width)).decode()
     image = f'<img src="data:image/png;base64,{data}" alt="{caption}">'
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

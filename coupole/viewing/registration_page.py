@@ -42,13 +42,13 @@ def write(found: Registered, merged: Merged | None, folder: Path) -> None:
 
 
 def _pictures(found: Registered, merged: Merged | None, folder: Path) -> str:
-    shown = _image(scans_drawn(found), "Each scan in its place in a colour of its own, from three sides")
+    figures = _image(scans_drawn(found), "Each scan in its place in a colour of its own, from three sides")
     if merged is not None:
         mesh = read_ply(MeshFile(folder / "mesh.ply"))
         vertices = mesh.vertices.astype(np.float64)
         solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
-        shown += _image(solid_drawn(solid, _STONE), "The merged mesh, from three sides")
-    return shown
+        figures += _image(solid_drawn(solid, _STONE), "The merged mesh, from three sides")
+    return figures
 
 
 def _image(sheet: Any, alternative: str) -> str:
@@ -116,14 +116,14 @@ def _files(merged: Merged | None) -> str:
 def _scans(found: Registered) -> str:
     rows = []
     for number, scan in enumerate(found.scans):
-        placed = number in found.placed
+        is_placed = number in found.placed
         rows.append(
             (
                 text(scan.name),
                 f"{scan.survey.count:,}",
                 f"{scan.survey.spacing_mm:.3g}",
                 text(scan.viewpoint.stand),
-                f"{point_uncertainty_mm(found, number):.3g}" if placed else "not placed",
+                f"{point_uncertainty_mm(found, number):.3g}" if is_placed else "not placed",
             )
         )
     head = ("scan", "points", "spacing, mm", "seen from", "u of its points, mm")
@@ -141,16 +141,21 @@ def _loops(found: Registered) -> str:
     ]
     if not rows:
         return "<p>No pairs form a ring."
-    told = f"<p>{len(found.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
-    told += (
+    summary = f"<p>{len(found.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
+    summary += (
         f"{worst_loop_mm(found):.3g} mm. All uncertainties hold a factor of {found.loop_factor:.2f} by the loops."
     )
-    return told + table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
+    return summary + table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
 
 
 def _targets(found: Registered) -> str:
     rows = [
-        (text(one.name), text(found.names[found.placed[one.scan]]), f"{one.u_mm:.3g}", f"{one.left_mm:.3g}")
-        for one in sorted(found.fit.sightings, key=lambda one: -one.left_mm / one.u_mm)[:_TARGETS_SHOWN]
+        (
+            text(sighting.name),
+            text(found.names[found.placed[sighting.scan]]),
+            f"{sighting.u_mm:.3g}",
+            f"{sighting.left_mm:.3g}",
+        )
+        for sighting in sorted(found.fit.sightings, key=lambda one: -one.left_mm / one.u_mm)[:_TARGETS_SHOWN]
     ]
     return table("Targets", ("target", "scan", "stated u, mm", "off, mm"), rows)

@@ -33,9 +33,9 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
     """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
     run's lock says whether it is `in_use`."""
     path = path or run.report_path
-    made = _page(run, status(run, in_use=in_use))
+    content = _page(run, status(run, in_use=in_use))
     try:
-        write_synced(path, made)
+        write_synced(path, content)
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror}") from error
     return path
@@ -44,12 +44,15 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
 def _page(run: Run, found: Status) -> str:
     events = list(journal.read(run.journal_path))
     views = sampled_views(run, (event for event in events if isinstance(event, FrameProven)))
-    covered = _coverage(run, views)
+    object_coverage = _coverage(run, views)
     lines = told.troubles(events, views, found)
     sections = {
         "measured": ("What was measured", _measured(run, events, views)),
         "exposure": ("Exposure", exposures(views, run.about.get("scaling") or "")),
-        "coverage": ("Coverage of the object", coverages(covered) if isinstance(covered, Coverage) else ""),
+        "coverage": (
+            "Coverage of the object",
+            coverages(object_coverage) if isinstance(object_coverage, Coverage) else "",
+        ),
         "light": ("Light on the object", told.light(events, views, found)),
         "time": ("Time", told.sessions(found)),
         "calibrations": ("Calibrations", told.calibrations(run)),
@@ -57,12 +60,12 @@ def _page(run: Run, found: Status) -> str:
         "pictures": ("Pictures", pictures(views)),
         "technical": ("Devices and software", told.technical(run, events, found)),
     }
-    shown = {name: part for name, part in sections.items() if part[1]}
-    simulated = "<p>Simulated: no real light, no real object.</p>" if run.simulated else ""
-    glance = facts(_glance(run, found, views, covered, lines))
-    body = "".join(section(name, *part) for name, part in shown.items())
-    head = f"<header><h1>{text(run.folder.name)}</h1>{simulated}</header>"
-    return page(run.folder.name, f"{head}<main>{glance}{_contents(shown)}{body}</main>")
+    parts = {name: part for name, part in sections.items() if part[1]}
+    remark = "<p>Simulated: no real light, no real object.</p>" if run.simulated else ""
+    glance = facts(_glance(run, found, views, object_coverage, lines))
+    body = "".join(section(name, *part) for name, part in parts.items())
+    head = f"<header><h1>{text(run.folder.name)}</h1>{remark}</header>"
+    return page(run.folder.name, f"{head}<main>{glance}{_contents(parts)}{body}</main>")
 
 
 def _contents(sections: Mapping[str, tuple[str, str]]) -> str:
@@ -103,8 +106,8 @@ def _glance(
 
 
 def _exposure_in_words(run: Run, views: Sequence[SampledView]) -> str:
-    found = exposure_in_words(views)
-    return f"{found}{' (by simulated light)' if run.simulated else ''}" if found else "no picture yet"
+    verdicts = exposure_in_words(views)
+    return f"{verdicts}{' (by simulated light)' if run.simulated else ''}" if verdicts else "no picture yet"
 
 
 def _plans_budget_lux_h(run: Run) -> float | None:
@@ -119,16 +122,16 @@ def _plans_budget_lux_h(run: Run) -> float | None:
 
 def _measured(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> str:
     """Views, their lights and what of them is proven."""
-    occluded = {event.view: len(event.hidden_leds) for event in events if isinstance(event, ViewBegun)}
+    hidden_counts = {event.view: len(event.hidden_leds) for event in events if isinstance(event, ViewBegun)}
     rows = []
     for view in views:
         share = f"{view.proven} of {view.expected}"
         if view.proven < view.expected:
             share = f"<span class=stopped>{share}</span>"
         left_out = len(run.hidden_leds.get(view.name, ()))
-        hidden = f"{left_out}, left out" if left_out else str(occluded.get(view.name, "")) or "not known"
-        times = ", ".join(f"{one.exposure_us / 1e3:g} ms" for one in view.exposures)
-        rows.append((text(view.name), share, str(view.leds), times, str(view.darks), hidden))
+        hidden_text = f"{left_out}, left out" if left_out else str(hidden_counts.get(view.name, "")) or "not known"
+        times = ", ".join(f"{exposure.exposure_us / 1e3:g} ms" for exposure in view.exposures)
+        rows.append((text(view.name), share, str(view.leds), times, str(view.darks), hidden_text))
     head = ("view", "frames proven", "LEDs", "exposures", "dark frames", "hidden LEDs")
     return (
         table("Views, in the plan's order", head, rows)

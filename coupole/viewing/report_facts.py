@@ -25,8 +25,8 @@ _STOPPED_IN_0_1 = "Interrupted"
 def light_in_words(found: Status, budget_lux_h: float | None) -> str:
     """Return the light of all sessions; a burst whose end was not recorded counts as planned."""
     light_s = sum(session.light_s for session in found.sessions)
-    allowed = f" (the object may receive {budget_lux_h:g} in its life)" if budget_lux_h else ""
-    return f"{found.dose_lux_h:.3f} lux h{allowed}, LEDs on for {light_s:.1f} s"
+    budget = f" (the object may receive {budget_lux_h:g} in its life)" if budget_lux_h else ""
+    return f"{found.dose_lux_h:.3f} lux h{budget}, LEDs on for {light_s:.1f} s"
 
 
 def light(events: Sequence[Event], views: Iterable[SampledView], found: Status) -> str:
@@ -40,8 +40,10 @@ def light(events: Sequence[Event], views: Iterable[SampledView], found: Status) 
         of_view = [e for e in events if isinstance(e, BurstBegun | BurstEnded) and e.view == view.name]
         lux_h = run_dose.lux_h_of_points(of_view)
         rows.append((text(view.name), f"{lux_h[point] if lux_h else 0.0:.3f}"))
-    killed = any(session.outcome == "" for session in found.sessions)
-    note = '<p class="note">A burst in which a session was killed counts as it was planned.</p>' if killed else ""
+    was_killed = any(session.outcome == "" for session in found.sessions)
+    note = (
+        '<p class="note">A burst in which a session was killed counts as it was planned.</p>' if was_killed else ""
+    )
     return table("Light on the point that received most", ("view", "lux h"), rows) + note
 
 
@@ -51,9 +53,9 @@ def duration_in_words(found: Status) -> str:
     pauses = sum(session.pauses for session in found.sessions)
     paused_s = sum(session.paused_s for session in found.sessions)
     count = len(found.sessions)
-    paused = f"{pauses} {'pause' if pauses == 1 else 'pauses'} of {duration_text(paused_s)} in all"
+    pause_text = f"{pauses} {'pause' if pauses == 1 else 'pauses'} of {duration_text(paused_s)} in all"
     sessions = "1 session" if count == 1 else f"{count} sessions"
-    return f"{duration_text(total_s)} in {sessions}, {paused if pauses else 'no pause'}"
+    return f"{duration_text(total_s)} in {sessions}, {pause_text if pauses else 'no pause'}"
 
 
 def sessions(found: Status) -> str:
@@ -61,8 +63,8 @@ def sessions(found: Status) -> str:
     rows = []
     for number, session in enumerate(found.sessions, 1):
         outcome, reason = _end_of(session, found, last=number == len(found.sessions))
-        paused = f"{session.pauses} ({duration_text(session.paused_s)})" if session.pauses else "none"
-        rows.append((moment(session.begun), duration_text(session.duration_s), paused, outcome, text(reason)))
+        pause_text = f"{session.pauses} ({duration_text(session.paused_s)})" if session.pauses else "none"
+        rows.append((moment(session.begun), duration_text(session.duration_s), pause_text, outcome, text(reason)))
     return table("Sessions", ("begun (UTC)", "duration", "pauses", "ended", "why"), rows)
 
 
@@ -73,38 +75,38 @@ def _end_of(session: Session, found: Status, *, last: bool) -> tuple[str, str]:
 
 def calibrations_in_words(run: Run) -> str:
     """The kinds that were in force."""
-    stamped = run.about.get("calibrations", "none")
-    return ", ".join(map(text, stamped)) if isinstance(stamped, dict) and stamped else "none in force"
+    stamps = run.about.get("calibrations", "none")
+    return ", ".join(map(text, stamps)) if isinstance(stamps, dict) and stamps else "none in force"
 
 
 def calibrations(run: Run) -> str:
     """The records that were in force: when they were made, until when they hold, and the run's copies."""
-    stamped = run.about.get("calibrations", "none")
-    if not isinstance(stamped, dict) or not stamped:
+    stamps = run.about.get("calibrations", "none")
+    if not isinstance(stamps, dict) or not stamps:
         return ""
     records = _records(run)
     rows = []
-    for kind, digest in stamped.items():
+    for kind, digest in stamps.items():
         record, path = records.get(digest, (None, ""))
-        made = f"{record.created:%Y-%m-%d}" if record else "the run has no readable copy"
+        date = f"{record.created:%Y-%m-%d}" if record else "the run has no readable copy"
         until = f"{record.validity.expires:%Y-%m-%d}" if record else ""
-        rows.append((text(kind), made, until, link(path) if path else "", f"<code>{text(digest[:12])}</code>"))
+        rows.append((text(kind), date, until, link(path) if path else "", f"<code>{text(digest[:12])}</code>"))
     return table("Calibrations in force", ("kind", "made", "valid until", "record", "checksum"), rows)
 
 
 def _records(run: Run) -> dict[str, tuple[Any, str]]:
     """Records among the run's copies, and their places, by their checksum."""
-    found = {}
-    for described in run.about.get("files", []):
-        stored = described.get("stored") or ""
-        if "/calibrations/" not in stored or not stored.endswith((".yaml", ".yml")):
+    records = {}
+    for entry in run.about.get("files", []):
+        path = entry.get("stored") or ""
+        if "/calibrations/" not in path or not path.endswith((".yaml", ".yml")):
             continue
         try:
-            record = read_record(run.folder / stored)
+            record = read_record(run.folder / path)
         except (InputError, OSError, ValueError):
             continue
-        found[record.sha256] = (record, stored)
-    return found
+        records[record.sha256] = (record, path)
+    return records
 
 
 # -- trouble --------------------------------------------------------------------------------------------------
@@ -148,8 +150,8 @@ def technical(run: Run, events: Iterable[Event], found: Status) -> str:
     """Devices, software, clocks, counters, files."""
     about = run.about
     devices = [
-        (text(kind), *(text(one.get(key) or "") for key in ("vendor", "model", "serial", "firmware")))
-        for kind, one in about.get("devices", {}).items()
+        (text(kind), *(text(device.get(key) or "") for key in ("vendor", "model", "serial", "firmware")))
+        for kind, device in about.get("devices", {}).items()
     ]
     software = about.get("software", {})
     return (
@@ -209,7 +211,7 @@ def _link_of_the_arm(events: Iterable[Event]) -> str:
 def _files(run: Run) -> str:
     names = ("README.txt", "run.json", "journal.jsonl", "manifest.sha256")
     paths = [run.folder / name for name in names]
-    paths += [run.folder / described["stored"] for described in _stored(run)]
+    paths += [run.folder / entry["stored"] for entry in _stored(run)]
     paths += [run.view_path(view) for view in run.about["views"]]
     rows = [
         (link(str(path.relative_to(run.folder))), bytes_text(path.stat().st_size))
@@ -220,5 +222,5 @@ def _files(run: Run) -> str:
 
 
 def _stored(run: Run) -> list[dict[str, Any]]:
-    described = [run.about["plan"], run.about["rig"], *run.about.get("files", [])]
-    return [one for one in described if one.get("stored")]
+    entries = [run.about["plan"], run.about["rig"], *run.about.get("files", [])]
+    return [entry for entry in entries if entry.get("stored")]

@@ -23,8 +23,8 @@ def exposure_in_words(views: Sequence[SampledView]) -> str:
     """Return how many views are well, over- and under-exposed; empty without pictures."""
     verdicts = [verdict for view in views if (verdict := view.verdict())]
     counts = {verdict: verdicts.count(verdict) for verdict in ("well exposed", "over-exposed", "under-exposed")}
-    told = [f"{count} of {len(verdicts)} views {verdict}" for verdict, count in counts.items() if count]
-    return ", ".join(told)
+    phrases = [f"{count} of {len(verdicts)} views {verdict}" for verdict, count in counts.items() if count]
+    return ", ".join(phrases)
 
 
 def exposures(views: Sequence[SampledView], scaling: str) -> str:
@@ -32,25 +32,25 @@ def exposures(views: Sequence[SampledView], scaling: str) -> str:
     rows = [
         (
             f'<a href="#view-{anchor(view.name)}">{text(view.name)}</a>',
-            f"{one.exposure_us / 1e3:g} ms",
-            f"{one.seen.pictures} of {one.frames}",
-            f"{one.seen.brightest:.0%}",
-            f"{one.seen.saturated:.2%}" + (f"<br>{text(one.worst)}" if one.worst else ""),
-            _histogram(view.name, one),
-            one.seen.verdict(),
+            f"{exposure.exposure_us / 1e3:g} ms",
+            f"{exposure.seen.pictures} of {exposure.frames}",
+            f"{exposure.seen.brightest:.0%}",
+            f"{exposure.seen.saturated:.2%}" + (f"<br>{text(exposure.worst)}" if exposure.worst else ""),
+            _histogram(view.name, exposure),
+            exposure.seen.verdict(),
         )
         for view in views
-        for one in view.exposures
-        if one.seen.pictures
+        for exposure in view.exposures
+        if exposure.seen.pictures
     ]
     if not rows:
         return ""
     head = ("view", "exposure", "pictures looked at", "brightest", "saturated", "histogram", "verdict")
-    colours = {name for view in views for one in view.exposures for name in one.histograms}
+    colours = {name for view in views for exposure in view.exposures for name in exposure.histograms}
     lines = ", ".join(f"{_SPOKEN.get(name, name)}" for name in sorted(colours, key="RGBY".find))
-    simulated = f"<p>The light is simulated: {text(scaling)}. A real cell's may differ.</p>" if scaling else ""
+    remark = f"<p>The light is simulated: {text(scaling)}. A real cell's may differ.</p>" if scaling else ""
     return (
-        simulated
+        remark
         + table("Exposure of each view, by pictures spread over its lights", head, rows)
         + '<p class="note">Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above '
         "black. Saturated: the largest share of a picture's pixels at full scale, and the shot that has it. "
@@ -69,10 +69,10 @@ def _histogram(view: str, one: SampledExposure) -> str:
         lines.append(f'<polyline class="{name}" points="{points}"/>')
     black = one.black_share * _WIDTH
     lines.append(f'<line x1="{black:.1f}" x2="{black:.1f}" y1="0" y2="{_HEIGHT}"/>')
-    said = f"Histogram of view {view} at {one.exposure_us / 1e3:g} ms"
+    caption = f"Histogram of view {view} at {one.exposure_us / 1e3:g} ms"
     return (
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
-        f'aria-label="{text(said)}">{"".join(lines)}</svg>'
+        f'aria-label="{text(caption)}">{"".join(lines)}</svg>'
     )
 
 
@@ -116,11 +116,11 @@ _FRAMED = ("view", "object in field", "of the field", "mm away", "sharp", "px pe
 
 
 def _framings(found: Coverage) -> Iterable[Sequence[str]]:
-    for seen in found.views:
-        away = f"{seen.nearest_mm:.0f} to {seen.farthest_mm:.0f}" if math.isfinite(seen.nearest_mm) else "-"
-        scale = f"{seen.px_per_mm[0]:.1f} to {seen.px_per_mm[1]:.1f}" if math.isfinite(seen.px_per_mm[0]) else "-"
-        shares = f"{seen.in_field:.0%}", f"{seen.fills:.0%}"
-        yield text(seen.view), *shares, away, f"{seen.in_focus:.0%}", scale
+    for view in found.views:
+        away = f"{view.nearest_mm:.0f} to {view.farthest_mm:.0f}" if math.isfinite(view.nearest_mm) else "-"
+        scale = f"{view.px_per_mm[0]:.1f} to {view.px_per_mm[1]:.1f}" if math.isfinite(view.px_per_mm[0]) else "-"
+        shares = f"{view.in_field:.0%}", f"{view.fills:.0%}"
+        yield text(view.view), *shares, away, f"{view.in_focus:.0%}", scale
 
 
 def _legend() -> str:

@@ -16,11 +16,11 @@ _MOST_VIEWS = 4
 def write(result: Mapping[str, Any], folder: Path) -> None:
     """Write the page of a `result.json` beside it; its pictures are inside. Raises OSError."""
     title = f"{result['restoration']}: {len(result['hypotheses'])} hypotheses"
-    told = (
+    note = (
         "<p>Each picture shows a <strong>hypothesis</strong>: what this object may have looked like if its "
         "sources are right. All are computed; none is a photograph.</p>"
     )
-    body = f"<h1>{text(title)}</h1>{told}"
+    body = f"<h1>{text(title)}</h1>{note}"
     for view in result["views"][:_MOST_VIEWS]:
         body += section(anchor(f"view-{view['view']}"), f"View {text(view['view'])}", _view(view, result, folder))
     for hypothesis in result["hypotheses"]:
@@ -32,23 +32,23 @@ def write(result: Mapping[str, Any], folder: Path) -> None:
 
 
 def _view(view: Mapping[str, Any], result: Mapping[str, Any], folder: Path) -> str:
-    titles = {one["name"]: one["title"] for one in result["hypotheses"]}
+    titles = {entry["name"]: entry["title"] for entry in result["hypotheses"]}
     figures = [
-        _figure(folder / one["png"], f"Hypothesis {name}: {titles[name]}")
-        for name, one in view["pictures"].items()
+        _figure(folder / entry["png"], f"Hypothesis {name}: {titles[name]}")
+        for name, entry in view["pictures"].items()
     ]
-    told = f'<div class="beside">{"".join(figures)}</div>'
-    for one in view["differences"]:
-        names = " and ".join(one["hypotheses"])
-        told += f"<h3>{text(names)}</h3>"
-        told += _figure(folder / one["png"], f"Colour difference of hypotheses {names}, CIEDE2000")
+    body = f'<div class="beside">{"".join(figures)}</div>'
+    for entry in view["differences"]:
+        names = " and ".join(entry["hypotheses"])
+        body += f"<h3>{text(names)}</h3>"
+        body += _figure(folder / entry["png"], f"Colour difference of hypotheses {names}, CIEDE2000")
         rows = [
             (text(part), f"{of['mean_de00']:.1f}", f"{of['de00_of_means']:.1f}", f"{of['pixels']:,}")
-            for part, of in one["parts"].items()
+            for part, of in entry["parts"].items()
         ]
         head = ("part", "mean dE00", "dE00 of mean colours", "pixels")
-        told += table(f"How far {names} are apart in this view", head, rows)
-    return told
+        body += table(f"How far {names} are apart in this view", head, rows)
+    return body
 
 
 def _figure(path: Path, caption: str) -> str:
@@ -64,8 +64,8 @@ def _hypothesis(hypothesis: Mapping[str, Any]) -> str:
     rows = [
         (text(part), f"<code>{text(flat(material))}</code>") for part, material in hypothesis["materials"].items()
     ]
-    told = f"<p>{text(hypothesis['title'])}</p><h3>Sources</h3><ul>{sources}</ul>"
-    return told + table("Materials", ("part", "material"), rows)
+    body = f"<p>{text(hypothesis['title'])}</p><h3>Sources</h3><ul>{sources}</ul>"
+    return body + table("Materials", ("part", "material"), rows)
 
 
 def flat(material: Any) -> str:
@@ -75,14 +75,14 @@ def flat(material: Any) -> str:
         rest = [f"{key} {flat(value)}" for key, value in material.items() if key != "kind" and value is not None]
         return ", ".join(kind + rest) if kind and not rest else "{" + ", ".join(kind + rest) + "}"
     if isinstance(material, Sequence) and not isinstance(material, str):
-        return "[" + ", ".join(flat(one) for one in material) + "]"
+        return "[" + ", ".join(flat(part) for part in material) + "]"
     return f"{material:g}" if isinstance(material, float) else str(material)
 
 
 def _parts(result: Mapping[str, Any]) -> str:
     rows = [(text(name), f"{count:,}") for name, count in result["parts"].items()]
-    told = "".join(f"<li>{text(remark)}.</li>" for remark in result["remarks"])
-    return table("Triangles", ("part", "triangles"), rows) + (f"<ul>{told}</ul>" if told else "")
+    remarks = "".join(f"<li>{text(remark)}.</li>" for remark in result["remarks"])
+    return table("Triangles", ("part", "triangles"), rows) + (f"<ul>{remarks}</ul>" if remarks else "")
 
 
 def _files(result: Mapping[str, Any]) -> str:
@@ -90,8 +90,8 @@ def _files(result: Mapping[str, Any]) -> str:
     for view in result["views"]:
         if view["side_by_side"]:
             rows[link(view["side_by_side"])] = f"view {text(view['view'])}, all hypotheses"
-        for name, one in view["pictures"].items():
-            rows[f"{link(one['png'])}, {link(one['exr'])}"] = (
+        for name, paths in view["pictures"].items():
+            rows[f"{link(paths['png'])}, {link(paths['exr'])}"] = (
                 f"hypothesis {text(name)}, view {text(view['view'])}: for the eye, and radiance by band"
             )
     return facts(rows) + (

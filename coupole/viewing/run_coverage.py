@@ -79,10 +79,10 @@ def coverage(rig: Rig, corners_mm: NDArray[np.float64], poses: dict[str, Transfo
     ]
 
     def views_of(asked_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-        found = np.zeros(len(asked_mm), np.int64)
+        counts = np.zeros(len(asked_mm), np.int64)
         for sight in sights:
-            found += points_shown(sight, mesh, asked_mm)[1]
-        return found
+            counts += points_shown(sight, mesh, asked_mm)[1]
+        return counts
 
     reachable = _seen_from_above(mesh, points_mm)
     if not reachable.any():
@@ -106,12 +106,12 @@ def _seen_from_above(mesh: Any, points_mm: NDArray[np.float64]) -> NDArray[np.bo
     turn = np.pi * (1 + np.sqrt(5.0)) * number
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     far_mm = 4 * float(np.ptp(points_mm, axis=0).max()) + 1.0
-    found = np.zeros(len(points_mm), np.bool_)
+    is_open = np.zeros(len(points_mm), np.bool_)
     for direction in directions:
-        left = np.flatnonzero(~found)
-        starts_mm = points_mm[left] + RAY_START_MM * direction
-        found[left] = ~blocked(mesh, starts_mm, starts_mm + far_mm * direction)
-    return found
+        rows = np.flatnonzero(~is_open)
+        starts_mm = points_mm[rows] + RAY_START_MM * direction
+        is_open[rows] = ~blocked(mesh, starts_mm, starts_mm + far_mm * direction)
+    return is_open
 
 
 def _drawn(
@@ -135,14 +135,14 @@ def _drawn(
     depth_mm = np.asarray(
         mesh.run(starts_mm.reshape(-1, 3).astype(np.float32), ways, query="DISTANCE"), np.float64
     )
-    met = (depth_mm < 1e29).reshape(_DRAWN_PX, _DRAWN_PX)
-    depth_mm = np.where(met, depth_mm.reshape(_DRAWN_PX, _DRAWN_PX), 4 * reach_mm)
-    counts = views_of((starts_mm - depth_mm[..., None] * to_eye)[met])
+    is_object = (depth_mm < 1e29).reshape(_DRAWN_PX, _DRAWN_PX)
+    depth_mm = np.where(is_object, depth_mm.reshape(_DRAWN_PX, _DRAWN_PX), 4 * reach_mm)
+    counts = views_of((starts_mm - depth_mm[..., None] * to_eye)[is_object])
     steps = np.hypot(*np.gradient(depth_mm, 2 * reach_mm / _DRAWN_PX))
-    shade = (0.65 + 0.35 / np.sqrt(1 + steps**2))[met]
+    shade = (0.65 + 0.35 / np.sqrt(1 + steps**2))[is_object]
     pixels = np.full((_DRAWN_PX, _DRAWN_PX, 4), _BACKGROUND, np.uint8)
-    pixels[~met, 3] = 0
-    pixels[met, :3] = np.rint(255 * of_share(counts / MOST) * shade[:, None])
+    pixels[~is_object, 3] = 0
+    pixels[is_object, :3] = np.rint(255 * of_share(counts / MOST) * shade[:, None])
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()

@@ -52,8 +52,8 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         yield "frames of a simulated cell"
     views = f"{len(about['views'])} view{'s' if len(about['views']) > 1 else ''}"
     yield f"{about['triangles']} triangles in {views}, {about['samples']} samples in all channels"
-    if refined := about.get("refined"):
-        before, after = (refined["disagreement"][when]["median_mm"] for when in ("before", "after"))
+    if refinement := about.get("refined"):
+        before, after = (refinement["disagreement"][when]["median_mm"] for when in ("before", "after"))
         yield f"views were refined: they disagreed by {before:.3f} mm (median), and by {after:.3f} mm afterwards"
     if poses := about.get("poses"):
         yield (
@@ -73,7 +73,10 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
             f"95 % interval of the median sample: {_bounds([interval['low'], interval['high']])}, if the mesh's "
             f"vertices are off by {about['scan_noise_um']:g} um"
         )
-    if min((left for left in about["residual"].values() if left is not None), default=0.0) > POOR_RESIDUAL:
+    if (
+        min((residual for residual in about["residual"].values() if residual is not None), default=0.0)
+        > POOR_RESIDUAL
+    ):
         yield (
             "the materials explain the samples poorly: is the object translucent or fluorescent, did it move, do "
             "mesh and records belong to it?"
@@ -112,8 +115,8 @@ def _page(folder: Path) -> Iterator[str]:
 def _inter_reflection(about: dict[str, Any]) -> str:
     if not about["subtracted"]:
         return "Inter-reflection is left in the samples."
-    each = (view["inter_reflection"] for view in about["views"])
-    shares = [f"{100 * half:.1f} % ({100 * far:.1f} %)" for half, far in each]
+    shares_of_views = (view["inter_reflection"] for view in about["views"])
+    shares = [f"{100 * half:.1f} % ({100 * far:.1f} %)" for half, far in shares_of_views]
     return (
         "Inter-reflection was taken off the samples, in the median (and the 95th percentile) of each view: "
         f"{', '.join(shares)}; the disk under the object is taken to reflect {about['support_reflectance']:g}."
@@ -122,19 +125,19 @@ def _inter_reflection(about: dict[str, Any]) -> str:
 
 def _uncertain(about: dict[str, Any]) -> Iterator[str]:
     """A table of sources, beside the paper's."""
-    if not (known := about["uncertainty_percent"]) or known["monte_carlo"]["median"] is None:
+    if not (percentages := about["uncertainty_percent"]) or percentages["monte_carlo"]["median"] is None:
         return
-    drawn = known["monte_carlo"]
+    trial = percentages["monte_carlo"]
     yield (
-        f"<h2>Uncertainty of samples</h2><p>Bounds at {100 * drawn['coverage']:.0f} %, by Monte Carlo through the "
-        f"measurement equation ({drawn['samples']} samples, {drawn['draws']} draws of each), and with one source "
+        f"<h2>Uncertainty of samples</h2><p>Bounds at {100 * trial['coverage']:.0f} %, by Monte Carlo through the "
+        f"measurement equation ({trial['samples']} samples, {trial['draws']} draws of each), and with one source "
         "removed at a time; last, what was published of La Coupole (seed 003, 6.1 and 7)."
     )
     yield "<table><tr><th><th>median sample<th>95th percentile<th>narrower by"
-    whole = _width(drawn)
-    rows = [("all sources", drawn), *((f"without {name}", row) for name, row in known["without"].items())]
+    whole = _width(trial)
+    rows = [("all sources", trial), *((f"without {name}", row) for name, row in percentages["without"].items())]
     for name, row in rows:
-        narrower = "" if row is drawn else f"{100 * (1 - _width(row) / whole):.0f} %"
+        narrower = "" if row is trial else f"{100 * (1 - _width(row) / whole):.0f} %"
         middle, far = _bounds(row["median"]), _bounds(row["percentile_95"])
         yield f"<tr><th>{html.escape(name)}<td>{middle}<td>{far}<td>{narrower}"
     for name, median, percentile_95, narrower in PUBLISHED:
@@ -149,11 +152,11 @@ def _material_uncertainty(about: dict[str, Any]) -> Iterator[str]:
         "samples kept for the check lie in the 95 % interval of what is made."
         "<table><tr><th><th>normal, degrees<th>kd<th>ks<th>alpha<th>inside"
     )
-    for name, known in about["material_uncertainty"].items():
-        if known["normal_deg"] is not None:
-            yield f"<tr><th>{FITS[name].title}<td>{known['normal_deg']:.2f}"
-            each = (known[f"{field}_percent"] for field in ("kd", "ks", "alpha"))
-            yield "".join("<td>" if percent is None else f"<td>{percent:.1f} %" for percent in each)
+    for name, uncertainties in about["material_uncertainty"].items():
+        if uncertainties["normal_deg"] is not None:
+            yield f"<tr><th>{FITS[name].title}<td>{uncertainties['normal_deg']:.2f}"
+            percentages = (uncertainties[f"{field}_percent"] for field in ("kd", "ks", "alpha"))
+            yield "".join("<td>" if percent is None else f"<td>{percent:.1f} %" for percent in percentages)
             inside = about["held_out_inside"][name]
             yield "<td>" if inside is None else f"<td>{100 * inside:.1f} %"
     yield "</table><p>Fewer than 95 % inside: the material misses something that neighbouring LEDs do not share."
@@ -190,21 +193,21 @@ def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iter
     if not len(frames.leds):
         return
     number = int(np.argmax(np.isfinite(frames.share[..., 0]).sum(axis=(1, 2))))
-    one, measured = frames.leds[number], frames.share[number].astype(np.float32)
+    lamp, photo = frames.leds[number], frames.share[number].astype(np.float32)
     rows = slice(0, len(view.triangles))
-    led = view.leds == one
+    led = view.leds == lamp
     under = result.view_samples(view, rows, led)
     lit = lit_on(under.centres_mm, under.led_mm, view.led_normals[led], about["emission"] == "paper")
     share = (lit[..., None] * view.full_scales[led])[:, 0]
-    measured *= frames.picture(result.direct_shares(view, rows, led)[:, 0])
-    shown = np.isfinite(measured).all(axis=2, keepdims=True)
-    white = float(np.nanquantile(measured, 0.995)) if shown.any() else 1.0
-    yield f"<p>Direct light of LED {one} in the frame, made by each fit, and how far each is off, white 10 %<br>"
-    yield figure("measured", display(_rgb(np.nan_to_num(measured)), white))
+    photo *= frames.picture(result.direct_shares(view, rows, led)[:, 0])
+    is_known = np.isfinite(photo).all(axis=2, keepdims=True)
+    white = float(np.nanquantile(photo, 0.995)) if is_known.any() else 1.0
+    yield f"<p>Direct light of LED {lamp} in the frame, made by each fit, and how far each is off, white 10 %<br>"
+    yield figure("measured", display(_rgb(np.nan_to_num(photo)), white))
     for name in FITS:
-        made = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)
-        off = np.where(shown, np.abs(made - measured), 0.0).mean(axis=2)
-        yield figure(FITS[name].title, display(_rgb(np.nan_to_num(np.where(shown, made, 0.0))), white))
+        model = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)
+        off = np.where(is_known, np.abs(model - photo), 0.0).mean(axis=2)
+        yield figure(FITS[name].title, display(_rgb(np.nan_to_num(np.where(is_known, model, 0.0))), white))
         yield figure("off", grey(np.nan_to_num(off) / (0.1 * white)))
 
 
@@ -215,30 +218,32 @@ def _fields(path: Path) -> dict[str, NDArray[Any]]:
 
 def _view(path: Path, fits: dict[str, dict[str, NDArray[Any]]]) -> Iterator[str]:
     with h5py.File(path, "r") as file:
-        seen, triangles = file["seen"][()], file["triangles"][()]
-    found = fits[GGX_NORMAL.name]
-    row = np.searchsorted(found["triangles"], triangles)
-    mesh, fitted = fits[GGX.name]["normals"][row], found["normals"][row]
-    kd, ks = (_rgb(found[name][row]) for name in ("kd", "ks"))
-    uncertain = np.sqrt(found["covariance"][row][:, _VARIANCES])
-    yield figure("normals of the mesh", _picture(seen, 0.5 + 0.5 * mesh))
-    yield figure("fitted", _picture(seen, 0.5 + 0.5 * fitted))
-    turned = np.degrees(np.arccos(np.clip(np.sum(mesh * fitted, axis=1), -1, 1)))
-    yield figure("angle between them, white 10 degrees", grey(_picture(seen, turned[:, None] / 10.0)[..., 0]))
+        rows, triangles = file["seen"][()], file["triangles"][()]
+    materials = fits[GGX_NORMAL.name]
+    row = np.searchsorted(materials["triangles"], triangles)
+    mesh, fit_normals = fits[GGX.name]["normals"][row], materials["normals"][row]
+    kd, ks = (_rgb(materials[name][row]) for name in ("kd", "ks"))
+    uncertain = np.sqrt(materials["covariance"][row][:, _VARIANCES])
+    yield figure("normals of the mesh", _picture(rows, 0.5 + 0.5 * mesh))
+    yield figure("fitted", _picture(rows, 0.5 + 0.5 * fit_normals))
+    angles_deg = np.degrees(np.arccos(np.clip(np.sum(mesh * fit_normals, axis=1), -1, 1)))
+    yield figure("angle between them, white 10 degrees", grey(_picture(rows, angles_deg[:, None] / 10.0)[..., 0]))
     sd_deg = np.degrees(np.hypot(uncertain[:, :1], uncertain[:, 1:2]))
     yield figure(
-        "standard uncertainty of fitted normals, white 10 degrees", grey(_picture(seen, sd_deg / 10)[..., 0])
+        "standard uncertainty of fitted normals, white 10 degrees", grey(_picture(rows, sd_deg / 10)[..., 0])
     )
-    yield figure("diffuse", display(_picture(seen, kd)))
+    yield figure("diffuse", display(_picture(rows, kd)))
     caption = "standard uncertainty of diffuse, white 10 %"
-    yield figure(caption, grey(_picture(seen, uncertain[:, 2:3] / 0.1)[..., 0]))
-    yield figure("specular ks, white 0.1", display(_picture(seen, ks), WHITE_KS))
-    rough = np.where(ks.max(axis=1) > LEAST_KS, found["alpha"][row], 0.0)
+    yield figure(caption, grey(_picture(rows, uncertain[:, 2:3] / 0.1)[..., 0]))
+    yield figure("specular ks, white 0.1", display(_picture(rows, ks), WHITE_KS))
+    rough = np.where(ks.max(axis=1) > LEAST_KS, materials["alpha"][row], 0.0)
     caption = f"roughness alpha, white 1, where ks is above {LEAST_KS:g}"
-    yield figure(caption, grey(_picture(seen, rough[:, None])[..., 0]))
+    yield figure(caption, grey(_picture(rows, rough[:, None])[..., 0]))
     doubt = np.where(ks.max(axis=1) > LEAST_KS, uncertain[:, 4], 0.0)[:, None]
-    yield figure("its relative standard uncertainty, white 50 %", grey(_picture(seen, doubt / 0.5)[..., 0]))
-    yield figure("what is left, white 10 %", grey(_picture(seen, found["residual"][row][:, None] / 0.1)[..., 0]))
+    yield figure("its relative standard uncertainty, white 50 %", grey(_picture(rows, doubt / 0.5)[..., 0]))
+    yield figure(
+        "what is left, white 10 %", grey(_picture(rows, materials["residual"][row][:, None] / 0.1)[..., 0])
+    )
 
 
 def _rgb(values: NDArray[Any]) -> NDArray[Any]:

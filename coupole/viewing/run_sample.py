@@ -73,23 +73,25 @@ class SampledView:
     def verdict(self) -> str:
         """`over-exposed` if even the shortest exposure saturates, `under-exposed` if even the longest is dark,
         else `well exposed`; empty without pictures."""
-        seen = [one.seen for one in self.exposures if one.seen.pictures]
-        if not seen:
+        figures = [exposure.seen for exposure in self.exposures if exposure.seen.pictures]
+        if not figures:
             return ""
-        if seen[0].saturated > OVER_EXPOSED:
-            return seen[0].verdict()
-        return "well exposed" if len(seen) > 1 and seen[-1].saturated > OVER_EXPOSED else seen[-1].verdict()
+        if figures[0].saturated > OVER_EXPOSED:
+            return figures[0].verdict()
+        return (
+            "well exposed" if len(figures) > 1 and figures[-1].saturated > OVER_EXPOSED else figures[-1].verdict()
+        )
 
 
 def sampled_views(run: Run, proven: Iterable[FrameProven]) -> list[SampledView]:
     """All views of a run, in the plan's order. A file that cannot be read is told of in its view's `trouble`."""
     frames: dict[str, list[FrameProven]] = {name: [] for name in run.about["views"]}
-    expected = dict.fromkeys(frames, 0)
+    shot_counts = dict.fromkeys(frames, 0)
     for event in proven:
         frames.setdefault(event.shot.view, []).append(event)
     for shot in run.expected_shots():
-        expected[shot.view] += 1
-    return [_sampled(run, name, of_view, expected.get(name, 0)) for name, of_view in frames.items()]
+        shot_counts[shot.view] += 1
+    return [_sampled(run, name, of_view, shot_counts.get(name, 0)) for name, of_view in frames.items()]
 
 
 def _sampled(run: Run, name: str, proven: Sequence[FrameProven], expected: int) -> SampledView:
@@ -112,13 +114,13 @@ def _look_into(view: SampledView, file: View, shots: Sequence[FrameProven]) -> N
     by_exposure: dict[int, list[FrameProven]] = {}
     for event in shots:
         by_exposure.setdefault(int(file.records[event.index]["exposure_us"]), []).append(event)
-    wanted = max(_PICTURES_PER_EXPOSURE, PICTURES_PER_VIEW // len(by_exposure))
+    count = max(_PICTURES_PER_EXPOSURE, PICTURES_PER_VIEW // len(by_exposure))
     for exposure_us, of_exposure in sorted(by_exposure.items()):
-        found = SampledExposure(exposure_us, len(of_exposure))
-        view.exposures.append(found)
-        chosen = np.unique(np.linspace(0, len(of_exposure) - 1, wanted).round().astype(int))
-        for event in (of_exposure[place] for place in chosen):
+        sample = SampledExposure(exposure_us, len(of_exposure))
+        view.exposures.append(sample)
+        places = np.unique(np.linspace(0, len(of_exposure) - 1, count).round().astype(int))
+        for event in (of_exposure[place] for place in places):
             raw = file.pixels(event.index)
-            found.add(str(event.shot), raw, coding)
+            sample.add(str(event.shot), raw, coding)
             picture = look(raw, coding, _PICTURE_WIDTH_PX, saturation=True, focus=False)
             view.pictures.append((str(event.shot), picture))

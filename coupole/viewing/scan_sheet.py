@@ -47,10 +47,10 @@ def import_scan(
         )
         progress("writing")
         sources = [path for path in (mesh_path, targets_path) if path is not None]
-        found = write_scan(scan, sources, unit, partial)
+        document = write_scan(scan, sources, unit, partial)
         progress("drawing")
         picture(scan).save(partial / "scan.png")
-    return found
+    return document
 
 
 def picture(scan: Scan) -> Any:
@@ -88,12 +88,12 @@ def _write_facts(draw: Any, scan: Scan, at: tuple[int, int]) -> None:
         return
     _, pairs_mm = target_distances_mm(scan.targets_mm)
     counts, borders_mm = np.histogram(pairs_mm, 40)
-    left, bottom, width, height = at[0], 2 * _HEIGHT_PX - 60, _WIDTH_PX - 80, _HEIGHT_PX - 240
+    left_px, bottom, width, height = at[0], 2 * _HEIGHT_PX - 60, _WIDTH_PX - 80, _HEIGHT_PX - 240
     for k, count in enumerate(counts):
-        x = left + width * k / len(counts)
+        x = left_px + width * k / len(counts)
         top = bottom - height * count / counts.max()
         draw.rectangle([x, top, x + width / len(counts) - 2, bottom], fill=(120, 130, 150))
-    draw.line([(left, bottom), (left + width, bottom)], fill="black")
-    draw.text((left, bottom + 8), f"{borders_mm[0]:.1f} mm", fill="black", font_size=16)
-    draw.text((left + width, bottom + 8), f"{borders_mm[-1]:.1f} mm", fill="black", font_size=16, anchor="ra")
-    draw.text((left, bottom + 28), "distances between targets", fill="black", font_size=16)
+    draw.line([(left_px, bottom), (left_px + width, bottom)], fill="black")
+    draw.text((left_px, bottom + 8), f"{borders_mm[0]:.1f} mm", fill="black", font_size=16)
+    draw.text((left_px + width, bottom + 8), f"{borders_mm[-1]:.1f} mm", fill="black", font_size=16, anchor="ra")
+    draw.text((left_px, bottom + 28), "distances between targets", fill="black", font_size=16)

@@ -58,14 +58,14 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
     coding = Coding(sensor.bayer_pattern, sensor.black_dn, sensor.white_dn)
     with frozen(world_config(job.cell, job, sensor), job.cell.files) as config:
         stills = load_class(STILLS)(config)
-    chosen = list(_spread(job, count))
-    if not chosen:
+    shots = list(_spread(job, count))
+    if not shots:
         raise InputError(f"{job.document.path}: expected shots with light; the plan has none")
-    made, pictures = [], []
+    previews, pictures = [], []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for number, (view, burst, step) in enumerate(chosen):
-            progress(number, len(chosen))
+        for number, (view, burst, step) in enumerate(shots):
+            progress(number, len(shots))
             led = int(burst.table["led"][step])
             raw: NDArray[np.uint16] = stills.take(
                 flange_at(view, job),
@@ -78,17 +78,17 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
             shot = f"{view.name}/{burst.labels[step]}"
             file = shot.replace("/", "-") + ".png"
             _save(folder / file, picture, f"{job.plan.name} {shot}, simulated")
-            found = figures(raw, coding)
-            made.append(Still(shot, file, max(found.saturated.values()), found.brightest))
+            picture_figures = figures(raw, coding)
+            previews.append(Still(shot, file, max(picture_figures.saturated.values()), picture_figures.brightest))
             pictures.append(picture)
-        progress(len(chosen), len(chosen))
-        sheet = contact_sheet(pictures, [still.shot for still in made])
-        _save(folder / "sheet.png", sheet, f"{job.plan.name}: {len(made)} shots, simulated")
+        progress(len(shots), len(shots))
+        sheet = contact_sheet(pictures, [still.shot for still in previews])
+        _save(folder / "sheet.png", sheet, f"{job.plan.name}: {len(previews)} shots, simulated")
     except OSError as error:
         raise StorageError(
             f"{folder}: {error.strerror or error}. Choose another folder, or free space."
         ) from error
-    return made
+    return previews
 
 
 def flange_at(view: ViewPose, job: Job) -> Transform:
@@ -102,14 +102,14 @@ def _spread(job: Job, count: int) -> Iterator[tuple[ViewPose, Burst, int]]:
     """Shots of all views in turn, in each spread evenly over its bursts and lights."""
     views = job.schedule.views
     for number, view in enumerate(views):
-        mine = count // len(views) + (number < count % len(views))
+        share = count // len(views) + (number < count % len(views))
         shots = [
             (burst, int(step))
             for burst in job.schedule.bursts[number]
             for step in np.argsort(burst.table["led"], kind="stable")
             if burst.is_light()[step]
         ]
-        for place in np.unique(np.linspace(0, len(shots) - 1, min(mine, len(shots))).astype(int)):
+        for place in np.unique(np.linspace(0, len(shots) - 1, min(share, len(shots))).astype(int)):
             yield view, *shots[place]
 
 

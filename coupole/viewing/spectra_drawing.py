@@ -37,14 +37,14 @@ def chart(title: str, nm: Array, curves: Sequence[Curve]) -> str:
         y = (_HIGH - _BELOW) - (values - bottom) / (top - bottom) * (_HIGH - _BELOW - 8)
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
 
-    drawn = []
+    shapes = []
     for number, curve in enumerate(curves):
         colour = COLOURS[number % len(COLOURS)]
         if curve.low is not None and curve.high is not None:
             around = points(np.concatenate([curve.high, curve.low[::-1]]), np.concatenate([nm, nm[::-1]]))
-            drawn.append(f'<polygon points="{around}" style="fill:{colour};opacity:.22"/>')
+            shapes.append(f'<polygon points="{around}" style="fill:{colour};opacity:.22"/>')
         dash = ";stroke-dasharray:5 4" if curve.dashed else ""
-        drawn.append(f'<polyline points="{points(curve.values, nm)}" style="stroke:{colour}{dash}"/>')
+        shapes.append(f'<polyline points="{points(curve.values, nm)}" style="stroke:{colour}{dash}"/>')
     marks = [
         _mark(_LEFT - 4, points(np.array([v]), nm[:1]).split(",")[1], "end", f"{v:.3g}") for v in (bottom, top)
     ]
@@ -56,7 +56,7 @@ def chart(title: str, nm: Array, curves: Sequence[Curve]) -> str:
         for number, curve in enumerate(curves)
     )
     return (
-        f'<figure><svg viewBox="0 0 {_WIDE} {_HIGH}" role="img" aria-label="{text(title)}">{"".join(drawn)}'
+        f'<figure><svg viewBox="0 0 {_WIDE} {_HIGH}" role="img" aria-label="{text(title)}">{"".join(shapes)}'
         f'{"".join(marks)}</svg><figcaption>{text(title)}</figcaption><ul class="legend">{legend}</ul></figure>'
     )
 
@@ -69,11 +69,11 @@ def patches(pairs: Sequence[tuple[str, Sequence[tuple[str, tuple[int, int, int]]
             f'<rect x="{150 * at}" width="150" height="70" style="fill:rgb({red},{green},{blue})"/>'
             for at, (_, (red, green, blue)) in enumerate(colours)
         )
-        told = ", ".join(one for one, _ in colours)
+        labels = ", ".join(label for label, _ in colours)
         rows.append(
             f'<figure><svg viewBox="0 0 {150 * len(colours)} 70" style="max-width:{150 * len(colours)}px" '
-            f'role="img" aria-label="{text(f"{name}: {told}")}">{cells}</svg>'
-            f"<figcaption>{text(name)}: {text(told)}</figcaption></figure>"
+            f'role="img" aria-label="{text(f"{name}: {labels}")}">{cells}</svg>'
+            f"<figcaption>{text(name)}: {text(labels)}</figcaption></figure>"
         )
     return "".join(rows)
 

@@ -49,8 +49,8 @@ class _Console(Console):
 
     @property
     def size(self) -> ConsoleDimensions:
-        found = terminal_size()
-        return ConsoleDimensions(*found) if found and found.columns else super().size
+        size = terminal_size()
+        return ConsoleDimensions(*size) if size and size.columns else super().size
 
     @size.setter
     def size(self, new_size: tuple[int, int]) -> None:
@@ -116,15 +116,15 @@ def ask_number(question: str) -> float | None:
     while True:
         print(f"{question} ", end="", file=sys.stderr, flush=True)
         try:
-            typed = sys.stdin.readline().strip()
+            answer = sys.stdin.readline().strip()
         except OSError:  # no standard input
             return None
-        if not typed:
+        if not answer:
             return None
         with contextlib.suppress(ValueError):
-            if math.isfinite(number := float(typed.removesuffix("mm").replace(",", "."))):
+            if math.isfinite(number := float(answer.removesuffix("mm").replace(",", "."))):
                 return number
-        print(f"expected a number, found {typed!r}", file=sys.stderr)
+        print(f"expected a number, found {answer!r}", file=sys.stderr)
 
 
 def duration_text(seconds: float) -> str:
@@ -178,10 +178,10 @@ class RunObserver:
         self.newest = progress
         elapsed_s = max(1e-6, time.monotonic() - self._started_s)
         rate = (progress.proven - self._before) / elapsed_s
-        left = f"{duration_text(progress.left_s / self._speed)} left"
+        remaining_time = f"{duration_text(progress.left_s / self._speed)} left"
         dose = f"{progress.dose_lux_h:.3f} lux.h"
         rates = f"{rate:5.1f} frames/s  {rate * self._frame_bytes / 1e6:5.1f} MB/s  "
-        detail = f"{dose}, {left}" if self._console.width < _WIDE else f"{rates}{dose}, {left}"
+        detail = f"{dose}, {remaining_time}" if self._console.width < _WIDE else f"{rates}{dose}, {remaining_time}"
         if self._bars is not None:
             self._bars.update(self._run_bar, completed=progress.proven, detail=detail)
             self._bars.update(
@@ -194,7 +194,7 @@ class RunObserver:
             self._printed_s = time.monotonic()
             self._console.print(
                 f"view {progress.view} ({progress.view_number + 1}/{progress.views}) {progress.light}: "
-                f"{progress.proven}/{progress.frames} frames proven, {rates}{dose}, {left}"
+                f"{progress.proven}/{progress.frames} frames proven, {rates}{dose}, {remaining_time}"
             )
 
     def note(self, message: str) -> None:
@@ -204,9 +204,9 @@ class RunObserver:
 def show_status(console: Console, status: Status) -> None:
     """Progress of a run; only what failed is red."""
     colour = {"done": "green", "failed": "red"}.get(status.state, "yellow")
-    stopped = ", but stopped" if status.stopped_pid else ""
+    note = ", but stopped" if status.stopped_pid else ""
     console.print(
-        f"[{colour}]{status.state}{stopped}[/]: {status.proven} of {status.shots} shots proven, "
+        f"[{colour}]{status.state}{note}[/]: {status.proven} of {status.shots} shots proven, "
         f"{status.darks_proven} dark frames, {status.reshot} re-shot; last event {status.last_event or 'none'}"
     )
     if status.stopped_pid:
@@ -219,8 +219,8 @@ def show_status(console: Console, status: Status) -> None:
         console.print(f"  {status.reason}", markup=False)
     console.print(f"  proof: {status.proof}")
     console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
-    for view, (proven, expected) in status.views.items():
-        console.print(f"  {view}: {proven} of {expected} frames")
+    for view, (proven, total) in status.views.items():
+        console.print(f"  {view}: {proven} of {total} frames")
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:
@@ -242,9 +242,13 @@ def show_dry_run(
         console.print(f"exposure: not known; {HOW_TO_KNOW}")
     else:
         table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
-        for view, seen in exposures.items():
+        for view, exposure in exposures.items():
             table.add_row(
-                view, str(seen.pictures), f"{seen.brightest:.0%}", f"{seen.saturated:.2%}", seen.verdict()
+                view,
+                str(exposure.pictures),
+                f"{exposure.brightest:.0%}",
+                f"{exposure.saturated:.2%}",
+                exposure.verdict(),
             )
         console.print(table)
         console.print(f"exposure judged by {found['exposure_scale']}", markup=False)
@@ -258,12 +262,12 @@ def show_dry_run(
 def show_advice(console: Console, advice: Advice) -> None:
     """Print the result of metering."""
     table = Table("view", "at least", "at most", "object", box=None)
-    for seen in advice.views:
+    for view in advice.views:
         table.add_row(
-            seen.view,
-            f"{seen.shortest_us:,.0f} us",
-            f"{seen.longest_us:,.0f} us",
-            f"{seen.object_share:.0%} of the pixels",
+            view.view,
+            f"{view.shortest_us:,.0f} us",
+            f"{view.longest_us:,.0f} us",
+            f"{view.object_share:.0%} of the pixels",
         )
     console.print(table)
     console.print(f"noise: {advice.noise.read_dn:.2f} DN read, {advice.noise.gain_dn:.4f} DN per electron")
@@ -296,18 +300,18 @@ class LiveFigures:
         if shown is None or shown.number == self._number:
             return
         self._number = shown.number
-        seen = shown.figures
-        best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), seen.sharpness)
-        saturated = ", ".join(f"{name} {share:.2%}" for name, share in seen.saturated.items())
-        told = f"sharpness {seen.sharpness / best:.0%} of the best" if best else "nothing but noise"
+        figures = shown.figures
+        best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), figures.sharpness)
+        saturation = ", ".join(f"{name} {share:.2%}" for name, share in figures.saturated.items())
+        detail = f"sharpness {figures.sharpness / best:.0%} of the best" if best else "nothing but noise"
         if shown.run:  # its frames are under different lights: their sharpness cannot be compared
-            told = f"{shown.run}, {shown.dose_lux_h:.3f} lux.h"
+            detail = f"{shown.run}, {shown.dose_lux_h:.3f} lux.h"
         line = (
-            f"{shown.title}, {shown.exposure_us} us: brightest {seen.brightest:.0%}; saturated {saturated}; "
-            f"{told}; {shown.frames_per_s:.1f} frames/s"
+            f"{shown.title}, {shown.exposure_us} us: brightest {figures.brightest:.0%}; saturated {saturation}; "
+            f"{detail}; {shown.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
-            self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in seen.histograms.items())]))
+            self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in figures.histograms.items())]))
         elif time.monotonic() - self._said_s > _PLAIN_LINE_EVERY_S:
             self._said_s = time.monotonic()
             self._console.print(line)

@@ -39,12 +39,12 @@ class Outlet:
         before."""
         self.fd, self.queue = fd, queue
         self.reader_fd = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
-        ours, theirs = os.pipe()
-        self._pipe = fcntl.fcntl(ours, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
+        read_fd, write_fd = os.pipe()
+        self._pipe = fcntl.fcntl(read_fd, fcntl.F_DUPFD_CLOEXEC, _FIRST_KEPT_FD)
         os.set_blocking(self._pipe, False)
-        os.dup2(theirs, fd)
-        os.close(ours)
-        os.close(theirs)
+        os.dup2(write_fd, fd)
+        os.close(read_fd)
+        os.close(write_fd)
         self._order = threading.RLock()
         threading.Thread(target=self._give, name=f"text {fd}", daemon=True).start()
         threading.Thread(target=self._listen, name=f"text into {fd}", daemon=True).start()
@@ -165,8 +165,8 @@ def full_stdout() -> str:
 def unread() -> Unread | None:
     """Return what of standard error was not taken so far; None if all was, or its reader is only a little late."""
     outlet = _installed.get("stderr")
-    found = outlet.queue.unread() if outlet else None
-    return found if found and (found.lost_bytes or found.stalled_s >= PATIENCE_S) else None
+    text = outlet.queue.unread() if outlet else None
+    return text if text and (text.lost_bytes or text.stalled_s >= PATIENCE_S) else None
 
 
 def terminal_size() -> os.terminal_size | None:

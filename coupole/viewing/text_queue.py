@@ -104,9 +104,9 @@ class TextQueue:
         self._untold_lines, self._untold_bytes = self._untold_lines + lines, self._untold_bytes + len(text)
 
     def _notice(self) -> bytes:
-        what = f"{self._untold_lines} lines of text ({self._untold_bytes} bytes)"
+        amount = f"{self._untold_lines} lines of text ({self._untold_bytes} bytes)"
         self._untold_lines = self._untold_bytes = 0
-        return f"\n[{what} were dropped: nobody read them]\n".encode()
+        return f"\n[{amount} were dropped: nobody read them]\n".encode()
 
     def _handed_out(self, text: bytes) -> bytes:
         self._taken_bytes += len(text)

@@ -44,13 +44,13 @@ class Lookout:
     def project(self, points_mm: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Pixels [..., 2] and nearness [...] of points [..., 3]: it is larger for nearer points, and linear in the
         picture. NaN for points behind the viewpoint."""
-        seen = apply(inverse(self.world_from_eye), points_mm)
-        depth_mm = seen[..., 2]
+        points_eye = apply(inverse(self.world_from_eye), points_mm)
+        depth_mm = points_eye[..., 2]
         middle = np.array((self.width_px, self.height_px)) / 2
         if not self.perspective:
-            return seen[..., :2] * self.scale + middle, -_NEARNESS_PER_MM * depth_mm
+            return points_eye[..., :2] * self.scale + middle, -_NEARNESS_PER_MM * depth_mm
         in_front = np.where(depth_mm > 1.0, depth_mm, np.nan)
-        return seen[..., :2] * (self.scale / in_front)[..., None] + middle, 1.0 / in_front
+        return points_eye[..., :2] * (self.scale / in_front)[..., None] + middle, 1.0 / in_front
 
 
 class Canvas:
@@ -81,11 +81,11 @@ class Canvas:
         layer = self._near.copy() if opacity == 1.0 else np.full_like(self._near, -np.inf)
         face = np.full(layer.shape, -1, np.int32)
         _rasterise(pixels, near, layer, face)
-        drawn = (face >= 0) & (layer >= self._near)
-        shaded = (colour * self._shade(corners_mm)[:, None])[face[drawn]]
+        is_front = (face >= 0) & (layer >= self._near)
+        pixel_colours = (colour * self._shade(corners_mm)[:, None])[face[is_front]]
         if outlined:
-            shaded[_edges(np.where(face >= 0, body[face], -1))[drawn]] *= _OUTLINE
-        self._colour[drawn] += opacity * (shaded - self._colour[drawn])
+            pixel_colours[_edges(np.where(face >= 0, body[face], -1))[is_front]] *= _OUTLINE
+        self._colour[is_front] += opacity * (pixel_colours - self._colour[is_front])
         if opacity == 1.0:
             self._near = layer
 
@@ -152,10 +152,10 @@ class Canvas:
         inside = ((places >= 0) & (places < (width, height))).all(axis=1)
         flat = places[inside, 1] * width + places[inside, 0]
         bias = _LINE_BIAS * nearness[inside] if self._lookout.perspective else _LINE_BIAS_MM * _NEARNESS_PER_MM
-        seen = nearness[inside] + bias >= self._near.ravel()[flat]
+        is_front = nearness[inside] + bias >= self._near.ravel()[flat]
         at, of = np.unique(flat, return_inverse=True)
         strength = np.full((len(at), 1), hidden, np.float32)
-        strength[of[seen]] = opacity
+        strength[of[is_front]] = opacity
         pixels = self._colour.reshape(-1, 3)
         pixels[at] += strength * (np.asarray(colour, np.float32) - pixels[at])
 
@@ -182,11 +182,11 @@ def _rasterise(pixels, near, nearest, face):  # type: ignore[no-untyped-def]
         twice = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if twice == 0.0 or np.isnan(twice) or np.isnan(near[k].sum()):
             continue
-        left, right = max(0, int(np.ceil(min(ax, bx, cx) - 0.5))), min(width - 1, int(max(ax, bx, cx) - 0.5))
+        left_px, right = max(0, int(np.ceil(min(ax, bx, cx) - 0.5))), min(width - 1, int(max(ax, bx, cx) - 0.5))
         top, bottom = max(0, int(np.ceil(min(ay, by, cy) - 0.5))), min(height - 1, int(max(ay, by, cy) - 0.5))
         for row in range(top, bottom + 1):
             y = row + 0.5
-            for column in range(left, right + 1):
+            for column in range(left_px, right + 1):
                 x = column + 0.5
                 wb = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / twice
                 wc = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / twice

@@ -68,13 +68,13 @@ _BUTTONS = [["toImage"], ["orbitRotation", "tableRotation", "pan3d", "zoom3d"], 
 def write_page(scene: Scene, path: Path) -> None:
     """Write the HTML page, plotly.js in it."""
     clear = sum(not stop.refusal for stop in scene.stops)
-    checked = "" if scene.paths_checked else " Paths were not checked for collisions."
+    remark = "" if scene.paths_checked else " Paths were not checked for collisions."
     why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
     figure, steps = _figure(scene)
     page = _PAGE.format(
         title=escape(scene.plan),
         red=css(colours.RED),
-        about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{checked} "
+        about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{remark} "
         "Drag to rotate, scroll to zoom, point at a part for its name; the slider (arrow keys) goes from view "
         "to view. LEDs are lighter the more they reach of what the camera sees.",
         refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
@@ -94,22 +94,24 @@ def _figure(scene: Scene) -> tuple[Any, list[dict[str, Any]]]:
     """The drawing, and for each step of the slider what is visible, its name and words in HTML."""
     import plotly.graph_objects as go
 
-    shown: list[tuple[int, Any]] = [(_ALWAYS, trace) for trace in _cell(scene)]
-    shown.append((_OVERVIEW, _leds(scene, scene.led_share, None)))
+    step_traces: list[tuple[int, Any]] = [(_ALWAYS, trace) for trace in _cell(scene)]
+    step_traces.append((_OVERVIEW, _leds(scene, scene.led_share, None)))
     few = len(scene.stops) <= _MANY
     for stop in scene.stops:
-        shown += [(_ALWAYS, trace) for trace in _ways(stop)]
+        step_traces += [(_ALWAYS, trace) for trace in _ways(stop)]
         for step in (_OVERVIEW, stop.number):
-            shown += [(step, trace) for trace in _camera(scene, stop)]
+            step_traces += [(step, trace) for trace in _camera(scene, stop)]
             if step == stop.number or few or stop.clash is not None:
-                shown += [(step, trace) for trace in _arm(scene, stop, opacity=0.3 if step == _OVERVIEW else 1.0)]
+                step_traces += [
+                    (step, trace) for trace in _arm(scene, stop, opacity=0.3 if step == _OVERVIEW else 1.0)
+                ]
         share = np.zeros(len(scene.leds_mm)) if stop.shadow is None else stop.shadow.share()
-        shown.append((stop.number, _leds(scene, share, stop)))
-    traces = [trace.update(visible=step in (_ALWAYS, _OVERVIEW)) for step, trace in shown]
+        step_traces.append((stop.number, _leds(scene, share, stop)))
+    traces = [trace.update(visible=step in (_ALWAYS, _OVERVIEW)) for step, trace in step_traces]
     titles = ["all views", *(_title(scene, stop) for stop in scene.stops)]
     names = ["all views", *(f"{stop.number} {stop.name}" for stop in scene.stops)]
     steps = [
-        {"name": name, "words": words, "visible": [step in (_ALWAYS, k) for step, _ in shown]}
+        {"name": name, "words": words, "visible": [step in (_ALWAYS, k) for step, _ in step_traces]}
         for k, (name, words) in enumerate(zip(names, titles, strict=True))
     ]
     axis = {"showbackground": False, "gridcolor": "#dddddd", "zeroline": False}
@@ -160,8 +162,8 @@ def _cell(scene: Scene) -> list[Any]:
     traces += [_mesh(volume, colours.KEEP_OUT, 0.1, f"keep-out {volume.name}") for volume in scene.keep_out]
     traces.append(_mesh(joined("arm at home", scene.arm(scene.home_deg, _ROUND)), colours.HOME, 0.25))
     if not scene.used.all():
-        unused = {"size": 2, "color": css(colours.UNUSED)}
-        traces.append(_points(scene.leds_mm[~scene.used], unused, "LED that the plan does not light"))
+        marker = {"size": 2, "color": css(colours.UNUSED)}
+        traces.append(_points(scene.leds_mm[~scene.used], marker, "LED that the plan does not light"))
     return traces
 
 
@@ -217,11 +219,11 @@ def _camera(scene: Scene, stop: Stop) -> list[Any]:
 def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
     """LEDs of the plan, coloured by the share that they reach; in a view with the causes of occlusion."""
     columns = [scene.led_ids, share]
-    told = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
+    hover = "LED %{customdata[0]:.0f}: reaches %{customdata[1]:.0%} of the visible surface"
     if stop is not None and stop.shadow is not None:
         columns += [stop.shadow.share(code) for code in (AWAY, BY_OBJECT, BY_ARM, BY_TOOL)]
-        told += "<br>turned away from %{customdata[2]:.0%}; hidden by the object %{customdata[3]:.0%}, "
-        told += "by the arm %{customdata[4]:.0%}, by the tool %{customdata[5]:.0%}"
+        hover += "<br>turned away from %{customdata[2]:.0%}; hidden by the object %{customdata[3]:.0%}, "
+        hover += "by the arm %{customdata[4]:.0%}, by the tool %{customdata[5]:.0%}"
     marker = {
         "size": 3.5,
         "color": share[scene.used].astype(np.float32),
@@ -232,7 +234,7 @@ def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
         "colorbar": {"title": {"text": "reached"}, "tickformat": ".0%", "len": 0.5, "thickness": 12},
     }
     told_of = np.stack(columns, axis=1)[scene.used].astype(np.float32)
-    trace = _points(scene.leds_mm[scene.used], marker, told)
+    trace = _points(scene.leds_mm[scene.used], marker, hover)
     return trace.update(customdata=told_of)
 
 

@@ -40,12 +40,12 @@ def write_picture(scene: Scene, path: Path) -> None:
     strip_top = HEIGHT_PX - _STRIP
     height, right = strip_top - _HEADER - _MARGIN, WIDTH_PX - _LEFT - 3 * _MARGIN
     half, beside = (height - _MARGIN) // 2, _LEFT + 2 * _MARGIN
-    for title, lookout, left, top in (
+    for title, lookout, x, top in (
         ("the cell", _cell_lookout(scene, _LEFT, height), _MARGIN, _HEADER),
         ("from above", _flat_lookout(scene, right, half, above=True), beside, _HEADER),
         ("from the side", _flat_lookout(scene, right, half, above=False), beside, _HEADER + half + _MARGIN),
     ):
-        _paste(sheet, pen, _cell_from(scene, lookout), (left, top), title)
+        _paste(sheet, pen, _cell_from(scene, lookout), (x, top), title)
     _legend(pen, (_MARGIN + 14, _HEADER + height - 14))
     pictures = _chosen([stop for stop in scene.stops if stop.sight is not None])
     for k, stop in enumerate(pictures):
@@ -97,8 +97,8 @@ def _cell_from(scene: Scene, lookout: Lookout) -> Any:
     canvas.fill(arms, [colours.ARM] * len(arms), opacity=_GHOST)
     canvas.fill(tools, [colours.TOOL] * len(tools), opacity=_GHOST_TOOL)
     for volume in scene.keep_out:
-        touched = any(stop.clash and f"keep-out `{volume.name}`" in stop.clash.bodies for stop in scene.stops)
-        canvas.fill([volume], [colours.RED if touched else colours.KEEP_OUT], opacity=0.08)
+        is_touched = any(stop.clash and f"keep-out `{volume.name}`" in stop.clash.bodies for stop in scene.stops)
+        canvas.fill([volume], [colours.RED if is_touched else colours.KEEP_OUT], opacity=0.08)
     for stop in scene.stops:
         canvas.line(stop.flange_way_mm, colours.FLANGE_WAY, 1.0)
         canvas.line(stop.camera_way_mm, colours.RED if stop.refusal else colours.CAMERA_WAY, 2.0, hidden=0.3)
@@ -185,11 +185,11 @@ def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left: in
 
 def _chosen(stops: list[Stop]) -> list[Stop]:
     """Refused views first, then others at even intervals, in the order of visiting."""
-    refused = [stop for stop in stops if stop.refusal][:_CAMERAS]
-    others = [stop for stop in stops if not stop.refusal]
-    room = min(len(others), _CAMERAS - len(refused))
-    evenly = np.linspace(0, len(others) - 1, room).round().astype(int)
-    return sorted([*refused, *(others[k] for k in evenly)], key=lambda stop: stop.number)
+    refusals = [stop for stop in stops if stop.refusal][:_CAMERAS]
+    clear = [stop for stop in stops if not stop.refusal]
+    room = min(len(clear), _CAMERAS - len(refusals))
+    evenly = np.linspace(0, len(clear) - 1, room).round().astype(int)
+    return sorted([*refusals, *(clear[k] for k in evenly)], key=lambda stop: stop.number)
 
 
 def _seen_by(scene: Scene, stop: Stop, width: int, height: int) -> Any:
@@ -283,10 +283,10 @@ def _legend(pen: Any, bottom_left: tuple[int, int]) -> None:
 def _paste(
     sheet: Any, pen: Any, image: Any, at: tuple[int, int], title: str, colour: str = "rgb(190,194,200)"
 ) -> None:
-    left, top = at
+    x, top = at
     sheet.paste(image, at)
-    pen.rectangle((left - 1, top - 1, left + image.width, top + image.height), None, colour)
-    pen.text((left + 10, top + 10), title, colours.css(colours.INK), _font(16), anchor="lt")
+    pen.rectangle((x - 1, top - 1, x + image.width, top + image.height), None, colour)
+    pen.text((x + 10, top + 10), title, colours.css(colours.INK), _font(16), anchor="lt")
 
 
 def _font(size: int) -> Any:

@@ -118,10 +118,10 @@ class Scene:
         """Text on the plan's LEDs in a view, one string per line."""
         if stop.shadow is None or not self.used.any():
             return []
-        reached, occluded = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
+        share, dark_leds = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
         return [
-            f"an LED reaches {reached:.0%} of the visible surface",
-            f"{occluded} of {self.used.sum()} LEDs reach nothing of it",
+            f"an LED reaches {share:.0%} of the visible surface",
+            f"{dark_leds} of {self.used.sum()} LEDs reach nothing of it",
         ]
 
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
@@ -141,10 +141,10 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
     """The scene of a job; without `bodies` collisions are not checked."""
     rig, views = job.cell.rig, job.schedule.views
     shadows, corners_mm = job.motion.occlusions, job.shape.corners_mm
-    refused = [index for index in range(len(views)) if index not in itinerary.order]
+    refused_indices = [index for index in range(len(views)) if index not in itinerary.order]
     home_deg = place_deg = np.array(rig.motion.home_joints_deg)
     stops = []
-    for number, index in enumerate([*itinerary.order, *refused], start=1):
+    for number, index in enumerate([*itinerary.order, *refused_indices], start=1):
         view, visit = views[index], itinerary.visits[index]
         if visit is not None:
             stops.append(_visited(number, view, place_deg, visit, rig, shadows))
@@ -152,8 +152,8 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         else:
             why = _refusal(view, itinerary.refusals)
             stops.append(_refused(number, view, why, (place_deg, home_deg), rig, bodies, shadows))
-    used = np.zeros(len(job.cell.leds.ids), np.bool_)
-    used[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
+    is_lit = np.zeros(len(job.cell.leds.ids), np.bool_)
+    is_lit[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
     return Scene(
         job.plan.name,
         rig,
@@ -164,7 +164,7 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
         tuple(map(_keep_out_solid, rig.keep_out)),
         shadows.leds_mm,
         job.cell.leds.ids,
-        used,
+        is_lit,
         bodies is not None,
         capsules_of(shadows.arm),
     )

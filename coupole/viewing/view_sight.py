@@ -42,13 +42,13 @@ def footprint(sight: Sight, mesh: Any, support_radius_mm: float) -> Points:
     with np.errstate(divide="ignore"):
         reach = np.where(rays[:, 2] < 0, -eye_mm[2] / rays[:, 2], np.inf)
     if mesh is not None:
-        met = mesh.run(
+        distances_mm = mesh.run(
             np.tile(eye_mm, (len(rays), 1)).astype(np.float32),
             rays.astype(np.float32),
             dists=np.full(len(rays), _FAR_MM, np.float32),
             query="DISTANCE",
         )
-        reach = np.where(met < _FAR_MM, np.minimum(met, reach), reach)
+        reach = np.where(distances_mm < _FAR_MM, np.minimum(distances_mm, reach), reach)
     hit = np.isfinite(reach) & (reach > 0)
     points = eye_mm + reach[hit, None] * rays[hit]
     points = points[np.linalg.norm(points[:, :2], axis=1) <= support_radius_mm]

@@ -75,10 +75,10 @@ def found_response(photographs: Photographs) -> Response:
     curves, uncertain, noise = [], [], []
     for channel in range(3):
         samples = _samples(photographs.values[..., channel])
-        curve, sigma, left = _solved(samples, np.log(photographs.exposure_s))
+        curve, sigma, value_noise = _solved(samples, np.log(photographs.exposure_s))
         curves.append(curve)
         uncertain.append(sigma)
-        noise.append(left)
+        noise.append(value_noise)
     return Response(np.stack(curves, axis=1), np.stack(uncertain, axis=1), np.array(noise))
 
 
@@ -112,9 +112,9 @@ def _samples(values: NDArray[np.float32]) -> Array:
             f"{np.count_nonzero(useful)}; take photographs in steps of 2 times the exposure"
         )
     flat = useful & (steep <= np.quantile(steep[useful], 0.6))
-    seen = values[:, flat].T.astype(float)
-    order = np.argsort(seen.mean(axis=1), kind="stable")
-    return np.asarray(seen[order[np.linspace(0, len(order) - 1, min(_PIXELS, len(order))).astype(int)]])
+    pixels = values[:, flat].T.astype(float)
+    order = np.argsort(pixels.mean(axis=1), kind="stable")
+    return np.asarray(pixels[order[np.linspace(0, len(order) - 1, min(_PIXELS, len(order))).astype(int)]])
 
 
 def _solved(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
@@ -127,9 +127,9 @@ def _solved(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
         weights = hat(samples) / (1.0 + (off / (_OUTLIER * noise * slope)) ** 2) ** 2
     free = max(1, int((weights > 0.0).sum()) - len(samples) - NODES // 8)
     uncertain = np.sqrt(np.maximum(np.diag(inverse) * float((weights * off**2).sum() / free), 0.0))
-    met = np.flatnonzero(np.histogram(samples[weights > 0.0], bins=NODES, range=(0.0, 1.0))[0])
-    uncertain[: met.min()] = np.inf
-    uncertain[met.max() + 1 :] = np.inf
+    bins = np.flatnonzero(np.histogram(samples[weights > 0.0], bins=NODES, range=(0.0, 1.0))[0])
+    uncertain[: bins.min()] = np.inf
+    uncertain[bins.max() + 1 :] = np.inf
     return g, uncertain, noise
 
 
@@ -145,11 +145,11 @@ def _fitted(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]
 
 def _left_over(samples: Array, weights: Array, g: Array, log_t: Array) -> tuple[Array, float]:
     """Each sample less its pixel's mean, in ln of exposure; and the noise of values that this means."""
-    spread = _at(g, samples) - log_t
-    mean = (weights * spread).sum(axis=1, keepdims=True) / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
+    logs = _at(g, samples) - log_t
+    mean = (weights * logs).sum(axis=1, keepdims=True) / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
     slope = np.maximum(_at(np.gradient(g, 1.0 / (NODES - 1)), samples), 1e-3)
-    typical = np.median(np.abs((spread - mean) / slope)[weights > 0.2])
-    return spread - mean, float(1.4826 * typical * np.sqrt(samples.shape[1] / (samples.shape[1] - 1.0)))
+    typical = np.median(np.abs((logs - mean) / slope)[weights > 0.2])
+    return logs - mean, float(1.4826 * typical * np.sqrt(samples.shape[1] / (samples.shape[1] - 1.0)))
 
 
 def _normal_equations(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:

@@ -38,22 +38,22 @@ class Merged:
 def merged(photographs: Photographs, response: Response) -> Merged:
     shape = photographs.values.shape[1:]
     radiance, uncertain = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    saturated, dark = np.empty(shape, bool), np.empty(shape, bool)
+    is_saturated, dark = np.empty(shape, bool), np.empty(shape, bool)
     contradicting = np.zeros(photographs.values.shape[:3], bool)
     for channel in range(3):
         values = photographs.values[..., channel]
         usable = (values > DARK) & (values < SATURATED)
-        found = response.exposure(values, channel) / photographs.exposure_s[:, None, None]
-        off = _contradicting(found, values, usable, response, channel)
+        radiances = response.exposure(values, channel) / photographs.exposure_s[:, None, None]
+        off = _contradicting(radiances, values, usable, response, channel)
         contradicting |= off
-        mean, sigma = _mean(found, usable & ~off, photographs.exposure_s, response, channel)
-        saturated[..., channel] = ~usable.any(axis=0) & (values[0] >= SATURATED)
-        dark[..., channel] = ~usable.any(axis=0) & ~saturated[..., channel]
-        bound = np.where(saturated[..., channel], found[0], found[-1])
-        known = usable.any(axis=0)
-        radiance[..., channel] = np.where(known, mean, bound)
-        uncertain[..., channel] = np.where(known, sigma, np.inf)
-    return Merged(radiance, uncertain, saturated, dark, contradicting)
+        mean, sigma = _mean(radiances, usable & ~off, photographs.exposure_s, response, channel)
+        is_saturated[..., channel] = ~usable.any(axis=0) & (values[0] >= SATURATED)
+        dark[..., channel] = ~usable.any(axis=0) & ~is_saturated[..., channel]
+        bound = np.where(is_saturated[..., channel], radiances[0], radiances[-1])
+        is_usable = usable.any(axis=0)
+        radiance[..., channel] = np.where(is_usable, mean, bound)
+        uncertain[..., channel] = np.where(is_usable, sigma, np.inf)
+    return Merged(radiance, uncertain, is_saturated, dark, contradicting)
 
 
 def _mean(
@@ -69,13 +69,15 @@ def _mean(
     mean = np.where(usable, found, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     for _ in range(_ROUNDS):
         total, sums, curve = np.zeros_like(mean), np.zeros_like(mean), np.zeros_like(mean)
-        for one, taken, time in zip(found, usable, exposure_s, strict=True):
-            expected = response.value(mean * time, channel)
-            sigma = response.slope(expected, channel) * noise  # relative
-            weight = np.where(taken, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
-            total, sums = total + weight, sums + weight * one
-            known = np.where(np.isfinite(response.uncertainty[:, channel]), response.uncertainty[:, channel], 0.0)
-            curve += weight * np.interp(expected, np.linspace(0.0, 1.0, len(known)), known)
+        for radiance, is_usable, time in zip(found, usable, exposure_s, strict=True):
+            model = response.value(mean * time, channel)
+            sigma = response.slope(model, channel) * noise  # relative
+            weight = np.where(is_usable, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
+            total, sums = total + weight, sums + weight * radiance
+            u_curve = np.where(
+                np.isfinite(response.uncertainty[:, channel]), response.uncertainty[:, channel], 0.0
+            )
+            curve += weight * np.interp(model, np.linspace(0.0, 1.0, len(u_curve)), u_curve)
         mean = sums / np.maximum(total, 1e-300)
     relative = 1.0 / (np.sqrt(np.maximum(total, 1e-300)) * np.maximum(mean, 1e-30))
     return mean, np.hypot(relative, curve / np.maximum(total, 1e-300))
@@ -105,7 +107,7 @@ def _contradicting(
 
 def _median(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the median over photographs, without NaN."""
-    ordered = np.sort(logs, axis=0)  # NaN last
+    ascending = np.sort(logs, axis=0)  # NaN last
     last = np.maximum(np.isfinite(logs).sum(axis=0) - 1, 0)
-    low, high = (np.take_along_axis(ordered, index[None], axis=0)[0] for index in (last // 2, (last + 1) // 2))
+    low, high = (np.take_along_axis(ascending, index[None], axis=0)[0] for index in (last // 2, (last + 1) // 2))
     return np.asarray(0.5 * (low + high))

@@ -61,10 +61,10 @@ def draw_response(path: Path, response: Response, title: str) -> None:
     z = np.linspace(0.0, 1.0, NODES)
     for number, (name, colour) in enumerate(zip(("red", "green", "blue"), _COLOURS, strict=True)):
         curve, sigma = response.log_exposure[:, number], response.uncertainty[:, number]
-        known = np.isfinite(sigma) & (z > 0.0)
-        axes.plot(z[known], np.exp(curve[known]), color=colour, label=name)
-        bounds = [np.exp(curve[known] + sign * 1.96 * sigma[known]) for sign in (-1, 1)]
-        axes.fill_between(z[known], *bounds, color=colour, alpha=0.2, linewidth=0)
+        is_finite = np.isfinite(sigma) & (z > 0.0)
+        axes.plot(z[is_finite], np.exp(curve[is_finite]), color=colour, label=name)
+        bounds = [np.exp(curve[is_finite] + sign * 1.96 * sigma[is_finite]) for sign in (-1, 1)]
+        axes.fill_between(z[is_finite], *bounds, color=colour, alpha=0.2, linewidth=0)
     axes.set(xlabel="value, over the largest", ylabel="exposure, 1 at half of it", yscale="log", title=title)
     axes.grid(alpha=0.3)
     axes.legend()

@@ -40,21 +40,21 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         raise InputError(
             f"--exposure-s: expected a time for each of {len(paths)} photographs, found {len(exposure_s)}"
         )
-    read = [_read(path) for path in paths]
-    told = [_exif(path) for path in paths] if exposure_s is None else [{_TIME: time} for time in exposure_s]
-    for number, what in ((_APERTURE, "apertures"), (_ISO, "ISO numbers")):
-        found = {one.get(number) for one in told}
-        if len(found) > 1:
-            raise InputError(f"bracket: expected photographs that differ in time alone; found {what} {found}")
-    if untold := [str(path) for path, one in zip(paths, told, strict=True) if not one.get(_TIME)]:
+    pictures = [_read(path) for path in paths]
+    exif_tags = [_exif(path) for path in paths] if exposure_s is None else [{_TIME: time} for time in exposure_s]
+    for number, label in ((_APERTURE, "apertures"), (_ISO, "ISO numbers")):
+        settings = {tags.get(number) for tags in exif_tags}
+        if len(settings) > 1:
+            raise InputError(f"bracket: expected photographs that differ in time alone; found {label} {settings}")
+    if untold := [str(path) for path, tags in zip(paths, exif_tags, strict=True) if not tags.get(_TIME)]:
         raise InputError(f"{untold[0]}: has no exposure time in its EXIF; give all of them with --exposure-s")
     shapes = {
         (values.shape, levels, path.suffix.lower() in _PLAIN)
-        for path, (values, levels) in zip(paths, read, strict=True)
+        for path, (values, levels) in zip(paths, pictures, strict=True)
     }
     if len(shapes) > 1:
         raise InputError(f"bracket: expected photographs of one size and kind; found {sorted(map(str, shapes))}")
-    times = np.array([float(one[_TIME]) for one in told])
+    times = np.array([float(tags[_TIME]) for tags in exif_tags])
     order = np.argsort(times, kind="stable")
     times = times[order]
     if np.any(times <= 0.0) or times[-1] / times[0] < _LEAST_RATIO:
@@ -63,9 +63,9 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         )
     return Photographs(
         tuple(paths[k] for k in order),
-        np.stack([read[k][0] for k in order]),
+        np.stack([pictures[k][0] for k in order]),
         times,
-        read[0][1],
+        pictures[0][1],
         raw=paths[0].suffix.lower() not in _PLAIN,
     )
 
@@ -77,14 +77,14 @@ def _read(path: Path) -> tuple[NDArray[np.float32], int]:
     import cv2
 
     try:
-        encoded = np.frombuffer(path.read_bytes(), np.uint8)
+        content = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    found = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if encoded.size else None
-    if found is None or found.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
+    picture = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if content.size else None
+    if picture is None or picture.dtype not in {np.dtype(np.uint8), np.dtype(np.uint16)}:
         raise InputError(f"{path}: expected a photograph of 8 or 16 bits (JPEG, PNG, TIFF), or a raw file")
-    most = 255 if found.dtype == np.uint8 else 65535
-    return (found[..., ::-1] / np.float32(most)).astype(np.float32), most + 1
+    most = 255 if picture.dtype == np.uint8 else 65535
+    return (picture[..., ::-1] / np.float32(most)).astype(np.float32), most + 1
 
 
 def _raw(path: Path) -> NDArray[np.float32]:
@@ -93,7 +93,7 @@ def _raw(path: Path) -> NDArray[np.float32]:
 
     try:
         with rawpy.imread(str(path)) as raw:
-            made: Any = raw.postprocess(
+            picture: Any = raw.postprocess(
                 half_size=True,
                 gamma=(1.0, 1.0),
                 no_auto_bright=True,
@@ -105,7 +105,7 @@ def _raw(path: Path) -> NDArray[np.float32]:
             )
     except (rawpy.LibRawError, OSError) as error:
         raise InputError(f"{path}: expected JPEG, PNG, TIFF, or a raw file that LibRaw reads; {error}") from error
-    return np.asarray(made, np.float32) / np.float32(65535.0)
+    return np.asarray(picture, np.float32) / np.float32(65535.0)
 
 
 def _exif(path: Path) -> dict[int, float]:
@@ -113,13 +113,13 @@ def _exif(path: Path) -> dict[int, float]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as opened:
-            tags = opened.getexif()
+        with Image.open(path) as image:
+            tags = image.getexif()
     except (OSError, UnidentifiedImageError):
         return _exif_of_raw(path)
     inner = tags.get_ifd(_EXIF)
-    found = {number: inner.get(number, tags.get(number)) for number in (_TIME, _APERTURE, _ISO)}
-    return {number: float(value) for number, value in found.items() if value is not None}
+    values = {number: inner.get(number, tags.get(number)) for number in (_TIME, _APERTURE, _ISO)}
+    return {number: float(value) for number, value in values.items() if value is not None}
 
 
 def _exif_of_raw(path: Path) -> dict[int, float]:
@@ -127,8 +127,8 @@ def _exif_of_raw(path: Path) -> dict[int, float]:
     import tifffile
 
     try:
-        with tifffile.TiffFile(path) as opened:
-            inner = opened.pages[0].tags[_EXIF].value  # type: ignore[union-attr]
+        with tifffile.TiffFile(path) as file:
+            inner = file.pages[0].tags[_EXIF].value  # type: ignore[union-attr]
     except (OSError, KeyError, ValueError, tifffile.TiffFileError):
         return {}
     names = {_TIME: "ExposureTime", _APERTURE: "FNumber", _ISO: "ISOSpeedRatings"}

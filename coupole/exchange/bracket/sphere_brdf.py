@@ -96,7 +96,7 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
         good &= np.isfinite(f).all(axis=1) & (f > 0.0).all(axis=1)
         frames = _frames(normals[good])
         parts.append((frames @ to_light, frames @ np.array([0.0, 0.0, 1.0]), f[good]))
-    ways_in, ways_out, f = (np.concatenate(one) for one in zip(*parts, strict=True))
+    ways_in, ways_out, f = (np.concatenate(part) for part in zip(*parts, strict=True))
     if len(f) < _FEWEST:
         raise InputError(
             f"sphere: expected at least {_FEWEST} lit pixels, neither dark nor saturated; found {len(f)}"
@@ -109,13 +109,13 @@ def table_of(samples: Samples) -> SpecularTable:
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
 
-    chosen = np.random.default_rng(1).permutation(len(samples.f))[: _MOST_SAMPLES // 2]
-    one, other = samples.ways_in[chosen], samples.ways_out[chosen]
+    picks = np.random.default_rng(1).permutation(len(samples.f))[: _MOST_SAMPLES // 2]
+    ways_in, ways_out = samples.ways_in[picks], samples.ways_out[picks]
     incidence = np.radians(_INCIDENCE_DEG)
     theta = (0.5 * np.pi + incidence[-1]) * np.linspace(0.0, 1.0, _THETAS) ** 2
     phi = np.linspace(0.0, np.pi, _PHIS)
-    both = zip(specular_coordinates(one, other), specular_coordinates(other, one), strict=True)
-    at = [np.concatenate(pair) for pair in both]
+    pairs = zip(specular_coordinates(ways_in, ways_out), specular_coordinates(ways_out, ways_in), strict=True)
+    at = [np.concatenate(pair) for pair in pairs]
     places = [_between(nodes, where) for nodes, where in zip((incidence, theta, phi), at, strict=True)]
     shape = (len(incidence), _THETAS, _PHIS)
     rows, columns, weights = [], [], []
@@ -127,7 +127,7 @@ def table_of(samples: Samples) -> SpecularTable:
         weights.append(np.prod(shares, axis=0))
     entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
     design = coo_matrix(entries, (len(at[0]), int(np.prod(shape)))).tocsr()
-    logs = np.tile(np.log(samples.f[chosen]), (2, 1))
+    logs = np.tile(np.log(samples.f[picks]), (2, 1))
     normal = (design.T @ design + _SMOOTH * len(logs) / np.prod(shape) * _roughness(shape)).tocsc()
     values = np.stack([spsolve(normal, design.T @ logs[:, band]) for band in range(3)], axis=1)
     cosines = np.linalg.inv(np.cos(np.outer(phi, np.arange(_PHIS))))
@@ -139,8 +139,10 @@ def evaluated(table: SpecularTable) -> Callable[[Array, Array], Array]:
 
     def reflectance(ways_in: Array, ways_out: Array) -> Array:
         parts = range(0, len(ways_in), _AT_ONCE)
-        found = [tabulated(ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE], table=table) for at in parts]
-        return np.concatenate(found)
+        blocks = [
+            tabulated(ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE], table=table) for at in parts
+        ]
+        return np.concatenate(blocks)
 
     return reflectance
 

@@ -32,11 +32,11 @@ def coarse_mesh(
     """Make a coarse mesh from places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most
     `most` triangles."""
     cells = 4.0
-    found = _clustered(places, triangles, cells)
-    while len(found.triangles) <= most and cells < 1 << 16:
-        kept, cells = found, cells * _FINER
-        found = _clustered(places, triangles, cells)
-    return kept if len(found.triangles) > most else found
+    trial = _clustered(places, triangles, cells)
+    while len(trial.triangles) <= most and cells < 1 << 16:
+        last_fit, cells = trial, cells * _FINER
+        trial = _clustered(places, triangles, cells)
+    return last_fit if len(trial.triangles) > most else trial
 
 
 def _clustered(places: NDArray[np.uint16], triangles: NDArray[np.uint32], cells: float) -> CoarseMesh:

@@ -54,8 +54,8 @@ class LightPlanes:
         system[:count, :count] = apart**2 * np.log(np.maximum(apart, 1e-300))
         system[:count, count:], system[count:, :count] = tail, tail.T
         right = np.vstack([values.reshape(count, -1), np.zeros((4, values[0].size))])
-        found = np.linalg.lstsq(system, right, rcond=1e-12)[0]
-        bases: NDArray[np.float32] = found.reshape(count + 4, *values.shape[1:]).astype(np.float32)
+        solution = np.linalg.lstsq(system, right, rcond=1e-12)[0]
+        bases: NDArray[np.float32] = solution.reshape(count + 4, *values.shape[1:]).astype(np.float32)
         return bases
 
 
@@ -84,13 +84,13 @@ def light_planes(
         say("frames", number + 1, count)
     means = roots.mean(axis=0)
     apart = (roots - means).reshape(len(roots), -1)
-    found = _components(apart, min(planes, len(apart), apart.shape[1]))
-    of_leds = found.reshape(len(found), count, 3)
+    components = _components(apart, min(planes, len(apart), apart.shape[1]))
+    of_leds = components.reshape(len(components), count, 3)
     pictures = np.zeros((0, 0, 0), np.float32)
     for number in range(count):
         off = np.sqrt(np.maximum(frame(number), 0.0)) - means[number].astype(np.float32)
         if not pictures.size:
-            pictures = np.zeros((len(found), *off.shape[:2]), np.float32)
+            pictures = np.zeros((len(components), *off.shape[:2]), np.float32)
         turn = of_leds[:, number].astype(np.float32)
         for first in range(0, len(off), _BAND_ROWS):
             band = off[first : first + _BAND_ROWS]
@@ -105,19 +105,19 @@ def _components(apart: Floats, count: int) -> Floats:
     powers, of_rows = eigh(apart @ apart.T, subset_by_index=(low, len(apart) - 1))
     firm = powers > max(powers.max(), 0.0) * 1e-12
     rows = (of_rows[:, firm].T @ apart)[::-1]
-    found: Floats = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    return found
+    components: Floats = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    return components
 
 
 def _missed_between(roots: Floats, ways: Floats, planes: int) -> tuple[float, float]:
     out = np.arange(len(ways)) % _APART == _APART // 2
     if out.sum() < 1 or (~out).sum() < 6:
         return math.nan, math.nan
-    kept = roots[:, ~out]
-    means = kept.mean(axis=0)
-    apart = (kept - means).reshape(len(kept), -1)
-    found = _components(apart, min(planes, len(apart), apart.shape[1]))
-    short = (apart @ found.T @ found).reshape(kept.shape) + means
+    training = roots[:, ~out]
+    means = training.mean(axis=0)
+    apart = (training - means).reshape(len(training), -1)
+    components = _components(apart, min(planes, len(apart), apart.shape[1]))
+    short = (apart @ components.T @ components).reshape(training.shape) + means
     between = np.einsum("wl,plc->pwc", weights(ways[~out], ways[out], KERNEL), short)
     return missed(np.maximum(between, 0.0) ** 2, roots[:, out] ** 2)
 

@@ -69,35 +69,35 @@ def block_of(name: str, values: NDArray[Any]) -> Block:
         raise ValueError(f"{name}: a page reads {', '.join(TYPES)}, not {values.dtype.name}")
     small = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("<")))
     rows = small.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize).T
-    packed = zlib.compress(np.ascontiguousarray(rows).tobytes(), 6)
-    return Block(name, base64.b64encode(packed).decode("ascii"), values.dtype.name, values.shape)
+    content = zlib.compress(np.ascontiguousarray(rows).tobytes(), 6)
+    return Block(name, base64.b64encode(content).decode("ascii"), values.dtype.name, values.shape)
 
 
 def jpeg_of(name: str, picture: NDArray[np.uint8], quality: int) -> Block:
     """A picture [h, w] or [h, w, 3] (red first), as JPEG without coarser colours; its numbers change a little."""
-    shown = picture if picture.ndim == 2 else picture[..., ::-1]
+    pixels = picture if picture.ndim == 2 else picture[..., ::-1]
     options = (cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, _SAME_SIZE)
-    packed = cv2.imencode(".jpg", shown, options)[1].tobytes()
-    return Block(name, base64.b64encode(packed).decode("ascii"), "jpeg", picture.shape)
+    content = cv2.imencode(".jpg", pixels, options)[1].tobytes()
+    return Block(name, base64.b64encode(content).decode("ascii"), "jpeg", picture.shape)
 
 
 def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Values from 1e-4 to 10 in steps of 4.6 %, so at most 2.3 % off: 1 to 255; 0 where there is none. What is
     outside is put to the nearer end."""
-    known = np.isfinite(values)
-    inside = np.clip(np.where(known, values, LOG_LEAST), LOG_LEAST, LOG_LEAST * LOG_RATIO)
+    is_finite = np.isfinite(values)
+    inside = np.clip(np.where(is_finite, values, LOG_LEAST), LOG_LEAST, LOG_LEAST * LOG_RATIO)
     codes = 1.0 + np.rint(np.log(inside / LOG_LEAST) / np.log(LOG_RATIO) * LOG_STEPS)
-    return np.where(known, codes, 0.0).astype(np.uint8)
+    return np.where(is_finite, codes, 0.0).astype(np.uint8)
 
 
 def octahedral(normals: NDArray[np.float64]) -> NDArray[np.uint16]:
     """[n, 2] of unit vectors [n, 3]: the octahedron's faces unfolded into a square (Meyer et al., On
     floating-point normal vectors, 2010); at most 0.004 degrees off. Vectors that are not finite become z."""
-    known = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, [0.0, 0.0, 1.0])
-    known = known / np.abs(known).sum(axis=1, keepdims=True)
-    flat = known[:, :2]
+    unit = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, [0.0, 0.0, 1.0])
+    unit = unit / np.abs(unit).sum(axis=1, keepdims=True)
+    flat = unit[:, :2]
     sign = np.where(flat >= 0.0, 1.0, -1.0)
-    flat = np.where(known[:, 2:] < 0.0, (1.0 - np.abs(flat[:, ::-1])) * sign, flat)
+    flat = np.where(unit[:, 2:] < 0.0, (1.0 - np.abs(flat[:, ::-1])) * sign, flat)
     codes: NDArray[np.uint16] = np.rint((flat * 0.5 + 0.5) * 65535.0).astype(np.uint16)
     return codes
 

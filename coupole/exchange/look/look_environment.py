@@ -24,5 +24,5 @@ def with_environment(look: Look, path: Path | None, axes: NDArray[np.float64]) -
     order = np.argsort(np.arange(SAMPLES) * 0.6180339887498949 % 1.0)  # so that the first few stand for all
     irradiances = SAMPLES * radiances / density[:, None]
     about = {"name": path.name, "ways": ways[order].tolist(), "irradiances": irradiances[order].tolist()}
-    told = look.about["told"] | {"Surroundings": f"{path.name}, {SAMPLES} directions of it"}
-    return replace(look, about=look.about | {"environment": about, "told": told})
+    facts = look.about["told"] | {"Surroundings": f"{path.name}, {SAMPLES} directions of it"}
+    return replace(look, about=look.about | {"environment": about, "told": facts})

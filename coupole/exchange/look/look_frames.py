@@ -90,30 +90,30 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
     design = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
     scale = np.abs(design).max(axis=0)
     height, width = surface.seen.shape
-    wanted = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=1)
-    found = np.linalg.lstsq(design / scale, wanted, rcond=None)[0]
-    return axes, found / scale[:, None]
+    shares = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=1)
+    coefficients = np.linalg.lstsq(design / scale, shares, rcond=None)[0]
+    return axes, coefficients / scale[:, None]
 
 
 def averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
     """Means of step x step pixels that have a value in all channels; NaN where none has. The last row and column
     are of what is left over."""
     height, width = share.shape[:2]
-    known = np.isfinite(share).all(axis=2, keepdims=True)
+    is_finite = np.isfinite(share).all(axis=2, keepdims=True)
     sums, counts = (
         np.add.reduceat(
             np.add.reduceat(values, range(0, height, step), axis=0, dtype=np.float64),
             range(0, width, step),
             axis=1,
         )
-        for values in (np.where(known, share, 0.0), known)
+        for values in (np.where(is_finite, share, 0.0), is_finite)
     )
     return np.where(counts > 0, sums / np.maximum(counts, 1.0), np.nan)
 
 
 def _coded(small: Floats) -> tuple[NDArray[np.uint8], float]:
     """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
-    known = np.asarray(np.isfinite(small).all(axis=2))
-    peak = max(float(np.quantile(small[known], _WHITE_QUANTILE)) if known.any() else 1.0, 1e-9)
-    shown = srgb(np.where(known[..., None], small, 0.0) / peak)
-    return np.where(known[..., None], 1.0 + np.rint(254.0 * shown), 0.0).astype(np.uint8), peak
+    is_finite = np.asarray(np.isfinite(small).all(axis=2))
+    peak = max(float(np.quantile(small[is_finite], _WHITE_QUANTILE)) if is_finite.any() else 1.0, 1e-9)
+    encoding = srgb(np.where(is_finite[..., None], small, 0.0) / peak)
+    return np.where(is_finite[..., None], 1.0 + np.rint(254.0 * encoding), 0.0).astype(np.uint8), peak

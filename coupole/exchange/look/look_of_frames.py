@@ -53,11 +53,11 @@ class Frames:
         frame, run = self.chosen[led], self.of_run
         steps = 65535.0 / (run.white_dn - run.black_dn)
         linear = np.clip((frame.read() - self.dark(frame)) * np.float32(steps), 0, 65535)
-        counted = np.rint(linear).astype(np.uint16)
+        codes = np.rint(linear).astype(np.uint16)
         if run.pattern == "MONO":
-            colours = np.repeat(counted[..., None], 3, axis=2)
+            colours = np.repeat(codes[..., None], 3, axis=2)
         else:
-            colours = cv2.demosaicing(counted, getattr(cv2, f"COLOR_Bayer{run.pattern}2RGB"))
+            colours = cv2.demosaicing(codes, getattr(cv2, f"COLOR_Bayer{run.pattern}2RGB"))
         return colours.astype(np.float32) * np.float32(self.shortest_us / frame.exposure_us / 65535.0)
 
 
@@ -70,8 +70,10 @@ def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
     run = Run(folder)
     frames = open_light_frames([folder])
     names = list(dict.fromkeys(frame.view for frame in frames.lit if frame.led is not None))
-    wanted = [name for name in names if not patterns or any(fnmatch.fnmatchcase(name, one) for one in patterns)]
-    if not wanted:
+    view_names = [
+        name for name in names if not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+    ]
+    if not view_names:
         raise InputError(
             f"{folder}: no view with frames under single LEDs matches; it has {', '.join(names) or 'none'}"
         )
@@ -81,16 +83,18 @@ def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
     tiles: list[Block] = []
     pictures: list[Block] = []
     views = []
-    for name in wanted:
-        mine = Frames(frames, dark, frames_of_leds(folder, frames, name))
-        target_mm = _target_mm(mine, cell.rig.lens.focus_distance_mm)
-        ways = _ways(mine, cell.leds, target_mm)
-        about, lights, tiled, shown = _view(mine, name, ways, lambda step, *n, of=name: say(f"{of}: {step}", *n))
-        about |= _shots(run, mine, name, cell.leds, target_mm)
+    for name in view_names:
+        view_frames = Frames(frames, dark, frames_of_leds(folder, frames, name))
+        target_mm = _target_mm(view_frames, cell.rig.lens.focus_distance_mm)
+        ways = _ways(view_frames, cell.leds, target_mm)
+        about, lights, view_tiles, view_pictures = _view(
+            view_frames, name, ways, lambda step, *n, of=name: say(f"{of}: {step}", *n)
+        )
+        about |= _shots(run, view_frames, name, cell.leds, target_mm)
         views.append(about)
         blocks.append(lights)
-        tiles += tiled
-        pictures += shown
+        tiles += view_tiles
+        pictures += view_pictures
     tiles.sort(key=lambda block: -int(block.name.rsplit("-", 3)[1]))  # the coarsest first
     return Look(_about(run, frames, views), tuple(blocks), (*tiles, *pictures), errors=_ERRORS)
 
@@ -149,8 +153,8 @@ def _towards(frames: Frames, target_mm: Floats, places_mm: Floats) -> Floats:
     """[n, 3] unit vectors from the target to places: x right of the picture, y up, z to the camera."""
     into_camera = inverse(next(iter(frames.chosen.values())).base_from_camera)
     apart = (apply(into_camera, places_mm) - apply(into_camera, target_mm)) * (1.0, -1.0, -1.0)
-    found: Floats = apart / np.linalg.norm(apart, axis=1, keepdims=True)
-    return found
+    ways: Floats = apart / np.linalg.norm(apart, axis=1, keepdims=True)
+    return ways
 
 
 def _ways(frames: Frames, leds: LedTable, target_mm: Floats) -> Floats:
@@ -162,37 +166,39 @@ def _view(
 ) -> tuple[dict[str, Any], Block, list[Block], list[Block]]:
     """Return what the page knows of a view; its block of lights; tiles; pictures of frames."""
     leds = sorted(frames.chosen)
-    shown: list[dict[str, Any]] = []
+    frame_facts: list[dict[str, Any]] = []
     pictures: list[Block] = []
 
     def see(number: int, share: NDArray[np.float32]) -> None:
         frame = frames.chosen[leds[number]]
-        block, told = _frame(f"frame-{name}-{leds[number]}", share)
+        block, frame_about = _frame(f"frame-{name}-{leds[number]}", share)
         pictures.append(block)
         of_shot = {"shot": str(frame.shot), "exposure_us": frame.exposure_us, "way": ways[number].tolist()}
-        shown.append({"led": leds[number], **of_shot, **told})
+        frame_facts.append({"led": leds[number], **of_shot, **frame_about})
 
-    taken = light_planes(lambda number: frames.share(leds[number]), ways, see, say)
-    low, high = taken.planes.min(axis=(1, 2)), taken.planes.max(axis=(1, 2))
+    light_planes_of_view = light_planes(lambda number: frames.share(leds[number]), ways, see, say)
+    low, high = light_planes_of_view.planes.min(axis=(1, 2)), light_planes_of_view.planes.max(axis=(1, 2))
     step = np.maximum(high - low, 1e-12) / 255.0
-    height, width = taken.planes.shape[1:]
-    tiles = list(_plane_tiles(taken.planes, name, low, step, say))
-    lights = block_of(f"lights-{name}", taken.bases(ways))
+    height, width = light_planes_of_view.planes.shape[1:]
+    tiles = list(_plane_tiles(light_planes_of_view.planes, name, low, step, say))
+    lights = block_of(f"lights-{name}", light_planes_of_view.bases(ways))
     about = {
         "name": name,
         "picture_px": [width, height],
         "levels": levels_of(width, height),
         "tiles": f"tile-{name}",
         "lights": lights.name,
-        "planes": len(taken.planes),
+        "planes": len(light_planes_of_view.planes),
         "low": low.tolist(),
         "step": step.tolist(),
         "frame_step_px": math.ceil(max(width, height) / MOST_PX),
         "shortest_us": frames.shortest_us,
-        "missed": _missed_as_written(frames, leds, taken, tiles, low, step),
-        "missed_between": None if math.isnan(taken.missed_between[0]) else taken.missed_between,
+        "missed": _missed_as_written(frames, leds, light_planes_of_view, tiles, low, step),
+        "missed_between": None
+        if math.isnan(light_planes_of_view.missed_between[0])
+        else light_planes_of_view.missed_between,
         "apart_deg": _apart_deg(ways),
-        "frames": shown,
+        "frames": frame_facts,
     }
     return about, lights, tiles, pictures
 
@@ -211,11 +217,11 @@ def _plane_tiles(
 ) -> Iterator[Block]:
     """Tiles of planes, one under the other in 8 bit from `low` in steps."""
     total = sum(-(-w // TILE_PX) * -(-h // TILE_PX) for w, h in levels_of(planes.shape[2], planes.shape[1]))
-    for done, tile in enumerate(tiles_of(planes), start=1):
+    for count, tile in enumerate(tiles_of(planes), start=1):
         codes = np.rint((tile.values - low[:, None, None]) / step[:, None, None])
-        known = np.where(np.isfinite(codes), codes, 0.0).clip(0, 255).astype(np.uint8)
-        yield jpeg_of(tile.name(f"tile-{name}"), known.reshape(-1, TILE_PX), PLANE_QUALITY)
-        say("tiles", done, total)
+        tile_codes = np.where(np.isfinite(codes), codes, 0.0).clip(0, 255).astype(np.uint8)
+        yield jpeg_of(tile.name(f"tile-{name}"), tile_codes.reshape(-1, TILE_PX), PLANE_QUALITY)
+        say("tiles", count, total)
 
 
 def _missed_as_written(
@@ -227,19 +233,19 @@ def _missed_as_written(
     step: NDArray[np.float32],
 ) -> tuple[float, float]:
     """Median and rms of the shares that the page's first tile misses under some LEDs."""
-    packed = np.frombuffer(base64.b64decode(tiles[0].text), np.uint8)
-    read = cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE)
-    assert read is not None
-    codes = read.reshape(-1, TILE_PX, TILE_PX).astype(np.float64)
+    jpeg = np.frombuffer(base64.b64decode(tiles[0].text), np.uint8)
+    picture = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    codes = picture.reshape(-1, TILE_PX, TILE_PX).astype(np.float64)
     planes = codes * step[:, None, None] + low[:, None, None]
-    found, measured = [], []
+    models, shares = [], []
     for number in range(0, len(leds), -(-len(leds) // _CHECKED)):
         share = frames.share(leds[number])[:TILE_PX, :TILE_PX]
         inside = planes[:, : share.shape[0], : share.shape[1]]
         root = np.einsum("phw,pc->hwc", inside, taken.of_leds[:, number]) + taken.means[number]
-        found.append(np.maximum(root, 0.0).ravel() ** 2)
-        measured.append(share.ravel().astype(np.float64))
-    return missed(np.concatenate(found), np.concatenate(measured))
+        models.append(np.maximum(root, 0.0).ravel() ** 2)
+        shares.append(share.ravel().astype(np.float64))
+    return missed(np.concatenate(models), np.concatenate(shares))
 
 
 def _apart_deg(ways: Floats) -> float:
@@ -254,19 +260,19 @@ def _apart_deg(ways: Floats) -> float:
 def _shots(run: Run, frames: Frames, view: str, leds: LedTable, target_mm: Floats) -> dict[str, Any]:
     """LEDs of the view whose frame is not there: not proven, or hidden; and how many shots are proven."""
     proven = run.proven()
-    expected = [shot for shot in run.expected_shots() if shot.view == view and isinstance(shot.light, Led)]
-    missing = {shot.light.id for shot in expected if isinstance(shot.light, Led)} - set(frames.chosen)
-    hidden = run.hidden_leds.get(view, [])
+    plan_shots = [shot for shot in run.expected_shots() if shot.view == view and isinstance(shot.light, Led)]
+    missing = {shot.light.id for shot in plan_shots if isinstance(shot.light, Led)} - set(frames.chosen)
+    hidden_ids = run.hidden_leds.get(view, [])
 
     def at(ids: Sequence[int]) -> list[list[float]]:
         if not ids:
             return []
-        found: list[list[float]] = _towards(frames, target_mm, leds.positions_mm[leds.rows(ids)]).tolist()
-        return found
+        ways: list[list[float]] = _towards(frames, target_mm, leds.positions_mm[leds.rows(ids)]).tolist()
+        return ways
 
     return {
-        "shots": len(expected),
-        "proven": sum(shot in proven for shot in expected),
+        "shots": len(plan_shots),
+        "proven": sum(shot in proven for shot in plan_shots),
         "unproven": at(sorted(missing)),
-        "hidden": at(sorted(hidden)),
+        "hidden": at(sorted(hidden_ids)),
     }

@@ -23,15 +23,15 @@ def look_of_pictures(folder: Path) -> Look:
         raise InputError(f"{folder / MATERIALS}: is not there; `coupole reflectance --pictures` makes it")
     fields = np.full((_FIELDS, height, width), np.nan, np.float32)
     with opened(folder / MATERIALS) as file:
-        known = mask.copy()
-        known[mask] = np.isfinite(file["alpha"][()])
+        is_fitted = mask.copy()
+        is_fitted[mask] = np.isfinite(file["alpha"][()])
         first = 0
         for name in ("normal", "kd", "ks", "alpha", "residual"):
             values = np.atleast_2d(file[name][()].T).astype(np.float32)
-            fields[first : first + len(values), known] = values[:, known[mask]]
+            fields[first : first + len(values), is_fitted] = values[:, is_fitted[mask]]
             first += len(values)
     tiles = list(_material_tiles(fields))
-    shown = {
+    document = {
         "kind": "pictures",
         "picture_px": [width, height],
         "tile_px": TILE_PX,
@@ -54,7 +54,7 @@ def look_of_pictures(folder: Path) -> Look:
         },
     }
     errors = {"normals": "0.004 degrees", "kd, ks, roughness": "0.05 % or 3e-8"}
-    return Look(shown, (), tuple(sorted(tiles, key=_level, reverse=True)), errors=errors)
+    return Look(document, (), tuple(sorted(tiles, key=_level, reverse=True)), errors=errors)
 
 
 _TILES = "tile"

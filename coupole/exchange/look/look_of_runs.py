@@ -44,7 +44,7 @@ def look_of_result(
 
     Raises InputError if it is none, or has no material.
     """
-    known = read_about(folder)
+    source_about = read_about(folder)
     result = RunResult(folder)
     left_of = residual_fit(result) if planes else None
     fit = left_of or best_fit(result, MATERIALS)
@@ -56,23 +56,23 @@ def look_of_result(
     places, triangles, origin_mm, step_mm = welded(corners_mm)
     count = len(triangles)
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
-    of_triangles, measured = _materials(result, fit, support_from_base)
+    of_triangles, count_measured = _materials(result, fit, support_from_base)
     blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
-    views = [found for view in result.views if (found := frames_of_view(result, view, support_from_base))]
+    views = [frames for view in result.views if (frames := frames_of_view(result, view, support_from_base))]
     about: dict[str, Any] = {
         "kind": "mesh",
         "fit": fit,
-        "simulated": bool(known.get("simulated")),
-        "software": known.get("software", {}),
+        "simulated": bool(source_about.get("simulated")),
+        "software": source_about.get("software", {}),
         "views": [view for view, _ in views],
-        "led_exponent": 2 if known.get("emission") == "paper" else 1,
+        "led_exponent": 2 if source_about.get("emission") == "paper" else 1,
         "triangles": count,
-        "measured": measured,
+        "measured": count_measured,
         "irradiance": math.pi,
         "unit": "1/sr",
         "told": {
-            "Object": "simulated" if known.get("simulated") else "measured",
-            "Triangles": f"{count:,}, {measured:,} with a material",
+            "Object": "simulated" if source_about.get("simulated") else "measured",
+            "Triangles": f"{count:,}, {count_measured:,} with a material",
             "Views": ", ".join(view.view for view in result.views),
             "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
             "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
@@ -86,8 +86,8 @@ def look_of_result(
     errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
     if with_samples:
         errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
-        told = samples_of_result(result, support_from_base, known["scan_noise_um"], say)
-        about["samples"], later = told[0], later + told[1]
+        samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
+        about["samples"], later = samples[0], later + samples[1]
     return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
 
 
@@ -113,16 +113,16 @@ def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[
     """Numbers of all triangles by name, 0 of those without a material; how many have one."""
     materials, count = result.materials(fit), len(result.corners_mm)
     finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
-    at, mine = result.triangles[finite], finite.nonzero()[0]
-    turned = materials.normals[mine] @ support_from_base[:3, :3].T
+    at, rows = result.triangles[finite], finite.nonzero()[0]
+    normals = materials.normals[rows] @ support_from_base[:3, :3].T
     values: dict[str, NDArray[Any]] = {
-        "normals": octahedral(turned),
-        "kd": halves(red_green_blue(materials.kd[mine])),
-        "ks": halves(red_green_blue(materials.ks[mine])),
-        "gloss": halves(_pair(materials.alpha, materials.residual)[mine]),
-        "uncertainty": _uncertainty(result.materials_path(fit))[mine],
+        "normals": octahedral(normals),
+        "kd": halves(red_green_blue(materials.kd[rows])),
+        "ks": halves(red_green_blue(materials.ks[rows])),
+        "gloss": halves(_pair(materials.alpha, materials.residual)[rows]),
+        "uncertainty": _uncertainty(result.materials_path(fit))[rows],
     }
-    return {name: _spread(one, at, count) for name, one in values.items()}, len(at)
+    return {name: _spread(numbers, at, count) for name, numbers in values.items()}, len(at)
 
 
 def _first(
@@ -132,9 +132,9 @@ def _first(
     if len(triangles) <= over:
         return ()
     coarse = coarse_mesh(places, triangles, over)
-    found: dict[str, NDArray[Any]] = {"places": coarse.places, "triangles": coarse.triangles}
-    found |= {name: values[coarse.stands_for] for name, values in of_triangles.items()}
-    return tuple(block_of(f"first-{name}", values) for name, values in found.items())
+    arrays: dict[str, NDArray[Any]] = {"places": coarse.places, "triangles": coarse.triangles}
+    arrays |= {name: values[coarse.stands_for] for name, values in of_triangles.items()}
+    return tuple(block_of(f"first-{name}", values) for name, values in arrays.items())
 
 
 def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:

@@ -75,7 +75,7 @@ class _Materials:
     def add(self, layers: Sequence[tuple[Layer, ...]], name: str, *, is_drawn: bool = False) -> int:
         """Several for one name; the number of the first."""
         first = len(self.layers)
-        self.layers += [(one, is_drawn) for one in layers]
+        self.layers += [(stack, is_drawn) for stack in layers]
         self.names += [name] * len(layers)
         return first
 
@@ -84,37 +84,37 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
     """Return the page's contents for a scene whose paths are relative to `folder`. Raises InputError, with what
     can be shown."""
     scene = with_plain_lights(scene, folder)
-    found, face = _Materials(folder), None
+    materials, face = _Materials(folder), None
     parts: list[_Part] = []
     for thing in scene.objects:
         if isinstance(thing, MakieTile):
-            parts += _makie(thing, found)
+            parts += _makie(thing, materials)
         elif isinstance(thing, NashijiSlab):
             if face:
                 raise InputError(f"{scene.name}: has several nashiji_slab; a page shows {SHOWN}")
-            mine, face = _nashiji(thing, found)
-            parts += mine
+            slab_parts, face = _nashiji(thing, materials)
+            parts += slab_parts
         elif isinstance(thing, Makie):
-            parts.append(_sprinkled(thing, found))
+            parts.append(_sprinkled(thing, materials))
         elif isinstance(thing, Nashiji):
-            parts.append(_lacquered(thing, found))
+            parts.append(_lacquered(thing, materials))
         else:
             casts = thing.kind != "plane"
-            parts += [_opaque(piece, found, casts) for piece in objects.pieces(thing, folder)]
+            parts += [_opaque(piece, materials, casts) for piece in objects.pieces(thing, folder)]
     powers = illuminants(scene, folder)
     corners_mm = np.concatenate([part.corners_mm for part in parts])
     places, triangles, origin_mm, step_mm = welded(corners_mm.reshape(-1, 3))
     normals = flat_normals(corners_mm)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
-    made = tables(found.layers, powers, scene.observer)
+    colour_tables = tables(materials.layers, powers, scene.observer)
     blocks: dict[str, NDArray[Any]] = {
         "places": places,
         "triangles": triangles,
         "normals": octahedral(normals),
         "material": _numbered(parts),
-        "tables": made.reshape(-1, *made.shape[-2:]),
+        "tables": colour_tables.reshape(-1, *colour_tables.shape[-2:]),
     }
-    about = _about(scene, folder, powers, found) | {
+    about = _about(scene, folder, powers, materials) | {
         "triangles": len(triangles),
         "face": face,
         "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
@@ -135,7 +135,7 @@ def told(material: Material) -> str:
 
 def _plain(value: Any) -> str:
     if isinstance(value, dict):
-        return " ".join(str(one) for name, one in value.items() if name != "kind" or len(value) == 1)
+        return " ".join(str(part) for name, part in value.items() if name != "kind" or len(value) == 1)
     return str(value)
 
 
@@ -185,18 +185,18 @@ def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
     metal = Metal(kind="metal", roughness=thing.roughness)
     black = Lacquer(kind="lacquer")
     layers = (*layers_of(metal, found.folder), *layers_of(black, found.folder))
-    drawn = found.add([layers], f"{told(metal)}, by its share, over {told(black)}", is_drawn=True)
+    drawing = found.add([layers], f"{told(metal)}, by its share, over {told(black)}", is_drawn=True)
     face = objects.placed(Piece(tile.face, black), thing).corners_mm
     body = objects.placed(Piece(tile.body, black), thing).corners_mm
-    return [_Part(face, drawn, share=tile.share), _Part(body, found.number(black))]
+    return [_Part(face, drawing, share=tile.share), _Part(body, found.number(black))]
 
 
 def _sprinkled(thing: Makie, found: _Materials) -> _Part:
     grains = coarse_grains(thing, found.folder)
     layers = (*layers_of(thing.metal, found.folder), *layers_of(thing.lacquer, found.folder))
-    drawn = found.add([layers], f"{told(thing.metal)}, by its share, over {told(thing.lacquer)}", is_drawn=True)
+    drawing = found.add([layers], f"{told(thing.metal)}, by its share, over {told(thing.lacquer)}", is_drawn=True)
     return _Part(
-        objects.placed(Piece(grains.corners_mm, thing.metal), thing).corners_mm, drawn, share=grains.share
+        objects.placed(Piece(grains.corners_mm, thing.metal), thing).corners_mm, drawing, share=grains.share
     )
 
 
@@ -244,11 +244,11 @@ def _box(parts: Sequence[_Part]) -> list[list[float]]:
 
 def _numbered(parts: Sequence[_Part]) -> NDArray[np.uint16]:
     """[n, 2] of triangles: number of the material, code of the first layer's share."""
-    made = []
+    blocks = []
     for part in parts:
-        one = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)
-        one[:, 0] = part.number
+        block = np.full((len(part.corners_mm), 2), _WHOLE, np.uint16)
+        block[:, 0] = part.number
         if part.share is not None:
-            one[:, 1] = np.rint(_WHOLE * np.clip(part.share, 0.0, 1.0))
-        made.append(one)
-    return np.concatenate(made)
+            block[:, 1] = np.rint(_WHOLE * np.clip(part.share, 0.0, 1.0))
+        blocks.append(block)
+    return np.concatenate(blocks)

@@ -103,8 +103,10 @@ def page_text(look: Look, title: str, inside: list[Block], data: str) -> str:
     scripts = "\n".join(_part(name) for name in SCRIPTS)
     early = _early(look, inside)
     tags = [f"<script>{block.script}</script>\n" for block in inside[early:]]
-    held = {block.name for block in inside}
-    tags += [f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in held]
+    inside_names = {block.name for block in inside}
+    tags += [
+        f'<script src="{quote(f"{data}/{name}.js")}"></script>\n' for name in names if name not in inside_names
+    ]
     parts = {
         "TITLE": escape(title),
         "STYLE": _part("page.css"),
@@ -129,8 +131,8 @@ def _early(look: Look, inside: list[Block]) -> int:
 def _shared_out(look: Look, most_bytes: int) -> tuple[list[Block], list[Block]]:
     """Share out the blocks: those that go into the page, and those that go beside it. All that a page needs to
     begin goes into it, or none of it; then as many of the others as have room, in their order."""
-    needed = sum(len(block.script) for block in (*look.first, *look.blocks))
-    free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - needed
+    start_bytes = sum(len(block.script) for block in (*look.first, *look.blocks))
+    free = most_bytes - _own_bytes() - len(json.dumps(look.about)) - start_bytes
     if free < 0:
         return [], [*look.blocks, *look.later]
     inside = list(look.blocks)
@@ -153,10 +155,10 @@ def _earlier(data: Path) -> list[Path]:
     """Data of an earlier page. Raises InputError if the folder holds anything else."""
     if not data.exists() and not data.is_symlink():
         return []
-    found = list(data.iterdir()) if data.is_dir() and not data.is_symlink() else [data]
-    if not all(_is_script(one) for one in found):
+    paths = list(data.iterdir()) if data.is_dir() and not data.is_symlink() else [data]
+    if not all(_is_script(path) for path in paths):
         raise InputError(f"{data}: holds something else than a page's data; name another page with --out")
-    return found
+    return paths
 
 
 def _is_script(path: Path) -> bool:
@@ -169,8 +171,8 @@ def _is_script(path: Path) -> bool:
 
 def _clear(data: Path, earlier: list[Path]) -> None:
     """Remove the data of an earlier page, and their folder."""
-    for one in earlier:
-        one.unlink()
+    for path in earlier:
+        path.unlink()
     if data.exists():
         data.rmdir()
 

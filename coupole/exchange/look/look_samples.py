@@ -30,12 +30,12 @@ def samples_of_result(
     say: Callable[[str, int, int], None],
 ) -> tuple[list[dict[str, Any]], list[Block]]:
     """Return what the page knows of the samples of all views, and their blocks."""
-    told, blocks = [], []
+    view_facts, blocks = [], []
     for view in result.views:
-        of_view, mine = samples_of_view(result, view, support_from_base, scan_noise_um, say)
-        told.append(of_view)
-        blocks += mine
-    return told, blocks
+        of_view, view_blocks = samples_of_view(result, view, support_from_base, scan_noise_um, say)
+        view_facts.append(of_view)
+        blocks += view_blocks
+    return view_facts, blocks
 
 
 def samples_of_view(
@@ -75,14 +75,14 @@ def _codes(
     """[3, rows, leds]"""
     beside = triangles_beside(result, view, rows)
     mean = result.view_samples(view, slice(int(rows[0]), int(rows[-1]) + 1)).values.mean(axis=2, dtype=np.float64)
-    made = np.zeros((3, len(rows), len(view.leds)), np.uint8)
-    made[0] = log_coded(np.where(mean > 0.0, mean, np.nan))
+    codes = np.zeros((3, len(rows), len(view.leds)), np.uint8)
+    codes[0] = log_coded(np.where(mean > 0.0, mean, np.nan))
     for first in range(0, len(view.leds), _LEDS):
         leds = np.arange(first, min(first + _LEDS, len(view.leds)))
         samples = channel_samples(result, view, rows, leds, None, scan_noise_um, beside)
-        known = samples.at(samples.known)
-        low, high = bounds(known.places, known.sources, _QUANTILE_95)
+        finite_samples = samples.at(samples.known)
+        low, high = bounds(finite_samples.places, finite_samples.sources, _QUANTILE_95)
         ends = np.full((2, len(samples.f)), np.nan)
         ends[:, samples.known] = 1.0 - low, np.minimum(high - 1.0, _FAR)
-        made[1:, :, leds] = log_coded(ends).reshape(2, len(rows), len(leds))
-    return made
+        codes[1:, :, leds] = log_coded(ends).reshape(2, len(rows), len(leds))
+    return codes

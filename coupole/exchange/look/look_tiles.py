@@ -31,10 +31,10 @@ class Tile:
 
 def levels_of(width: int, height: int) -> list[list[int]]:
     """Width and height, pixels, of each level; the last fits into one tile."""
-    found = [[width, height]]
-    while max(found[-1]) > TILE_PX:
-        found.append([-(-side // 2) for side in found[-1]])
-    return found
+    sizes = [[width, height]]
+    while max(sizes[-1]) > TILE_PX:
+        sizes.append([-(-side // 2) for side in sizes[-1]])
+    return sizes
 
 
 def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
@@ -55,11 +55,11 @@ def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
 def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """[n, ceil(h / 2), ceil(w / 2)] means of those of 2 x 2 pixels that have a value."""
     count, height, width = values.shape
-    found = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
-    for whole, half in zip(values, found, strict=True):
+    means = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
+    for whole, half in zip(values, means, strict=True):
         even = np.pad(whole, ((0, height % 2), (0, width % 2)), constant_values=np.nan)
         four = np.stack([even[row::2, column::2] for row in (0, 1) for column in (0, 1)])
-        known = np.isfinite(four)
-        counted = known.sum(axis=0)
-        half[:] = np.where(counted, np.where(known, four, 0.0).sum(axis=0) / np.maximum(counted, 1), np.nan)
-    return found
+        is_finite = np.isfinite(four)
+        counts = is_finite.sum(axis=0)
+        half[:] = np.where(counts, np.where(is_finite, four, 0.0).sum(axis=0) / np.maximum(counts, 1), np.nan)
+    return means

@@ -70,46 +70,48 @@ def residual_blocks(
 ) -> tuple[dict[str, Any], list[Block]]:
     """Return what a page knows of residuals, and two blocks of each view: codes [3 + planes, triangles of the
     mesh] and planes. `kept` is the share of the energy of all views' residuals."""
-    views, blocks, missed, energy = [], [], 0.0, 0.0
+    views, blocks, missed_energy, energy = [], [], 0.0, 0.0
     support_from_base = inverse(result.base_from_support)
     for number, view in enumerate(result.views):
-        found = residual_planes(result, view, planes)
-        codes = np.zeros((len(found.codes), len(result.corners_mm)), np.uint8)
-        codes[:, view.triangles] = found.codes
+        planes_of_view = residual_planes(result, view, planes)
+        codes = np.zeros((len(planes_of_view.codes), len(result.corners_mm)), np.uint8)
+        codes[:, view.triangles] = planes_of_view.codes
         names = [f"residual-{view.path.stem}", f"planes-{view.path.stem}"]
-        blocks += [block_of(names[0], codes), block_of(names[1], found.planes)]
+        blocks += [block_of(names[0], codes), block_of(names[1], planes_of_view.planes)]
         camera_mm = apply(support_from_base, view.camera_mm).tolist()
         views.append({"name": view.view, "blocks": names, "camera_mm": camera_mm})
-        missed, energy = missed + found.missed, energy + found.energy
+        missed_energy, energy = missed_energy + planes_of_view.missed, energy + planes_of_view.energy
         say("residuals", number + 1, len(result.views))
-    kept = 1.0 - missed / energy if energy > 0.0 else 1.0
-    return {"planes": planes, "side": SIDE, "kept": round(kept, 4), "views": views}, blocks
+    share = 1.0 - missed_energy / energy if energy > 0.0 else 1.0
+    return {"planes": planes, "side": SIDE, "kept": round(share, 4), "views": views}, blocks
 
 
 def residual_planes(result: RunResult, view: ViewSamples, count: int) -> ResidualPlanes:
     """`count` planes of a view's residuals."""
     coefficients = result.slices(FIT.name, view)
-    known = np.flatnonzero(np.isfinite(coefficients).all(axis=(1, 2)))
+    rows_of_fit = np.flatnonzero(np.isfinite(coefficients).all(axis=(1, 2)))
     channels = coefficients.shape[1]
-    some = np.random.default_rng(0).permutation(known)
-    learnt = coefficients[np.sort(some[:_LEARNT]), :, :COUNT].astype(np.float64)
-    rows, back = _components(learnt, count)
-    numbers = np.empty((count, len(known)), np.float32)
-    for first in range(0, len(known), _BLOCK):
-        part = coefficients[known[first : first + _BLOCK], :, :COUNT]
+    some = np.random.default_rng(0).permutation(rows_of_fit)
+    training = coefficients[np.sort(some[:_LEARNT]), :, :COUNT].astype(np.float64)
+    rows, back = _components(training, count)
+    numbers = np.empty((count, len(rows_of_fit)), np.float32)
+    for first in range(0, len(rows_of_fit), _BLOCK):
+        part = coefficients[rows_of_fit[first : first + _BLOCK], :, :COUNT]
         numbers[:, first : first + _BLOCK] = rows @ part.reshape(len(part), -1).T
     peaks = np.maximum(np.abs(numbers).max(axis=1, initial=0.0), 1e-30)
     codes = np.zeros((3 + count, len(coefficients)), np.uint8)
-    shares = np.clip(red_green_blue(coefficients[known, :, COUNT].astype(np.float64)), 0.0, 1.0)
-    codes[:3, known] = 1.0 + np.rint(_SHARE_STEPS * shares.T)
+    shares = np.clip(red_green_blue(coefficients[rows_of_fit, :, COUNT].astype(np.float64)), 0.0, 1.0)
+    codes[:3, rows_of_fit] = 1.0 + np.rint(_SHARE_STEPS * shares.T)
     roots = np.sign(numbers) * np.sqrt(np.abs(numbers) / peaks[:, None])
-    codes[3:, known] = 128.0 + np.rint(_STEPS * roots)
-    scaled = (peaks[:, None] * back).reshape(count, channels, COUNT)
-    table = np.einsum("pck,kn->npc", scaled, _functions(table_directions().reshape(-1, 3)))
+    codes[3:, rows_of_fit] = 128.0 + np.rint(_STEPS * roots)
+    basis = (peaks[:, None] * back).reshape(count, channels, COUNT)
+    table = np.einsum("pck,kn->npc", basis, _functions(table_directions().reshape(-1, 3)))
     planes = red_green_blue(table.reshape(-1, channels)).reshape(SIDE, SIDE, count, 3).transpose(2, 0, 1, 3)
-    judged = np.sort(some[:_JUDGED])
-    missed, energy = _missed(result, view, coefficients[judged], codes[:, judged], scaled, judged)
-    return ResidualPlanes(planes.astype(np.float16), codes, missed, energy)
+    check_rows = np.sort(some[:_JUDGED])
+    missed_energy, energy = _missed(
+        result, view, coefficients[check_rows], codes[:, check_rows], basis, check_rows
+    )
+    return ResidualPlanes(planes.astype(np.float16), codes, missed_energy, energy)
 
 
 def table_directions() -> Floats:
@@ -132,10 +134,10 @@ def _components(learnt: Floats, count: int) -> tuple[Floats, Floats]:
     size = apart.shape[1]
     powers, axes = eigh(apart.T @ apart, subset_by_index=(max(0, size - count), size - 1))
     axes = np.where(powers > 1e-12 * max(powers.max(initial=0.0), 1e-300), axes, 0.0)[:, ::-1].T
-    each = axes.reshape(-1, channels, COUNT)
+    components = axes.reshape(-1, channels, COUNT)
     rows, back = np.zeros((2, count, channels * COUNT))
-    rows[: len(each)] = (each @ root.T).reshape(len(each), -1)
-    back[: len(each)] = (each @ np.linalg.inv(root)).reshape(len(each), -1)
+    rows[: len(components)] = (components @ root.T).reshape(len(components), -1)
+    back[: len(components)] = (components @ np.linalg.inv(root)).reshape(len(components), -1)
     return rows, back
 
 
@@ -194,6 +196,6 @@ def _missed(
     roots = (codes[3:].astype(np.float64) - 128.0) / _STEPS
     short = np.einsum("pn,pck->nck", roots * np.abs(roots), scaled)
     shares = (codes[: coefficients.shape[1]].T - 1.0) / _SHARE_STEPS
-    shown = np.concatenate([short, shares[:, :, None]], axis=2).astype(np.float32)
-    page = FIT.values(lights, shown, model)
+    page_coefficients = np.concatenate([short, shares[:, :, None]], axis=2).astype(np.float32)
+    page = FIT.values(lights, page_coefficients, model)
     return float(np.sum((page - fit) ** 2)), float(np.sum((fit - model) ** 2))

@@ -94,20 +94,20 @@ def tables(
     triangle has its own share of the first layer and the second has the rest, else 0, and the colour of white.
     Colours outside the gamut have numbers below 0.
     """
-    made = np.zeros((len(powers), len(found), LAYERS, COLUMNS, 4), np.float32)
-    made[..., :ANGLES, 3] = 1.0
-    made[..., ANGLES, 3] = 1.0
+    numbers = np.zeros((len(powers), len(found), LAYERS, COLUMNS, 4), np.float32)
+    numbers[..., :ANGLES, 3] = 1.0
+    numbers[..., ANGLES, 3] = 1.0
     for at, power in enumerate(powers.values()):
         for number, (layers, is_drawn) in enumerate(found):
             for place, layer in enumerate(layers):
-                here = made[at, number, place]
+                here = numbers[at, number, place]
                 here[:ANGLES, :3] = colours(layer.mirror, power, observer)
                 here[:ANGLES, 3] = layer.passing
                 here[ANGLES, :3] = colours(layer.body, power, observer) / np.pi
                 here[ANGLES, 3] = layer.roughness
-            made[at, number, :, ANGLES + 1, 0] = is_drawn
-            made[at, number, :, ANGLES + 1, 1:] = colours(np.ones(BANDS), power, observer)
-    return made
+            numbers[at, number, :, ANGLES + 1, 0] = is_drawn
+            numbers[at, number, :, ANGLES + 1, 1:] = colours(np.ones(BANDS), power, observer)
+    return numbers
 
 
 def colours(spectral: Array, power: Array, observer: light.Observer) -> Array:
@@ -132,8 +132,8 @@ def _coated(body: InternalReflectance, material: Paint | Lacquer, folder: Path) 
 def _under_face(body: InternalReflectance, index: Array, roughness: float) -> Layer:
     """A body under a glossy face, with all reflections between them (Saunderson), as `materials.coated` has it."""
     face = fresnel.reflectance(COSINES, indices.at_d_line(index.astype(complex)))
-    seen = materials.under_face(body, index)
-    return Layer(np.repeat(face[:, None], BANDS, axis=1), 1.0 - face, seen, roughness)
+    reflectance = materials.under_face(body, index)
+    return Layer(np.repeat(face[:, None], BANDS, axis=1), 1.0 - face, reflectance, roughness)
 
 
 def _metal(material: Metal, folder: Path) -> Layer:
@@ -151,11 +151,11 @@ def _stack(films: Sequence[Film], base: Complex) -> Array:
 
 def _gilt(material: Gilt, folder: Path) -> tuple[Layer, ...]:
     """Leaf with the bole's light that comes through it, and bare bole, by their shares."""
-    gilded, index = materials.gilt_of(material, folder)
-    bare = _under_face(gilded.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
+    gilding, index = materials.gilt_of(material, folder)
+    bare = _under_face(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < materials.THINNEST_NM or material.uncovered == 1.0:
         return (bare,)
-    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole)
+    through = gilding.leaf.transmittance[-1] * layered.emerging(gilding.leaf, gilding.bole)
     films = [Film(index, material.thickness_nm)]
     leaf = _bodied(_stack(films, indices.constant(indices.EGG_WHITE)), through, material.roughness)
     if material.uncovered == 0.0:

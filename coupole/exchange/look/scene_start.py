@@ -39,11 +39,11 @@ class _Lamp:
 
 def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
     """Spectral power [81] by name: the scene's own first, then those that a page always offers."""
-    found = {named(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
-    offered = {name: known_light.illuminant(name) for name in ("D65", "A")}
-    offered |= {"LED of the dome": spectral_power(LedSpectrum())}
-    offered |= {name: known_light.led(name) for name in ("LED-B1", "LED-B3")}
-    return found | {name: one for name, one in offered.items() if name not in found}
+    powers = {named(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
+    offers = {name: known_light.illuminant(name) for name in ("D65", "A")}
+    offers |= {"LED of the dome": spectral_power(LedSpectrum())}
+    offers |= {name: known_light.led(name) for name in ("LED-B1", "LED-B3")}
+    return powers | {name: curve for name, curve in offers.items() if name not in powers}
 
 
 def named(spectrum: Power) -> str:
@@ -72,11 +72,11 @@ def start_of(scene: PlainScene, folder: Path) -> dict[str, Any]:
     white_cd_m2 = scene.display.white_cd_m2 or max(
         [lamp.illuminance_lux / math.pi for lamp in lamps] + [light.luminance_cd_m2 for light in around]
     )
-    shown = [_shown(lamp, white_cd_m2) for lamp in lamps] or [_dark(named(around[0].spectrum))]
-    is_used_to_first = shown[0]["illuminant"] == named(scene.lights[0].spectrum)
+    lights = [_shown(lamp, white_cd_m2) for lamp in lamps] or [_dark(named(around[0].spectrum))]
+    is_used_to_first = lights[0]["illuminant"] == named(scene.lights[0].spectrum)
     sky = sum(light.luminance_cd_m2 for light in around) / white_cd_m2
     return {
-        "lights": shown,
+        "lights": lights,
         "sky": min(sky, 100.0),
         "skyIlluminant": named(next(iter(around or scene.lights)).spectrum),
         "white": 1.0 if scene.display.white_cd_m2 else 0.0,

@@ -36,8 +36,8 @@ def coarse_grains(thing: Makie, folder: Path) -> Grains:
     """The drawing's shares on triangles as coarse as a page can hold, in the object's frame. Raises InputError."""
     area_mm2 = float(skin_of(body_corners(thing.body, folder)).areas_mm2().sum())
     grain_mm = max(thing.grain_mm, float(np.sqrt(4.0 * area_mm2 / _TRIANGLES)))
-    found = makie_grains(thing.model_copy(update={"grain_mm": grain_mm}), folder)
-    return Grains(found.corners_mm, thing.density * found.share)
+    grains = makie_grains(thing.model_copy(update={"grain_mm": grain_mm}), folder)
+    return Grains(grains.corners_mm, thing.density * grains.share)
 
 
 def lacquered_corners(thing: Nashiji, folder: Path) -> Array:
@@ -49,17 +49,21 @@ def nashiji_layers(thing: Nashiji, folder: Path) -> tuple[Layer, Layer]:
     """The lacquer's face over the ground, and the flakes' lobe. Raises InputError."""
     if not isinstance(thing.ground, Diffuse):
         raise InputError(f"nashiji on a ground of kind {thing.ground.kind}: a page shows grounds of kind diffuse")
-    covered, taken = _covered(thing), absorption.per_mm(thing.absorption, indices.URUSHI, folder)
+    cover, absorption_per_mm = _covered(thing), absorption.per_mm(thing.absorption, indices.URUSHI, folder)
     face = fresnel.reflectance(COSINES, indices.URUSHI)
     passing = 1.0 - face
     inside = np.sqrt(1.0 - (1.0 - COSINES**2) / indices.URUSHI**2)
     ground = internal(thing.ground.reflectance, folder, indices.URUSHI)
     index = np.full(BANDS, indices.URUSHI)
-    body = materials.under_face(ground, index) * (1.0 - covered) ** 2 * np.exp(-2.0 * taken * thing.depth_mm)
+    body = (
+        materials.under_face(ground, index)
+        * (1.0 - cover) ** 2
+        * np.exp(-2.0 * absorption_per_mm * thing.depth_mm)
+    )
     coat = Layer(np.repeat(face[:, None], BANDS, axis=1), passing, body, _FACE_ROUGHNESS)
     metal = fresnel.reflectance(inside[:, None], materials.metal_of(thing.metal, folder) / indices.URUSHI)
-    ways = 2.0 * taken * thing.depth_mm / inside[:, None]
-    lobe = covered * passing[:, None] ** 2 * metal * -np.expm1(-ways) / ways
+    ways = 2.0 * absorption_per_mm * thing.depth_mm / inside[:, None]
+    lobe = cover * passing[:, None] ** 2 * metal * -np.expm1(-ways) / ways
     tilt = np.tan(np.radians(thing.tilt_deg))
     roughness = min(1.0, indices.URUSHI * float(np.hypot(tilt, thing.metal.roughness)))
     return coat, Layer(lobe, np.ones(ANGLES), np.zeros(BANDS), roughness)

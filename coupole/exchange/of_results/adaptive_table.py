@@ -119,11 +119,11 @@ class AdaptiveTable:
 
 def encode_adaptive(material: Material, most_error: float, told: str = "") -> bytes:
     """The file; its description says what it misses. Raises InputError if no table is large enough."""
-    checked = tuple(_pairs(material))
-    table, missed = _smallest(material, most_error, checked)
+    pairs = tuple(_pairs(material))
+    table, errors = _smallest(material, most_error, pairs)
     text = (
-        f"{material.name}; misses the fit by {missed[0]:.1e} in the median and {missed[1]:.1e} at 95 % of all "
-        f"directions, by {missed[2]:.1e} and {missed[3]:.1e} of those in its lobe; {told}"
+        f"{material.name}; misses the fit by {errors[0]:.1e} in the median and {errors[1]:.1e} at 95 % of all "
+        f"directions, by {errors[2]:.1e} and {errors[3]:.1e} of those in its lobe; {told}"
     )
     return table.encode(text)
 
@@ -131,20 +131,21 @@ def encode_adaptive(material: Material, most_error: float, told: str = "") -> by
 def _smallest(material: Material, most_error: float, checked: tuple[Checked, ...]) -> tuple[AdaptiveTable, Floats]:
     """A table that misses no more; from the smallest on it grows by what helps more for its bytes."""
     table = AdaptiveTable(material, THETAS[0], SIDES[0], CROWDINGS[0])
-    missed = _missed(table, checked)
-    while missed[1::2].max() > most_error:
-        tried = [(larger, _missed(larger, checked)) for larger in _larger(table)]
-        if not tried:
+    errors = _missed(table, checked)
+    while errors[1::2].max() > most_error:
+        trials = [(larger, _missed(larger, checked)) for larger in _larger(table)]
+        if not trials:
             raise InputError(
                 f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB misses "
-                f"its fit by {missed[1::2].max():.1e} or more in 5 % of the directions; ask for no less"
+                f"its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; ask for no less"
             )
-        worst = missed[1::2].max()
+        worst = errors[1::2].max()
         gains = [
-            np.log(worst / one[1::2].max()) / np.log(larger.size_bytes / table.size_bytes) for larger, one in tried
+            np.log(worst / trial_errors[1::2].max()) / np.log(larger.size_bytes / table.size_bytes)
+            for larger, trial_errors in trials
         ]
-        table, missed = tried[int(np.argmax(gains))]
-    return table, missed
+        table, errors = trials[int(np.argmax(gains))]
+    return table, errors
 
 
 def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
@@ -162,8 +163,8 @@ def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
 
 def _missed(table: AdaptiveTable, checked: tuple[Checked, ...]) -> Floats:
     """Median and `SHARE` of the relative errors, of each set of pairs."""
-    read = table.read()
-    return np.concatenate([np.quantile(pairs.misses(read), [0.5, SHARE]) for pairs in checked])
+    reflectance = table.read()
+    return np.concatenate([np.quantile(pairs.misses(reflectance), [0.5, SHARE]) for pairs in checked])
 
 
 def _pairs(material: Material) -> Iterator[Checked]:
@@ -179,8 +180,8 @@ def _pairs(material: Material) -> Iterator[Checked]:
         2.0 * np.pi * random.uniform(size=len(share)),
     )
     half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    mirrored = 2.0 * np.sum(ways[0] * half, axis=-1, keepdims=True) * half - ways[0]
-    for ways_out in (ways[1], mirrored):
+    mirror_ways = 2.0 * np.sum(ways[0] * half, axis=-1, keepdims=True) * half - ways[0]
+    for ways_out in (ways[1], mirror_ways):
         high = (ways[0, :, 2] > _LOWEST_Z) & (ways_out[:, 2] > _LOWEST_Z)
         pair = ways[0][high][:_PAIRS], ways_out[high][:_PAIRS]
         yield Checked(*pair, material.reflectance(*pair))

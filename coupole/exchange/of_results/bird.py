@@ -52,17 +52,20 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
 
 def _data(samples: SamplesOfTriangle, channel: int) -> dict[str, Any]:
     f, high, low = samples.f[:, channel], samples.high[:, channel], samples.low[:, channel]
-    known = np.isfinite(f)
-    kept = known & (f >= 0.0) & np.isfinite(high)
-    u = np.maximum(high - 1.0, 1.0 - low)[kept] * f[kept]
-    theta_i, phi_i = _polar(samples.towards_light[kept])
-    theta_r, phi_r = _polar(samples.towards_camera[kept])
+    is_finite = np.isfinite(f)
+    is_usable = is_finite & (f >= 0.0) & np.isfinite(high)
+    u = np.maximum(high - 1.0, 1.0 - low)[is_usable] * f[is_usable]
+    theta_i, phi_i = _polar(samples.towards_light[is_usable])
+    theta_r, phi_r = _polar(samples.towards_camera[is_usable])
     angles = {"theta_i": theta_i, "phi_i": phi_i, "theta_r": theta_r, "phi_r": phi_r}
-    negative, open_ended = int((known & (f < 0.0)).sum()), int((known & (f >= 0.0) & ~np.isfinite(high)).sum())
+    negative, open_ended = (
+        int((is_finite & (f < 0.0)).sum()),
+        int((is_finite & (f >= 0.0) & ~np.isfinite(high)).sum()),
+    )
     left_out = f"left out: {negative} samples below 0, {open_ended} without an upper bound"
     return {
         **{name: {"unit": "deg", "values": values.tolist()} for name, values in angles.items()},
-        "BRDF": {"unit": "1/sr", "values": f[kept].tolist(), "comments": left_out},
+        "BRDF": {"unit": "1/sr", "values": f[is_usable].tolist(), "comments": left_out},
         "uBRDF": {
             "unit": "1/sr",
             "values": u.tolist(),
@@ -80,16 +83,16 @@ def _polar(ways: Floats) -> tuple[NDArray[Any], NDArray[Any]]:
 
 def _metadata(surface: MeasuredSurface, triangle: int, channel: str) -> dict[str, Any]:
     about, path = surface.about, surface.result.folder / ABOUT
-    made = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
+    timestamp = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
     name = f"{sha256(path)} triangle {triangle} {channel}"
     nowhere = dict.fromkeys(("country", "city", "street", "building_nr", "postal_code"), _NOT_SAID)
     area = {"value": float(surface.result.areas_mm2[triangle]), "unit": "mm^2"}
-    simulated = bool(about.get("simulated"))
+    is_simulated = bool(about.get("simulated"))
     return {
         "schema": SCHEMA,
         "id": f"urn:sha256:{hashlib.sha256(name.encode()).hexdigest()}",
         "type": "BRDF",
-        "timestamp": made,
+        "timestamp": timestamp,
         "provenance": {
             "organization": _NOT_SAID,
             "location": nowhere,
@@ -98,7 +101,7 @@ def _metadata(surface: MeasuredSurface, triangle: int, channel: str) -> dict[str
             "comments": "to be filled in by whoever publishes this file",
         },
         "description": f"Triangle {triangle} of a scanned object, the camera's {channel}; {surface.remark}",
-        "method": "simulation" if simulated else "measurement",
+        "method": "simulation" if is_simulated else "measurement",
         "instrumentation": _NOT_SAID,
         "software": {"name": "Coupole", "version": about["software"]["coupole"]},
         "sample": {

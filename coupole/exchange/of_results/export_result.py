@@ -34,5 +34,5 @@ def export_result(
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: has files already. Choose another --out, or give --overwrite")
     with writing_into(folder):
-        written: list[Path] = importlib.import_module(f"{_HERE}.{to}").write(surface, folder)
-    return written
+        paths: list[Path] = importlib.import_module(f"{_HERE}.{to}").write(surface, folder)
+    return paths

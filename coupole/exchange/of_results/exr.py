@@ -20,21 +20,21 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     support_from_base = inverse(surface.result.base_from_support)
     paths = []
     for view in surface.result.views:
-        seen = surface_of_view(surface.result, view)
-        number = np.where(seen.seen >= 0, view.triangles[seen.seen], -1)
+        view_surface = surface_of_view(surface.result, view)
+        number = np.where(view_surface.seen >= 0, view.triangles[view_surface.seen], -1)
 
         def picture(values: NDArray[np.float64], number: NDArray[np.int64] = number) -> NDArray[np.float32]:
-            found = values[number].astype(np.float32)
-            found[number < 0] = np.nan
-            return np.ascontiguousarray(found)
+            pixels = values[number].astype(np.float32)
+            pixels[number < 0] = np.nan
+            return np.ascontiguousarray(pixels)
 
-        places = apply(support_from_base, seen.places_mm.reshape(-1, 3).astype(np.float64))
+        places = apply(support_from_base, view_surface.places_mm.reshape(-1, 3).astype(np.float64))
         parts = {
             "kd": _channels("RGB", picture(surface.kd)),
             "ks": _channels("RGB", picture(surface.ks)),
             "alpha": {"Y": picture(surface.alpha)},
             "normal": _channels("XYZ", picture(surface.normals)),
-            "place": _channels("XYZ", places.reshape(seen.places_mm.shape).astype(np.float32)),
+            "place": _channels("XYZ", places.reshape(view_surface.places_mm.shape).astype(np.float32)),
             **{name: {"Y": picture(values)} for name, values in surface.uncertain.items()},
         }
         paths.append(_write(folder / f"{view.view}.exr", parts, surface.remark))
@@ -49,8 +49,8 @@ def _write(path: Path, parts: dict[str, dict[str, NDArray[np.float32]]], remark:
     partial = path.with_name(f".{path.name}.part")
     head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "comments": remark}
     try:
-        found = [OpenEXR.Part({**head, "name": name}, channels, name) for name, channels in parts.items()]
-        OpenEXR.File(found).write(str(partial))
+        exr_parts = [OpenEXR.Part({**head, "name": name}, channels, name) for name, channels in parts.items()]
+        OpenEXR.File(exr_parts).write(str(partial))
         partial.replace(path)
     except (OSError, RuntimeError) as error:
         raise StorageError(f"{path}: {reason(error)}") from error

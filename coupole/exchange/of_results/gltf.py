@@ -30,17 +30,17 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.glb`: metres, y up. Triangles without a material are left out."""
-    known = np.flatnonzero(surface.known)
-    corners = (surface.vertices_mm[surface.triangles[known]].reshape(-1, 3) @ Y_UP_FROM_SUPPORT.T) * 1e-3
-    normals = np.repeat(surface.normals[known] @ Y_UP_FROM_SUPPORT.T, 3, axis=0)
-    places = np.repeat(middles(len(known)), 3, axis=0)
-    most_ks = max(float(surface.ks[known].max(initial=0.0)) / _F0, 1e-6)
-    gloss = np.zeros((len(known), 3))
-    gloss[:, 1] = np.sqrt(surface.alpha[known])
+    rows = np.flatnonzero(surface.known)
+    corners = (surface.vertices_mm[surface.triangles[rows]].reshape(-1, 3) @ Y_UP_FROM_SUPPORT.T) * 1e-3
+    normals = np.repeat(surface.normals[rows] @ Y_UP_FROM_SUPPORT.T, 3, axis=0)
+    places = np.repeat(middles(len(rows)), 3, axis=0)
+    most_ks = max(float(surface.ks[rows].max(initial=0.0)) / _F0, 1e-6)
+    gloss = np.zeros((len(rows), 3))
+    gloss[:, 1] = np.sqrt(surface.alpha[rows])
     pictures = [
-        _png(srgb(surface.under_a_layer(known))),
+        _png(srgb(surface.under_a_layer(rows))),
         _png(gloss),
-        _png(srgb(surface.ks[known] / (_F0 * most_ks))),
+        _png(srgb(surface.ks[rows] / (_F0 * most_ks))),
     ]
     arrays = [values.astype("<f4") for values in (corners, normals, places)]
     document = _document(surface, arrays, pictures, most_ks)

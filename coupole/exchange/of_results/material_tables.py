@@ -33,8 +33,8 @@ class Material:
         values = np.zeros(len(ways_in))
         _lobes(np.ascontiguousarray(ways_in), np.ascontiguousarray(ways_out), self.alpha, values)
         above = (ways_in[:, 2] > 0.0) & (ways_out[:, 2] > 0.0)
-        found: Floats = np.where(above[:, None], self.kd + values[:, None] * self.ks, 0.0)
-        return found
+        f: Floats = np.where(above[:, None], self.kd + values[:, None] * self.ks, 0.0)
+        return f
 
 
 def materials_of(surface: MeasuredSurface) -> Iterator[Material]:

@@ -28,18 +28,18 @@ _SURFACE = "measured_surface"
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.mtlx`, its textures (OpenEXR, float32, linear) and `surface.obj` (metres, y up, one texture
     coordinate and one normal for each triangle). Triangles without a material are left out."""
-    known = np.flatnonzero(surface.known)
-    ks = surface.ks[known]
+    rows = np.flatnonzero(surface.known)
+    ks = surface.ks[rows]
     most = ks.max(axis=1, keepdims=True)
     textures = {
-        "base_color": surface.under_a_layer(known),
+        "base_color": surface.under_a_layer(rows),
         "specular_color": np.where(most > 0.0, ks / np.maximum(most, 1e-12), 1.0),
         "specular_weight": most / _F0,
-        "specular_roughness": np.sqrt(surface.alpha[known])[:, None],
+        "specular_roughness": np.sqrt(surface.alpha[rows])[:, None],
     }
     paths = [_write_texture(folder / f"{name}.exr", values) for name, values in textures.items()]
     write_synced(folder / DOCUMENT, _document(surface))
-    write_synced(folder / MESH, _mesh(surface, known))
+    write_synced(folder / MESH, _mesh(surface, rows))
     return [folder / DOCUMENT, folder / MESH, *paths]
 
 
@@ -73,8 +73,8 @@ def _document(surface: MeasuredSurface) -> bytes:
 
 
 def _mesh(surface: MeasuredSurface, known: np.ndarray[tuple[int], np.dtype[np.int64]]) -> str:
-    used, corner = np.unique(surface.triangles[known], return_inverse=True)
-    places = (surface.vertices_mm[used] @ Y_UP_FROM_SUPPORT.T) * 1e-3
+    vertices, corner = np.unique(surface.triangles[known], return_inverse=True)
+    places = (surface.vertices_mm[vertices] @ Y_UP_FROM_SUPPORT.T) * 1e-3
     normals = surface.normals[known] @ Y_UP_FROM_SUPPORT.T
     texels = middles(len(known))
     number = np.arange(1, len(known) + 1)

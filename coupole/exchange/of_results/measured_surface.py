@@ -89,9 +89,9 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
     corners = vertices_mm[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    found = result.materials(name)
-    fitted = np.isfinite(found.alpha)
-    normals[result.triangles[fitted]] = found.normals[fitted] @ support_from_base[:3, :3].T
+    materials = result.materials(name)
+    is_fitted = np.isfinite(materials.alpha)
+    normals[result.triangles[is_fitted]] = materials.normals[is_fitted] @ support_from_base[:3, :3].T
 
     def everywhere(values: Floats) -> Floats:
         whole = np.full((len(triangles), *values.shape[1:]), np.nan)
@@ -105,9 +105,9 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
         vertices_mm,
         triangles,
         normals,
-        everywhere(red_green_blue(found.kd)),
-        everywhere(red_green_blue(found.ks)),
-        everywhere(found.alpha),
+        everywhere(red_green_blue(materials.kd)),
+        everywhere(red_green_blue(materials.ks)),
+        everywhere(materials.alpha),
         {key: everywhere(values) for key, values in standard_uncertainties(path).items()},
         chosen,
     )

@@ -65,9 +65,9 @@ def _of_view(
     shape = (len(leds), surface.result.channels)
     f, low, high = np.empty(shape), np.empty(shape), np.empty(shape)
     for channel in range(surface.result.channels):
-        mine = channel_samples(surface.result, view, np.array([row]), leds, channel, scan_noise_um)
-        f[:, channel] = mine.f
-        low[:, channel], high[:, channel] = bounds(mine.places, mine.sources, quantile)
+        samples = channel_samples(surface.result, view, np.array([row]), leds, channel, scan_noise_um)
+        f[:, channel] = samples.f
+        low[:, channel], high[:, channel] = bounds(samples.places, samples.sources, quantile)
     corners = surface.result.corners_mm[triangle].astype(np.float64)
     own_from_base = _frame(normal, along_x)
     ways = [

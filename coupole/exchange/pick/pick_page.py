@@ -57,14 +57,14 @@ def page_text(points_mm: NDArray[np.float64], triangles: NDArray[np.int64], titl
         "triangles": base64.b64encode(triangles.astype("<u4").tobytes()).decode(),
     }
     look = resources.files("coupole.exchange.look") / "page"
-    own = resources.files(__package__) / "page"
+    folder = resources.files(__package__) / "page"
     scripts = [(look / name).read_text(encoding="utf-8") for name in _SHARED]
-    scripts += [(own / name).read_text(encoding="utf-8") for name in SCRIPTS]
-    filled = {
+    scripts += [(folder / name).read_text(encoding="utf-8") for name in SCRIPTS]
+    contents = {
         "TITLE": escape(title),
-        "STYLE": (own / "pick.css").read_text(encoding="utf-8"),
+        "STYLE": (folder / "pick.css").read_text(encoding="utf-8"),
         "MESH": in_script(mesh),
         "SCRIPTS": "\n".join(scripts),
     }
-    page = (own / "pick.html").read_text(encoding="utf-8")
-    return re.sub(f"%({'|'.join(filled)})%", lambda found: filled[found[1]], page)
+    page = (folder / "pick.html").read_text(encoding="utf-8")
+    return re.sub(f"%({'|'.join(contents)})%", lambda found: contents[found[1]], page)

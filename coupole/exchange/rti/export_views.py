@@ -60,18 +60,18 @@ def export_views(
     names = [source.resolve().name] if of_result else chosen_views(Run(source), views)
     if not overwrite:
         refuse_standing([_first_file(out, to, name) for name in names])
-    written = Written()
+    export = Written()
     with writing_into(out), threadpool_limits(1, "blas"):  # its threads only wait for each other here
         if to == "dome":
-            written.paths = [rti_pictures.write_dome(Run(source), name, out / f"{name}.dome") for name in names]
+            export.paths = [rti_pictures.write_dome(Run(source), name, out / f"{name}.dome") for name in names]
         elif to == "iiif":
-            written.paths = iiif.write(lit_views(source, views, out, say), out, how.base_url, say)
+            export.paths = iiif.write(lit_views(source, views, out, say), out, how.base_url, say)
         else:
             for view in lit_views(source, views, out, say):
                 paths, misses_dn = _write(view, to, out, how, say)
-                written.paths += paths
-                written.misses_dn[view.name] = misses_dn
-    return written
+                export.paths += paths
+                export.misses_dn[view.name] = misses_dn
+    return export
 
 
 def _first_file(out: Path, to: str, name: str) -> Path:

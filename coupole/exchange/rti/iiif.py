@@ -67,21 +67,21 @@ def write_tiles(codes: NDArray[np.uint8], folder: Path, url: str) -> list[Path]:
     factors = [1]
     while max(width, height) / factors[-1] > _TILE_PX:
         factors.append(2 * factors[-1])
-    written = {"full/max": codes}
+    codes_by_address = {"full/max": codes}
     sizes = []
     for factor in factors:
         across, down = -(-width // factor), -(-height // factor)
         level = np.asarray(cv2.resize(codes, (across, down), interpolation=cv2.INTER_AREA), np.uint8)
         if max(across, down) <= _LARGEST_WHOLE_PX:
             sizes.append({"width": across, "height": down})
-            written[f"full/{across},{down}"] = level
+            codes_by_address[f"full/{across},{down}"] = level
         for top in range(0, down, _TILE_PX):
-            for left in range(0, across, _TILE_PX):
-                tile = level[top : top + _TILE_PX, left : left + _TILE_PX]
+            for left_px in range(0, across, _TILE_PX):
+                tile = level[top : top + _TILE_PX, left_px : left_px + _TILE_PX]
                 if tile.shape != level.shape:
-                    x, y = left * factor, top * factor
-                    wide, high = (min(_TILE_PX * factor, one) for one in (width - x, height - y))
-                    written[f"{x},{y},{wide},{high}/{tile.shape[1]},{tile.shape[0]}"] = tile
+                    x, y = left_px * factor, top * factor
+                    wide, high = (min(_TILE_PX * factor, side_px) for side_px in (width - x, height - y))
+                    codes_by_address[f"{x},{y},{wide},{high}/{tile.shape[1]},{tile.shape[0]}"] = tile
     info = {
         "@context": "http://iiif.io/api/image/3/context.json",
         "id": url,
@@ -93,8 +93,8 @@ def write_tiles(codes: NDArray[np.uint8], folder: Path, url: str) -> list[Path]:
         "sizes": sizes[::-1],
         "tiles": [{"width": _TILE_PX, "height": _TILE_PX, "scaleFactors": factors}],
     }
-    paths = [folder / address / "0" / "default.jpg" for address in written]
-    for path, part in zip(paths, written.values(), strict=True):
+    paths = [folder / address / "0" / "default.jpg" for address in codes_by_address]
+    for path, part in zip(paths, codes_by_address.values(), strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(_jpeg(part))
     write_synced(folder / "info.json", json.dumps(info, indent=1) + "\n")
@@ -111,8 +111,8 @@ def _pictures(view: LitView, say: Said) -> Iterator[tuple[str, str, NDArray[np.u
     yield "soft", "Soft light: the mean of all lights", _codes(srgb(total / max(white, np.float32(1e-9))))
     tilt = np.radians(_RAKING_ELEVATION_DEG)
     for side, (x, y) in _SIDES.items():
-        wanted = np.array([x * np.cos(tilt), y * np.cos(tilt), np.sin(tilt)])
-        number = int(np.argmax(view.directions @ wanted))
+        direction = np.array([x * np.cos(tilt), y * np.cos(tilt), np.sin(tilt)])
+        number = int(np.argmax(view.directions @ direction))
         elevation_deg = np.degrees(np.arcsin(view.directions[number, 2]))
         label = f"Light from the {side}, {elevation_deg:.0f} degrees above the picture's plane"
         yield side, label, _codes(view.encoded(number))

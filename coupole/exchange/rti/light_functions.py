@@ -75,10 +75,10 @@ def bilinear_nodes(lights: Floats, resolution: int) -> Floats:
     is nearest to interpolation by radial functions, over the half sphere."""
     directions = _half_sphere(_DENSE_PER_NODE * resolution * resolution)
     between = np.sort(np.linalg.norm(lights[:, None] - lights[None], axis=2), axis=1)[:, 1]
-    away = np.array([np.linalg.norm(lights - one, axis=1).min() for one in directions])
+    away = np.array([np.linalg.norm(lights - direction, axis=1).min() for direction in directions])
     trust = np.where(away < 2.0 * np.median(between), 1.0, _UNLIT_WEIGHT)[:, None]
-    shares, wanted = bilinear(directions, resolution), weights(lights, directions, _KERNEL)
-    return np.asarray(np.linalg.lstsq(trust * shares, trust * wanted, rcond=None)[0])
+    shares, goal = bilinear(directions, resolution), weights(lights, directions, _KERNEL)
+    return np.asarray(np.linalg.lstsq(trust * shares, trust * goal, rcond=None)[0])
 
 
 def _half_sphere(count: int) -> Floats:

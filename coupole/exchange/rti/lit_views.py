@@ -55,8 +55,8 @@ class LitView:
 
     def encoded(self, number: int) -> Picture:
         """[h, w, 3] as displays take it: sRGB, 0 to 1."""
-        encoded: Picture = srgb(self.linear(number))
-        return encoded
+        picture: Picture = srgb(self.linear(number))
+        return picture
 
     def some_pixels(self, most: int) -> slice:
         """Choose pixels at equal steps, in the order of rows."""
@@ -64,11 +64,11 @@ class LitView:
 
     def samples(self, pixels: slice, say: Said) -> Picture:
         """[lights, pixels, 3] encoded."""
-        found = []
+        values = []
         for number in range(len(self)):
-            found.append(srgb(self.linear(number).reshape(-1, 3)[pixels]))
+            values.append(srgb(self.linear(number).reshape(-1, 3)[pixels]))
             say(f"{self.name}: reading", number + 1, len(self))
-        return np.stack(found)
+        return np.stack(values)
 
     def projected(self, weights: Floats, say: Said) -> Picture:
         """[h, w, planes]: sums of encoded values by `weights` [lights, 3, planes]."""
@@ -90,10 +90,12 @@ class LitView:
 def chosen_views(run: Run, patterns: Sequence[str]) -> list[str]:
     """Names of the views that match one of the patterns; all without patterns. Raises InputError if none does."""
     names = list(dict.fromkeys(shot.view for shot in run.proven()))
-    chosen = [name for name in names if not patterns or any(fnmatch.fnmatchcase(name, one) for one in patterns)]
-    if not chosen:
+    matches = [
+        name for name in names if not patterns or any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+    ]
+    if not matches:
         raise InputError(f"{run.folder}: no view matches; it has {', '.join(names)}")
-    return chosen
+    return matches
 
 
 def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -> Iterator[LitView]:
@@ -111,21 +113,21 @@ def lit_views(source: Path, patterns: Sequence[str], scratch: Path, say: Said) -
 def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
     """A view whose pictures are written into `folder`: nominal places of LEDs, values divided by their nominal
     light. Raises InputError for too few LEDs before the camera."""
-    taken = write_pictures(run.folder, name, folder, lambda step, done, of: say(f"{name}: {step}", done, of))
-    directions = taken.lights_mm / np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
+    pictures = write_pictures(run.folder, name, folder, lambda step, done, of: say(f"{name}: {step}", done, of))
+    directions = pictures.lights_mm / np.linalg.norm(pictures.lights_mm, axis=1, keepdims=True)
     strengths = read_rows(folder / INTENSITIES, (3,))
-    height, width = read_picture(taken.files[0]).shape[:2]
+    height, width = read_picture(pictures.files[0]).shape[:2]
 
     def linear(number: int) -> Picture:
         factors = (1.0 / (65535.0 * strengths[number])).astype(np.float32)
-        values: Picture = read_picture(taken.files[number]) * factors
+        values: Picture = read_picture(pictures.files[number]) * factors
         return values
 
     return _seen(
         name=name,
-        origin=f"Coupole, {'simulated' if taken.simulated else 'measured'}: {run.folder.name}, view {name}",
+        origin=f"Coupole, {'simulated' if pictures.simulated else 'measured'}: {run.folder.name}, view {name}",
         size_px=(width, height),
-        pixel_mm=taken.width_mm / width,
+        pixel_mm=pictures.width_mm / width,
         directions=directions,
         linear=linear,
         say=say,
@@ -135,8 +137,8 @@ def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
 def view_of_result(result: PictureResult, say: Said) -> LitView:
     """The view of a result of pictures; black outside its mask."""
     about, height, width = result.about, *result.mask.shape
-    known: dict[Any, str] = {True: "simulated", False: "measured"}
-    kind = known.get(about.get("simulated"), "not known whether measured or simulated")
+    kinds: dict[Any, str] = {True: "simulated", False: "measured"}
+    kind = kinds.get(about.get("simulated"), "not known whether measured or simulated")
     of = about.get("uncalibrated_run") or result.folder.name
     return _seen(
         name=result.folder.name,
@@ -158,9 +160,9 @@ def _seen(*, linear: Callable[[int], Picture], directions: Floats, name: str, sa
             f"{name}: {len(above)} lights are before the picture's plane; at least {FEWEST_LIGHTS} are needed"
         )
     brightest = linear(int(above[0])).max(axis=2)
-    for done, number in enumerate(above):
+    for count, number in enumerate(above):
         brightest = np.maximum(brightest, linear(int(number)).max(axis=2))
-        say(f"{name}: white", done + 1, len(above))
+        say(f"{name}: white", count + 1, len(above))
     if not brightest.any():
         raise InputError(f"{name}: the pictures are black")
     white = np.float32(np.quantile(brightest[brightest > 0], WHITE_QUANTILE))

@@ -51,8 +51,8 @@ class PlaneCode:
 
     def misses_dn(self, samples: Picture, planes: Floats) -> float:
         """Rms of what planes [pixels, planes] miss of encoded values [lights, pixels, 3], in steps of 8 bits."""
-        shown = np.einsum("lcp,np->lnc", self.functions, planes) + self.base[:, None]
-        return 255.0 * float(np.sqrt(np.mean((np.clip(shown, 0.0, 1.0) - samples) ** 2)))
+        decoding = np.einsum("lcp,np->lnc", self.functions, planes) + self.base[:, None]
+        return 255.0 * float(np.sqrt(np.mean((np.clip(decoding, 0.0, 1.0) - samples) ** 2)))
 
 
 def eight_bits(values: Picture, low: Any, scale: Any) -> NDArray[np.uint8]:
@@ -82,8 +82,8 @@ def of_principal_parts(samples: Picture, lights: Floats, name: str, planes: int)
     """Return the code of principal components of encoded values [lights, pixels, 3] (relight's `mrgb`). Functions
     of light are tables of 8 bit, over the lights (`rbf`) or the nodes of a grid (`bilinear`)."""
     count = len(lights)
-    seen = samples[:, samples.any(axis=(0, 2))]
-    values = seen.transpose(1, 0, 2).reshape(seen.shape[1], -1)
+    lit_samples = samples[:, samples.any(axis=(0, 2))]
+    values = lit_samples.transpose(1, 0, 2).reshape(lit_samples.shape[1], -1)
     mean = values.mean(axis=0, dtype=np.float64)
     vectors = _principal(values - mean.astype(np.float32), planes)
     if name == "bilinear":
@@ -109,9 +109,9 @@ def _principal(values: Picture, count: int) -> Floats:
     """[count, dimensions] of values [pixels, dimensions], the largest first; zeros where there are no more."""
     vectors = np.zeros((count, values.shape[1]))
     if count < min(values.shape):
-        _, sizes, found = scipy.sparse.linalg.svds(values, k=count, random_state=0)
+        _, sizes, components = scipy.sparse.linalg.svds(values, k=count, random_state=0)
     else:
-        _, sizes, found = np.linalg.svd(values, full_matrices=False)
+        _, sizes, components = np.linalg.svd(values, full_matrices=False)
     order = np.argsort(-sizes)[:count]
-    vectors[: len(order)] = found[order]
+    vectors[: len(order)] = components[order]
     return vectors

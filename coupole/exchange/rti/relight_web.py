@@ -39,14 +39,14 @@ def write(view: LitView, folder: Path, basis: str, planes: int, say: Said) -> tu
     low, high = values.min(axis=(0, 1)), values.max(axis=(0, 1))
     scale = np.maximum(high - low, 1e-6).astype(np.float64)
     bias = -low / scale
-    paths, decoded = [], []
+    paths, decodings = [], []
     for number in range(values.shape[2] // 3):
         channels = slice(3 * number, 3 * number + 3)
         content = rgb_jpeg(eight_bits(values[..., channels], low[channels], scale[channels]))
-        decoded.append(np.asarray(Image.open(io.BytesIO(content))).reshape(-1, 3)[some].copy())
+        decodings.append(np.asarray(Image.open(io.BytesIO(content))).reshape(-1, 3)[some].copy())
         paths.append(folder / f"plane_{number}.jpg")
         write_synced(paths[-1], content)
-    misses_dn = code.misses_dn(samples, (np.concatenate(decoded, axis=1) / 255.0 - bias) * scale)
+    misses_dn = code.misses_dn(samples, (np.concatenate(decodings, axis=1) / 255.0 - bias) * scale)
     material = {"scale": scale.tolist(), "bias": bias.tolist()}
     if code.ranges:
         material["range"] = list(code.ranges)

@@ -30,21 +30,21 @@ def write_ptm(view: LitView, path: Path, say: Said) -> float:
     width, height = view.size_px
     terms = light_functions.ptm(view.directions)
     code = of_terms(terms, "ptm")
-    each = code.planes_of(view, say).reshape(-1, 6, 3)
-    luminance, colours = np.empty((len(each), 6), np.float32), np.empty((len(each), 3), np.uint8)
-    for first in range(0, len(each), _BLOCK):
+    coefficients = code.planes_of(view, say).reshape(-1, 6, 3)
+    luminance, colours = np.empty((len(coefficients), 6), np.float32), np.empty((len(coefficients), 3), np.uint8)
+    for first in range(0, len(coefficients), _BLOCK):
         block = slice(first, first + _BLOCK)
-        found, colour = _one_colour(each[block], np.linalg.qr(terms).R)
-        luminance[block], colours[block] = found[:, _PTM_ORDER], np.rint(255.0 * colour)
+        terms_of_block, colour = _one_colour(coefficients[block], np.linalg.qr(terms).R)
+        luminance[block], colours[block] = terms_of_block[:, _PTM_ORDER], np.rint(255.0 * colour)
     scale, bias, codes = _with_whole_bias(luminance)
     header = ["PTM_1.2", "PTM_FORMAT_LRGB", str(width), str(height)]
     header += [" ".join(f"{value:.9g}" for value in scale), " ".join(map(str, bias))]
     bottom_first = (plane.reshape(height, width, -1)[::-1].tobytes() for plane in (codes, colours))
     write_synced(path, "\n".join([*header, ""]).encode("ascii") + b"".join(bottom_first))
     some = view.some_pixels(_CHECKED_PIXELS)
-    shown = np.empty(codes[some].shape)
-    shown[:, _PTM_ORDER] = (codes[some] - bias.astype(np.float64)) * scale / 255.0
-    planes = shown[..., None] * (colours[some] / 255.0)[:, None]
+    decoding = np.empty(codes[some].shape)
+    decoding[:, _PTM_ORDER] = (codes[some] - bias.astype(np.float64)) * scale / 255.0
+    planes = decoding[..., None] * (colours[some] / 255.0)[:, None]
     return code.misses_dn(view.samples(some, say), planes.reshape(len(planes), -1))
 
 
@@ -62,15 +62,15 @@ def write_hsh(view: LitView, path: Path, say: Said) -> float:
     header = f"#HSH1.2\r\n3\r\n{width} {height} 3\r\n9 2 1\r\n".encode("ascii")
     write_synced(path, header + scale.tobytes() + bias.tobytes() + codes.tobytes())
     some = view.some_pixels(_CHECKED_PIXELS)
-    shown = (codes[some] / 255.0 * scale + bias).transpose(0, 2, 1)
-    return code.misses_dn(view.samples(some, say), shown.reshape(len(shown), -1))
+    decoding = (codes[some] / 255.0 * scale + bias).transpose(0, 2, 1)
+    return code.misses_dn(view.samples(some, say), decoding.reshape(len(decoding), -1))
 
 
 def _one_colour(each: Picture, triangular: Floats) -> tuple[Floats, Floats]:
     """Luminance [pixels, 6] and colour [pixels, 3], the largest channel 1, whose product is nearest to `each`
     [pixels, 6, 3] over the lights; `triangular` is R of the terms' QR: the first singular vectors of R `each`."""
-    weighed = np.einsum("ij,pjc->pic", triangular.astype(np.float32), each)
-    products = np.einsum("pic,pid->pcd", weighed, weighed)
+    projections = np.einsum("ij,pjc->pic", triangular.astype(np.float32), each)
+    products = np.einsum("pic,pid->pcd", projections, projections)
     vectors = np.linalg.eigh(products)[1][..., -1].astype(np.float64)
     vectors *= np.where(vectors.sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
     vectors = np.maximum(vectors, 0.0)

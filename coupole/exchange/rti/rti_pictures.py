@@ -33,31 +33,33 @@ def export_rti(
     `overwrite`); StorageError for damaged frames or a disk that cannot be written.
     """
     run = Run(folder)
-    chosen = chosen_views(run, views)
+    names = chosen_views(run, views)
     if not overwrite:
-        refuse_standing([out / view / f"{view}.lp" for view in chosen])
+        refuse_standing([out / view / f"{view}.lp" for view in names])
     paths: list[Path] = []
-    for view in chosen:
+    for view in names:
         with writing_into(out / view):
             paths += _export_view(run, view, out / view, say)
     return paths
 
 
 def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], None]) -> list[Path]:
-    taken = write_pictures(run.folder, view, out / LINEAR, lambda step, done, of: say(f"{view}: {step}", done, of))
-    brightest = _read(taken.files[0])
-    for source in taken.files:
+    pictures = write_pictures(
+        run.folder, view, out / LINEAR, lambda step, done, of: say(f"{view}: {step}", done, of)
+    )
+    brightest = _read(pictures.files[0])
+    for source in pictures.files:
         brightest = np.maximum(brightest, _read(source))
     codes = _srgb_codes(float(np.quantile(brightest.max(axis=2), WHITE_QUANTILE)))
     paths = []
-    for number, source in enumerate(taken.files):
+    for number, source in enumerate(pictures.files):
         paths.append(out / f"{source.stem}.jpg")
         write_synced(paths[-1], cv2.imencode(".jpg", codes[_read(source)], _JPEG)[1].tobytes())
-        say(f"{view}: jpeg", number + 1, len(taken.files))
-    directions = taken.lights_mm / np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
+        say(f"{view}: jpeg", number + 1, len(pictures.files))
+    directions = pictures.lights_mm / np.linalg.norm(pictures.lights_mm, axis=1, keepdims=True)
     lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
     write_synced(out / f"{view}.lp", "\n".join([str(len(lines)), *lines]) + "\n")
-    dome = _write_dome(run, view, taken, out / f"{view}.dome")
+    dome = _write_dome(run, view, pictures, out / f"{view}.dome")
     return [*paths, out / f"{view}.lp", dome, *sorted((out / LINEAR).iterdir())]
 
 

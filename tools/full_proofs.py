@@ -45,11 +45,13 @@ class Proof:
 def _rooms() -> list[Proof]:
     """All tests at full scale, a folder each."""
     folders = sorted(path.parent.name for path in (ROOT / "tests").glob("*/") if any(path.rglob("test_*.py")))
-    found = []
+    proofs = []
     for folder in folders:
         apart = f" --ignore {_APART[f'tests/{folder}']}" if f"tests/{folder}" in _APART else ""
-        found.append(Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}"))
-    return found
+        proofs.append(
+            Proof(f"tests-{folder}", f"tests/{folder} at full scale", f"{_PYTEST} tests/{folder}{apart}")
+        )
+    return proofs
 
 
 PROOFS = (
@@ -114,7 +116,7 @@ class Ended:
 def run(proof: Proof) -> Ended:
     """Run one proof with its output in a file."""
     log = LOGS / f"{proof.name}.log"
-    commit, started = _commit(), time.monotonic()
+    commit, start_s = _commit(), time.monotonic()
     with log.open("w") as file:
         command = [sys.executable, *shlex.split(proof.command)]
         code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False).returncode
@@ -124,7 +126,7 @@ def run(proof: Proof) -> Ended:
         date=f"{datetime.now(UTC):%Y-%m-%d}",
         commit=commit,
         machine=f"{os.cpu_count()} cores",
-        minutes=round((time.monotonic() - started) / 60.0, 1),
+        minutes=round((time.monotonic() - start_s) / 60.0, 1),
         code=code,
         figure=lines[-1].strip("= ") if lines else "",
     )
@@ -134,8 +136,8 @@ def _commit() -> str:
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
-    changed = "changed: " if git("status", "--porcelain", "--untracked-files=no") else ""
-    return changed + git("rev-parse", "--short=8", "HEAD")
+    prefix = "changed: " if git("status", "--porcelain", "--untracked-files=no") else ""
+    return prefix + git("rev-parse", "--short=8", "HEAD")
 
 
 # -- what is kept ---------------------------------------------------------------------------------------------
@@ -144,8 +146,8 @@ def _commit() -> str:
 def kept() -> dict[str, Ended]:
     """The last end of each proof."""
     lines = ENDED.read_text(encoding="utf-8").splitlines() if ENDED.exists() else []
-    found = [Ended(**json.loads(line)) for line in lines]
-    return {one.name: one for one in found}
+    outcomes = [Ended(**json.loads(line)) for line in lines]
+    return {outcome.name: outcome for outcome in outcomes}
 
 
 def keep(ended: Ended) -> None:
@@ -160,15 +162,15 @@ def table(found: dict[str, Ended]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for proof in PROOFS:
-        one = found.get(proof.name)
-        if one is None:
+        outcome = found.get(proof.name)
+        if outcome is None:
             lines.append(f"| {proof.name} | {proof.shows} | not run | | | | |")
             continue
-        verdict = "good" if one.code == 0 else f"**exit {one.code}**"
-        figure = re.sub(r"\s+", " ", one.figure).replace("|", "/")
+        verdict = "good" if outcome.code == 0 else f"**exit {outcome.code}**"
+        figure = re.sub(r"\s+", " ", outcome.figure).replace("|", "/")
         lines.append(
-            f"| {proof.name} | {proof.shows} | {one.date}, {one.commit} | {one.machine} | {one.minutes:.1f} "
-            f"| {verdict} | {figure} |"
+            f"| {proof.name} | {proof.shows} | {outcome.date}, {outcome.commit} | {outcome.machine} "
+            f"| {outcome.minutes:.1f} | {verdict} | {figure} |"
         )
     return "\n".join(lines)
 
@@ -186,21 +188,21 @@ def main() -> int:
             console.print(f"{proof.name:18} {proof.shows}\n{'':18} python {proof.command}", highlight=False)
         return 0
     LOGS.mkdir(parents=True, exist_ok=True)
-    failed = False
+    any_failure = False
     if not options.table:
-        good = set() if options.again else {name for name, one in kept().items() if one.code == 0}
+        good = set() if options.again else {name for name, earlier in kept().items() if earlier.code == 0}
         for proof in PROOFS:
             if proof.name in good or (options.only and proof.name not in options.only):
                 continue
             with console.status(f"{proof.name}: {proof.shows}"):
-                ended = run(proof)
-            keep(ended)
-            failed |= ended.code != 0
+                outcome = run(proof)
+            keep(outcome)
+            any_failure |= outcome.code != 0
             console.print(
-                f"{proof.name}: {ended.minutes:.1f} min, exit {ended.code}, {ended.figure}", markup=False
+                f"{proof.name}: {outcome.minutes:.1f} min, exit {outcome.code}, {outcome.figure}", markup=False
             )
     print(table(kept()))
-    return int(failed)
+    return int(any_failure)
 
 
 if __name__ == "__main__":

@@ -112,7 +112,8 @@ def test(references: References, folder: Path) -> None:
         for true, finding in results:
             first = finding.candidates[0]
             print(
-                f"  {finding.name:38s} {true:28s} {finding.verdict:9s} {finding.class_name:28s} {first.probability:.2f}"
+                f"  {finding.name:38s} {true:28s} {finding.verdict:9s} {finding.class_name:28s} "
+                f"{first.probability:.2f}"
             )
     right = sum(finding.candidates[0].class_name == true for true, finding in with_class)
     match_is_right = [finding.class_name == true for true, finding in with_class if finding.verdict == "match"]
@@ -121,7 +122,7 @@ def test(references: References, folder: Path) -> None:
     print(f"(2) match, right: {Rate(sum(match_is_right), len(with_class))}; wrong: {wrong}")
     for number, results in ((3, without_class), (4, never)):
         print(
-            f"({number}) unknown: {Rate(sum(finding.verdict == 'unknown' for _, match in results), len(results))}"
+            f"({number}) unknown: {Rate(sum(finding.verdict == 'unknown' for _, finding in results), len(results))}"
         )
 
 

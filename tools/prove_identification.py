@@ -121,9 +121,8 @@ def test(references: References, folder: Path) -> None:
     wrong = Rate(len(match_is_right) - sum(match_is_right), len(with_class))
     print(f"(2) match, right: {Rate(sum(match_is_right), len(with_class))}; wrong: {wrong}")
     for number, results in ((3, without_class), (4, never)):
-        print(
-            f"({number}) unknown: {Rate(sum(finding.verdict == 'unknown' for _, finding in results), len(results))}"
-        )
+        unknown = Rate(sum(finding.verdict == "unknown" for _, finding in results), len(results))
+        print(f"({number}) unknown: {unknown}")
 
 
 def main() -> None:

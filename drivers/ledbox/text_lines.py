@@ -97,7 +97,7 @@ def _check_template(name: str, template: str) -> None:
         if missing := must - template_fields:
             raise ValueError(f"it lacks {{{min(missing)}}}")
         if unknown := template_fields - may:
-            allowed_fields = ", ".join(f"{{{field}}}" for field in sorted(may)) or "no field"
+            allowed_fields = ", ".join(f"{{{known_field}}}" for known_field in sorted(may)) or "no field"
             raise ValueError(f"it has {{{min(unknown)}}}; allowed: {allowed_fields}")
         line = template.format(led=0, on_ms=1)
     except (ValueError, IndexError, KeyError) as error:

@@ -90,8 +90,8 @@ class ArmWitness:
             )
         if not is_counted:
             return (
-                f"{missing_cycles} cycles passed without an answer, but its counter of late answers rose by {rise}: "
-                "RSI was started anew, or its cycle has changed"
+                f"{missing_cycles} cycles passed without an answer, but its counter of late answers "
+                f"rose by {rise}: RSI was started anew, or its cycle has changed"
             )
         silent_s = (now_ns - self._last_ns) / 1e9 - advance // step * self._cycle_s
         if not 0 < self._unaccounted_s < silent_s:

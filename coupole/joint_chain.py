@@ -246,9 +246,9 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
     """The existing branches [6], plus those that py-opw-kinematics misses when the wrist is stretched."""
     base_from_opw = base_from_flange @ _solver(wrist)[1]
     raw = _raw_branches(wrist, base_from_opw)
-    branches = [branch for branch in raw if not np.isnan(branch).any()]
-    if len(branches) == len(raw):
-        return branches
+    branches_deg = [branch for branch in raw if not np.isnan(branch).any()]
+    if len(branches_deg) == len(raw):
+        return branches_deg
     # Turned a little about the wrist centre the same wrist position is reached by the same A1, A2, A3.
     nudged_pose = np.array(base_from_opw, dtype=np.float64)
     wrist_mm = nudged_pose[:3, 3] - wrist.c4_mm * nudged_pose[:3, 2]
@@ -264,8 +264,8 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
             continue
         a6_deg = float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
         a6_deg = -a6_deg if wrist.flip_axes[5] else a6_deg
-        branches.append(np.array([*branch[:3], 0.0, stretched_deg, a6_deg]))
-    return branches
+        branches_deg.append(np.array([*branch[:3], 0.0, stretched_deg, a6_deg]))
+    return branches_deg
 
 
 def _turned(first: float, fore: float) -> Floats:

@@ -109,20 +109,21 @@ def test(references: References, folder: Path) -> None:
         ("not in it", never),
     ):
         print(f"\n{title}:")
-        for true, finding in results:
-            first = finding.candidates[0]
+        for true, answer in results:
+            first = answer.candidates[0]
             print(
-                f"  {finding.name:38s} {true:28s} {finding.verdict:9s} {finding.class_name:28s} "
+                f"  {answer.name:38s} {true:28s} {answer.verdict:9s} {answer.class_name:28s} "
                 f"{first.probability:.2f}"
             )
-    right = sum(finding.candidates[0].class_name == true for true, finding in with_class)
-    match_is_right = [finding.class_name == true for true, finding in with_class if finding.verdict == "match"]
+    right = sum(answer.candidates[0].class_name == true for true, answer in with_class)
+    match_is_right = [answer.class_name == true for true, answer in with_class if answer.verdict == "match"]
     print(f"\n(1) first candidate right: {Rate(right, len(with_class))}")
     wrong = Rate(len(match_is_right) - sum(match_is_right), len(with_class))
     print(f"(2) match, right: {Rate(sum(match_is_right), len(with_class))}; wrong: {wrong}")
     for number, results in ((3, without_class), (4, never)):
-        unknown = Rate(sum(finding.verdict == "unknown" for _, finding in results), len(results))
-        print(f"({number}) unknown: {unknown}")
+        print(
+            f"({number}) unknown: {Rate(sum(answer.verdict == 'unknown' for _, answer in results), len(results))}"
+        )
 
 
 def main() -> None:

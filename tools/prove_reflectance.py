@@ -147,16 +147,18 @@ def _print(verdicts: list[dict[str, Any]], faults: list[str], cells: int) -> Non
     thirds = [f"{low:g}-{high:g}" for low, high in pairwise(THIRDS_DEG)]
     table = Table("material", *(f"in, {third}" for third in thirds), "normals", "in", "mae: GGX, SH, RBF, GGX+RBF",
                   "new view", box=None)  # fmt: skip
-    for verdict in verdicts:
-        shares = np.array(verdict["inside"])
-        mae = " ".join(f"{1e2 * verdict['mae'][name]:.2f}" for name in ("ggx_normal", "sh", "rbf", "ggx_rbf"))
+    for material_verdict in verdicts:
+        shares = np.array(material_verdict["inside"])
+        mae = " ".join(
+            f"{1e2 * material_verdict['mae'][name]:.2f}" for name in ("ggx_normal", "sh", "rbf", "ggx_rbf")
+        )
         table.add_row(
-            verdict["material"],
+            material_verdict["material"],
             *(f"{1e2 * column.min():.1f}-{1e2 * column.max():.1f} %" for column in shares.T),
-            f"{verdict['fitted_deg']:.2f} of {verdict['scanned_deg']:.2f} deg",
-            f"{1e2 * verdict['normals_inside']:.1f} %",
+            f"{material_verdict['fitted_deg']:.2f} of {material_verdict['scanned_deg']:.2f} deg",
+            f"{1e2 * material_verdict['normals_inside']:.1f} %",
             f"{mae} %",
-            f"{verdict['new_over_old_view']:.2f}",
+            f"{material_verdict['new_over_old_view']:.2f}",
         )
     console.print(table)
     for fault in faults:

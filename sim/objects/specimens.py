@@ -135,7 +135,9 @@ def specimen(name: str) -> Material:
     name."""
     if name not in SPECIMENS:
         raise InputError(f"specimen: expected one of {', '.join(SPECIMENS)}; found {name!r}; choose one of them")
-    brdf = SPECIMENS[name]()
+    specimen_brdf = SPECIMENS[name]()
     weights = camera_weights(LedModel(), light.camera())
-    red, green, blue = np.clip(albedo(brdf, np.array([np.sqrt(0.5)]), nodes=24)[0] @ weights.T, 1e-6, 1.0).tolist()
-    return Material(name, (red, green, blue), table=tabulate(brdf, weights))
+    red, green, blue = np.clip(
+        albedo(specimen_brdf, np.array([np.sqrt(0.5)]), nodes=24)[0] @ weights.T, 1e-6, 1.0
+    ).tolist()
+    return Material(name, (red, green, blue), table=tabulate(specimen_brdf, weights))

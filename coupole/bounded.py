@@ -157,16 +157,16 @@ class _Runner(Generic[T]):
 
     def _run(self) -> None:
         try:
-            found = self._do()
+            outcome = self._do()
         except BaseException as error:  # noqa: BLE001  raised again in the thread that waits
             self._done.set_exception(error)
             return
         with self._lock:
             if not self.is_left:
-                self._done.set_result(found)
+                self._done.set_result(outcome)
                 return
         with suppress(Exception):
-            self._unwanted(found)
+            self._unwanted(outcome)
 
     def ended(self, within_s: float) -> bool:
         with suppress(TimeoutError):
@@ -294,7 +294,7 @@ def leave_behind(waited_for: threading.Thread | Call) -> None:
 
 def left_behind() -> bool:
     """Tell whether something that was given up still hangs."""
-    return any(one in _UNDER_WAY if isinstance(one, Call) else one.is_alive() for one in _LEFT)
+    return any(leftover in _UNDER_WAY if isinstance(leftover, Call) else leftover.is_alive() for leftover in _LEFT)
 
 
 def leave(code: int) -> NoReturn:

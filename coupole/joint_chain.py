@@ -138,9 +138,9 @@ def shoulder_mm(chain: JointChain) -> Floats:
 @lru_cache(maxsize=32)
 def structure_of(chain: JointChain) -> Structure | None:
     """The chain's solvable structure; None if it has neither."""
-    for found in (_spherical_wrist(chain), _parallel_axes(chain)):
-        if found is not None and all(_solves(found, chain, joints_deg) for joints_deg in _PROOF_DEG):
-            return found
+    for structure in (_spherical_wrist(chain), _parallel_axes(chain)):
+        if structure is not None and all(_solves(structure, chain, joints_deg) for joints_deg in _PROOF_DEG):
+            return structure
     return None
 
 
@@ -167,10 +167,10 @@ def _solves(structure: Structure, chain: JointChain, joints_deg: tuple[float, ..
     """True if all solutions for a pose reproduce it and include the joint angles from which the pose was
     computed."""
     pose = link_frames(chain, joints_deg)[FLANGE]
-    found = np.array(_branches(structure, pose)).reshape(-1, 6)
-    off_deg = np.abs((found - joints_deg + 180.0) % 360.0 - 180.0).max(axis=1, initial=0.0)
-    there = link_frames(chain, found)[:, FLANGE]
-    return len(found) > 0 and bool(np.abs(there - pose).max() < 1e-6) and bool(off_deg.min() < 1e-6)
+    branches_deg = np.array(_branches(structure, pose)).reshape(-1, 6)
+    off_deg = np.abs((branches_deg - joints_deg + 180.0) % 360.0 - 180.0).max(axis=1, initial=0.0)
+    there = link_frames(chain, branches_deg)[:, FLANGE]
+    return len(branches_deg) > 0 and bool(np.abs(there - pose).max() < 1e-6) and bool(off_deg.min() < 1e-6)
 
 
 def _directions(chain: JointChain) -> Floats:
@@ -238,25 +238,25 @@ def _raw_branches(wrist: SphericalWrist, base_from_opw: Transform) -> Floats:
     """[8, 6] in degrees, wrapped to +-180, regardless of limits; NaN where a branch does not exist."""
     from py_opw_kinematics import RigidTransform
 
-    found: Floats = _solver(wrist)[0].reach(RigidTransform.from_matrix(base_from_opw)).joints[0]
-    return found + 0.0  # makes -0 to 0
+    branches_deg: Floats = _solver(wrist)[0].reach(RigidTransform.from_matrix(base_from_opw)).joints[0]
+    return branches_deg + 0.0  # makes -0 to 0
 
 
 def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transform) -> list[Floats]:
     """The existing branches [6], plus those that py-opw-kinematics misses when the wrist is stretched."""
     base_from_opw = base_from_flange @ _solver(wrist)[1]
     raw = _raw_branches(wrist, base_from_opw)
-    found = [branch for branch in raw if not np.isnan(branch).any()]
-    if len(found) == len(raw):
-        return found
+    branches_deg = [branch for branch in raw if not np.isnan(branch).any()]
+    if len(branches_deg) == len(raw):
+        return branches_deg
     # Turned a little about the wrist centre the same wrist position is reached by the same A1, A2, A3.
-    nudged = np.array(base_from_opw, dtype=np.float64)
-    wrist_mm = nudged[:3, 3] - wrist.c4_mm * nudged[:3, 2]
+    nudged_pose = np.array(base_from_opw, dtype=np.float64)
+    wrist_mm = nudged_pose[:3, 3] - wrist.c4_mm * nudged_pose[:3, 2]
     c, s = np.cos(_WRIST_NUDGE_RAD), np.sin(_WRIST_NUDGE_RAD)
-    nudged[:3, :3] = nudged[:3, :3] @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    nudged[:3, 3] = wrist_mm + wrist.c4_mm * nudged[:3, 2]
+    nudged_pose[:3, :3] = nudged_pose[:3, :3] @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    nudged_pose[:3, 3] = wrist_mm + wrist.c4_mm * nudged_pose[:3, 2]
     stretched_deg = wrist.offsets_deg[4] * (-1.0 if wrist.flip_axes[4] else 1.0)
-    for branch in _raw_branches(wrist, nudged):
+    for branch in _raw_branches(wrist, nudged_pose):
         first, _, _ = wrist.theta(branch)[:3]
         fore = wrist.theta(branch)[1:3].sum()
         turn = _turned(first, fore).T @ base_from_opw[:3, :3]
@@ -264,8 +264,8 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
             continue
         a6_deg = float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
         a6_deg = -a6_deg if wrist.flip_axes[5] else a6_deg
-        found.append(np.array([*branch[:3], 0.0, stretched_deg, a6_deg]))
-    return found
+        branches_deg.append(np.array([*branch[:3], 0.0, stretched_deg, a6_deg]))
+    return branches_deg
 
 
 def _turned(first: float, fore: float) -> Floats:
@@ -326,21 +326,25 @@ def _branches_of_parallel_axes(arm: ParallelAxes, base_from_flange: Transform) -
     origin lies d4 along n; n in the last frame is (sin t5 cos t6, -sin t5 sin t6, cos t5); axis 5 there is
     (-sin t6, -cos t6, 0); what is left are two links in the plane across n."""
     last = inverse(np.array(arm.base_from_first)) @ base_from_flange @ inverse(np.array(arm.last_from_flange))
-    turned, place_mm = last[:3, :3], last[:3, 3]
+    rotation, place_mm = last[:3, :3], last[:3, 3]
     out_mm = float(np.hypot(place_mm[0], place_mm[1]))
     if out_mm * (1.0 + _ROUNDING) < abs(arm.d4_mm) or out_mm == 0.0:
         return []
     towards, aside = np.arctan2(place_mm[1], place_mm[0]), np.arcsin(np.clip(arm.d4_mm / out_mm, -1.0, 1.0))
-    found = []
+    solutions_rad = []
     for t1 in (towards + aside, towards + np.pi - aside):
         across = np.array((np.sin(t1), -np.cos(t1), 0.0))
-        seen = turned.T @ across
-        sine = float(np.hypot(seen[0], seen[1]))
-        for t5 in (np.arctan2(sine, seen[2]), -np.arctan2(sine, seen[2])):
+        axis_in_flange = rotation.T @ across
+        sine = float(np.hypot(axis_in_flange[0], axis_in_flange[1]))
+        for t5 in (np.arctan2(sine, axis_in_flange[2]), -np.arctan2(sine, axis_in_flange[2])):
             # With the wrist stretched axes 2 to 4 and 6 are parallel: of the family of solutions the one with t6 =
             # 0 is given.
-            t6 = np.arctan2(-seen[1] * np.sign(t5), seen[0] * np.sign(t5)) if sine > _ROUNDING else 0.0
-            fifth = turned @ np.array((-np.sin(t6), -np.cos(t6), 0.0))
+            t6 = (
+                np.arctan2(-axis_in_flange[1] * np.sign(t5), axis_in_flange[0] * np.sign(t5))
+                if sine > _ROUNDING
+                else 0.0
+            )
+            fifth = rotation @ np.array((-np.sin(t6), -np.cos(t6), 0.0))
             elbow_mm = place_mm - arm.d5_mm * fifth - arm.d4_mm * across
             x_mm, y_mm = elbow_mm[0] * np.cos(t1) + elbow_mm[1] * np.sin(t1), elbow_mm[2]
             bend = (x_mm**2 + y_mm**2 - arm.a2_mm**2 - arm.a3_mm**2) / (2.0 * arm.a2_mm * arm.a3_mm)
@@ -351,8 +355,10 @@ def _branches_of_parallel_axes(arm: ParallelAxes, base_from_flange: Transform) -
                 t2 = np.arctan2(y_mm, x_mm) - np.arctan2(
                     arm.a3_mm * np.sin(t3), arm.a2_mm + arm.a3_mm * np.cos(t3)
                 )
-                found.append((np.array((t1, t2, t3, wrist - t2 - t3, t5, t6)) - arm.zeros_rad) * arm.senses)
-    return [np.degrees((angles + np.pi) % (2.0 * np.pi) - np.pi) + 0.0 for angles in found]
+                solutions_rad.append(
+                    (np.array((t1, t2, t3, wrist - t2 - t3, t5, t6)) - arm.zeros_rad) * arm.senses
+                )
+    return [np.degrees((angles + np.pi) % (2.0 * np.pi) - np.pi) + 0.0 for angles in solutions_rad]
 
 
 def _rows(matrix: Transform) -> tuple[tuple[float, ...], ...]:

@@ -91,9 +91,9 @@ def inverse(arm: Arm, base_from_flange: Transform) -> NDArray[np.float64]:
     three parallel axes. Raises ValueError for an arm without `structure_of`.
     """
     solutions = [
-        turned
+        angles_deg
         for branch in joint_chain.branches(arm.chain, base_from_flange)
-        for turned in product(*(_turns(a, limits) for a, limits in zip(branch, arm.limits_deg, strict=True)))
+        for angles_deg in product(*(_turns(a, limits) for a, limits in zip(branch, arm.limits_deg, strict=True)))
     ]
     return np.unique(np.array(solutions, dtype=np.float64).reshape(-1, 6).round(12) + 0.0, axis=0)
 

@@ -49,8 +49,8 @@ def line(name: str, value: float, unit: str, peer: str, ratio: float, **more: An
 
 
 def cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
 
 
 # -- check ------------------------------------------------------------------------------------------------
@@ -68,14 +68,14 @@ def bench_check(asked: Asked) -> None:
         "--no-paths",
     ]
     bare = [sys.executable, "-c", "import numpy, pydantic, h5py"]
-    ours: list[float] = []
+    times_s: list[float] = []
     peers: list[float] = []
     for _ in range(asked.rounds):
-        for argv, times in ((command, ours), (bare, peers)):
+        for argv, times in ((command, times_s), (bare, peers)):
             start = time.perf_counter()
             subprocess.run(argv, check=True, capture_output=True, cwd=ROOT)
             times.append(time.perf_counter() - start)
-    value, peer = statistics.median(ours), statistics.median(peers)
+    value, peer = statistics.median(times_s), statistics.median(peers)
     line("check_large_plan", value, "s", "limit_3_s", 3.0 / value)
     line("check_large_plan", value, "s", "python_imports", peer / value)
 
@@ -155,7 +155,7 @@ def bench_matching(asked: Asked) -> None:
     here = random.random(len(log)) > 0.02
     stamps = (log["t_trigger_ns"] * (1 + 3e-5) + 5e9).astype(np.int64)
     frame_ids, stamps = (np.arange(len(log)) + 1)[here], stamps[here]
-    ours: list[float] = []
+    times_s: list[float] = []
     peers: list[float] = []
 
     def pair() -> None:
@@ -163,15 +163,15 @@ def bench_matching(asked: Asked) -> None:
         nearest.clip(0, len(log) - 1)
 
     def prove() -> None:
-        judged = match(log, frame_ids, stamps, complete=True)
-        assert np.count_nonzero(judged.step_of_frame >= 0) == len(frame_ids)
+        matching = match(log, frame_ids, stamps, complete=True)
+        assert np.count_nonzero(matching.step_of_frame >= 0) == len(frame_ids)
 
     for _ in range(2 if asked.smallest else max(asked.rounds, 3) * 20):
-        for work, times in ((prove, ours), (pair, peers)):
+        for work, times in ((prove, times_s), (pair, peers)):
             start = time.perf_counter()
             work()
             times.append((time.perf_counter() - start) / len(frame_ids) * 1e6)
-    value, peer = statistics.median(ours), statistics.median(peers)
+    value, peer = statistics.median(times_s), statistics.median(peers)
     line("matching_per_frame", value, "us", "frame_period_at_100_hz", 10_000 / value)
     line("matching_per_frame", value, "us", "numpy_nearest_pairing", peer / value, peer_value=round(peer, 4))
 
@@ -299,9 +299,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(BENCHES):
         parser.error(f"expected some of {', '.join(BENCHES)}; found {', '.join(sorted(unknown))}")
-    asked = Asked(arguments.rounds, arguments.frames, arguments.smallest)
+    request = Asked(arguments.rounds, arguments.frames, arguments.smallest)
     for name in arguments.names or BENCHES:
-        BENCHES[name](asked)
+        BENCHES[name](request)
 
 
 if __name__ == "__main__":

@@ -37,49 +37,49 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
     from coupole.storage.bitshuffle import CODECS
 
-    drawn = pictures(DISTINCT, SMALLEST_PX if smallest else SIZE_PX)
+    originals = pictures(DISTINCT, SMALLEST_PX if smallest else SIZE_PX)
     few = SMALLEST_FRAMES if smallest else FEW_FRAMES
     most = SMALLEST_FRAMES if smallest else FRAMES
-    frames = min(most, int(shutil.disk_usage(root).free * 0.4 / drawn[0].nbytes))
+    frames = min(most, int(shutil.disk_usage(root).free * 0.4 / originals[0].nbytes))
     with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
         for name, codec in CODECS.items():
-            yield from _speeds(Path(folder) / "small.h5", drawn, few, name, codec, rounds)
-        path, kept = Path(folder) / "view.h5", Path(folder) / "kept"
-        proven = _write_view(path, drawn, frames)
+            yield from _speeds(Path(folder) / "small.h5", originals, few, name, codec, rounds)
+        path, target_folder = Path(folder) / "view.h5", Path(folder) / "kept"
+        proven = _write_view(path, originals, frames)
         for name, codec in CODECS.items():
-            _archive(path, proven, codec, kept)
-            for what, read in (("tile_through_all_frames", _read_tile), ("one_frame", _read_frame)):
-                ours_s, before_s = _interleaved(rounds, read, path, kept / path.name)
-                figure = _figure(f"archive_{name}_{what}", ours_s, "s", "contiguous", before_s / ours_s)
+            _archive(path, proven, codec, target_folder)
+            for reading, reader in (("tile_through_all_frames", _read_tile), ("one_frame", _read_frame)):
+                ours_s, before_s = _interleaved(rounds, reader, path, target_folder / path.name)
+                figure = _figure(f"archive_{name}_{reading}", ours_s, "s", "contiguous", before_s / ours_s)
                 yield {**figure, "peer_value": round(before_s, 4), "frames": frames}
-            (kept / path.name).replace(path)
+            (target_folder / path.name).replace(path)
 
 
 def _speeds(
     path: Path, pictures: NDArray[np.uint16], frames: int, name: str, codec: Any, rounds: int
 ) -> Iterator[dict[str, Any]]:
     """Ratio and speed for a small view, repeated, interleaved with plain h5py."""
-    proven, kept = _write_view(path, pictures, frames), path.parent / "kept_small"
+    proven, target_folder = _write_view(path, pictures, frames), path.parent / "kept_small"
     compress, read_back, plain, cpu_ms = [], [], [], []
     for _ in range(rounds):
         _forget(path)
         used_s = _cpu_s()
-        done = _archive(path, proven, codec, kept)
+        archiving = _archive(path, proven, codec, target_folder)
         cpu_ms.append(1e3 * (_cpu_s() - used_s) / frames)
-        compress.append(done.pixel_bytes / done.compress_s / 1e6)
-        read_back.append(done.pixel_bytes / done.read_back_s / 1e6)
-        (kept / path.name).replace(path)
+        compress.append(archiving.pixel_bytes / archiving.compress_s / 1e6)
+        read_back.append(archiving.pixel_bytes / archiving.read_back_s / 1e6)
+        (target_folder / path.name).replace(path)
         plain.append(_plain_h5py_mb_s(path.with_name("plain.h5"), path, codec))
-    ours, peer, cost_ms = statistics.median(compress), statistics.median(plain), statistics.median(cpu_ms)
-    yield _figure(f"archive_{name}_ratio", done.ratio, "1", "uncompressed", done.ratio)
+    speed_mb_s, peer, cost_ms = statistics.median(compress), statistics.median(plain), statistics.median(cpu_ms)
+    yield _figure(f"archive_{name}_ratio", archiving.ratio, "1", "uncompressed", archiving.ratio)
     yield {
-        **_figure(f"archive_{name}_compress", ours, "MB/s", "plain_h5py", ours / peer),
+        **_figure(f"archive_{name}_compress", speed_mb_s, "MB/s", "plain_h5py", speed_mb_s / peer),
         "peer_value": round(peer, 1),
         "both_passes_cpu_ms_per_frame": round(cost_ms, 1),
         "both_passes_mb_s_per_core": round(pictures[0].nbytes / cost_ms / 1e3, 1),
     }
     back = statistics.median(read_back)
-    yield _figure(f"archive_{name}_read_back", back, "MB/s", "compress", back / ours)
+    yield _figure(f"archive_{name}_read_back", back, "MB/s", "compress", back / speed_mb_s)
 
 
 def _archive(path: Path, proven: list[Any], codec: Any, kept: Path) -> Any:
@@ -93,8 +93,8 @@ def _figure(name: str, value: float, unit: str, peer: str, ratio: float, **more:
 
 
 def _cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
 
 
 def pictures(count: int, size_px: tuple[int, int] = SIZE_PX) -> NDArray[np.uint16]:
@@ -102,7 +102,7 @@ def pictures(count: int, size_px: tuple[int, int] = SIZE_PX) -> NDArray[np.uint1
     DN, 64 DN black; the light comes from another side in each. Smaller ones show the object smaller."""
     width_px, height_px = size_px
     memory = mmap.mmap(-1, count * width_px * height_px * 2)
-    drawn = np.frombuffer(memory, np.uint16).reshape(count, height_px, width_px)
+    images = np.frombuffer(memory, np.uint16).reshape(count, height_px, width_px)
     y, x = np.mgrid[:height_px, :width_px].astype(np.float32)
     scale = width_px / SIZE_PX[0]
     object_here = np.hypot(x - width_px / 2, y - height_px / 2) < 1300 * scale
@@ -110,13 +110,13 @@ def pictures(count: int, size_px: tuple[int, int] = SIZE_PX) -> NDArray[np.uint1
     relief[::2, ::2] *= 0.8
     relief[1::2, ::2] *= 0.6
     random = np.random.default_rng(1)
-    for number, picture in enumerate(drawn):
+    for number, picture in enumerate(images):
         angle = 2 * np.pi * number / count
         away = np.hypot(x - width_px * (0.5 + 0.2 * np.cos(angle)), y - height_px * (0.5 + 0.2 * np.sin(angle)))
         electrons = 3.35 * 700 * relief * np.exp(-0.5 * (away / (900 * scale)) ** 2)
         noise = random.standard_normal((height_px, width_px), np.float32) * np.sqrt(electrons + 13**2)
         picture[:] = np.clip(np.rint((electrons + noise) / 3.35 + 64), 0, 4095)
-    return drawn
+    return images
 
 
 def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[Any]:
@@ -156,8 +156,8 @@ def _plain_h5py_mb_s(path: Path, before: Path, codec: Any) -> float:
         for number in range(len(pixels)):
             data[number] = pixels[number]
         size_bytes = pixels.size * pixels.dtype.itemsize
-    with path.open("r+b") as written:
-        os.fsync(written.fileno())
+    with path.open("r+b") as raw_file:
+        os.fsync(raw_file.fileno())
     return float(size_bytes / (time.perf_counter() - start_s) / 1e6)
 
 
@@ -173,19 +173,19 @@ def _interleaved(
     """Median seconds for reading from either file."""
     times: dict[Path, list[float]] = {ours: [], before: []}
     for _ in range(rounds):
-        for path, found in times.items():
+        for path, times_s in times.items():
             _forget(path)
             with h5py.File(path) as file:
                 start_s = time.perf_counter()
                 read(file[_DATA])
-                found.append(time.perf_counter() - start_s)
+                times_s.append(time.perf_counter() - start_s)
     return statistics.median(times[ours]), statistics.median(times[before])
 
 
 def _read_tile(data: h5py.Dataset) -> None:
-    left, top = (round(share * size_px) for share, size_px in zip(TILE_AT, data.shape[:0:-1], strict=True))
+    first_column, top = (round(share * size_px) for share, size_px in zip(TILE_AT, data.shape[:0:-1], strict=True))
     for number in range(len(data)):
-        data[number, top : top + TILE_PX, left : left + TILE_PX]
+        data[number, top : top + TILE_PX, first_column : first_column + TILE_PX]
 
 
 def _read_frame(data: h5py.Dataset) -> None:

@@ -63,8 +63,8 @@ def _detection(rounds: int, scale: float) -> dict[str, Any]:
 
     board = Board(kind="charuco", corners=(11, 8), square_mm=16.0, marker_mm=12.0)
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    printed = cv2.aruco.CharucoBoard((12, 9), 16.0, 12.0, markers)
-    flat = printed.generateImage((round(scale * 2880), round(scale * 2160)))
+    charuco_board = cv2.aruco.CharucoBoard((12, 9), 16.0, 12.0, markers)
+    flat = charuco_board.generateImage((round(scale * 2880), round(scale * 2160)))
     turn = np.array([[0.9, -0.2, scale * 900.0], [0.18, 0.92, scale * 250.0]])
     width_px, height_px = (round(scale * side_px) for side_px in SIZE_PX)
     picture = cv2.warpAffine(flat, turn, (width_px, height_px), borderValue=128)
@@ -72,7 +72,7 @@ def _detection(rounds: int, scale: float) -> dict[str, Any]:
     grey = np.asarray(np.clip(image / 16, 0, 255), np.uint8)
 
     def plain() -> Any:
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(grey)
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board).detectBoard(grey)
         return corners, ids
 
     return _compared(
@@ -116,12 +116,12 @@ def _scene(
     for number, eye in enumerate(base_from_camera):
         there = (in_base - eye[:3, 3]) @ eye[:3, :3]
         front = np.flatnonzero(there[:, 2] > 100)
-        seen = _see(there[front], LENS)
-        inside = ((seen > 60) & (seen < np.array(SIZE_PX) - 60)).all(axis=1)
+        image_points = _see(there[front], LENS)
+        inside = ((image_points > 60) & (image_points < np.array(SIZE_PX) - 60)).all(axis=1)
         rows = front[inside]
         point.append(rows)
         view.append(np.full(len(rows), number))
-        pixels.append(seen[inside] + random.normal(0, PIXEL_PX, (len(rows), 2)))
+        pixels.append(image_points[inside] + random.normal(0, PIXEL_PX, (len(rows), 2)))
     flanges = []
     for eye in base_from_camera:
         off = _pose(random.normal(0, ROBOT_MM, 3), np.radians(random.normal(0, ROBOT_DEG, 3)))
@@ -184,8 +184,8 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
 
     scene = _dome(size.boards, size.views)
     count = len(scene.places_mm)
-    known = Boards(np.arange(size.boards), scene.body_of, scene.base_from_body, scene.places_mm)
-    seen = LedSightings(
+    boards = Boards(np.arange(size.boards), scene.body_of, scene.base_from_body, scene.places_mm)
+    sightings = LedSightings(
         scene.view,
         scene.point,
         scene.pixels,
@@ -197,10 +197,10 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
 
     def ours() -> Any:
         return adjust_leds(
-            seen,
+            sightings,
             scene.point,
             scene.base_from_flange,
-            known,
+            boards,
             scene.base_from_body,
             prior,
             Stated(tolerance_mm=TOLERANCE_MM),
@@ -245,10 +245,10 @@ def _dome(boards: int, views: int) -> _Scene:
     )
     order = np.random.default_rng(5).permutation(len(scene.view))
     rank = np.zeros(len(order), int)
-    seen = np.zeros(6 * boards, int)
+    counts = np.zeros(6 * boards, int)
     for row in order:
-        rank[row] = seen[scene.point[row]]
-        seen[scene.point[row]] += 1
+        rank[row] = counts[scene.point[row]]
+        counts[scene.point[row]] += 1
     keep = np.flatnonzero(rank < 6)
     return _Scene(
         scene.places_mm,
@@ -289,8 +289,8 @@ def _plain(scene: _Scene, offsets: bool, steps: int | None) -> Any:
         hand_eye = x[at_camera : at_camera + 6]
         there = Rotation.from_rotvec(hand_eye[3:]).inv().apply(in_flange - hand_eye[:3])
         off = (_see(there, np.append(x[at_camera + 6 : at_offset], 0.0)) - scene.pixels) / PIXEL_PX
-        held = [off.ravel(), ((of_views - view_0) / scale).ravel()]
-        return np.concatenate([*held, x[at_offset:] / TOLERANCE_MM] if offsets else held)
+        parts = [off.ravel(), ((of_views - view_0) / scale).ravel()]
+        return np.concatenate([*parts, x[at_offset:] / TOLERANCE_MM] if offsets else parts)
 
     rows = 2 * len(scene.view)
     pattern = lil_matrix((rows + 6 * views + (3 * points if offsets else 0), size), dtype=np.int8)
@@ -307,8 +307,8 @@ def _plain(scene: _Scene, offsets: bool, steps: int | None) -> Any:
     poses = np.arange(6 * views)
     pattern[rows + poses, at_view + poses] = 1
     if offsets:
-        own = np.arange(3 * points)
-        pattern[rows + 6 * views + own, at_offset + own] = 1
+        coordinates = np.arange(3 * points)
+        pattern[rows + 6 * views + coordinates, at_offset + coordinates] = 1
     return least_squares(
         residuals, start, jac_sparsity=pattern.tocsr(), x_scale="jac", method="trf", max_nfev=steps
     )
@@ -352,10 +352,10 @@ def _compared(
 ) -> dict[str, Any]:
     seconds: dict[str, list[float]] = {"coupole": [], peer: []}
     for _ in range(rounds):
-        for who, work in (("coupole", ours), (peer, theirs)):
+        for solver, work in (("coupole", ours), (peer, theirs)):
             started_s = time.perf_counter()
             work()
-            seconds[who].append(time.perf_counter() - started_s)
+            seconds[solver].append(time.perf_counter() - started_s)
     ours_s, peer_s = statistics.median(seconds["coupole"]), statistics.median(seconds[peer])
     return {
         "name": name,

@@ -45,15 +45,18 @@ def _packing(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, Any]]
 
     orders: tuple[tuple[Literal["lsb", "msb"], str | None], ...] = (("lsb", "<"), ("msb", None))
     for order, bitorder in orders:
-        packed, out = pack12(frame, order), np.empty(frame.size * 3 // 2, np.uint8)
+        packed_bytes, out = pack12(frame, order), np.empty(frame.size * 3 // 2, np.uint8)
         encode = partial(imagecodecs.packints_encode, frame.reshape(-1), 12, bitorder=bitorder, out=out)
-        decode = partial(imagecodecs.packints_decode, packed, np.uint16, 12, bitorder=bitorder)
-        ours = partial(pack12, frame, order, out=out.copy())
-        same = bool(np.array_equal(np.frombuffer(encode(), np.uint8), packed))
-        yield _figure(f"pack12_{order}", "imagecodecs", _medians_s(rounds, ours, encode), same)
-        same = bool(np.array_equal(decode(), unpack12(packed, order)))
+        decode = partial(imagecodecs.packints_decode, packed_bytes, np.uint16, 12, bitorder=bitorder)
+        encode_with_coupole = partial(pack12, frame, order, out=out.copy())
+        same = bool(np.array_equal(np.frombuffer(encode(), np.uint8), packed_bytes))
+        yield _figure(f"pack12_{order}", "imagecodecs", _medians_s(rounds, encode_with_coupole, encode), same)
+        same = bool(np.array_equal(decode(), unpack12(packed_bytes, order)))
         yield _figure(
-            f"unpack12_{order}", "imagecodecs", _medians_s(rounds, partial(unpack12, packed, order), decode), same
+            f"unpack12_{order}",
+            "imagecodecs",
+            _medians_s(rounds, partial(unpack12, packed_bytes, order), decode),
+            same,
         )
 
 
@@ -79,8 +82,8 @@ def _bitshuffle(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, An
 def _tiles(frame: NDArray[np.uint16], tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
     rows, columns = tile
     for top in range(0, frame.shape[0], rows):
-        for left in range(0, frame.shape[1], columns):
-            yield np.ascontiguousarray(frame[top : top + rows, left : left + columns])
+        for column in range(0, frame.shape[1], columns):
+            yield np.ascontiguousarray(frame[top : top + rows, column : column + columns])
 
 
 def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
@@ -90,12 +93,12 @@ def _imagecodecs_tile(part: NDArray[np.uint16], codec: Any) -> bytes:
     from coupole.storage.bitshuffle import BLOCK_PIXELS
 
     block_bytes = BLOCK_PIXELS * part.itemsize
-    shuffled = memoryview(
+    shuffled_bytes = memoryview(
         imagecodecs.bitshuffle_encode(part.tobytes(), itemsize=part.itemsize, blocksize=BLOCK_PIXELS)
     )
     pieces = [struct.pack(">QI", part.nbytes, block_bytes)]
     for start in range(0, part.nbytes, block_bytes):
-        block = shuffled[start : start + block_bytes]
+        block = shuffled_bytes[start : start + block_bytes]
         small = (
             imagecodecs.lz4_encode(block)
             if codec.level is None
@@ -123,8 +126,8 @@ def _exif(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
                 return dict(exifread.process_file(file, details=False))
 
         tags = theirs()
-        seen = (str(tags["EXIF DateTimeOriginal"]), str(tags["EXIF SubSecTimeOriginal"]))
-        same = seen == ("2026:03:04 05:06:07", "12") and read_exif(path).taken_ns % 10**9 == 120_000_000
+        texts = (str(tags["EXIF DateTimeOriginal"]), str(tags["EXIF SubSecTimeOriginal"]))
+        same = texts == ("2026:03:04 05:06:07", "12") and read_exif(path).taken_ns % 10**9 == 120_000_000
         yield _figure("read_exif", "exifread", _medians_s(10 * rounds, partial(read_exif, path), theirs), same)
 
 
@@ -139,12 +142,12 @@ def _at_once(work: Callable[[], object], threads: int) -> None:
 def _medians_s(rounds: int, ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float]:
     """Medians of interleaved rounds, without the first of each: numba compiles, memory is allocated."""
     times: tuple[list[float], list[float]] = ([], [])
-    for counted in range(-1, rounds):
-        for work, found in zip((ours, theirs), times, strict=True):
+    for number in range(-1, rounds):
+        for work, seconds in zip((ours, theirs), times, strict=True):
             start_s = time.perf_counter()
             work()
-            if counted >= 0:
-                found.append(time.perf_counter() - start_s)
+            if number >= 0:
+                seconds.append(time.perf_counter() - start_s)
     return statistics.median(times[0]), statistics.median(times[1])
 
 

@@ -63,9 +63,9 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
 
     rig = job.cell.rig
     tool = tuple(Capsule(t.name, 7, tuple(t.from_mm), tuple(t.to_mm), t.radius_mm) for t in rig.tool)
-    described = described_arm(rig)
-    assert described is not None, "the demo's rig has an arm that is described"
-    capsules = [c for c in (*capsules_of(described), *tool) if c.link]
+    arm_description = described_arm(rig)
+    assert arm_description is not None, "the demo's rig has an arm that is described"
+    capsules = [c for c in (*capsules_of(arm_description), *tool) if c.link]
     arm, around = trimesh.collision.CollisionManager(), trimesh.collision.CollisionManager()
     base_from_support = rig.support.base_from_support.matrix()
     corners = job.shape.corners_mm.reshape(-1, 3) @ base_from_support[:3, :3].T + base_from_support[:3, 3]
@@ -74,7 +74,7 @@ def fcl_check(job: Any, poses_deg: NDArray[np.float64]) -> Callable[[], None] | 
     around.add_object("support", disk.apply_translation(-25.0 * base_from_support[:3, 2]))
     for number, capsule in enumerate(capsules):
         arm.add_object(str(number), capsule_mesh(capsule))
-    places = link_frames(described.arm, poses_deg)
+    places = link_frames(arm_description.arm, poses_deg)
 
     def check() -> None:
         for frames in places:

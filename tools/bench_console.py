@@ -51,11 +51,11 @@ class Console:
         end_s = time.monotonic() + _RUNS_TAKE_S
         while time.monotonic() < end_s:
             time.sleep(1.0)
-            found = self.ask("GET", f"/api/v1/queue/{entry}/output")
-            if found["entry"]["state"] not in ("waiting", "running"):
-                figures: dict[str, Any] = found["figures"]
-                if found["entry"]["state"] != "done" or figures["missing"]:
-                    raise RuntimeError(f"a run was not complete: {found}")
+            reply = self.ask("GET", f"/api/v1/queue/{entry}/output")
+            if reply["entry"]["state"] not in ("waiting", "running"):
+                figures: dict[str, Any] = reply["figures"]
+                if reply["entry"]["state"] != "done" or figures["missing"]:
+                    raise RuntimeError(f"a run was not complete: {reply}")
                 return figures
         raise RuntimeError("a run took too long")
 
@@ -125,12 +125,16 @@ def _watchers(url: str, count: int) -> None:
         loop = asyncio.get_running_loop()
         loop.add_reader(sys.stdin, until.set)
         async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
-            asked = {"name": "Eve", "password": _PASSWORD}
-            async with http.post(f"{url}/api/v1/sign-in", json=asked) as reply:
+            credentials = {"name": "Eve", "password": _PASSWORD}
+            async with http.post(f"{url}/api/v1/sign-in", json=credentials) as reply:
                 reply.raise_for_status()
                 cookies = {cookie.key: cookie.value for cookie in http.cookie_jar}
-        await asyncio.gather(*(_watch(url, cookies, until, seen) for seen in all_seen))
-        print(json.dumps([[seen.updates, seen.pictures, seen.bytes, seen.connections] for seen in all_seen]))
+        await asyncio.gather(*(_watch(url, cookies, until, watcher) for watcher in all_seen))
+        print(
+            json.dumps(
+                [[watcher.updates, watcher.pictures, watcher.bytes, watcher.connections] for watcher in all_seen]
+            )
+        )
 
     asyncio.run(work())
 
@@ -142,8 +146,8 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         rig, plan = _cell(root, folder, {"lights": SMALLEST} if smallest else {})
         console = _serve(root, rig, folder)
         without: list[float] = []
-        watched: list[float] = []
-        seen = [[0, 0, 0, 0]]
+        efficiencies: list[float] = []
+        counts_of_watchers = [[0, 0, 0, 0]]
         try:
             console.ask("POST", "/api/v1/accounts", {"name": "Eve", "password": _PASSWORD, "role": "observer"})
             for _ in range(rounds):
@@ -152,22 +156,22 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
                 with subprocess.Popen(
                     command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
                 ) as watchers:
-                    watched.append(console.acquire(plan)["efficiency"])
-                    seen = json.loads(watchers.communicate("\n")[0])
+                    efficiencies.append(console.acquire(plan)["efficiency"])
+                    counts_of_watchers = json.loads(watchers.communicate("\n")[0])
         finally:
             console.process.terminate()
             console.process.wait()
-    value, peer = statistics.median(watched), statistics.median(without)
+    value, peer = statistics.median(efficiencies), statistics.median(without)
     yield {
         "name": "efficiency_with_ten_watchers" if count == WATCHERS else f"efficiency_with_{count}_watchers",
         "value": value,
         "unit": "ideal/taken",
         "peer": "nobody_watches",
         "ratio": value / peer,
-        "updates": min(one[0] for one in seen),
-        "pictures": min(one[1] for one in seen),
-        "connections": max(one[3] for one in seen),
-        "mb": round(sum(one[2] for one in seen) / 1e6, 1),
+        "updates": min(counts[0] for counts in counts_of_watchers),
+        "pictures": min(counts[1] for counts in counts_of_watchers),
+        "connections": max(counts[3] for counts in counts_of_watchers),
+        "mb": round(sum(counts[2] for counts in counts_of_watchers) / 1e6, 1),
     }
 
 

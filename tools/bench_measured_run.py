@@ -89,8 +89,8 @@ def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
 
 
 def _spread(ids: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    chosen: NDArray[np.int64] = np.sort(ids)[np.linspace(0, len(ids) - 1, count).astype(int)].astype(np.int64)
-    return chosen
+    subset: NDArray[np.int64] = np.sort(ids)[np.linspace(0, len(ids) - 1, count).astype(int)].astype(np.int64)
+    return subset
 
 
 def _rows(by: Any, leds: NDArray[np.int64]) -> list[int]:
@@ -130,34 +130,34 @@ def read_run(folder: Path) -> tuple[Any, Any]:
     from coupole.scan.mesh_files import read_mesh
     from coupole.storage.run import Run
 
-    known = np.load(folder / "leds.npz")
+    led_arrays = np.load(folder / "leds.npz")
     frames = open_light_frames([next((folder / "runs").iterdir())])
-    run, shape, count = Run(next((folder / "runs").iterdir())), read_mesh(folder / MESH), len(known["ids"])
+    run, shape, count = Run(next((folder / "runs").iterdir())), read_mesh(folder / MESH), len(led_arrays["ids"])
     focal_px, (width, height) = frames.focal_px, frames.size_px
     equal = np.ones((count, len(channels_of(frames.pattern))))
     about = frames.about
     lens = Intrinsics(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     camera, pose = CameraPrior(lens, (), np.eye(4), np.zeros((6, 6))), frames.lit[0].base_from_flange
     (pointing,) = pointings(camera, pose[None], np.zeros(3))
-    measured = MeasuredRun(
+    measured_run = MeasuredRun(
         run,
         frames,
         (MeasuredView(VIEW, pose, frames.lit, pointing),),
         lens,
-        apply(known["support"], shape.vertices)[shape.triangles],
+        apply(led_arrays["support"], shape.vertices)[shape.triangles],
         shape.triangles,
-        Positions(known["ids"], known["centres_mm"], known["normals"]),
-        Powers(known["ids"], POWER * equal, np.full(count, 25.0), 0.01 * equal, 0.01 * equal),
+        Positions(led_arrays["ids"], led_arrays["centres_mm"], led_arrays["normals"]),
+        Powers(led_arrays["ids"], POWER * equal, np.full(count, 25.0), 0.01 * equal, 0.01 * equal),
         "lambertian",
         {},
         0.3,
         folder / MESH,
         (about.focal_length_mm or 0.0, about.focus_distance_mm or 0.0, about.f_number or 0.0),
-        known["support"],
+        led_arrays["support"],
         Drift(),
         True,
         camera,
     )
-    radiometry = Radiometry(measured)
+    radiometry = Radiometry(measured_run)
     radiometry.noise[:] = NOISE
-    return measured, radiometry
+    return measured_run, radiometry

@@ -154,8 +154,8 @@ def _in_a_process(path: Path) -> tuple[float, float]:
         "start = time.perf_counter(); read_scan(Path(sys.argv[1])); took = time.perf_counter() - start; "
         "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; print(json.dumps([took, peak * 1024 / 1e9]))"
     )
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True, env=os.environ
     )
-    seconds, peak_gb = json.loads(done.stdout)
+    seconds, peak_gb = json.loads(process.stdout)
     return seconds, peak_gb

@@ -89,7 +89,7 @@ def _medians(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, floa
     for _ in range(rounds):
         for name, work in works.items():
             times[name].append(_timed(work))
-    return {name: statistics.median(each) for name, each in times.items()}
+    return {name: statistics.median(seconds) for name, seconds in times.items()}
 
 
 def _figure(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> dict[str, Any]:
@@ -116,8 +116,8 @@ def _memory(root: Path, folder: Path, scope: Scope) -> Iterator[dict[str, Any]]:
         shutil.rmtree(folder / "runs", ignore_errors=True)
         make_run(root, folder, count, scope.run)
         script = _ALONE.format(tools=str(root / "tools"), root=str(root), folder=str(folder))
-        done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-        peaks.append(json.loads(done.stdout) / 1e9)
+        process = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+        peaks.append(json.loads(process.stdout) / 1e9)
     ratio = peaks[0] / peaks[1]
     yield _figure(
         "extraction_peak_memory", peaks[1], "GB", f"{scope.few_frames}_frames", ratio, frames=scope.frames
@@ -128,21 +128,21 @@ def extract(folder: Path, say: Callable[[str, int, int], None]) -> dict[str, Any
     """The whole of it: what a view sees, shadows, samples, into a file."""
     from coupole.reflectance.extraction.extraction import extract_view, geometry_of
 
-    measured, radiometry = read_run(folder)
+    measured_run, radiometry = read_run(folder)
     (folder / "samples").mkdir(exist_ok=True)
     path = folder / "samples" / f"{VIEW}.h5"
     path.unlink(missing_ok=True)
-    return extract_view(measured, geometry_of(measured), radiometry, measured.views[0], path, say)
+    return extract_view(measured_run, geometry_of(measured_run), radiometry, measured_run.views[0], path, say)
 
 
 def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:
     from coupole.reflectance.extraction.extraction import geometry_of, shadows_of, view_pass
 
-    measured, radiometry = read_run(folder)
-    path = measured.run.view_path(VIEW)
-    geometry = geometry_of(measured)
-    work, _ = view_pass(measured, geometry, radiometry, measured.views[0], _cores())
-    count, frames = len(work.facets.centres_mm), len(measured.views[0].frames)
+    measured_run, radiometry = read_run(folder)
+    path = measured_run.run.view_path(VIEW)
+    geometry = geometry_of(measured_run)
+    work, _ = view_pass(measured_run, geometry, radiometry, measured_run.views[0], _cores())
+    count, frames = len(work.facets.centres_mm), len(measured_run.views[0].frames)
     codes_of = shadows_of(work, geometry)
 
     def all_reached(part: slice, _pool: Executor) -> NDArray[np.uint8]:
@@ -163,9 +163,11 @@ def _extraction(folder: Path, rounds: int) -> Iterator[dict[str, Any]]:
 
     next(work.samples(all_reached, 1))  # compiles
     works: dict[str, Callable[[], Any]] = {
-        "read": lambda: _read_direct(path, frames * measured.frames.size_px[0] * measured.frames.size_px[1] * 2),
+        "read": lambda: _read_direct(
+            path, frames * measured_run.frames.size_px[0] * measured_run.frames.size_px[1] * 2
+        ),
         "values": partial(from_disk, values),
-        "seen": lambda: view_pass(measured, geometry, radiometry, measured.views[0], _cores()),
+        "seen": lambda: view_pass(measured_run, geometry, radiometry, measured_run.views[0], _cores()),
         "shadows": shadows,
         "whole": partial(from_disk, lambda: extract(folder, lambda step, done, of: None)),
     }
@@ -208,8 +210,8 @@ def _result(folder: Path) -> Any:
     from coupole.reflectance.run_result import OBJECT, RunResult
     from coupole.reflectance.run_result_files import write_object
 
-    measured, _ = read_run(folder)
-    write_object(folder / OBJECT, measured.corners_mm, measured.base_from_support)
+    measured_run, _ = read_run(folder)
+    write_object(folder / OBJECT, measured_run.corners_mm, measured_run.base_from_support)
     return RunResult(folder)
 
 
@@ -228,29 +230,33 @@ def _fits(samples: Any, rounds: int, by_scipy: int) -> Iterator[dict[str, Any]]:
     from coupole.reflectance.triangle_fit import fit_triangles
 
     count, leds, _ = samples.values.shape
-    used = np.ones(leds, np.bool_)
-    each = float(np.isfinite(samples.values).sum() / samples.values.shape[2] / count)
+    led_mask = np.ones(leds, np.bool_)
+    samples_per_triangle = float(np.isfinite(samples.values).sum() / samples.values.shape[2] / count)
     works: dict[str, Callable[[], Any]] = {
-        "sh": lambda: fit_slices(samples, used, (HARMONICS, None)),
-        "rbf": lambda: fit_slices(samples, used, (RADIAL, None)),
-        "ggx": lambda: fit_triangles(samples, used, None),
-        "ggx_normal": lambda: fit_triangles(samples, used, 30.0),
-        "sgemm": lambda: sgemm_products(round(each), count, _cores()),
+        "sh": lambda: fit_slices(samples, led_mask, (HARMONICS, None)),
+        "rbf": lambda: fit_slices(samples, led_mask, (RADIAL, None)),
+        "ggx": lambda: fit_triangles(samples, led_mask, None),
+        "ggx_normal": lambda: fit_triangles(samples, led_mask, 30.0),
+        "sgemm": lambda: sgemm_products(round(samples_per_triangle), count, _cores()),
     }
     for work in works.values():
         work()
-    us = {name: 1e6 * seconds / count for name, seconds in _medians(works, rounds).items()}
+    times_us = {name: 1e6 * seconds / count for name, seconds in _medians(works, rounds).items()}
     few = samples.of_triangles(np.arange(0, count, count // by_scipy))
     scipy = {
         name: 1e6 * _timed(partial(fit, few)) / len(few.values) / _cores()
         for name, fit in (("sh", scipy_harmonics), ("ggx", scipy_ggx))
     }
-    about = {"samples": round(each), "triangles": count, "cores": _cores()}
-    yield _figure("sh_fit", us["sh"], "us", "half_ofsgemm_products", 2.0 * us["sgemm"] / us["sh"], **about)
-    yield _figure("sh_fit", us["sh"], "us", "scipy_on_all_cores", scipy["sh"] / us["sh"], **about)
-    yield _figure("rbf_fit", us["rbf"], "us", "twice_sh", 2.0 * us["sh"] / us["rbf"], **about)
+    about = {"samples": round(samples_per_triangle), "triangles": count, "cores": _cores()}
+    yield _figure(
+        "sh_fit", times_us["sh"], "us", "half_ofsgemm_products", 2.0 * times_us["sgemm"] / times_us["sh"], **about
+    )
+    yield _figure("sh_fit", times_us["sh"], "us", "scipy_on_all_cores", scipy["sh"] / times_us["sh"], **about)
+    yield _figure("rbf_fit", times_us["rbf"], "us", "twice_sh", 2.0 * times_us["sh"] / times_us["rbf"], **about)
     for name in ("ggx", "ggx_normal"):
-        yield _figure(f"{name}_fit", us[name], "us", "scipy_on_all_cores", scipy["ggx"] / us[name], **about)
+        yield _figure(
+            f"{name}_fit", times_us[name], "us", "scipy_on_all_cores", scipy["ggx"] / times_us[name], **about
+        )
 
 
 # -- representations and pictures -----------------------------------------------------------------------------
@@ -264,9 +270,9 @@ def _representations(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
     from coupole.reflectance.triangle_fit import fit_triangles, model_values
 
     leds, channels = samples.values.shape[1:]
-    used = np.ones(leds, np.bool_)
-    ggx = fit_triangles(samples, used, 30.0)
-    harmonics, radial = (fit_slices(samples, used, (basis, None))[0] for basis in (HARMONICS, RADIAL))
+    led_mask = np.ones(leds, np.bool_)
+    ggx = fit_triangles(samples, led_mask, 30.0)
+    harmonics, radial = (fit_slices(samples, led_mask, (basis, None))[0] for basis in (HARMONICS, RADIAL))
     works: dict[str, Callable[[], Any]] = {
         "ggx_normal": lambda: model_values(samples, ggx),
         "sh": lambda: slice_values(samples, harmonics, HARMONICS),
@@ -275,8 +281,8 @@ def _representations(samples: Any, rounds: int) -> Iterator[dict[str, Any]]:
     for work in works.values():
         work()
     seconds = _medians(works, rounds)
-    own = 4 * sum(3 if name == "normals" else channels if name in ("kd", "ks") else 1 for name in FIELDS)
-    sizes = {"ggx_normal": own, "sh": 4 * channels * COUNT, "rbf": 4 * channels * COUNT}
+    bytes_of_ggx = 4 * sum(3 if name == "normals" else channels if name in ("kd", "ks") else 1 for name in FIELDS)
+    sizes = {"ggx_normal": bytes_of_ggx, "sh": 4 * channels * COUNT, "rbf": 4 * channels * COUNT}
     for name, size in sizes.items():
         megabytes = size * PAPER_TRIANGLES / 1e6
         yield _figure(f"bytes_{name}", megabytes, "MB", "paper", PAPER_BYTES[name] / 1e6 / megabytes)
@@ -302,9 +308,9 @@ def _relit(
     from coupole.reflectance.triangle_fit import fit_triangles
 
     result = _result(folder)
-    found = fit_triangles(samples, np.ones(samples.values.shape[1], np.bool_), 30.0)
+    materials = fit_triangles(samples, np.ones(samples.values.shape[1], np.bool_), 30.0)
     (folder / "fits").mkdir(exist_ok=True)
-    whole = found.at(np.arange(len(result.triangles)) % len(samples.values))
+    whole = materials.at(np.arange(len(result.triangles)) % len(samples.values))
     count = len(result.triangles)
     certain = MaterialUncertainty(np.zeros((count, 5, 5)), *np.zeros((2, *whole.kd.shape)))
     nothing = np.zeros(count, np.float32)

@@ -98,7 +98,7 @@ def times_s(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float
             start_s = time.perf_counter()
             work()
             times[name].append(time.perf_counter() - start_s)
-    return {name: statistics.median(each[1:]) for name, each in times.items()}
+    return {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
 
 
 # -- triangle of each pixel -------------------------------------------------------------------------------
@@ -112,12 +112,12 @@ def gbuffer_figures(rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     pose = camera_pose()
     focal_px = 1.0 / (1.0 / 35.0 - 1.0 / WORKING_DISTANCE_MM) / SENSOR_WIDTH_MM * size.full_px[0]
     straight = sight(Lens(*size.full_px, focal_px))
-    bent = sight(Lens(*size.full_px, focal_px, (-0.05, 0.02, 1e-4, -2e-4, 0.01)))
+    distorted_sight = sight(Lens(*size.full_px, focal_px, (-0.05, 0.02, 1e-4, -2e-4, 0.01)))
     for millions in (size.medium, size.large):
         corners = corners_of_relief(int(millions * 1e6))
         works: dict[str, Callable[[], Any]] = {
             "straight": partial(visible_triangles, corners, straight, pose),
-            "bent": partial(visible_triangles, corners, bent, pose),
+            "bent": partial(visible_triangles, corners, distorted_sight, pose),
         }
         works |= ray_tracers(corners, straight.lens, pose)
         medians = times_s(works, max(rounds, size.least_rounds))
@@ -172,20 +172,20 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int], **settings: Any)
     from sim.world.config import Config
 
     job = read_job(root / "configs/plans/demo.yaml")
-    told = world_config(job.cell, job, job.cell.rig.sensor)
-    raised = np.eye(4)
-    raised[2, 3] = RAISED_MM
-    told["scene"]["objects"] = [{"path": mesh, "unit": "mm", "support_from_object": raised.tolist()}]
-    told["settings"] |= {"shading": "flat", **settings}
-    told["camera"] |= {
+    world = world_config(job.cell, job, job.cell.rig.sensor)
+    support_from_object = np.eye(4)
+    support_from_object[2, 3] = RAISED_MM
+    world["scene"]["objects"] = [{"path": mesh, "unit": "mm", "support_from_object": support_from_object.tolist()}]
+    world["settings"] |= {"shading": "flat", **settings}
+    world["camera"] |= {
         "width_px": size[0],
         "height_px": size[1],
         "pixel_pitch_um": SENSOR_WIDTH_MM / size[0] * 1e3,
         "focus_distance_mm": WORKING_DISTANCE_MM,
         "flange_from_camera": np.eye(4).tolist(),
     }
-    config = Config.model_validate(told)
-    pose = np.array(config.scene.base_from_support) @ raised @ camera_pose()
+    config = Config.model_validate(world)
+    pose = np.array(config.scene.base_from_support) @ support_from_object @ camera_pose()
     return Photographer(config.scene, config.photographed, config.settings), pose
 
 
@@ -206,10 +206,10 @@ def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
             write_relief(mesh, int(millions * 1e6))
             by, pose = photographer(root, mesh, size_px)
             peer = mitsuba_frame(mesh, by, size_px) if size_px == size.full_px else None
-        nudged = pose.copy()
-        nudged[0, 3] += 0.01
+        nudged_pose = pose.copy()
+        nudged_pose[0, 3] += 0.01
         out = np.zeros(size_px[::-1], np.uint16)
-        render_leds(by, nudged, out, range(1))
+        render_leds(by, nudged_pose, out, range(1))
         render_leds(by, pose, out, range(1))
         per_frame: dict[str, list[float]] = {"shadow_rays": [], "shadows_kept": [], "radiance_kept": []}
         peers: list[float] = []
@@ -220,14 +220,14 @@ def frame_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
                 peers.append(time.perf_counter() - start_s)
             first = 1 + turn * size.leds_of_a_round
             leds = range(first, first + size.leds_of_a_round)
-            for times, place in zip(per_frame.values(), (pose, nudged, nudged), strict=True):
+            for times, place in zip(per_frame.values(), (pose, nudged_pose, nudged_pose), strict=True):
                 render_leds(by, place, out, range(1))  # rasterises the new pose, which is not timed here
                 start_s = time.perf_counter()
                 render_leds(by, place, out, leds)
                 times.append((time.perf_counter() - start_s) / len(leds))
         peer_s = statistics.median(peers) if peers else None
-        for name, each in per_frame.items():
-            value = 1.0 / statistics.median(each)
+        for name, seconds in per_frame.items():
+            value = 1.0 / statistics.median(seconds)
             yield {
                 "name": f"frames_{label}_{name}",
                 "value": value,
@@ -256,13 +256,15 @@ def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
     with tempfile.TemporaryDirectory() as folder:
         mesh = Path(folder) / "mesh.ply"
         write_relief(mesh, int(size.medium * 1e6))
-        made = {name: photographer(root, mesh, size.full_px, **settings) for name, settings in ways.items()}
-        peer = mitsuba_frame(mesh, made["flat"][0], size.full_px)
-    times: dict[str, list[float]] = {name: [] for name in (*made, "mitsuba")}
+        photographers = {
+            name: photographer(root, mesh, size.full_px, **settings) for name, settings in ways.items()
+        }
+        peer = mitsuba_frame(mesh, photographers["flat"][0], size.full_px)
+    times: dict[str, list[float]] = {name: [] for name in (*photographers, "mitsuba")}
     for turn in range(1 + rounds):
         first = 1 + turn * size.pixel_leds_of_a_round
         leds = range(first, first + size.pixel_leds_of_a_round)
-        for name, (by, pose) in made.items():
+        for name, (by, pose) in photographers.items():
             if turn == 0:
                 render_leds(by, pose, out, range(1))  # rasterises, and prepares what a pose needs
             start_s = time.perf_counter()
@@ -272,7 +274,7 @@ def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
             start_s = time.perf_counter()
             peer(turn)
             times["mitsuba"].append(time.perf_counter() - start_s)
-    frame_s = {name: statistics.median(each[1:]) for name, each in times.items() if each}
+    frame_s = {name: statistics.median(seconds[1:]) for name, seconds in times.items() if seconds}
     for name in list(ways)[1:]:
         for rival in ("mitsuba", "flat"):
             if rival in frame_s:
@@ -284,7 +286,7 @@ def pixel_figures(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any
                     "ratio": frame_s[rival] / frame_s[name],
                     "peer_value": round(1.0 / frame_s[rival], 4),
                 }
-    by, pose = made["pixel_direct"]
+    by, pose = photographers["pixel_direct"]
     yield _blur_figure(by, pose, max(rounds, size.least_rounds), size)
 
 
@@ -296,8 +298,8 @@ def _blur_figure(by: Any, pose: NDArray[np.float64], rounds: int, size: Size) ->
     look = by._look_from(pose)
     image = electrons(look.view.site, by._led(look, 500), by._falloff, electrons_per_radiance=1.0)
     disk_px, channels = by._disk_px(look), by.sensor.channels()
-    blurred = partial(through, by._objective, image, disk_px, channels, pixel_pitch_um=5.5)
-    blur_s = times_s({"ours": blurred}, rounds)["ours"]
+    blur = partial(through, by._objective, image, disk_px, channels, pixel_pitch_um=5.5)
+    blur_s = times_s({"ours": blur}, rounds)["ours"]
     name = f"blur_{size.full_px[0]}x{size.full_px[1]}"
     return {"name": name, "value": blur_s, "unit": "s", "peer": "limit_1_s", "ratio": 1.0 / blur_s}
 
@@ -364,8 +366,8 @@ def memory_figure(root: Path, size: Size) -> dict[str, Any]:
         mesh = Path(folder) / "mesh.ply"
         write_relief(mesh, int(size.large * 1e6))
         script = _ALONE.format(tools=str(root / "tools"), root=str(root), mesh=str(mesh), size_px=size.full_px)
-        done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-    peak, read_s = json.loads(done.stdout)
+        process = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    peak, read_s = json.loads(process.stdout)
     return {
         "name": f"peak_memory_{size.large:g}_M_triangles",
         "value": peak,

@@ -33,8 +33,8 @@ _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
 @contextmanager
 def our_responder() -> Iterator[tuple[StandInController, bool]]:
     """The driver's process with a session, and True if it runs under SCHED_FIFO."""
-    with asked(Settings(arm_model=shipped_arm("kr10_r1100_sixx").arm, listen="127.0.0.1:0")) as ours:
-        yield ours
+    with asked(Settings(arm_model=shipped_arm("kr10_r1100_sixx").arm, listen="127.0.0.1:0")) as responder:
+        yield responder
 
 
 @contextmanager
@@ -73,12 +73,12 @@ def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
     cycles, blocks = (SMALLEST_CYCLES, 1) if smallest else (BLOCK_CYCLES, BLOCKS)
     with tempfile.TemporaryDirectory() as folder, above_the_loop():  # busy neighbours have normal priority
         for load, count in (("idle", 0), ("two_busy_neighbours", 2)):
-            with our_responder() as ours, c_responder(Path(folder)) as theirs, neighbours(count):
-                both = [ours] if theirs is None else [ours, theirs]
+            with our_responder() as our_side, c_responder(Path(folder)) as peer_side, neighbours(count):
+                responders = [our_side] if peer_side is None else [our_side, peer_side]
                 for _ in range(rounds * blocks):
-                    for controller, _ in both:
+                    for controller, _ in responders:
                         controller.ask(cycles)
-                yield from compared(load, *both)
+                yield from compared(load, *responders)
 
 
 def compared(

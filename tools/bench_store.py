@@ -56,7 +56,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
 
 def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Frames per second and CPU time per frame of each writer, in turn."""
-    known: dict[str, Writer] = {
+    writer_of_name: dict[str, Writer] = {
         "coupole": _coupole,
         "coupole_packed12": partial(_coupole, packed=True),
         "o_direct_copy": _o_direct_copy,
@@ -66,21 +66,21 @@ def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
         "tensorstore": _tensorstore,
         "tifffile": _tifffile,
     }
-    for missing in [name for name in known if not _installed(name)]:
+    for missing in [name for name in writer_of_name if not _installed(name)]:
         print(f"{missing} is not installed and is left out", file=sys.stderr)
-        del known[missing]
-    seconds: dict[str, list[float]] = {name: [] for name in known}
-    cpu_ms: dict[str, list[float]] = {name: [] for name in known}
+        del writer_of_name[missing]
+    seconds: dict[str, list[float]] = {name: [] for name in writer_of_name}
+    cpu_ms: dict[str, list[float]] = {name: [] for name in writer_of_name}
     pixels = _pictures(size)
     for _ in range(rounds):
-        for name, write in known.items():
+        for name, write in writer_of_name.items():
             with tempfile.TemporaryDirectory(prefix=".bench-", dir=root) as folder:
                 used_s, started_s = _cpu_s(), time.perf_counter()
                 write(Path(folder), pixels, size.frames)
                 seconds[name].append(time.perf_counter() - started_s)
                 cpu_ms[name].append(1e3 * (_cpu_s() - used_s) / size.frames)
     ours_s, ours_ms = statistics.median(seconds["coupole"]), statistics.median(cpu_ms["coupole"])
-    for name in list(known)[1:]:
+    for name in list(writer_of_name)[1:]:
         peer_s = statistics.median(seconds[name])
         yield {
             "name": "store_full_size",
@@ -108,8 +108,8 @@ def _pictures(size: Size) -> NDArray[np.uint16]:
 
 
 def _cpu_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_utime + usage.ru_stime
 
 
 # -- the writers ------------------------------------------------------------------------------------------
@@ -242,7 +242,7 @@ def stream(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
             started_s = time.perf_counter()
             _o_direct_copy(Path(folder), pixels, size.stream_frames)
             peers.append(size.stream_frames / (time.perf_counter() - started_s))
-    value, peer = statistics.median(one.frames_per_s for one in bursts), statistics.median(peers)
+    value, peer = statistics.median(burst.frames_per_s for burst in bursts), statistics.median(peers)
     for name, limit in (("o_direct_copy", peer), ("camera_100_frames_per_s", 100.0)):
         yield {
             "name": "stream_full_size",
@@ -253,9 +253,9 @@ def stream(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
             "peer_value": round(limit, 2),
             "frames": rounds * size.stream_frames,
             "frame_px": [size.width_px, size.height_px],
-            "lost": sum(one.lost for one in bursts),
-            "cpu_ms_per_frame": round(statistics.median(one.cpu_ms_per_frame for one in bursts), 2),
-            "memory_grown_mb": round(max(one.grown_mb for one in bursts), 1),
+            "lost": sum(burst.lost for burst in bursts),
+            "cpu_ms_per_frame": round(statistics.median(burst.cpu_ms_per_frame for burst in bursts), 2),
+            "memory_grown_mb": round(max(burst.grown_mb for burst in bursts), 1),
         }
 
 
@@ -308,11 +308,11 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
     (folder / "plan.yaml").write_text(json.dumps(plan))
     job = read_job(folder / "plan.yaml")
     burst_frames = len(job.schedule.bursts[0][0].labels)
-    seen: list[tuple[float, int, float, float]] = []
+    readings: list[tuple[float, int, float, float]] = []
 
     class Watch(Unwatched):
         def progress(self, progress: Progress) -> None:
-            seen.append((time.perf_counter(), progress.proven, _cpu_s(), _resident_mb()))
+            readings.append((time.perf_counter(), progress.proven, _cpu_s(), _resident_mb()))
 
     with open_cell(job.cell, job=job) as cell:
         run = Run.create(folder, "stream", job.inputs, about_run(job, cell))
@@ -321,7 +321,7 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
             outcome = Sequencer(job, cell, recorder, observer=Watch()).acquire()
         finally:
             recorder.close()
-    second = [row for row in seen if row[1] > burst_frames]
+    second = [row for row in readings if row[1] > burst_frames]
     (first_s, first, cpu_before_s, mb_before), (last_s, last, cpu_after_s, mb_after) = second[0], second[-1]
     return Burst(
         frames_per_s=(last - first) / (last_s - first_s),

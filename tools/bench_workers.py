@@ -48,14 +48,14 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         _coupole(root, "acquire", str(plan), "--yes", "--output", str(folder / "runs"))
         (run,) = (folder / "runs").glob("*demo")
         _coupole(root, "reflectance", "extract", str(run), "--out", str(folder / "samples"))
-        found: dict[int, list[Fitted]] = {1: [], 2: []}
+        fits_of: dict[int, list[Fitted]] = {1: [], 2: []}
         for number in range(rounds):
-            for workers, fitted in found.items():
-                fitted.append(_fit(root, folder, workers, number))
+            for workers, fits in fits_of.items():
+                fits.append(_fit(root, folder, workers, number))
         _refuse_others(folder / "by-1", folder / "by-2")
-    seconds, cpu_s = ({n: statistics.median(getattr(one, name) for one in fitted) for n, fitted in found.items()}
+    seconds, cpu_s = ({n: statistics.median(getattr(fit, name) for fit in fits) for n, fits in fits_of.items()}
                       for name in ("seconds", "cpu_s"))  # fmt: skip
-    last = found[2][-1]
+    last = fits_of[2][-1]
     yield {
         "name": "fits_by_two_workers",
         "value": seconds[2],
@@ -64,7 +64,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         "ratio": seconds[1] / seconds[2],
         "ratio_of_cpu": round(cpu_s[1] / cpu_s[2], 3),
         "client_cpu_s": round(last.client_cpu_s, 2),
-        "worker_cpu_s": [round(one, 2) for one in last.workers_cpu_s],
+        "worker_cpu_s": [round(fit, 2) for fit in last.workers_cpu_s],
         "cores": len(os.sched_getaffinity(0)),
     }
 
@@ -93,18 +93,18 @@ def _fit(root: Path, folder: Path, workers: int, number: int) -> Fitted:
         client.returncode = os.waitstatus_to_exitcode(status)
         if client.returncode:
             raise RuntimeError((dask / "client.log").read_text())
-        each = (_cpu_s(process.pid) - before for process, before in zip(processes, used_s, strict=True))
-        return Fitted(seconds, usage.ru_utime + usage.ru_stime, tuple(each))
+        workers_cpu_s = (_cpu_s(process.pid) - before for process, before in zip(processes, used_s, strict=True))
+        return Fitted(seconds, usage.ru_utime + usage.ru_stime, tuple(workers_cpu_s))
 
 
 def _cpu_s(pid: int) -> float:
-    told = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(told[11]) + int(told[12])) / os.sysconf("SC_CLK_TCK")
+    stat_fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(stat_fields[11]) + int(stat_fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _refuse_others(one: Path, other: Path) -> None:
     """Raises RuntimeError if a file of fits or samples has other numbers than the other's."""
     for path in sorted(one.rglob("*.h5")):
-        with h5py.File(path) as mine, h5py.File(other / path.relative_to(one)) as its:
-            if wrong := [key for key in mine if mine[key][()].tobytes() != its[key][()].tobytes()]:
+        with h5py.File(path) as file, h5py.File(other / path.relative_to(one)) as its:
+            if wrong := [key for key in file if file[key][()].tobytes() != its[key][()].tobytes()]:
                 raise RuntimeError(f"{path.name}: two workers give another {wrong[0]} than one")

@@ -111,11 +111,11 @@ def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
     model: Arm | None = planning_arm(cell.cell.rig) if cell.absolute else None
     try:
         camera, hand_eye = _camera_and_hand_eye(cell, at, request, model)
-        if missed := [*_missed(camera), *_missed(hand_eye)]:
-            return Proof([], {}, "; ".join(missed))
-        judged = [Judged(*one) for one in judged_rays(cell, camera, hand_eye, at.board)]
-        judged += [one for one in _of_hand_eye(cell, hand_eye) if has_truth(cell, one.name)]
-        proof = Proof(judged, {})
+        if faults := [*_missed(camera), *_missed(hand_eye)]:
+            return Proof([], {}, "; ".join(faults))
+        judgements = [Judged(*judgement) for judgement in judged_rays(cell, camera, hand_eye, at.board)]
+        judgements += [judgement for judgement in _of_hand_eye(cell, hand_eye) if has_truth(cell, judgement.name)]
+        proof = Proof(judgements, {})
         if cell.stranger in LIGHT_STRANGERS:
             with tempfile.TemporaryDirectory() as name:
                 write_record(Path(name) / "hand-eye.yaml", hand_eye)
@@ -134,8 +134,8 @@ def _missed(record: Record) -> Iterator[str]:
 
 def _far(proof: Proof, name: str, cell: RandomCell, found_mm: Floats, true_mm: Floats) -> None:
     """Median and largest distance of points [n, 3] in the base from their true positions."""
-    own = cell.own_base(np.eye(4))
-    own_mm = true_mm @ own[:3, :3].T + own[:3, 3]
+    own_from_base = cell.own_base(np.eye(4))
+    own_mm = true_mm @ own_from_base[:3, :3].T + own_from_base[:3, 3]
     for suffix, there_mm in (("", own_mm), ("_in_true_base", true_mm)):
         off_mm = np.linalg.norm(found_mm - there_mm, axis=1)
         proof.accuracy[f"{name}{suffix}"] = float(np.median(off_mm))
@@ -163,11 +163,11 @@ def _camera_and_hand_eye(
     board = Board(
         kind="charuco", corners=(SQUARES[0] - 1, SQUARES[1] - 1), square_mm=SQUARE_MM, marker_mm=MARKER_MM
     )
-    found = find_board(board, sources)
+    detections = find_board(board, sources)
     off = (0.3, 0.02) if cell.absolute else (0.0, 1e-5)
     robot = RobotNoise(absolute_mm=off[0], absolute_deg=off[1])
-    camera = camera_from(found, sources, "brown4", request)[1].record
-    return camera, hand_eye_from(found, sources, board, "brown4", request, robot=robot, arm=model)[2].record
+    camera = camera_from(detections, sources, "brown4", request)[1].record
+    return camera, hand_eye_from(detections, sources, board, "brown4", request, robot=robot, arm=model)[2].record
 
 
 def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
@@ -184,8 +184,8 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
     }
     by_name = {parameter.name: parameter for parameter in record.parameters}
     for name, pose in record.transforms.items():
-        found = transform(pose.translation_mm, pose.abc_deg)
-        for step, error in zip(STEPS, _error(found, true[name]), strict=True):
+        estimated_pose = transform(pose.translation_mm, pose.abc_deg)
+        for step, error in zip(STEPS, _error(estimated_pose, true[name]), strict=True):
             parameter = by_name[f"{name}.{step}"]
             yield _judged(parameter.name, error, parameter.u, parameter.degrees_of_freedom)
 
@@ -205,25 +205,27 @@ def _prove_leds(
     ]
     photographs = Photographs(cell, at.leds[views], 1000)
     truth = as_built(read_leds(photographs.truth.scene.leds), photographs.truth.settings.dome)
-    stated = StatedOfLeds(tolerance_mm=0.05)
-    found = leds_from(photographs.leds(table, lit), table, prior, request, stated=stated, arm=arm).geometry
+    stated_tolerances = StatedOfLeds(tolerance_mm=0.05)
+    geometry = leds_from(
+        photographs.leds(table, lit), table, prior, request, stated=stated_tolerances, arm=arm
+    ).geometry
     row_of = {int(led): row for row, led in enumerate(truth.ids)}
     at_truth = [row_of[int(led)] for led in table.ids]
-    own = cell.own_base(np.eye(4))
-    true_mm = truth.positions_mm[at_truth] @ own[:3, :3].T + own[:3, 3]
-    normals = truth.normals[at_truth] @ own[:3, :3].T
-    _far(proof, "led_mm", cell, found.centres_mm, truth.positions_mm[at_truth])
-    for led, covariance in enumerate(found.centre_covariance):
+    own_from_base = cell.own_base(np.eye(4))
+    true_mm = truth.positions_mm[at_truth] @ own_from_base[:3, :3].T + own_from_base[:3, 3]
+    normals = truth.normals[at_truth] @ own_from_base[:3, :3].T
+    _far(proof, "led_mm", cell, geometry.centres_mm, truth.positions_mm[at_truth])
+    for led, covariance in enumerate(geometry.centre_covariance):
         u = np.sqrt(np.diag(covariance))
-        for axis, error in enumerate(found.centres_mm[led] - true_mm[led]):
+        for axis, error in enumerate(geometry.centres_mm[led] - true_mm[led]):
             proof.judged.append(_judged(f"leds.{'xyz'[axis]}_mm", error, u[axis]))
     tilts_deg = []
     for number, board in enumerate(np.unique(table.boards)):
-        mine = int(np.flatnonzero(table.boards == board)[0])
-        turned = found.state.base_from_board[number, :3, :3].T @ normals[mine]
-        u = np.sqrt(np.diag(found.normal_covariance[number]))
-        tilts_deg.append(float(np.degrees(np.linalg.norm(turned[:2]))))
-        for axis, error in enumerate(np.degrees([-turned[1], turned[0]])):
+        row_of_board = int(np.flatnonzero(table.boards == board)[0])
+        true_normal = geometry.state.base_from_board[number, :3, :3].T @ normals[row_of_board]
+        u = np.sqrt(np.diag(geometry.normal_covariance[number]))
+        tilts_deg.append(float(np.degrees(np.linalg.norm(true_normal[:2]))))
+        for axis, error in enumerate(np.degrees([-true_normal[1], true_normal[0]])):
             proof.judged.append(_judged(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis]))
     proof.accuracy["led_normal_deg"] = float(np.median(tilts_deg))
     proof.accuracy["led_normal_deg_worst"] = max(tilts_deg)
@@ -244,14 +246,18 @@ def _prove_mesh(
     sources = Photographs(cell, at.mesh, 2000, thing).sources()
     depth_mm = (200.0, 900.0)
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
-    stated = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
-    found = mesh_from(images, sources, scan, prior, request, stated=stated, depth_mm=depth_mm, arm=arm).pose
+    stated_tolerances = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
+    mesh_pose = mesh_from(
+        images, sources, scan, prior, request, stated=stated_tolerances, depth_mm=depth_mm, arm=arm
+    ).pose
     in_support = transform(place["translation_mm"], place["abc_deg"])
     true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))
-    u = np.sqrt(np.diag(found.covariance))
-    for step, error, one in zip(STEPS, _error(found.base_from_mesh, cell.own_base(true)), u, strict=True):
-        proof.judged.append(_judged(f"base_from_mesh.{step}", error, one))
-    _far(proof, "mesh_mm", cell, apply(found.base_from_mesh, scan.targets_mm), apply(true, scan.targets_mm))
+    u = np.sqrt(np.diag(mesh_pose.covariance))
+    for step, error, u_of_step in zip(
+        STEPS, _error(mesh_pose.base_from_mesh, cell.own_base(true)), u, strict=True
+    ):
+        proof.judged.append(_judged(f"base_from_mesh.{step}", error, u_of_step))
+    _far(proof, "mesh_mm", cell, apply(mesh_pose.base_from_mesh, scan.targets_mm), apply(true, scan.targets_mm))
 
 
 def _scanned(thing: dict[str, Any], seed: int, folder: Path) -> Scan:

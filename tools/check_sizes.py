@@ -36,7 +36,7 @@ def _large(path: Path, shown: Path) -> Iterator[str]:
         yield f"{shown}: {lines} lines, at most {MOST_MODULE_LINES} are allowed: split it by meaning"
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            first = min([node.lineno, *(one.lineno for one in node.decorator_list)])
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
             lines = (node.end_lineno or first) - first + 1
             if lines > MOST_FUNCTION_LINES:
                 yield f"{shown}:{first}: {node.name} has {lines} lines, at most {MOST_FUNCTION_LINES} are allowed"
@@ -61,9 +61,9 @@ def _crowded(package: Path) -> Iterator[str]:
 
 def main() -> None:
     root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent.parent
-    found = list(violations(root))
-    print("\n".join(found) or "sizes: all within bounds")
-    sys.exit(1 if found else 0)
+    faults = list(violations(root))
+    print("\n".join(faults) or "sizes: all within bounds")
+    sys.exit(1 if faults else 0)
 
 
 if __name__ == "__main__":

@@ -77,19 +77,25 @@ def report(day: Day, wrong: list[str]) -> int:
     labels = warm[-1]["labels"] - warm[0]["labels"]
     table = Table("who", "what", "after the warm-up", "at the end", "most", "grew by", box=None)
     limits = {"bytes": GROWTH_BYTES, "files": GROWTH_OTHER, "threads": GROWTH_OTHER, "sockets": GROWTH_OTHER}
-    for who in WHO:
-        for what, most in limits.items():
-            values = [sample[who][what] for sample in warm if who in sample]
+    for process in WHO:
+        for quantity, most in limits.items():
+            values = [sample[process][quantity] for sample in warm if process in sample]
             if not values:
                 continue
             first, last = _median(values[: len(values) // 10 + 1]), _median(values[-len(values) // 10 - 1 :])
-            table.add_row(who, what, *(f"{value:,.0f}" for value in (first, last, max(values), last - first)))
-            if last - first > most + (KEPT_BYTES * labels if (who, what) == ("controller", "bytes") else 0):
-                wrong.append(f"{who}: {what} grew by {last - first:,.0f}")
-    for what in warm[0]["on disk"]:
-        sizes = [sample["on disk"][what] for sample in (warm[0], warm[-1])]
+            table.add_row(
+                process, quantity, *(f"{value:,.0f}" for value in (first, last, max(values), last - first))
+            )
+            if last - first > most + (
+                KEPT_BYTES * labels if (process, quantity) == ("controller", "bytes") else 0
+            ):
+                wrong.append(f"{process}: {quantity} grew by {last - first:,.0f}")
+    for quantity in warm[0]["on disk"]:
+        sizes = [sample["on disk"][quantity] for sample in (warm[0], warm[-1])]
         a_frame = (sizes[1] - sizes[0]) / max(1, labels)
-        table.add_row("on disk", f"{what}, bytes", *(f"{size:,}" for size in sizes), "", f"{a_frame:.1f} a frame")
+        table.add_row(
+            "on disk", f"{quantity}, bytes", *(f"{size:,}" for size in sizes), "", f"{a_frame:.1f} a frame"
+        )
     console.print(table)
     for text in wrong:
         console.print(text, markup=False)

@@ -106,24 +106,24 @@ def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> N
         covariance[steps], covariance[:, steps] = 0.0, 0.0
         covariance[steps, steps] = scale.camera_mm**2
     values, vectors = np.linalg.eigh(covariance)
-    drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
-    errors = dict(zip(names, drawn, strict=True))
+    draws = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+    errors = dict(zip(names, draws, strict=True))
     true_pose = cell.rig.flange_from_camera.matrix()
     shift = np.array([errors[f"flange_from_camera.{axis}_mm"] for axis in "xyz"])
     turn = np.array([errors[f"flange_from_camera.r{axis}_deg"] for axis in "xyz"])
-    turned = true_pose[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    rotation = true_pose[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
     content = _content(record)
     place = (true_pose[:3, 3] + shift).tolist()
     content["transforms"]["flange_from_camera"] = {
         "translation_mm": place,
-        "abc_deg": list(map(float, abc_from_rotation(turned))),
+        "abc_deg": list(map(float, abc_from_rotation(rotation))),
     }
-    known = dict(zip((f"flange_from_camera.{axis}_mm" for axis in "xyz"), place, strict=True))
+    place_of_name = dict(zip((f"flange_from_camera.{axis}_mm" for axis in "xyz"), place, strict=True))
     for parameter, variance in zip(content["parameters"], np.diag(covariance), strict=True):
         name = parameter["name"]
         parameter["u"] = float(np.sqrt(variance))
         if parameter["value"] is not None and not name.startswith("base_from_board"):
-            parameter["value"] = known.get(name, truth.get(name, 0.0) + float(errors[name]))
+            parameter["value"] = place_of_name.get(name, truth.get(name, 0.0) + float(errors[name]))
     content["covariance"] = covariance.tolist()
     write_record(folder / "hand-eye.yaml", _sealed(content))
 
@@ -141,11 +141,11 @@ def _set_sensor(folder: Path, scale: Scale) -> None:
     if sensor != SHIPPED_SENSOR:
         for parameter in content["parameters"]:
             name = parameter["name"].split(".")[0]
-            known = {
+            value_of_name = {
                 "dark_variance_dn2": (sensor.read_noise_e / sensor.electrons_per_dn) ** 2 + 1.0 / 12.0,
                 "gain_dn_per_e": 1.0 / sensor.electrons_per_dn,
             }
-            parameter["value"] = known.get(name, parameter["value"])
+            parameter["value"] = value_of_name.get(name, parameter["value"])
         write_record(folder / "response.yaml", _sealed(content))
     if scale.pitch_um == cell.rig.sensor.pixel_pitch_um and scale.size_px is None:
         return
@@ -170,12 +170,15 @@ def _set_sensor(folder: Path, scale: Scale) -> None:
 def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
     record, truth = read_record(SHIPPED / "leds.yaml"), true_leds()
     with h5py.File(SHIPPED / "leds.h5", "r") as file:
-        of_centres, shared, of_normals, axes = (
+        of_centres, shared_parts, of_normals, axes = (
             file[name][()] for name in ("centre_covariance", "shared_part", "normal_covariance", "board_axes")
         )
     content = _content(record)
     if scale.led_mm is not None:
-        of_centres, shared = np.broadcast_to(np.eye(3) * scale.led_mm**2, of_centres.shape), np.zeros(len(shared))
+        of_centres, shared_parts = (
+            np.broadcast_to(np.eye(3) * scale.led_mm**2, of_centres.shape),
+            np.zeros(len(shared_parts)),
+        )
         for parameter in content["parameters"]:
             if parameter["name"] == "led_centre_median_u_mm":
                 parameter["value"] = scale.led_mm
@@ -183,8 +186,10 @@ def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
         of_normals = np.broadcast_to(np.eye(2) * scale.led_normal_deg**2, of_normals.shape)
     roots, count = np.linalg.cholesky(of_centres), len(truth.ids)
     for_all = random.standard_normal(3)
-    own = random.standard_normal((count, 3)) * np.sqrt(1.0 - shared)[:, None]
-    centres = truth.positions_mm + np.einsum("nij,nj->ni", roots, own + np.sqrt(shared)[:, None] * for_all)
+    own_errors = random.standard_normal((count, 3)) * np.sqrt(1.0 - shared_parts)[:, None]
+    centres = truth.positions_mm + np.einsum(
+        "nij,nj->ni", roots, own_errors + np.sqrt(shared_parts)[:, None] * for_all
+    )
     boards, board = np.unique(truth.ids // 6, return_inverse=True)
     of_boards = random.standard_normal((len(boards), 2))[board]
     turns = np.einsum("nij,nj->ni", np.linalg.cholesky(of_normals), of_boards)
@@ -213,11 +218,11 @@ def _draw_powers(folder: Path, random: np.random.Generator) -> None:
         at = [names.index(f"{name[2:-2]}.{channel}") for name in columns]
         covariance = record.covariance_matrix[np.ix_(at, at)]
         values, vectors = np.linalg.eigh(covariance)
-        shared = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
+        shared_errors = vectors @ (np.sqrt(np.maximum(values, 0.0)) * random.standard_normal(len(values)))
         for row in table:
-            off = sum(float(row[name]) * error for name, error in zip(columns, shared, strict=True))
-            own = float(row[f"u_own_{channel}"]) * random.standard_normal()
-            row[f"power_{channel}"] = f"{truth[int(row['id'])] * np.exp(off + own):.9g}"
+            off = sum(float(row[name]) * error for name, error in zip(columns, shared_errors, strict=True))
+            own_error = float(row[f"u_own_{channel}"]) * random.standard_normal()
+            row[f"power_{channel}"] = f"{truth[int(row['id'])] * np.exp(off + own_error):.9g}"
     out = io.StringIO()
     writer = csv.DictWriter(out, list(table[0]), lineterminator="\n")
     writer.writeheader()

@@ -42,8 +42,8 @@ def ggx(of: Materials, lit: Lit) -> Array:
     """[n, 3] kd + ks D V: Walter and others 2007, Heitz 2014."""
     nl, nv, nh, _ = _cosines(of, lit)
     lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None]
-    shown: Array = np.pi * nl[:, None] * (of.diffuse + lobe * of.specular)
-    return shown
+    radiance: Array = np.pi * nl[:, None] * (of.diffuse + lobe * of.specular)
+    return radiance
 
 
 def gltf(of: Materials, lit: Lit) -> Array:
@@ -52,8 +52,8 @@ def gltf(of: Materials, lit: Lit) -> Array:
     fresnel = of.specular + (1.0 - of.specular) * (1.0 - vh[:, None]) ** 5
     lobe = (_d(nh, of.alpha) * _v(nl, nv, of.alpha))[:, None]
     base = of.diffuse / np.pi
-    shown: Array = np.pi * nl[:, None] * ((1.0 - fresnel.max(axis=1, keepdims=True)) * base + fresnel * lobe)
-    return shown
+    radiance: Array = np.pi * nl[:, None] * ((1.0 - fresnel.max(axis=1, keepdims=True)) * base + fresnel * lobe)
+    return radiance
 
 
 def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
@@ -61,14 +61,17 @@ def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
     compensation for what is scattered more than once, over what it lets through to the base colour `diffuse`."""
     nl, nv, nh, vh = _cosines(of, lit)
     grid = np.linspace(0.0, 0.999, _F0S) ** 2
-    once = _albedo(np.stack([np.sqrt(f0), of.alpha, nv], 1), np.stack([_albedos(one) for one in grid]))
+    once = _albedo(
+        np.stack([np.sqrt(f0), of.alpha, nv], 1),
+        np.stack([_albedos(normal_reflectance) for normal_reflectance in grid]),
+    )
     white = _albedo(np.stack([np.ones(len(f0)), of.alpha, nv], 1), np.stack([_albedos(None)] * _F0S))
     fresnel = _fresnel(vh, f0)
     more = 1.0 + fresnel * (1.0 - white) / white
     lobe = _d(nh, of.alpha) * _v(nl, nv, of.alpha) * fresnel * more
     through = (1.0 - once * more)[:, None] * of.diffuse / np.pi
-    shown: Array = np.pi * nl[:, None] * (lobe[:, None] * of.specular + through)
-    return shown
+    radiance: Array = np.pi * nl[:, None] * (lobe[:, None] * of.specular + through)
+    return radiance
 
 
 def lab_differences(found: Array, wanted: Array) -> Array:
@@ -89,7 +92,7 @@ def _cosines(of: Materials, lit: Lit) -> tuple[Array, Array, Array, Array]:
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     normals = of.normals / np.linalg.norm(of.normals, axis=1, keepdims=True)
     pairs = ((lit.lights, normals), (lit.cameras, normals), (half, normals), (lit.cameras, half))
-    nl, nv, nh, vh = (np.clip(np.sum(one * other, axis=1), 1e-4, 1.0) for one, other in pairs)
+    nl, nv, nh, vh = (np.clip(np.sum(first * second, axis=1), 1e-4, 1.0) for first, second in pairs)
     return nl, nv, nh, vh
 
 
@@ -120,7 +123,7 @@ def _albedos(f0: float | None) -> Array:
     normals (2018), on a grid of its two numbers."""
     u, v = ((np.arange(_STEPS) + 0.5) / _STEPS for _ in range(2))
     radius, phi = (part.ravel() for part in np.meshgrid(np.sqrt(u), 2 * np.pi * v, indexing="ij"))
-    found = np.empty((_ALPHAS, _COSINES))
+    albedos = np.empty((_ALPHAS, _COSINES))
     for i, alpha in enumerate(np.linspace(0.02, 1.0, _ALPHAS)):
         for j, nv in enumerate(np.linspace(0.02, 1.0, _COSINES)):
             way = np.array([alpha * np.sqrt(1.0 - nv**2), 0.0, nv])
@@ -139,9 +142,9 @@ def _albedos(f0: float | None) -> Array:
             lambda_v = 0.5 * (np.sqrt(1.0 + a2 * (1.0 / nv**2 - 1.0)) - 1.0)
             above = np.maximum(nl, 1e-6)
             lambda_l = 0.5 * (np.sqrt(1.0 + a2 * (1.0 / above**2 - 1.0)) - 1.0)
-            passed = np.where(nl > 0.0, (1.0 + lambda_v) / (1.0 + lambda_v + lambda_l), 0.0)
-            found[i, j] = np.mean(passed * (1.0 if f0 is None else _fresnel(vh, f0)))
-    return found
+            transmission = np.where(nl > 0.0, (1.0 + lambda_v) / (1.0 + lambda_v + lambda_l), 0.0)
+            albedos[i, j] = np.mean(transmission * (1.0 if f0 is None else _fresnel(vh, f0)))
+    return albedos
 
 
 def _albedo(at: Array, table: Array) -> Array:

@@ -99,18 +99,22 @@ def main() -> int:
         parser.error(f"--first: expected `drawn` or one of {', '.join((*KINDS, *MEANWHILE))}")
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         calls = count_calls(Path(folder))
-    wanted = chosen(options, len(calls))
+    cases = chosen(options, len(calls))
     options.keep.parent.mkdir(parents=True, exist_ok=True)
-    kept = [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
-    known = {case_of(line) for line in kept}
-    left = [case for case in wanted if case not in known]
+    outcomes = (
+        [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
+    )
+    earlier_cases = {case_of(line) for line in outcomes}
+    remaining_cases = [case for case in cases if case not in earlier_cases]
     with options.keep.open("a") as file:
-        for line in track(done(left, options.jobs), "cases", len(left), console=Console(stderr=True)):
-            kept.append(line)
+        for line in track(
+            done(remaining_cases, options.jobs), "cases", len(remaining_cases), console=Console(stderr=True)
+        ):
+            outcomes.append(line)
             file.write(json.dumps(line) + "\n")
             file.flush()
-    asked = set(wanted)
-    return report([line for line in kept if case_of(line) in asked])
+    selection = set(cases)
+    return report([line for line in outcomes if case_of(line) in selection])
 
 
 def chosen(options: argparse.Namespace, calls: int) -> list[Case]:
@@ -124,9 +128,9 @@ def chosen(options: argparse.Namespace, calls: int) -> list[Case]:
             cases[draw_pair(draw, calls, first, k)] = None
         return list(cases)
     kinds = [kind for kind in (*KINDS, *MEANWHILE) if not options.kinds or kind.startswith(tuple(options.kinds))]
-    wanted: list[Case] = [(Event(k, kind),) for k in range(1, calls + 1) for kind in kinds]
-    draw.shuffle(wanted)
-    return wanted[: options.cases]
+    single_cases: list[Case] = [(Event(k, kind),) for k in range(1, calls + 1) for kind in kinds]
+    draw.shuffle(single_cases)
+    return single_cases[: options.cases]
 
 
 def report(lines: list[dict[str, Any]]) -> int:
@@ -136,17 +140,17 @@ def report(lines: list[dict[str, Any]]) -> int:
         "cases",
         "wrong",
         "reached both",
-        *(f"{what} after, s (median, most)" for what in ("dark", "stop", "still")),
+        *(f"{event} after, s (median, most)" for event in ("dark", "stop", "still")),
         "a case takes, s",
         box=None,
     )
     for kind in (*KINDS, *MEANWHILE):
-        if not (mine := [line for line in lines if kind in (line["kind"], line.get("kind2"))]):
+        if not (lines_of_kind := [line for line in lines if kind in (line["kind"], line.get("kind2"))]):
             continue
-        wrong = sum(bool(line["wrong"]) for line in mine)
-        both = sum(bool(line.get("call2")) for line in mine)
-        times = [_spread(mine, name) for name in ("dark_s", "stop_s", "still_s", "took_s")]
-        table.add_row(kind, str(len(mine)), str(wrong), str(both or "-"), *times)
+        wrong = sum(bool(line["wrong"]) for line in lines_of_kind)
+        double_faults = sum(bool(line.get("call2")) for line in lines_of_kind)
+        times = [_spread(lines_of_kind, name) for name in ("dark_s", "stop_s", "still_s", "took_s")]
+        table.add_row(kind, str(len(lines_of_kind)), str(wrong), str(double_faults or "-"), *times)
     console.print(table)
     bad = [line for line in lines if line["wrong"]]
     console.print(f"{len(lines)} cases, {len(bad)} wrong", markup=False)

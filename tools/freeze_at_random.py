@@ -38,23 +38,25 @@ from fail_every_call import begin_job  # noqa: E402
 
 def one_run(arm: str, number: int, seed: int) -> list[dict[str, Any]]:
     """The freezes of one run; the last one's `wrong` tells too what is wrong with the run."""
-    draw, found = random.Random(f"{seed} {arm} {number}"), []
-    which = FROZEN[int(number % 8 != 0 and arm != "eki")]
+    draw, records = random.Random(f"{seed} {arm} {number}"), []
+    process_name = FROZEN[int(number % 8 != 0 and arm != "eki")]
     with tempfile.TemporaryDirectory(prefix="coupole-freeze-") as folder:
         cell = freezing.cell_in(Path(folder), arm)
         with freezing.running(cell, arm) as (world, process):
             moving = draw.random() < 0.75
             while freezing.moment(world, process, draw, moving=moving):
-                seen = freezing.freeze(world, freezing.frozen_pid(process, which), Freeze(arm, which, moving))
-                found.append({"number": number, **seen.line()})
-                if which != FROZEN[0] or not freezing.go_on(cell.run_folder, process):
+                observation = freezing.freeze(
+                    world, freezing.frozen_pid(process, process_name), Freeze(arm, process_name, moving)
+                )
+                records.append({"number": number, **observation.line()})
+                if process_name != FROZEN[0] or not freezing.go_on(cell.run_folder, process):
                     break
                 moving = draw.random() < 0.75
-            ended = cells.finish(process)
+            outcome = cells.finish(process)
             state = world.ask("state")
-        if found:
-            found[-1]["wrong"] += _wrong_at_the_end(ended, which, state, cell.run_folder)
-    return found
+        if records:
+            records[-1]["wrong"] += _wrong_at_the_end(outcome, process_name, state, cell.run_folder)
+    return records
 
 
 def _wrong_at_the_end(ended: cells.Ended, which: str, state: dict[str, Any], run: Path) -> list[str]:
@@ -88,8 +90,8 @@ def main() -> int:
         bars = {arm: progress.add_task(arm, total=options.freezes) for arm in options.arm}
 
         def keep(done: Future[list[dict[str, Any]]], file: TextIO) -> None:
-            lines.extend(found := done.result())
-            file.writelines(json.dumps(line) + "\n" for line in found)
+            lines.extend(new_lines := done.result())
+            file.writelines(json.dumps(line) + "\n" for line in new_lines)
             file.flush()
             for arm, bar in bars.items():
                 progress.update(bar, completed=_count(lines, arm))
@@ -101,38 +103,40 @@ def main() -> int:
         ):
             for arm in options.arm:
                 numbers = itertools.count(
-                    1 + max((one["number"] for one in lines if one["arm"] == arm), default=-1)
+                    1 + max((record["number"] for record in lines if record["arm"] == arm), default=-1)
                 )
                 under_way: set[Future[list[dict[str, Any]]]] = set()
-                while (left := options.freezes - _count(lines, arm)) > 0 or under_way:
-                    while left > 0 and len(under_way) < options.jobs:
+                while (remaining := options.freezes - _count(lines, arm)) > 0 or under_way:
+                    while remaining > 0 and len(under_way) < options.jobs:
                         under_way.add(pool.submit(one_run, arm, next(numbers), options.seed))
-                    done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-                    for future in done:
+                    finished_futures, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+                    for future in finished_futures:
                         keep(future, file)
     return report([line for line in lines if line["arm"] in options.arm])
 
 
 def _count(lines: list[dict[str, Any]], arm: str) -> int:
-    return sum(one["arm"] == arm for one in lines)
+    return sum(line["arm"] == arm for line in lines)
 
 
 def report(lines: list[dict[str, Any]]) -> int:
-    table = Table("arm", "frozen", "in", "cases", "wrong", *(f"{what}, s" for what in ("brakes", "still", "dark")))
+    table = Table(
+        "arm", "frozen", "in", "cases", "wrong", *(f"{event}, s" for event in ("brakes", "still", "dark"))
+    )
     table.add_column("turned, deg")
     for arm in ARMS:
-        for which in FROZEN:
+        for process_name in FROZEN:
             for moving in (True, False):
-                mine = [
-                    one
-                    for one in lines
-                    if (one["arm"], one["frozen"], one["while_moving"]) == (arm, which, moving)
+                cases = [
+                    record
+                    for record in lines
+                    if (record["arm"], record["frozen"], record["while_moving"]) == (arm, process_name, moving)
                 ]
-                if mine:
-                    wrong = sum(bool(one["wrong"]) for one in mine)
-                    spreads = (_spread(mine, name) for name in ("brakes_s", "still_s", "dark_s", "turned_deg"))
+                if cases:
+                    wrong = sum(bool(record["wrong"]) for record in cases)
+                    spreads = (_spread(cases, name) for name in ("brakes_s", "still_s", "dark_s", "turned_deg"))
                     table.add_row(
-                        arm, which, "motion" if moving else "burst", str(len(mine)), str(wrong), *spreads
+                        arm, process_name, "motion" if moving else "burst", str(len(cases)), str(wrong), *spreads
                     )
     Console(soft_wrap=True).print(table)
     bad = [line for line in lines if line["wrong"]]

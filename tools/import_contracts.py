@@ -22,20 +22,20 @@ class AllowListContract(Contract):
 
     def check(self, graph: ImportGraph, verbose: bool) -> ContractCheck:
         """One line for each import that is not allowed."""
-        allowed = {str(self.package), *map(str, cast(Iterable[object], self.allowed_modules or ()))}
-        own = {str(self.package), *graph.find_descendants(str(self.package))}
+        allow_list = {str(self.package), *map(str, cast(Iterable[object], self.allowed_modules or ()))}
+        own_modules = {str(self.package), *graph.find_descendants(str(self.package))}
         wrong = [
-            (importer, imported)
-            for importer in sorted(own)
-            for imported in sorted(graph.find_modules_directly_imported_by(importer))
-            if imported != str(self.package).partition(".")[0]
-            and not any(imported == module or imported.startswith(f"{module}.") for module in allowed)
+            (importer, dependency)
+            for importer in sorted(own_modules)
+            for dependency in sorted(graph.find_modules_directly_imported_by(importer))
+            if dependency != str(self.package).partition(".")[0]
+            and not any(dependency == module or dependency.startswith(f"{module}.") for module in allow_list)
         ]
         return ContractCheck(kept=not wrong, metadata={"wrong": wrong})
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        for importer, imported in check.metadata["wrong"]:
-            output.print_error(f"{importer} imports {imported}, which {self.package} may not use")
+        for importer, dependency in check.metadata["wrong"]:
+            output.print_error(f"{importer} imports {dependency}, which {self.package} may not use")
 
 
 class NoCirclesContract(Contract):
@@ -62,13 +62,13 @@ def _way_round(graph: ImportGraph, module: str) -> list[str]:
     waiting = deque([module])
     while waiting:
         importer = waiting.popleft()
-        for imported in sorted(graph.find_modules_directly_imported_by(importer)):
-            if imported == module:
+        for dependency in sorted(graph.find_modules_directly_imported_by(importer)):
+            if dependency == module:
                 way = [importer]
                 while way[-1] != module:
                     way.append(before[way[-1]])
                 return way[::-1]
-            if imported not in before:
-                before[imported] = importer
-                waiting.append(imported)
+            if dependency not in before:
+                before[dependency] = importer
+                waiting.append(dependency)
     return []

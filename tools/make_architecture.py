@@ -46,13 +46,13 @@ def room_of(module: str) -> str:
 def arrows() -> Counter[tuple[str, str]]:
     """Number of imports from one package into another."""
     graph = grimp.build_graph("coupole", *BESIDE, cache_dir=None)
-    found: Counter[tuple[str, str]] = Counter()
+    counts: Counter[tuple[str, str]] = Counter()
     for module in graph.modules:
-        for used in graph.find_modules_directly_imported_by(module):
-            pair = room_of(module), room_of(used)
+        for dependency in graph.find_modules_directly_imported_by(module):
+            pair = room_of(module), room_of(dependency)
             if pair[0] != pair[1] and "coupole" not in pair:
-                found[pair] += 1
-    return found
+                counts[pair] += 1
+    return counts
 
 
 def purpose(room: str) -> str:
@@ -75,17 +75,17 @@ def size(room: str) -> int:
 
 def drawing() -> str:
     """The SVG; its `desc` lists the arrows, one per line, for comparison by a test."""
-    rooms, found = rooms_in_order(), arrows()
+    rooms, count_of_arrow = rooms_in_order(), arrows()
     width = _MARGIN * 2 + _STEP_X * (len(rooms) - 1) + _BOX_W
     height = _MARGIN * 2 + _STEP_Y * (len(rooms) - 1) + _BOX_H
-    listed = "\n".join(sorted(f"{a} uses {b}" for a, b in found))
+    description = "\n".join(sorted(f"{a} uses {b}" for a, b in count_of_arrow))
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif">',
-        f"<title>Rooms of Coupole and which uses which</title><desc>{listed}</desc>",
+        f"<title>Rooms of Coupole and which uses which</title><desc>{description}</desc>",
         f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
     ]
-    for (user, used), count in sorted(found.items()):
-        i, j = rooms.index(user), rooms.index(used)
+    for (user, provider), count in sorted(count_of_arrow.items()):
+        i, j = rooms.index(user), rooms.index(provider)
         x, y = _MARGIN + i * _STEP_X + _BOX_W, _MARGIN + i * _STEP_Y + _BOX_H / 2
         at = _MARGIN + j * _STEP_X + 20 + 92 * (i + 1) / (len(rooms) + 1)
         end = _MARGIN + j * _STEP_Y

@@ -34,13 +34,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell-mm", type=float, default=2.8)
     parser.add_argument("--out", type=Path, default=ROOT / "configs/restorations/bust.ply")
-    asked = parser.parse_args()
-    points_mm, triangles = surface(asked.cell_mm)
+    options = parser.parse_args()
+    points_mm, triangles = surface(options.cell_mm)
     distances = np.stack(list(bodies(points_mm.astype(np.float32)).values()))
     codes = np.array([list(bytes.fromhex(code)) for code in COLOURS.values()], np.uint8)
     mesh = trimesh.Trimesh(points_mm, triangles, vertex_colors=codes[distances.argmin(axis=0)], process=False)
-    mesh.export(asked.out)
-    print(f"{asked.out}: {len(triangles)} triangles, {asked.out.stat().st_size / 1e6:.1f} MB")
+    mesh.export(options.out)
+    print(f"{options.out}: {len(triangles)} triangles, {options.out.stat().st_size / 1e6:.1f} MB")
 
 
 def surface(cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -56,13 +56,13 @@ def surface(cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _whole(places: Field) -> Field:
-    found = bodies(places)
-    head = _joined(found["skin"], found["lips"], 2.5)
-    head = _joined(head, found["eyes"], 1.0)
-    head = _joined(head, found["hair"], 4.0)
-    robe = _joined(_joined(found["tunic"], found["mantle"], 5.0), found["border"], 2.0)
-    whole = _joined(_joined(head, robe, 6.0), found["crown"], 1.5)
-    return _joined(whole, found["pedestal"], 3.0)
+    parts = bodies(places)
+    head = _joined(parts["skin"], parts["lips"], 2.5)
+    head = _joined(head, parts["eyes"], 1.0)
+    head = _joined(head, parts["hair"], 4.0)
+    robe = _joined(_joined(parts["tunic"], parts["mantle"], 5.0), parts["border"], 2.0)
+    whole = _joined(_joined(head, robe, 6.0), parts["crown"], 1.5)
+    return _joined(whole, parts["pedestal"], 3.0)
 
 
 def bodies(p: Field) -> dict[str, Field]:
@@ -98,8 +98,8 @@ def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
     chest = _ellipsoid(side, (0, 8, 105), (128, 76, 92))
     body = _joined(chest, _segment(side, (18, 12, 186), (106, 14, 146), 36.0, 40.0), 30.0) + folds
     edge = np.abs(x) - (26.0 + 0.42 * np.maximum(200.0 - z, 0.0) + 4.0 * np.sin(0.09 * z))
-    opened = _cut(body, np.maximum(edge, y + 20.0), 7.0)
-    return np.asarray(np.maximum(opened, 46.0 - z))
+    open_mantle = _cut(body, np.maximum(edge, y + 20.0), 7.0)
+    return np.asarray(np.maximum(open_mantle, 46.0 - z))
 
 
 def _border(p: Field, turn: Field) -> Field:
@@ -144,8 +144,8 @@ def _hair(p: Field, side: Field) -> Field:
     cap = _ellipsoid(p, (0, 2, 322), (69, 76, 76)) + strands
     cap = _cut(cap, _ellipsoid(p, (0, -84, 298), (50, 62, 62)), 6.0)
     wave = np.sin(0.105 * z)
-    shifted = side - np.stack([5.0 * wave, 7.0 * np.cos(0.105 * z), 0.0 * z], axis=-1)
-    lock = _segment(shifted, (60, -14, 330), (74, -2, 232), 17.0, 19.0)
+    shifted_side = side - np.stack([5.0 * wave, 7.0 * np.cos(0.105 * z), 0.0 * z], axis=-1)
+    lock = _segment(shifted_side, (60, -14, 330), (74, -2, 232), 17.0, 19.0)
     curl = _ellipsoid(side, (78, -8, 222), (22, 22, 19))
     lock = _joined(lock, curl, 10.0) + 2.3 * np.sin(0.5 * np.abs(x) - 0.42 * y + 0.3 * z)
     back = _segment(p, (0, 48, 320), (0, 58, 215), 44.0, 48.0) + strands

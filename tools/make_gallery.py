@@ -88,9 +88,9 @@ def make(piece: Piece) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", metavar="KIND")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     for piece in PIECES:
-        if not asked.kinds or piece.thing["kind"] in asked.kinds:
+        if not options.kinds or piece.thing["kind"] in options.kinds:
             print(make(piece).relative_to(ROOT))
 
 

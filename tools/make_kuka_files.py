@@ -77,18 +77,20 @@ _KRL_TYPE = {"INT": "Int", "REAL": "Real", "STRING": "String"}
 def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
     """Configuration of the ETHERNET object: elements sent, elements received, address."""
     host, port = settings.listen.rsplit(":", 1)
-    sent = "\n".join(
+    send_elements = "\n".join(
         f'      <ELEMENT TAG="DEF_{tag}" TYPE="{kind}" INDX="INTERNAL"/>'
         for tag, kind in (("RIst", "DOUBLE"), (settings.measured_tag, "DOUBLE"), (settings.delay_tag, "LONG"))
     )
     # With HOLDON an absolute correction keeps the arm in place; a relative one would keep moving it.
     hold_on = {"absolute": 1, "relative": 0}[settings.mode]
-    received = "\n".join(
+    receive_elements = "\n".join(
         f'      <ELEMENT TAG="{settings.tag}.{name}" TYPE="DOUBLE" INDX="{index}" HOLDON="{hold_on}"/>'
         for index, name in enumerate(NAMES[settings.corrects], start=1)
     )
     if settings.stop_tag:  # without HOLDON: it must not outlast the program that it ends
-        received += f'\n      <ELEMENT TAG="{settings.stop_tag}" TYPE="BOOL" INDX="{STOP_OUTPUT}" HOLDON="0"/>'
+        receive_elements += (
+            f'\n      <ELEMENT TAG="{settings.stop_tag}" TYPE="BOOL" INDX="{STOP_OUTPUT}" HOLDON="0"/>'
+        )
     return f"""\
 <ROOT>
   <CONFIG>
@@ -99,13 +101,13 @@ def rsi_xml(settings: kuka_rsi.Settings, pc_address: str) -> str:
   </CONFIG>
   <SEND>
     <ELEMENTS>
-{sent}
+{send_elements}
     </ELEMENTS>
   </SEND>
   <RECEIVE>
     <ELEMENTS>
       <ELEMENT TAG="DEF_EStr" TYPE="STRING" INDX="INTERNAL"/>
-{received}
+{receive_elements}
     </ELEMENTS>
   </RECEIVE>
 </ROOT>
@@ -120,10 +122,10 @@ def eki_xml(settings: kuka_eki.Settings) -> str:
         external, internal = "<TYPE>Client</TYPE>", f"\n      {here}"
     else:
         external, internal = f"<TYPE>Server</TYPE>\n      {here}", ""
-    received = "\n".join(
+    receive_elements = "\n".join(
         f'      <ELEMENT Tag="{wire.ROOT}/{path}" Type="{kind}"/>' for path, kind in wire.COMMAND_ELEMENTS
     )
-    sent = "\n".join(f'      <ELEMENT Tag="{wire.ROOT}/{path}"/>' for path, _ in wire.STATUS_ELEMENTS)
+    send_elements = "\n".join(f'      <ELEMENT Tag="{wire.ROOT}/{path}"/>' for path, _ in wire.STATUS_ELEMENTS)
     return f"""\
 <ETHERNETKRL>
   <CONFIGURATION>
@@ -139,13 +141,13 @@ def eki_xml(settings: kuka_eki.Settings) -> str:
   </CONFIGURATION>
   <RECEIVE>
     <XML>
-{received}
+{receive_elements}
       <ELEMENT Tag="{wire.ROOT}" Set_Flag="{RECEIVED_FLAG}"/>
     </XML>
   </RECEIVE>
   <SEND>
     <XML>
-{sent}
+{send_elements}
     </XML>
   </SEND>
 </ETHERNETKRL>
@@ -177,19 +179,19 @@ def correction_rows(settings: kuka_rsi.Settings) -> str:
     }[settings.corrects]
     if settings.corrects == "axes":
         most = settings.most_correction_deg
-        clamped = "; ".join(f"A{axis} +-{limit + 1:g}" for axis, limit in enumerate(most, start=1))
-        clamped = f"`LowerLimA1` to `UpperLimA6`, deg: {clamped}"
-        watched = "; ".join(f"`MaxA{axis}` = {limit:g}" for axis, limit in enumerate(most, start=1))
+        clamp_limits = "; ".join(f"A{axis} +-{limit + 1:g}" for axis, limit in enumerate(most, start=1))
+        clamp_limits = f"`LowerLimA1` to `UpperLimA6`, deg: {clamp_limits}"
+        limits = "; ".join(f"`MaxA{axis}` = {limit:g}" for axis, limit in enumerate(most, start=1))
     else:
-        clamped = (
+        clamp_limits = (
             f"`LowerLimX` to `UpperLimZ` = +-{settings.pose_correction_mm + 1:g} mm; "
             f"`MaxRotAngle` = {min(180.0, settings.pose_correction_deg + 1):g}; `RefCorrSys` = BASE"
         )
-        watched = f"`MaxTrans` = {settings.pose_correction_mm:g}; `MaxRotAngle` = {settings.pose_correction_deg:g}"
+        limits = f"`MaxTrans` = {settings.pose_correction_mm:g}; `MaxRotAngle` = {settings.pose_correction_deg:g}"
     stop = f"\n| `STOP1` | input from output {STOP_OUTPUT} of `ETHERNET1` | `Mode` = ExitMoveCorr |"
     return (
-        f"| `{clamp}` | inputs {inputs} from outputs 1 to 6 of `ETHERNET1` | {clamped} |\n"
-        f"| `{monitor}` | - (watches the sum of all corrections) | {watched} |{stop if settings.stop_tag else ''}"
+        f"| `{clamp}` | inputs {inputs} from outputs 1 to 6 of `ETHERNET1` | {clamp_limits} |\n"
+        f"| `{monitor}` | - (watches the sum of all corrections) | {limits} |{stop if settings.stop_tag else ''}"
     )
 
 
@@ -200,7 +202,7 @@ def filled(template: str, values: dict[str, str]) -> str:
 
 def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load: int) -> Iterable[tuple[str, str]]:
     """Path below the output folder, and text, of every file."""
-    lost = "CP_WAS_ALIVE"
+    loss_condition = "CP_WAS_ALIVE"
     values = {name: str(getattr(wire, name)) for name in WIRE_NUMBERS} | {
         "ROOT": wire.ROOT,
         "EKI_NAME": EKI_NAME,
@@ -208,7 +210,9 @@ def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load:
         "RECEIVED_FLAG": str(RECEIVED_FLAG),
         "ORDER_FLAG": str(ORDER_FLAG),
         "STATUS_MS": str(eki.status_ms),
-        "OPEN_AGAIN": lost if eki.controller_is == "server" else f"{lost} OR ($ROB_TIMER-CP_SENT_MS>2000)",
+        "OPEN_AGAIN": loss_condition
+        if eki.controller_is == "server"
+        else f"{loss_condition} OR ($ROB_TIMER-CP_SENT_MS>2000)",
         "GET_COMMAND": krl_get(),
         "SET_STATUS": krl_set(),
         "LOAD": str(load),

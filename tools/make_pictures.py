@@ -54,9 +54,9 @@ def polyline(points: NDArray[np.float64], style: str) -> str:
 def joints_of_shown_view(job: Job) -> NDArray[np.float64]:
     rig = job.cell.rig
     visits = plan_itinerary(job.schedule.views, rig, job.motion.bodies, rig.motion.home_joints_deg).visits
-    shown = visits[SHOWN_VIEW]
-    assert shown is not None
-    return shown.joints_deg
+    visit = visits[SHOWN_VIEW]
+    assert visit is not None
+    return visit.joints_deg
 
 
 def draw_cell(job: Job) -> str:

@@ -54,9 +54,9 @@ def main() -> None:
             render_scene(document, quick, Path(folder), lambda camera, done, total: None)
             for film in sorted(Path(folder).glob("*.mp4")):
                 _strip(Path(folder) / f"{film.stem}-frames", Path(folder) / f"{film.stem}.png")
-            for made in sorted([*Path(folder).glob("*.png"), *Path(folder).glob("*.mp4")]):
-                shutil.copy(made, PICTURES)
-                print(f"{made.name}: {made.stat().st_size / 1000:.0f} kB")
+            for path in sorted([*Path(folder).glob("*.png"), *Path(folder).glob("*.mp4")]):
+                shutil.copy(path, PICTURES)
+                print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def _bust() -> None:
@@ -64,11 +64,11 @@ def _bust() -> None:
     folder = ROOT / "configs" / "restorations"
     parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
     with tempfile.TemporaryDirectory() as out:
-        wanted = restore.read(folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet)
-        show_all(wanted, render_all(wanted, Path(out), _quiet), Path(out), _quiet)
-        shown = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
-        _smaller(Path(out) / "side-by-side-front.png", shown)
-        print(f"{shown.name}: {shown.stat().st_size / 1000:.0f} kB")
+        restoration = restore.read(folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet)
+        show_all(restoration, render_all(restoration, Path(out), _quiet), Path(out), _quiet)
+        picture = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
+        _smaller(Path(out) / "side-by-side-front.png", picture)
+        print(f"{picture.name}: {picture.stat().st_size / 1000:.0f} kB")
 
 
 def _quiet(step: str, done: int, total: int) -> None: ...

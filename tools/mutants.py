@@ -72,17 +72,17 @@ class Stale(Exception):
 
 def read_mutants(folder: Path) -> list[Mutant]:
     """All mutants of a folder's tables, in the order of the files' names. Raises Stale if a name comes twice."""
-    found: list[Mutant] = []
+    mutants: list[Mutant] = []
     for table in sorted(folder.glob("*.toml")):
         for file in tomllib.loads(table.read_text(encoding="utf-8"))["file"]:
-            for one in file["mutant"]:
-                own = {"tests": file["tests"], "select": file.get("select", ""), **one}
-                own["tests"] = tuple(own["tests"])
-                found.append(Mutant(path=file["path"], **own))
-    names = [mutant.name for mutant in found]
+            for entry in file["mutant"]:
+                settings = {"tests": file["tests"], "select": file.get("select", ""), **entry}
+                settings["tests"] = tuple(settings["tests"])
+                mutants.append(Mutant(path=file["path"], **settings))
+    names = [mutant.name for mutant in mutants]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise Stale(f"these names come twice: {', '.join(twice)}")
-    return found
+    return mutants
 
 
 def mutated(mutant: Mutant, root: Path) -> str:
@@ -96,15 +96,15 @@ def mutated(mutant: Mutant, root: Path) -> str:
 
 def stale(mutants: Iterable[Mutant], root: Path) -> list[str]:
     """Return what does not fit the tree: mutants without their text, tests that are not there."""
-    found = []
+    faults = []
     for mutant in mutants:
         try:
             mutated(mutant, root)
         except (Stale, OSError) as error:
-            found.append(str(error))
+            faults.append(str(error))
         missing = [test for test in mutant.tests if not (root / test.split("::")[0]).exists()]
-        found += [f"{mutant.name}: there is no {test}" for test in missing]
-    return found
+        faults += [f"{mutant.name}: there is no {test}" for test in missing]
+    return faults
 
 
 class Bench:
@@ -113,13 +113,13 @@ class Bench:
     def __init__(self, root: Path, scratch: Path) -> None:
         self._root, self._scratch = root, scratch
         self._healthy: set[tuple[tuple[str, ...], str]] = set()
-        listed = subprocess.run(
+        listing = subprocess.run(
             ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
             cwd=root,
             check=True,
             capture_output=True,
         ).stdout
-        for name in filter(None, listed.decode().split("\0")):
+        for name in filter(None, listing.decode().split("\0")):
             if (root / name).is_file():
                 (scratch / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(root / name, scratch / name)
@@ -145,35 +145,37 @@ class Bench:
         started_s = time.monotonic()
         try:
             file.write_text(text, encoding="utf-8")
-            code, failed = self._run(mutant)
+            code, failing_test = self._run(mutant)
         finally:
             shutil.copyfile(self._root / mutant.path, file)
         if code not in (_PASSED, _FAILED, _INTERRUPTED):
             raise Stale(f"{mutant.name}: pytest ended with {code} for {' '.join(mutant.tests)}")
         outcome = SURVIVED if code == _PASSED else KILLED
-        return Verdict(mutant.name, outcome, round(time.monotonic() - started_s, 1), key, failed)
+        return Verdict(mutant.name, outcome, round(time.monotonic() - started_s, 1), key, failing_test)
 
     def _see_healthy(self, mutant: Mutant) -> None:
         """Its tests must pass without it, else a failure would say nothing."""
         tests = (mutant.tests, mutant.select)
         if tests in self._healthy:
             return
-        code, failed = self._run(mutant)
+        code, failing_test = self._run(mutant)
         if code != _PASSED:
-            raise Stale(f"{mutant.name}: {' '.join(mutant.tests)} fail without any mutant (code {code}): {failed}")
+            raise Stale(
+                f"{mutant.name}: {' '.join(mutant.tests)} fail without any mutant (code {code}): {failing_test}"
+            )
         self._healthy.add(tests)
 
     def _run(self, mutant: Mutant) -> tuple[int, str]:
         """Exit code of pytest, and the first test that failed."""
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header"]
         command += ["-k", mutant.select] if mutant.select else []
-        compiled = "numba" in (self._root / mutant.path).read_text(encoding="utf-8")
+        has_numba = "numba" in (self._root / mutant.path).read_text(encoding="utf-8")
         with tempfile.TemporaryDirectory() as fresh:
             # numba does not look into the files of functions that a compiled function calls
-            cache = fresh if compiled else str(self._scratch / ".numba")
+            cache = fresh if has_numba else str(self._scratch / ".numba")
             env = {**os.environ, "NUMBA_CACHE_DIR": cache, "PYTHONDONTWRITEBYTECODE": "1"}
             try:
-                ended = subprocess.run(
+                process = subprocess.run(
                     [*command, *mutant.tests],
                     cwd=self._scratch,
                     env=env,
@@ -184,20 +186,20 @@ class Bench:
                 )
             except subprocess.TimeoutExpired:
                 return _FAILED, f"no end within {TIMEOUT_S:g} s"
-        lines = [line for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-        return ended.returncode, lines[0].split(" ", 1)[1].split(" - ")[0] if lines else ""
+        lines = [line for line in process.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        return process.returncode, lines[0].split(" ", 1)[1].split(" - ")[0] if lines else ""
 
 
 def earlier(path: Path) -> dict[str, Verdict]:
     """Verdicts of earlier runs by key; a torn last line is left out."""
-    found = {}
+    verdict_of_key = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
         try:
             verdict = Verdict(**json.loads(line))
         except (json.JSONDecodeError, TypeError):
             continue
-        found[verdict.key] = verdict
-    return found
+        verdict_of_key[verdict.key] = verdict
+    return verdict_of_key
 
 
 def judge_all(
@@ -205,12 +207,12 @@ def judge_all(
 ) -> tuple[list[Verdict], list[str]]:
     """Verdicts on all mutants, and what could not be judged."""
     results.parent.mkdir(parents=True, exist_ok=True)
-    known = {} if again else earlier(results)
+    earlier_verdicts = {} if again else earlier(results)
     verdicts, troubles = [], []
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch, results.open("a", encoding="utf-8") as file:
         bench = Bench(root, Path(scratch))
         for number, mutant in enumerate(mutants, 1):
-            verdict = known.get(bench.key(mutant))
+            verdict = earlier_verdicts.get(bench.key(mutant))
             if verdict is None:
                 try:
                     verdict = bench.judge(mutant)
@@ -232,9 +234,12 @@ def table(verdicts: Sequence[Verdict], mutants: Sequence[Mutant]) -> str:
     for verdict in verdicts:
         path = by_name[verdict.name].path
         lines.append(f"| {verdict.name} | {path} | {verdict.outcome} | {verdict.noticed_by} |")
-    tried = [verdict for verdict in verdicts if verdict.outcome != EQUIVALENT]
-    lines += ["", f"{sum(v.outcome == KILLED for v in tried)} of {len(tried)} killed ({_share(tried):.1%}), "]
-    lines[-1] += f"{len(verdicts) - len(tried)} equivalent, {sum(v.seconds for v in tried):.0f} s"
+    viable = [verdict for verdict in verdicts if verdict.outcome != EQUIVALENT]
+    lines += [
+        "",
+        f"{sum(v.outcome == KILLED for v in viable)} of {len(viable)} killed ({_share(viable):.1%}), ",
+    ]
+    lines[-1] += f"{len(verdicts) - len(viable)} equivalent, {sum(v.seconds for v in viable):.0f} s"
     return "\n".join(lines)
 
 
@@ -248,18 +253,20 @@ def main() -> int:
     parser.add_argument("--again", action="store_true", help="use no verdict of an earlier run")
     parser.add_argument("--check", action="store_true", help="run nothing: do all mutants still fit the code?")
     parser.add_argument("--results", type=Path, default=ROOT / ".mutants" / "verdicts.jsonl")
-    given = parser.parse_args()
+    options = parser.parse_args()
     mutants = read_mutants(ROOT / "tools" / "mutants")
-    mutants = [one for one in mutants if not given.only or any(part in one.name for part in given.only)]
-    if given.check:
-        found = stale(mutants, ROOT)
-        print("\n".join(found) or f"{len(mutants)} mutants fit the code")
-        return 2 if found else 0
-    verdicts, troubles = judge_all(mutants, ROOT, given.results, again=given.again)
+    mutants = [
+        mutant for mutant in mutants if not options.only or any(part in mutant.name for part in options.only)
+    ]
+    if options.check:
+        faults = stale(mutants, ROOT)
+        print("\n".join(faults) or f"{len(mutants)} mutants fit the code")
+        return 2 if faults else 0
+    verdicts, troubles = judge_all(mutants, ROOT, options.results, again=options.again)
     print(table(verdicts, mutants))
     print("\n".join(troubles))
-    tried = [verdict for verdict in verdicts if verdict.outcome != EQUIVALENT]
-    return 2 if troubles else int(_share(tried) < LEAST_KILLED)
+    viable = [verdict for verdict in verdicts if verdict.outcome != EQUIVALENT]
+    return 2 if troubles else int(_share(viable) < LEAST_KILLED)
 
 
 if __name__ == "__main__":

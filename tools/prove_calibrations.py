@@ -67,15 +67,15 @@ class Verdict:
     @property
     def faults(self) -> list[str]:
         """Violated limits. Values of one cell are correlated: the number of cells counts, not of values."""
-        found = []
+        faults = []
         if binom.cdf(round(self.covered * self.cells), self.cells, 0.90) < _CHANCE:
-            found.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth")
+            faults.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth")
         if binom.sf(round(self.covered * self.cells) - 1, self.cells, 0.99) < _CHANCE:
-            found.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth: they are too wide")
+            faults.append(f"{self.name}: {self.covered:.1%} of the intervals hold the truth: they are too wide")
         low, high = chi2.ppf((_CHANCE / 2, 1 - _CHANCE / 2), self.cells) / self.cells
         if not 0.8**2 * low < self.rms_over_u**2 < 1.25**2 * high:
-            found.append(f"{self.name}: rms(error/u) is {self.rms_over_u:.2f}")
-        return found
+            faults.append(f"{self.name}: rms(error/u) is {self.rms_over_u:.2f}")
+        return faults
 
 
 def main() -> None:
@@ -94,9 +94,9 @@ def main() -> None:
     add_smallest(parser, cells=1, width=768, images=20, led_boards=8, samples=2)
     arguments = parser.parse_args()
     settings = {name: getattr(arguments, name) for name in SETTINGS}
-    done, failed = kept(arguments.keep, settings), list[str]()
-    wanted = range(arguments.first_seed, arguments.first_seed + arguments.cells)
-    seeds = [seed for seed in wanted if seed not in done]
+    proof_of_seed, failures = kept(arguments.keep, settings), list[str]()
+    all_seeds = range(arguments.first_seed, arguments.first_seed + arguments.cells)
+    seeds = [seed for seed in all_seeds if seed not in proof_of_seed]
     if seeds:
         work = partial(
             prove_cell,
@@ -112,19 +112,21 @@ def main() -> None:
             for future in as_completed(seed_of):
                 seed = seed_of[future]
                 try:
-                    done[seed] = future.result()
+                    proof_of_seed[seed] = future.result()
                 except CoupoleError as error:
-                    failed.append(f"cell {seed}: {error}")
+                    failures.append(f"cell {seed}: {error}")
                 else:
-                    keep(arguments.keep, settings, seed, done[seed])
+                    keep(arguments.keep, settings, seed, proof_of_seed[seed])
                 spent_s = time.monotonic() - started_s
-                print(f"\r{len(done)} of {len(wanted)} cells, {spent_s:.0f} s", end="", file=sys.stderr)
+                print(
+                    f"\r{len(proof_of_seed)} of {len(all_seeds)} cells, {spent_s:.0f} s", end="", file=sys.stderr
+                )
         print(file=sys.stderr)
-    proofs = [done[seed] for seed in wanted if seed in done]
+    proofs = [proof_of_seed[seed] for seed in all_seeds if seed in proof_of_seed]
     tell_refused(proofs, as_json=arguments.json)
     proofs = [proof for proof in proofs if proof.refused is None]
     for verdict in verdicts(proofs):
-        failed += verdict.faults
+        failures += verdict.faults
         if arguments.json:
             print(json.dumps(asdict(verdict)))
         else:
@@ -133,8 +135,8 @@ def main() -> None:
                 f"median error {verdict.median_error:.3g}, u {verdict.median_u:.3g}  ({verdict.values} values)"
             )
     tell_accuracies(proofs, as_json=arguments.json)
-    if failed:
-        sys.exit("\n".join(failed))
+    if failures:
+        sys.exit("\n".join(failures))
 
 
 def _postures(arguments: argparse.Namespace) -> Postures:
@@ -147,10 +149,12 @@ def kept(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:
     if path is None or not path.exists():
         return {}
     cells = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    if others := [cell["settings"] for cell in cells if cell["settings"] != settings]:
-        sys.exit(f"{path}: its cells were made with {others[0]}, now it is {settings}; name another file")
+    if other_settings := [cell["settings"] for cell in cells if cell["settings"] != settings]:
+        sys.exit(f"{path}: its cells were made with {other_settings[0]}, now it is {settings}; name another file")
     return {
-        cell["seed"]: Proof([Judged(**one) for one in cell["judged"]], cell["accuracy"], cell.get("refused"))
+        cell["seed"]: Proof(
+            [Judged(**judgement) for judgement in cell["judged"]], cell["accuracy"], cell.get("refused")
+        )
         for cell in cells
     }
 
@@ -184,29 +188,35 @@ def accuracies(proofs: Sequence[Proof]) -> dict[str, tuple[float, float]]:
     """Median and 95th percentile over the cells of each figure."""
     names = proofs[0].accuracy if proofs else ()
     figures = {name: [proof.accuracy[name] for proof in proofs] for name in names}
-    return {name: (float(np.median(one)), float(np.quantile(one, 0.95))) for name, one in figures.items()}
+    return {
+        name: (float(np.median(figures_of_name)), float(np.quantile(figures_of_name, 0.95)))
+        for name, figures_of_name in figures.items()
+    }
 
 
 def verdicts(proofs: Sequence[Proof]) -> list[Verdict]:
     """Evaluation of the intervals."""
-    found = []
+    results = []
     cells = [proof.judged for proof in proofs]
-    for name in dict.fromkeys(one.name for cell in cells for one in cell):
-        mine = [one for cell in cells for one in cell if one.name == name]
-        error, u = np.array([one.error for one in mine]), np.array([one.u for one in mine])
-        inside = np.abs(error) <= np.array([one.half_width for one in mine])
-        found.append(
+    for name in dict.fromkeys(judgement.name for cell in cells for judgement in cell):
+        judgements = [judgement for cell in cells for judgement in cell if judgement.name == name]
+        error, u = (
+            np.array([judgement.error for judgement in judgements]),
+            np.array([judgement.u for judgement in judgements]),
+        )
+        inside = np.abs(error) <= np.array([judgement.half_width for judgement in judgements])
+        results.append(
             Verdict(
                 name,
-                sum(any(one.name == name for one in cell) for cell in cells),
-                len(mine),
+                sum(any(judgement.name == name for judgement in cell) for cell in cells),
+                len(judgements),
                 float(inside.mean()),
                 float(np.sqrt(np.mean((error / u) ** 2))),
                 float(np.median(np.abs(error))),
                 float(np.median(u)),
             )
         )
-    return found
+    return results
 
 
 if __name__ == "__main__":

@@ -99,13 +99,15 @@ def main() -> int:
         folder = arguments.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         result = _result(folder, fine, arguments.every, arguments.waves)
-        fitted = int(np.isfinite(RunResult(result).materials("ggx_normal").alpha).sum())
+        fit_count = int(np.isfinite(RunResult(result).materials("ggx_normal").alpha).sum())
         ratios = {}
-        for count in sorted({fitted // TRIANGLES_FOR_EACH, CLUSTERS, *arguments.clusters}):
-            told = cluster_result(result, count, 2_000_000_000)
-            ratios[count] = told["mae_ratio"]
-            mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in told["mae"].items() if value)
-            print(f"{count} clusters for {fitted} triangles: {mae}; ratio {told['mae_ratio']:.3f}", flush=True)
+        for count in sorted({fit_count // TRIANGLES_FOR_EACH, CLUSTERS, *arguments.clusters}):
+            report = cluster_result(result, count, 2_000_000_000)
+            ratios[count] = report["mae_ratio"]
+            mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in report["mae"].items() if value)
+            print(
+                f"{count} clusters for {fit_count} triangles: {mae}; ratio {report['mae_ratio']:.3f}", flush=True
+            )
     return int(ratios[CLUSTERS] > MOST_RATIO)
 
 
@@ -121,10 +123,11 @@ def _result(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
         if not records.exists():
             draw_records(records, 0, Scale(pitch_um=fine.pitch_um, size_px=fine.size_px))
     request = RunRequest((Path(about.read_text()),), calibrations=tuple(sorted(records.glob("*.yaml"))))
-    found = reflectance_of(request, folder / "result", say=_say)
-    mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in found["mae"].items() if value)
+    report = reflectance_of(request, folder / "result", say=_say)
+    mae = " ".join(f"{name} {1e2 * value:.3f} %" for name, value in report["mae"].items() if value)
     print(
-        f"{found['triangles']} triangles, {found['samples']} samples, {found['seconds']:.0f} s: {mae}", flush=True
+        f"{report['triangles']} triangles, {report['samples']} samples, {report['seconds']:.0f} s: {mae}",
+        flush=True,
     )
     return folder / "result"
 
@@ -148,9 +151,9 @@ def _acquire(folder: Path, fine: Fine | None, every: int, waves: int) -> Path:
         cell.world_settings["camera"] = {"kind": "memory", "sensor": {"prnu": 0.0}}
     views = OLD_VIEWS if fine is None else FINE_VIEWS
     cell.write(views=list(views), lights={"kind": "every", "every": every}, darks_per_view=2)
-    ended = cell.acquire()
-    if ended.code:
-        raise RuntimeError(ended.err)
+    outcome = cell.acquire()
+    if outcome.code:
+        raise RuntimeError(outcome.err)
     return cell.run_folder
 
 

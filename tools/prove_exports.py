@@ -62,14 +62,18 @@ def main() -> int:
     worst = 0.0
     with tempfile.TemporaryDirectory(prefix="coupole-exports-") as name:
         result = arguments.result or _made(Path(name))
-        for to, (found, wanted) in _compared(result, Path(name), arguments.pixels).items():
-            usable = (wanted > 1e-6) & np.isfinite(found)
-            off = np.abs(found[usable] / wanted[usable] - 1.0)
+        for to, (exported_values, true_values) in _compared(result, Path(name), arguments.pixels).items():
+            usable = (true_values > 1e-6) & np.isfinite(exported_values)
+            off = np.abs(exported_values[usable] / true_values[usable] - 1.0)
             median, high = np.quantile(off, [0.5, 0.95])
-            seen = np.isfinite(found).all(axis=1)
-            colours = lab_differences(found[seen], wanted[seen]) if to not in ("alta", "bird") else None
-            told = ("", "") if colours is None else (f"{colours.mean():.3f}", f"{np.quantile(colours, 0.95):.3f}")
-            lines.append(f"| `{to}` | {median:.1e} | {high:.1e} | {told[0]} | {told[1]} |")
+            finite = np.isfinite(exported_values).all(axis=1)
+            colours = (
+                lab_differences(exported_values[finite], true_values[finite])
+                if to not in ("alta", "bird")
+                else None
+            )
+            cells = ("", "") if colours is None else (f"{colours.mean():.3f}", f"{np.quantile(colours, 0.95):.3f}")
+            lines.append(f"| `{to}` | {median:.1e} | {high:.1e} | {cells[0]} | {cells[1]} |")
             worst = max(worst, high if to in LOSSLESS else 0.0)
     table = "\n".join(lines) + "\n"
     print(table, end="")
@@ -81,9 +85,9 @@ def main() -> int:
 
 def _made(folder: Path) -> Path:
     cell = shipped_cell(folder, material={"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS})
-    ended = cell.acquire()
-    if ended.code:
-        raise RuntimeError(ended.err)
+    outcome = cell.acquire()
+    if outcome.code:
+        raise RuntimeError(outcome.err)
     records = tuple(sorted(RECORDS.glob("*.yaml")))
     reflectance_of(RunRequest((cell.run_folder,), calibrations=records), folder / "result")
     return folder / "result"
@@ -94,30 +98,30 @@ def _compared(result: Path, folder: Path, count: int) -> dict[str, Row]:
     surface = read_surface(result)
     random = np.random.default_rng(1)
     lit = _lit(surface, count, random)
-    wanted = ggx(_of_surface(surface, lit), lit)
-    chosen = tuple(map(int, random.choice(np.flatnonzero(surface.known), TRIANGLES, replace=False)))
-    found: dict[str, Row] = {}
+    true_values = ggx(_of_surface(surface, lit), lit)
+    sampled_triangles = tuple(map(int, random.choice(np.flatnonzero(surface.known), TRIANGLES, replace=False)))
+    row_of_export: dict[str, Row] = {}
     readers: dict[str, Callable[[Path, Lit], np.ndarray]] = {
         "ply": _read_ply, "exr": _read_exr, "gltf": _read_gltf, "materialx": _read_materialx,
     }  # fmt: skip
-    for to, read in readers.items():
+    for to, reader in readers.items():
         with console.status(to):
             export_result(result, to, folder / to)
-            found[to] = read(folder / to, lit), wanted
+            row_of_export[to] = reader(folder / to, lit), true_values
     for name, to, most_error, evaluate in (
         ("bsdf", "bsdf", None, _bsdf),
         (f"bsdf --adaptive {ADAPTIVE}", "bsdf", ADAPTIVE, _bsdf),
         ("merl", "merl", None, _merl),
     ):
         with console.status(name):
-            export_result(result, to, folder / name, triangles=chosen, most_error=most_error)
-            rows = [_of_table(surface, folder / name, number, evaluate, random) for number in chosen]
+            export_result(result, to, folder / name, triangles=sampled_triangles, most_error=most_error)
+            rows = [_of_table(surface, folder / name, number, evaluate, random) for number in sampled_triangles]
             values, true = zip(*rows, strict=True)
-            found[name] = np.concatenate(values), np.concatenate(true)
+            row_of_export[name] = np.concatenate(values), np.concatenate(true)
     for to in ("alta", "bird"):
-        export_result(result, to, folder / to, triangles=chosen)
-        found[to] = _of_samples(surface, folder / to, chosen, to)
-    return found
+        export_result(result, to, folder / to, triangles=sampled_triangles)
+        row_of_export[to] = _of_samples(surface, folder / to, sampled_triangles, to)
+    return row_of_export
 
 
 def _lit(surface: MeasuredSurface, count: int, random: np.random.Generator) -> Lit:
@@ -126,24 +130,24 @@ def _lit(surface: MeasuredSurface, count: int, random: np.random.Generator) -> L
     support_from_base = np.linalg.inv(surface.result.base_from_support)
     for view in surface.result.views:
         with h5py.File(view.path, "r") as file:
-            seen = file["seen"][()]
-        number = np.where(seen >= 0, view.triangles[seen], 0)
-        row, column = np.nonzero((seen >= 0) & surface.known[number])
-        picked = random.choice(len(row), count // len(surface.result.views), replace=False)
-        row, column = row[picked], column[picked]
+            triangle_of_pixel = file["seen"][()]
+        number = np.where(triangle_of_pixel >= 0, view.triangles[triangle_of_pixel], 0)
+        row, column = np.nonzero((triangle_of_pixel >= 0) & surface.known[number])
+        subset = random.choice(len(row), count // len(surface.result.views), replace=False)
+        row, column = row[subset], column[subset]
         triangles = number[row, column]
         camera = support_from_base[:3, :3] @ view.camera_mm + support_from_base[:3, 3]
         centres = surface.vertices_mm[surface.triangles[triangles]].mean(axis=1)
         parts.append((triangles, camera - centres, np.full(len(row), view.view, object), row, column))
     triangles, ways, views, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-    repeated = [np.repeat(part, LIGHTS, axis=0) for part in (triangles, ways, views, rows, columns)]
-    lights = random.normal(size=(len(repeated[0]), 3))
-    normals = surface.normals[repeated[0]]
+    columns_per_light = [np.repeat(part, LIGHTS, axis=0) for part in (triangles, ways, views, rows, columns)]
+    lights = random.normal(size=(len(columns_per_light[0]), 3))
+    normals = surface.normals[columns_per_light[0]]
     lights += 1.5 * normals * np.linalg.norm(lights, axis=1, keepdims=True)
-    lights, cameras = (unit(part) for part in (lights, repeated[1]))
+    lights, cameras = (unit(part) for part in (lights, columns_per_light[1]))
     cosines = np.stack([np.sum(part * normals, axis=1) for part in (lights, cameras)])
-    kept = (cosines > np.cos(np.radians(80.0))).all(axis=0)
-    return Lit(*(part[kept] for part in (repeated[0], lights, cameras, *repeated[2:])))
+    in_range = (cosines > np.cos(np.radians(80.0))).all(axis=0)
+    return Lit(*(part[in_range] for part in (columns_per_light[0], lights, cameras, *columns_per_light[2:])))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -167,11 +171,11 @@ def _read_ply(folder: Path, lit: Lit) -> np.ndarray:
 
 
 def _read_exr(folder: Path, lit: Lit) -> np.ndarray:
-    found = np.empty((len(lit.triangles), 3))
+    radiance = np.empty((len(lit.triangles), 3))
     for view in sorted(set(lit.views)):
         parts = {part.name(): part.channels for part in OpenEXR.File(str(folder / f"{view}.exr"), True).parts}
-        mine = lit.views == view
-        here = lit.of(mine)
+        in_view = lit.views == view
+        here = lit.of(in_view)
 
         def pixels(part: str, names: str, parts: dict[str, Any] = parts, here: Lit = here) -> np.ndarray:
             planes = [parts[part][name].pixels[here.rows, here.columns] for name in names]
@@ -179,8 +183,8 @@ def _read_exr(folder: Path, lit: Lit) -> np.ndarray:
 
         alpha = pixels("alpha", "Y")[:, 0]
         values = Materials(pixels("normal", "XYZ"), pixels("kd", "RGB"), pixels("ks", "RGB"), alpha)
-        found[mine] = ggx(values, here)
-    return found
+        radiance[in_view] = ggx(values, here)
+    return radiance
 
 
 def _read_gltf(folder: Path, lit: Lit) -> np.ndarray:
@@ -266,11 +270,13 @@ def _of_table(
     ways[..., 2] = np.abs(ways[..., 2])
     light, camera = ways[:, (ways[..., 2] > 0.2).all(axis=0)][:, :1000]
     up = np.tile([0.0, 0.0, 1.0], (len(light), 1))
-    one = [np.repeat(values[number][None], len(light), 0) for values in (surface.kd, surface.ks, surface.alpha)]
+    material = [
+        np.repeat(values[number][None], len(light), 0) for values in (surface.kd, surface.ks, surface.alpha)
+    ]
     nothing = np.zeros(len(light), np.int64)
-    wanted = ggx(Materials(up, *one), Lit(nothing, light, camera, nothing, nothing, nothing))
+    true_values = ggx(Materials(up, *material), Lit(nothing, light, camera, nothing, nothing, nothing))
     (path,) = folder.glob(f"triangle{number}.*")
-    return evaluate(path, light, camera), wanted
+    return evaluate(path, light, camera), true_values
 
 
 def _bsdf(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
@@ -278,11 +284,11 @@ def _bsdf(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
     mitsuba.set_variant("scalar_rgb")
     bsdf = mitsuba.load_dict({"type": "measured", "filename": str(path)})
     interaction, context = mitsuba.SurfaceInteraction3f(), mitsuba.BSDFContext()
-    found = []
-    for one, other in zip(light, camera, strict=True):
-        interaction.wi = mitsuba.Vector3f(*other)
-        found.append(np.array(bsdf.eval(context, interaction, mitsuba.Vector3f(*one))))
-    return np.pi * np.array(found)
+    rows = []
+    for light_direction, camera_direction in zip(light, camera, strict=True):
+        interaction.wi = mitsuba.Vector3f(*camera_direction)
+        rows.append(np.array(bsdf.eval(context, interaction, mitsuba.Vector3f(*light_direction))))
+    return np.pi * np.array(rows)
 
 
 def _merl(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
@@ -303,7 +309,7 @@ def _merl(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
 
 def _of_samples(surface: MeasuredSurface, folder: Path, chosen: tuple[int, ...], to: str) -> Row:
     """Each value beside the nearest of the result's, as neither file says which LED a sample is from; [n, 1]."""
-    found, wanted = [], []
+    exported_values, true_values = [], []
     for number in chosen:
         for channel, name in enumerate(("red", "green", "blue")[: surface.result.channels]):
             f = []
@@ -311,18 +317,22 @@ def _of_samples(surface: MeasuredSurface, folder: Path, chosen: tuple[int, ...],
                 if number in view.triangles:
                     with h5py.File(view.path, "r") as file:
                         f.append(file["f"][int(np.searchsorted(view.triangles, number)), :, channel])
-            known = np.sort(np.concatenate(f))
-            known = known[np.isfinite(known)]
+            sample_values = np.sort(np.concatenate(f))
+            sample_values = sample_values[np.isfinite(sample_values)]
             path = folder / f"triangle{number}_{name}.{'alta' if to == 'alta' else 'brdf'}"
             if to == "alta":
-                mine = np.loadtxt(path, ndmin=2)[:, 3]
+                values = np.loadtxt(path, ndmin=2)[:, 3]
             else:
-                mine = np.array(json.loads(path.read_text())["data"]["BRDF"]["values"])
-            after = np.clip(np.searchsorted(known, mine), 1, len(known) - 1)
-            nearest = np.where(mine - known[after - 1] < known[after] - mine, known[after - 1], known[after])
-            found.append(mine)
-            wanted.append(nearest)
-    return np.concatenate(found)[:, None], np.concatenate(wanted)[:, None]
+                values = np.array(json.loads(path.read_text())["data"]["BRDF"]["values"])
+            after = np.clip(np.searchsorted(sample_values, values), 1, len(sample_values) - 1)
+            nearest = np.where(
+                values - sample_values[after - 1] < sample_values[after] - values,
+                sample_values[after - 1],
+                sample_values[after],
+            )
+            exported_values.append(values)
+            true_values.append(nearest)
+    return np.concatenate(exported_values)[:, None], np.concatenate(true_values)[:, None]
 
 
 if __name__ == "__main__":

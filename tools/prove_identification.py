@@ -44,14 +44,14 @@ def develop(references: References, mixtures: int) -> None:
 
 def _calibration(references: References) -> None:
     of_bands = references.of_bands("", references.reflectance[0])
-    found = of_bands.model.held_out.probabilities[:, :-1]
+    probabilities = of_bands.model.held_out.probabilities[:, :-1]
     several = np.bincount(of_bands.classes)[of_bands.classes] > 1
-    right = (found.argmax(axis=1) == of_bands.classes)[several]
-    stated = found.max(axis=1)[several]
+    right = (probabilities.argmax(axis=1) == of_bands.classes)[several]
+    stated_probability = probabilities.max(axis=1)[several]
     for low, high in ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.0)):
-        inside = (stated >= low) & (stated < high + 1e-9)
+        inside = (stated_probability >= low) & (stated_probability < high + 1e-9)
         rate = Rate(int(right[inside].sum()), int(inside.sum()))
-        print(f"stated {low:.2f} to {high:.2f}: mean {stated[inside].mean():.2f}, right {rate}")
+        print(f"stated {low:.2f} to {high:.2f}: mean {stated_probability[inside].mean():.2f}, right {rate}")
 
 
 def _mixtures(references: References, mixtures: int) -> None:
@@ -70,18 +70,22 @@ def _mixtures(references: References, mixtures: int) -> None:
         weights = random.uniform(0.5, 1.0, 2) / ratio[pair].mean(axis=1)
         mixture = kubelka_munk.opaque(weights / weights.sum() @ ratio[pair])
         noisy = np.clip(mixture + 0.001 * random.standard_normal(len(nm)), 0.001, 0.999)
-        found = identify(Measured("mixture", nm, noisy, ()), references)
+        identification = identify(Measured("mixture", nm, noisy, ()), references)
         true = {of_bands.model.class_names[classes[row]] for row in pair}
-        named = {part.class_name for part in found.parts} or {found.class_name}
-        verdicts[f"{found.verdict}, {'right' if named == true or (named < true) else 'wrong'}"] += 1
+        names = {part.class_name for part in identification.parts} or {identification.class_name}
+        verdicts[f"{identification.verdict}, {'right' if names == true or (names < true) else 'wrong'}"] += 1
         count += 1
     print("mixtures of two, both in the library:", ", ".join(f"{k} {v}" for k, v in sorted(verdicts.items())))
     rows = np.arange(len(values))
-    for what, groups in (("it", rows), ("its class", classes)):
-        kept = [groups != groups[row] for row in rows]
-        settled = [unmix(values[row], values[kept[row]], classes[kept[row]]) for row in rows]
-        seen = sum(found is not None and found.is_settled for found in settled)
-        print(f"mixture seen in a single pigment, {what} left out: {Rate(seen, len(rows))}")
+    for omission, groups in (("it", rows), ("its class", classes)):
+        rest_of_library = [groups != groups[row] for row in rows]
+        unmixings = [
+            unmix(values[row], values[rest_of_library[row]], classes[rest_of_library[row]]) for row in rows
+        ]
+        false_mixtures = sum(
+            identification is not None and identification.is_settled for identification in unmixings
+        )
+        print(f"mixture seen in a single pigment, {omission} left out: {Rate(false_mixtures, len(rows))}")
 
 
 def test(references: References, folder: Path) -> None:
@@ -96,21 +100,30 @@ def test(references: References, folder: Path) -> None:
             class_name = table[spectrum.name].class_name
             if class_name:
                 (inside if class_name in classes else outside).append((measured(spectrum), class_name))
-    found = [(true, identify(one, references)) for one, true in inside]
-    gone = [(true, identify(one, references.without_class(true))) for one, true in inside]
-    never = [(true, identify(one, references)) for one, true in outside]
-    for title, results in (("class in the library", found), ("taken out", gone), ("not in it", never)):
+    with_class = [(true, identify(sample, references)) for sample, true in inside]
+    without_class = [(true, identify(sample, references.without_class(true))) for sample, true in inside]
+    never = [(true, identify(sample, references)) for sample, true in outside]
+    for title, results in (
+        ("class in the library", with_class),
+        ("taken out", without_class),
+        ("not in it", never),
+    ):
         print(f"\n{title}:")
-        for true, one in results:
-            first = one.candidates[0]
-            print(f"  {one.name:38s} {true:28s} {one.verdict:9s} {one.class_name:28s} {first.probability:.2f}")
-    right = sum(one.candidates[0].class_name == true for true, one in found)
-    matched = [one.class_name == true for true, one in found if one.verdict == "match"]
-    print(f"\n(1) first candidate right: {Rate(right, len(found))}")
-    wrong = Rate(len(matched) - sum(matched), len(found))
-    print(f"(2) match, right: {Rate(sum(matched), len(found))}; wrong: {wrong}")
-    for number, results in ((3, gone), (4, never)):
-        print(f"({number}) unknown: {Rate(sum(one.verdict == 'unknown' for _, one in results), len(results))}")
+        for true, answer in results:
+            first = answer.candidates[0]
+            print(
+                f"  {answer.name:38s} {true:28s} {answer.verdict:9s} {answer.class_name:28s} "
+                f"{first.probability:.2f}"
+            )
+    right = sum(answer.candidates[0].class_name == true for true, answer in with_class)
+    match_is_right = [answer.class_name == true for true, answer in with_class if answer.verdict == "match"]
+    print(f"\n(1) first candidate right: {Rate(right, len(with_class))}")
+    wrong = Rate(len(match_is_right) - sum(match_is_right), len(with_class))
+    print(f"(2) match, right: {Rate(sum(match_is_right), len(with_class))}; wrong: {wrong}")
+    for number, results in ((3, without_class), (4, never)):
+        print(
+            f"({number}) unknown: {Rate(sum(answer.verdict == 'unknown' for _, answer in results), len(results))}"
+        )
 
 
 def main() -> None:
@@ -120,13 +133,13 @@ def main() -> None:
     parser.add_argument("--test", action="store_true")
     parser.add_argument("--mixtures", type=int, default=100, help="of two spectra")
     add_smallest(parser, mixtures=2)
-    asked = parser.parse_args()
-    spectra = read_library(asked.pigments / DEVELOPED_ON)
+    options = parser.parse_args()
+    spectra = read_library(options.pigments / DEVELOPED_ON)
     references = make_references(spectra, shipped_classes(spectra))
-    if asked.test:
-        test(references, asked.pigments)
+    if options.test:
+        test(references, options.pigments)
     else:
-        develop(references, asked.mixtures)
+        develop(references, options.mixtures)
 
 
 if __name__ == "__main__":

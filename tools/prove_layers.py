@@ -35,45 +35,45 @@ DRAWS = 1000
 
 def coverage(kind: str, rounds: int) -> float:
     """Mean over the paints of the share of K and S in their intervals, in bands that tell them."""
-    rng, held = np.random.default_rng(21), []
+    rng, shares = np.random.default_rng(21), []
     for k, s in PAINTS:
-        mine = []
+        inside = []
         for _ in range(rounds):
-            found = layer_fit.fit(cases.films_of(kind, k, s, rng), cases.FACE, cases.NOISE)
-            sure = found.determined
-            mine += [
-                np.abs(found.absorption - k)[sure] < COVERAGE_FACTOR * found.u_absorption[sure],
-                np.abs(found.scattering - s)[sure] < COVERAGE_FACTOR * found.u_scattering[sure],
+            fit = layer_fit.fit(cases.films_of(kind, k, s, rng), cases.FACE, cases.NOISE)
+            sure = fit.determined
+            inside += [
+                np.abs(fit.absorption - k)[sure] < COVERAGE_FACTOR * fit.u_absorption[sure],
+                np.abs(fit.scattering - s)[sure] < COVERAGE_FACTOR * fit.u_scattering[sure],
             ]
-        values = np.concatenate(mine)
+        values = np.concatenate(inside)
         if len(values) < 0.5 * 2 * rounds * cases.EACH:
             print(f"  {kind}, K {k:g}, S {s:g} per mm: hides its ground, or shows too little; not told")
             continue
         print(f"  {kind}, K {k:g}, S {s:g} per mm: {100 * values.mean():.1f} %")
-        held.append(values.mean())
-    return float(np.mean(held))
+        shares.append(values.mean())
+    return float(np.mean(shares))
 
 
 def photons(count: int) -> tuple[float, float]:
     """Coverage of the reflectance over another ground, and the largest error for twice the thickness."""
-    rng, held, worst = np.random.default_rng(22), [], 0.0
+    rng, shares, worst = np.random.default_rng(22), [], 0.0
     for depth in DEPTHS:
         thin, thick = walk(depth, count, 1), walk(2.0 * depth, count, 2)
-        for absorbed in ABSORBED:
-            exact = {g: thin.reflectance(absorbed, g) for g in (cases.BLACK, cases.WHITE, 0.5)}
+        for absorption in ABSORBED:
+            exact = {g: thin.reflectance(absorption, g) for g in (cases.BLACK, cases.WHITE, 0.5)}
             ends = [
                 Film(exact[g] + cases.NOISE * rng.standard_normal(DRAWS), np.full(DRAWS, g), str(g))
                 for g in (cases.BLACK, cases.WHITE)
             ]
-            shown = layer_fit.predict(layer_fit.fit(ends, BARE, cases.NOISE), BARE, 1.0, 0.5)
-            held.append(np.mean(np.abs(shown.seen - exact[0.5]) < COVERAGE_FACTOR * shown.u_seen))
+            prediction = layer_fit.predict(layer_fit.fit(ends, BARE, cases.NOISE), BARE, 1.0, 0.5)
+            shares.append(np.mean(np.abs(prediction.seen - exact[0.5]) < COVERAGE_FACTOR * prediction.u_seen))
             sharp = [Film(np.array([exact[g]]), np.array([g]), str(g)) for g in (cases.BLACK, cases.WHITE)]
-            found = layer_fit.fit(sharp, BARE, 1e-4)
+            sharp_fit = layer_fit.fit(sharp, BARE, 1e-4)
             for g in (cases.BLACK, cases.WHITE):
-                twice = layer_fit.predict(found, BARE, 2.0, g).seen[0] - thick.reflectance(absorbed, g)
+                twice = layer_fit.predict(sharp_fit, BARE, 2.0, g).seen[0] - thick.reflectance(absorption, g)
                 worst = max(worst, abs(float(twice)))
-            print(f"  photons, depth {depth:g}, absorbed {absorbed:g}: {100 * held[-1]:.1f} %")
-    return float(np.mean(held)), worst
+            print(f"  photons, depth {depth:g}, absorbed {absorption:g}: {100 * shares[-1]:.1f} %")
+    return float(np.mean(shares)), worst
 
 
 def main() -> int:
@@ -81,13 +81,13 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=60)
     parser.add_argument("--photons", type=int, default=300_000, help="of each walk")
     add_smallest(parser, rounds=2, photons=3000)
-    asked = parser.parse_args()
-    means = {kind: coverage(kind, asked.rounds) for kind in KINDS}
-    means["photons, another ground"], worst = photons(asked.photons)
+    options = parser.parse_args()
+    means = {kind: coverage(kind, options.rounds) for kind in KINDS}
+    means["photons, another ground"], worst = photons(options.photons)
     for kind, mean in means.items():
         print(f"{kind}: 95 % intervals hold {100 * mean:.1f} %")
     print(f"K and S of a film miss twice its thickness by up to {worst:.3f} of full reflectance")
-    return int(not asked.smallest and not all(0.93 <= mean <= 0.97 for mean in means.values()))
+    return int(not options.smallest and not all(0.93 <= mean <= 0.97 for mean in means.values()))
 
 
 if __name__ == "__main__":

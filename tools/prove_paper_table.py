@@ -83,17 +83,17 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=len(CASES), help="so many of the table")
     add_smallest(parser, every=90, triangles=800, cases=1)
     arguments = parser.parse_args()
-    found = []
+    cases = []
     for case in CASES[: arguments.cases]:
         with tempfile.TemporaryDirectory(prefix="coupole-table-") as folder:
-            acquired = _acquire(Path(folder), case, arguments)
-            found.append(_of(case, Path(folder), acquired, arguments.seed))
+            run_folder = _acquire(Path(folder), case, arguments)
+            cases.append(_of(case, Path(folder), run_folder, arguments.seed))
     if arguments.json:
-        print(json.dumps(found))
+        print(json.dumps(cases))
     else:
-        _print(found)
-    held = [(one["held"][level], *HELD[level]) for one in found for level in LEVELS]
-    return int(not arguments.smallest and not all(low <= share <= high for share, low, high in held))
+        _print(cases)
+    share_and_bounds = [(case_figures["held"][level], *HELD[level]) for case_figures in cases for level in LEVELS]
+    return int(not arguments.smallest and not all(low <= share <= high for share, low, high in share_and_bounds))
 
 
 def _of(case: Case, folder: Path, acquired: loop.Acquired, seed: int) -> dict[str, Any]:
@@ -107,9 +107,9 @@ def _of(case: Case, folder: Path, acquired: loop.Acquired, seed: int) -> dict[st
     request = RunRequest((acquired.old,), folder / "scan.ply", records, scan_noise_um=case.vertex_um)
     extract_runs(request, folder / "result")
     result, truth = RunResult(folder / "result"), loop.Truth.of(acquired, folder / "result")
-    told = uncertainty_of(result, case.vertex_um, paper=False)
-    assert told is not None
-    return {**asdict(case), "table": told, "held": _held(result, truth, case.vertex_um)}
+    table = uncertainty_of(result, case.vertex_um, paper=False)
+    assert table is not None
+    return {**asdict(case), "table": table, "held": _held(result, truth, case.vertex_um)}
 
 
 def _acquire(folder: Path, case: Case, asked: argparse.Namespace) -> loop.Acquired:
@@ -124,9 +124,9 @@ def _acquire(folder: Path, case: Case, asked: argparse.Namespace) -> loop.Acquir
     cell.world_settings.update(white_at_us=8000, material={"specimen": asked.material}, shading="pixel")
     cell.world_settings.update(interreflection=False, camera={"kind": "memory", "sensor": sensor})
     cell.write(views=[VIEW], lights={"kind": "every", "every": asked.every}, darks_per_view=8)
-    ended = cell.acquire()
-    if ended.code:
-        raise RuntimeError(ended.err)
+    outcome = cell.acquire()
+    if outcome.code:
+        raise RuntimeError(outcome.err)
     return loop.Acquired(asked.material, cell.run_folder, cell.run_folder, folder / "object.ply")
 
 
@@ -141,11 +141,11 @@ def _held(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, f
     (view,) = result.views
     inside = {level: [0, 0] for level in LEVELS}
     for channel in range(result.channels):
-        known = known_samples(result, view, channel, vertex_um, most=_SAMPLES, of_triangles=len(view.triangles))
-        true = truth.reflectance(view.view, view.triangles[known.rows], view.leds[known.leds])[:, channel]
-        ratio = true / known.f
+        samples = known_samples(result, view, channel, vertex_um, most=_SAMPLES, of_triangles=len(view.triangles))
+        true = truth.reflectance(view.view, view.triangles[samples.rows], view.leds[samples.leds])[:, channel]
+        ratio = true / samples.f
         for level, quantile in LEVELS.items():
-            low, high = bounds(known.places, known.sources, quantile)
+            low, high = bounds(samples.places, samples.sources, quantile)
             good = np.isfinite(ratio)
             inside[level][0] += int(np.count_nonzero((ratio > low) & (ratio < high) & good))
             inside[level][1] += int(good.sum())
@@ -154,18 +154,18 @@ def _held(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, f
 
 def _print(found: list[dict[str, Any]]) -> None:
     console = Console(soft_wrap=True)
-    for one in found:
-        table = Table(one["name"], "median, %", "95th, %", "less by, median and 95th", box=None)
-        whole = one["table"]["monte_carlo"]
-        for name, row in ({"all sources": whole} | one["table"]["without"]).items():
+    for case in found:
+        table = Table(case["name"], "median, %", "95th, %", "less by, median and 95th", box=None)
+        whole = case["table"]["monte_carlo"]
+        for name, row in ({"all sources": whole} | case["table"]["without"]).items():
             less = [1.0 - _width(row[key]) / _width(whole[key]) for key in ("median", "percentile_95")]
-            shown = "" if row is whole else f"{100 * less[0]:.1f} % {100 * less[1]:.1f} %"
+            reduction = "" if row is whole else f"{100 * less[0]:.1f} % {100 * less[1]:.1f} %"
             label = name if row is whole else f"without {name}"
-            table.add_row(label, _interval(row["median"]), _interval(row["percentile_95"]), shown)
-        table.add_row("the paper", one["paper"])
+            table.add_row(label, _interval(row["median"]), _interval(row["percentile_95"]), reduction)
+        table.add_row("the paper", case["paper"])
         console.print(table)
-        held = one["held"]
-        console.print(f"hold the truth: 68 %: {100 * held['68']:.1f} %, 95 %: {100 * held['95']:.1f} %\n")
+        shares = case["held"]
+        console.print(f"hold the truth: 68 %: {100 * shares['68']:.1f} %, 95 %: {100 * shares['95']:.1f} %\n")
 
 
 def _width(interval: list[float]) -> float:

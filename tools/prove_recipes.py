@@ -35,12 +35,14 @@ _SEED = 11
 def seen(shares: np.ndarray, chosen: list[Paint], under: Face) -> np.ndarray:
     """Return what a mixture shows, with NaN in bands that a paint does not know."""
     k, s = (
-        np.asarray(sum(c * getattr(p, what) for c, p in zip(shares, chosen, strict=True)))
-        for what in ("absorption", "scattering")
+        np.asarray(sum(c * getattr(p, coefficient) for c, p in zip(shares, chosen, strict=True)))
+        for coefficient in ("absorption", "scattering")
     )
-    known = np.isfinite(k + s)
-    shown = under.seen(InternalReflectance(kubelka_munk.opaque(np.where(known, k, 1.0) / np.where(known, s, 1.0))))
-    return np.where(known, shown.values, np.nan)
+    finite = np.isfinite(k + s)
+    spectrum = under.seen(
+        InternalReflectance(kubelka_munk.opaque(np.where(finite, k, 1.0) / np.where(finite, s, 1.0)))
+    )
+    return np.where(finite, spectrum.values, np.nan)
 
 
 def bound(shares: np.ndarray, chosen: list[Paint], under: Face, noise: float, bands: np.ndarray) -> np.ndarray:
@@ -65,18 +67,18 @@ def main() -> int:
     bands = np.all([np.isfinite(p.absorption + p.scattering) for p in palette], axis=0)
     least, errors, widths, half, right = [], [], [], [], []
     for _ in range(arguments.mixtures):
-        chosen = [palette[k] for k in rng.choice(len(palette), 3, replace=False)]
+        paints = [palette[k] for k in rng.choice(len(palette), 3, replace=False)]
         shares = rng.dirichlet(np.ones(3))
-        noisy = seen(shares, chosen, under) + arguments.noise * rng.standard_normal(len(bands))
-        found = recipe_search.find(noisy, palette, under, arguments.noise, 4)
-        least += list(bound(shares, chosen, under, arguments.noise, bands))
-        names = {paint.name for paint in chosen}
-        half += [found.best.half_widths.get(p.name, np.nan) for p in chosen]
-        right += [set(found.best.shares) == names] * 3
-        errors += [found.best.shares.get(p.name, 0.0) - share for p, share in zip(chosen, shares, strict=True)]
-        widths += [found.told_within(p.name) if p.name in found.best.shares else np.nan for p in chosen]
+        noisy = seen(shares, paints, under) + arguments.noise * rng.standard_normal(len(bands))
+        recipes = recipe_search.find(noisy, palette, under, arguments.noise, 4)
+        least += list(bound(shares, paints, under, arguments.noise, bands))
+        names = {paint.name for paint in paints}
+        half += [recipes.best.half_widths.get(p.name, np.nan) for p in paints]
+        right += [set(recipes.best.shares) == names] * 3
+        errors += [recipes.best.shares.get(p.name, 0.0) - share for p, share in zip(paints, shares, strict=True)]
+        widths += [recipes.told_within(p.name) if p.name in recipes.best.shares else np.nan for p in paints]
     u, off, same = np.array(least), np.abs(errors), np.array(right)
-    interval, told = np.array(half), np.array(widths) <= WITHIN
+    interval, narrow = np.array(half), np.array(widths) <= WITHIN
     ratio = float(np.median(off[same] / u[same]) / norm.ppf(0.75))
     print(f"{len(off)} shares, noise {arguments.noise:g}, {int(bands.sum())} bands")
     print(
@@ -93,8 +95,8 @@ def main() -> int:
         f"{100 * np.mean(off[same] < interval[same]):.0f} % in their intervals, errors {ratio:.2f} times the bound"
     )
     print(
-        f"said to be told within 2 %: {100 * np.mean(told):.0f} % of the shares, of which "
-        f"{100 * np.mean(off[told] < WITHIN):.0f} % are"
+        f"said to be told within 2 %: {100 * np.mean(narrow):.0f} % of the shares, of which "
+        f"{100 * np.mean(off[narrow] < WITHIN):.0f} % are"
     )
     return int(not arguments.smallest and ratio > WORST_RATIO)
 

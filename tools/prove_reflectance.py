@@ -51,23 +51,27 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     add_smallest(parser, draws=1, materials=["layered"], every=40)
     arguments = parser.parse_args()
-    done = {} if arguments.keep is None else _kept(arguments.keep, arguments.every)
-    wanted = [(m, scan, seed) for m in arguments.materials for scan in SCANS for seed in range(arguments.draws)]
+    judgement_of_cell = {} if arguments.keep is None else _kept(arguments.keep, arguments.every)
+    all_cells = [(m, scan, seed) for m in arguments.materials for scan in SCANS for seed in range(arguments.draws)]
     for material in arguments.materials:
-        missing = [cell for cell in wanted if cell[0] == material and cell not in done]
-        for cell, judged in _judged(material, missing, arguments.every):
-            done[cell] = judged
+        missing = [cell for cell in all_cells if cell[0] == material and cell not in judgement_of_cell]
+        for cell, judgement in _judged(material, missing, arguments.every):
+            judgement_of_cell[cell] = judgement
             if arguments.keep is not None:
                 with arguments.keep.open("a") as file:
-                    line = {"cell": cell, "every": arguments.every, "judged": judged}
+                    line = {"cell": cell, "every": arguments.every, "judged": judgement}
                     file.write(json.dumps(line) + "\n")
             print(f"{' '.join(map(str, cell))}: done", file=sys.stderr, flush=True)
-    verdicts = [verdict(m, [done[cell] for cell in wanted if cell[0] == m]) for m in arguments.materials]
-    faults = [fault for one in verdicts for fault in one["faults"]] + _faults_of_all(verdicts)
+    verdicts = [
+        verdict(m, [judgement_of_cell[cell] for cell in all_cells if cell[0] == m]) for m in arguments.materials
+    ]
+    faults = [
+        fault for verdict_of_material in verdicts for fault in verdict_of_material["faults"]
+    ] + _faults_of_all(verdicts)
     if arguments.json:
         print(json.dumps({"materials": verdicts, "faults": faults}))
     else:
-        _print(verdicts, faults, len(wanted))
+        _print(verdicts, faults, len(all_cells))
     return int(bool(faults) and not arguments.smallest)
 
 
@@ -75,7 +79,7 @@ def verdict(material: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
     """All cells of a material together, and which limits they break."""
     counts = np.sum([cell["inside"] for cell in cells], axis=0)
     inside = counts[..., 0] / np.maximum(counts[..., 1], 1)
-    fitted, scanned = _rms(cells, "fitted_deg"), _rms(cells, "scanned_deg")
+    fitted_deg, scanned_deg = _rms(cells, "fitted_deg"), _rms(cells, "scanned_deg")
     mae = {name: float(np.mean([cell["mae"][name] for cell in cells])) for name in cells[0]["mae"]}
     new = float(np.mean([cell["new_view"] / cell["old_view"] for cell in cells]))
     faults = [
@@ -84,20 +88,20 @@ def verdict(material: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
         for share, low, high in zip(row, THIRDS_DEG[:-1], THIRDS_DEG[1:], strict=True)
         if not HELD[0] <= share <= HELD[1]
     ]
-    if fitted > scanned:
-        faults.append(f"normals are off by {fitted:.2f} degrees, the scan's by {scanned:.2f}")
+    if fitted_deg > scanned_deg:
+        faults.append(f"normals are off by {fitted_deg:.2f} degrees, the scan's by {scanned_deg:.2f}")
     if mae["ggx_rbf"] > min(mae["sh"], mae["rbf"]):
         faults.append("GGX with radial functions misses more than harmonics or radial functions alone")
     if new > NEW_VIEW:
         faults.append(f"a new view is missed by {new:.2f} times the others")
-    held = [cell["normals_inside"] for cell in cells]
+    inside_counts = [cell["normals_inside"] for cell in cells]
     return {
         "material": material,
         "cells": len(cells),
         "inside": inside.tolist(),
-        "scanned_deg": scanned,
-        "fitted_deg": fitted,
-        "normals_inside": sum(n for n, _ in held) / sum(of for _, of in held),
+        "scanned_deg": scanned_deg,
+        "fitted_deg": fitted_deg,
+        "normals_inside": sum(n for n, _ in inside_counts) / sum(of for _, of in inside_counts),
         "mae": mae,
         "new_over_old_view": new,
         "faults": [f"{material}: {fault}" for fault in faults],
@@ -110,24 +114,27 @@ def _judged(
     if not missing:
         return
     with tempfile.TemporaryDirectory(prefix="coupole-loop-") as folder:
-        acquired = acquire(Path(folder), material, every=every)
+        acquisition = acquire(Path(folder), material, every=every)
         for cell in missing:
             _, scan, seed = cell
             place = Path(folder) / f"{scan}-{seed}"
             place.mkdir()
-            found: Judged = judge(acquired, scan, seed, place)
-            yield cell, found.line()
+            judgement: Judged = judge(acquisition, scan, seed, place)
+            yield cell, judgement.line()
 
 
 def _faults_of_all(verdicts: list[dict[str, Any]]) -> list[str]:
-    fitted, scanned = _rms(verdicts, "fitted_deg"), _rms(verdicts, "scanned_deg")
-    if fitted <= HALF * scanned:
+    fitted_deg, scanned_deg = _rms(verdicts, "fitted_deg"), _rms(verdicts, "scanned_deg")
+    if fitted_deg <= HALF * scanned_deg:
         return []
-    return [f"all materials: normals are off by {fitted:.2f} degrees, more than half of the scan's {scanned:.2f}"]
+    return [
+        f"all materials: normals are off by {fitted_deg:.2f} degrees, "
+        f"more than half of the scan's {scanned_deg:.2f}"
+    ]
 
 
 def _rms(found: list[dict[str, Any]], name: str) -> float:
-    return float(np.sqrt(np.mean([one[name] ** 2 for one in found])))
+    return float(np.sqrt(np.mean([figures[name] ** 2 for figures in found])))
 
 
 def _kept(path: Path, every: int) -> dict[tuple[str, str, int], dict[str, Any]]:
@@ -140,16 +147,18 @@ def _print(verdicts: list[dict[str, Any]], faults: list[str], cells: int) -> Non
     thirds = [f"{low:g}-{high:g}" for low, high in pairwise(THIRDS_DEG)]
     table = Table("material", *(f"in, {third}" for third in thirds), "normals", "in", "mae: GGX, SH, RBF, GGX+RBF",
                   "new view", box=None)  # fmt: skip
-    for one in verdicts:
-        shares = np.array(one["inside"])
-        mae = " ".join(f"{1e2 * one['mae'][name]:.2f}" for name in ("ggx_normal", "sh", "rbf", "ggx_rbf"))
+    for material_verdict in verdicts:
+        shares = np.array(material_verdict["inside"])
+        mae = " ".join(
+            f"{1e2 * material_verdict['mae'][name]:.2f}" for name in ("ggx_normal", "sh", "rbf", "ggx_rbf")
+        )
         table.add_row(
-            one["material"],
+            material_verdict["material"],
             *(f"{1e2 * column.min():.1f}-{1e2 * column.max():.1f} %" for column in shares.T),
-            f"{one['fitted_deg']:.2f} of {one['scanned_deg']:.2f} deg",
-            f"{1e2 * one['normals_inside']:.1f} %",
+            f"{material_verdict['fitted_deg']:.2f} of {material_verdict['scanned_deg']:.2f} deg",
+            f"{1e2 * material_verdict['normals_inside']:.1f} %",
             f"{mae} %",
-            f"{one['new_over_old_view']:.2f}",
+            f"{material_verdict['new_over_old_view']:.2f}",
         )
     console.print(table)
     for fault in faults:

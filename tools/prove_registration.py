@@ -50,29 +50,33 @@ def main() -> int:
         folder.mkdir(parents=True, exist_ok=True)
         truth = make_scans(folder, arguments.scans, arguments.across)
         paths = [folder / name for name in truth]
-        started = time.monotonic()
-        found = register(paths, "mm", say=_say)
-        placed = [found.scans[k] for k in found.placed]
-        poses = [found.first_from_scan[k] for k in found.placed]
+        start_s = time.monotonic()
+        registration = register(paths, "mm", say=_say)
+        placed_scans = [registration.scans[k] for k in registration.placed]
+        poses = [registration.first_from_scan[k] for k in registration.placed]
         out = Path(tempfile.mkdtemp(dir=folder))
-        merged = merge(placed, poses, "mm", arguments.mesh_mm, (5.0, 10.0, 50.0, 250.0), out, _say)
-        minutes = (time.monotonic() - started) / 60
-    memory = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    print(f"{merged.points:,} points; {merged.triangles:,} triangles; {merged.levels}")
-    off_mm, covered = compared(found, truth)
-    loops = [loop.error_mm for loop in found.loops] or [np.inf]
+        merged_mesh = merge(placed_scans, poses, "mm", arguments.mesh_mm, (5.0, 10.0, 50.0, 250.0), out, _say)
+        minutes = (time.monotonic() - start_s) / 60
+    memory = max(
+        resource.getrusage(process_kind).ru_maxrss
+        for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    print(f"{merged_mesh.points:,} points; {merged_mesh.triangles:,} triangles; {merged_mesh.levels}")
+    off_mm, coverage = compared(registration, truth)
+    loops = [loop.error_mm for loop in registration.loops] or [np.inf]
     print(
-        f"{len(found.placed)} placed, {len(found.unplaced)} not; {found.pairs} pairs, "
-        f"{len(found.rejected)} rejected, "
+        f"{len(registration.placed)} placed, {len(registration.unplaced)} not; {registration.pairs} pairs, "
+        f"{len(registration.rejected)} rejected, "
         f"{len(loops)} loops: median {np.median(loops):.3f} mm, worst {max(loops):.3f} mm; factor "
-        f"{found.loop_factor:.2f}, inflation {found.fit.inflation:.2f}, noise {found.fit.noise_mm:.3f} mm"
+        f"{registration.loop_factor:.2f}, inflation {registration.fit.inflation:.2f}, "
+        f"noise {registration.fit.noise_mm:.3f} mm"
     )
     gb = memory / 1e6
     print(
         f"off {np.median(off_mm):.3f} mm in the median, {off_mm.max():.3f} mm at worst; in 95 % regions "
-        f"{100 * covered:.1f} %; {minutes:.1f} minutes, {gb:.2f} GB in the largest process"
+        f"{100 * coverage:.1f} %; {minutes:.1f} minutes, {gb:.2f} GB in the largest process"
     )
-    wrong = bool(found.unplaced) or off_mm.max() > MOST_OFF_MM or covered < LEAST_COVERED
+    wrong = bool(registration.unplaced) or off_mm.max() > MOST_OFF_MM or coverage < LEAST_COVERED
     return int(wrong or minutes > MOST_MINUTES or gb > MOST_GB)
 
 
@@ -116,14 +120,14 @@ def _covered(found: Registered, world_from: list[np.ndarray], reference: int) ->
         if k == reference:
             continue
         x, y, z = fit.pivots_mm[k] - fit.pivots_mm[reference]
-        carried = np.eye(6)  # of a step about the reference's pivot to one about this scan's
-        carried[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
-        both = np.zeros((6, fit.covariance.shape[0]))
-        both[:, 6 * k : 6 * k + 6] += np.eye(6)
-        both[:, 6 * reference : 6 * reference + 6] -= carried
+        transport = np.eye(6)  # of a step about the reference's pivot to one about this scan's
+        transport[:3, 3:] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        jacobian = np.zeros((6, fit.covariance.shape[0]))
+        jacobian[:, 6 * k : 6 * k + 6] += np.eye(6)
+        jacobian[:, 6 * reference : 6 * reference + 6] -= transport
         step = step_between(pose, true_from_world @ world_from[k], fit.pivots_mm[k])
-        squared = step @ np.linalg.solve(both @ fit.covariance @ both.T, step)
-        inside.append(squared < chi2.ppf(0.95, 6))
+        squared_distance = step @ np.linalg.solve(jacobian @ fit.covariance @ jacobian.T, step)
+        inside.append(squared_distance < chi2.ppf(0.95, 6))
     return float(np.mean(inside))
 
 

@@ -96,7 +96,7 @@ def lamps(table: LedTable, base_from_support: Floats) -> list[int]:
     """LEDs nearest to `LAMPS` directions around the support."""
     azimuths = np.radians(np.arange(LAMPS) * 360.0 / LAMPS)
     elevation = np.radians(LAMPS_ELEVATION_DEG)
-    wanted = np.stack(
+    directions = np.stack(
         [
             np.cos(azimuths) * np.cos(elevation),
             np.sin(azimuths) * np.cos(elevation),
@@ -104,7 +104,7 @@ def lamps(table: LedTable, base_from_support: Floats) -> list[int]:
         ]
     )
     there = apply(inverse(base_from_support), table.positions_mm)
-    nearest = np.argmax(there / np.linalg.norm(there, axis=1, keepdims=True) @ wanted, axis=0)
+    nearest = np.argmax(there / np.linalg.norm(there, axis=1, keepdims=True) @ directions, axis=0)
     return [int(led) for led in table.ids[nearest]]
 
 
@@ -117,8 +117,8 @@ def _itinerary(folder: Path, template: str) -> Floats:
 
 
 def _some(joints_deg: Floats, count: int) -> Floats:
-    chosen: Floats = joints_deg[np.unique(np.linspace(0, len(joints_deg) - 1, count).astype(int))]
-    return chosen
+    subset: Floats = joints_deg[np.unique(np.linspace(0, len(joints_deg) - 1, count).astype(int))]
+    return subset
 
 
 # -- a cell and its truth ---------------------------------------------------------------------------------
@@ -184,9 +184,9 @@ class RandomCell:
     def true_lens(self) -> dict[str, float]:
         """True values of the lens, by the parameter names of records."""
         focal_px = 1e3 / self.pitch_um / (1.0 / self.cell.rig.lens.focal_length_mm - 1.0 / self.lens["focus_mm"])
-        bent = {name: self.lens[name] for name in ("k1", "p1", "p2")}
+        distortion = {name: self.lens[name] for name in ("k1", "p1", "p2")}
         middle = {"cx_px": 0.5 * (self.size_px[0] - 1), "cy_px": 0.5 * (self.size_px[1] - 1)}
-        return {"fx_px": focal_px, "fy_px": focal_px, **middle, **bent, "k2": 0.0}
+        return {"fx_px": focal_px, "fy_px": focal_px, **middle, **distortion, "k2": 0.0}
 
     def config(self, *things: dict[str, Any]) -> dict[str, Any]:
         """Configuration of the cell's world, with things on the support."""
@@ -268,9 +268,11 @@ class Photographs:
         spots = []
         for view, row in lit:
             frame = self.frame(view, [int(table.ids[row])])
-            found = find_spots(frame, float(self.camera["black_dn"]), self.camera["bayer_pattern"], self.white_dn)
-            spots += [(view, row, spot.pixel, spot.covariance) for spot in found.good]
-        seen = LedSightings(
+            found_spots = find_spots(
+                frame, float(self.camera["black_dn"]), self.camera["bayer_pattern"], self.white_dn
+            )
+            spots += [(view, row, spot.pixel, spot.covariance) for spot in found_spots.good]
+        sightings = LedSightings(
             np.array([spot[0] for spot in spots], dtype=np.intp),
             np.array([spot[1] for spot in spots], dtype=np.intp),
             np.array([spot[2] for spot in spots]).reshape(-1, 2),
@@ -281,7 +283,7 @@ class Photographs:
         size_px = (self.camera["width_px"], self.camera["height_px"])
         about = About(simulated=True)
         return LedImages(
-            seen, self.reported, views, size_px, (), about, (("rendered", "0" * 64),), self._joints_deg
+            sightings, self.reported, views, size_px, (), about, (("rendered", "0" * 64),), self._joints_deg
         )
 
     @property

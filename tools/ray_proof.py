@@ -56,7 +56,7 @@ def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: 
     """Yield what both records say of rays. `joints_deg` [n, 6] are those of the calibration's views."""
     down = _mean_down(cell, joints_deg)
     field = _field_mm(cell)
-    seen = true_pixels(cell, field, down)
+    true_px = true_pixels(cell, field, down)
     lens, free = intrinsics_of(camera)
     at = [optics.NAMES.index(name) for name in free]
 
@@ -67,12 +67,12 @@ def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: 
 
     turns = _derivatives(lambda step: optics.project(field @ _turn(step).T, lens.vector()).pixels, 3, 1e-6)
     without = np.eye(len(turns)) - turns @ np.linalg.pinv(turns)
-    yield from _judged("camera.ray_px", camera, pixels_by_lens, seen, without)
+    yield from _judged("camera.ray_px", camera, pixels_by_lens, true_px, without)
     if cell.stranger in ARM_STRANGERS:
         yield from _judged_views(cell, hand_eye, joints_deg)
         return
     in_flange = field @ cell.flange_from_camera[:3, :3].T + cell.flange_from_camera[:3, 3]
-    yield from _judged("hand-eye.ray_px", hand_eye, lambda step: _by_hand_eye(hand_eye, step, in_flange), seen)
+    yield from _judged("hand-eye.ray_px", hand_eye, lambda step: _by_hand_eye(hand_eye, step, in_flange), true_px)
 
 
 def has_truth(cell: RandomCell, parameter: str) -> bool:
@@ -102,7 +102,7 @@ def _judged(
 
 def _judged_views(cell: RandomCell, record: Record, joints_deg: Floats) -> Iterator[Vector]:
     """Corners of the board in views between those of the calibration: with the noise of a stop, as recorded."""
-    noise = {one.name: one.found for one in record.noise}
+    noise = {noise_term.name: noise_term.found for noise_term in record.noise}
     stop = np.array([noise["robot position"]] * 3 + [np.radians(noise["robot orientation"])] * 3)
     steps = np.linspace(0, len(joints_deg) - 2, _NEW_VIEWS).astype(int)
     count = len(record.parameters)
@@ -114,16 +114,16 @@ def _judged_views(cell: RandomCell, record: Record, joints_deg: Floats) -> Itera
     corners = SQUARE_MM * np.array([(i, j, 0.0) for i in (0, 5, 10) for j in (0, 3, 7)])
     for number, first in enumerate(steps):
         joints = 0.5 * (joints_deg[first] + joints_deg[first + 1])
-        reported = flange_pose(joints.tolist())
+        reported_pose = flange_pose(joints.tolist())
         true = cell.arm_errors.true_flange_pose(joints, _NEW_STOPS + number, joints_deg[first])
         in_camera = _board_points(corners, true_board(cell), true @ cell.flange_from_camera)
-        seen = true_pixels(cell, in_camera, 1.0)
+        true_px = true_pixels(cell, in_camera, 1.0)
 
-        def pixels(step: Floats, reported: Floats = reported) -> Floats:
+        def pixels(step: Floats, reported: Floats = reported_pose) -> Floats:
             at_stop = reported @ _moved(np.eye(4), step[count:])
             return _of_board(record, step[:count], at_stop, corners)
 
-        off = (pixels(np.zeros(count + 6)) - seen).ravel()
+        off = (pixels(np.zeros(count + 6)) - true_px).ravel()
         by = _derivatives(pixels, count + 6, sizes)
         u = np.sqrt(np.einsum("ki,ij,kj->k", by, covariance, by))
         for e, s in zip(off, u, strict=True):
@@ -155,24 +155,24 @@ def _of_board(record: Record, step: Floats, base_from_flange: Floats, corners_mm
 def _stepped(record: Record, step: Floats) -> tuple[Floats, Floats, Floats]:
     """Lens [9], flange_from_camera and base_from_board after a step of the record's parameters."""
     lens, free = intrinsics_of(record)
-    vector, names = lens.vector(), [one.name for one in record.parameters]
+    vector, names = lens.vector(), [parameter.name for parameter in record.parameters]
     vector[[optics.NAMES.index(name) for name in free]] += step[: len(free)]
     poses = []
     for name in ("flange_from_camera", "base_from_board"):
         first = names.index(f"{name}.x_mm")
-        own = step[first : first + 6].copy()
-        own[3:] = np.radians(own[3:])
+        pose_step = step[first : first + 6].copy()
+        pose_step[3:] = np.radians(pose_step[3:])
         pose = record.transforms[name]
-        poses.append(_moved(transform(pose.translation_mm, pose.abc_deg), own))
+        poses.append(_moved(transform(pose.translation_mm, pose.abc_deg), pose_step))
     return vector, poses[0], poses[1]
 
 
 def _moved(pose: Floats, step: Floats) -> Floats:
     """Shifted along the left frame's axes, turned about the right one's: as records state uncertainty."""
-    moved = pose.copy()
-    moved[:3, 3] += step[:3]
-    moved[:3, :3] = pose[:3, :3] @ _turn(step[3:])
-    return moved
+    moved_pose = pose.copy()
+    moved_pose[:3, 3] += step[:3]
+    moved_pose[:3, :3] = pose[:3, :3] @ _turn(step[3:])
+    return moved_pose
 
 
 def _turn(vector: Floats) -> Floats:
@@ -188,14 +188,14 @@ def _derivatives(pixels: Callable[[Floats], Floats], count: int, size: float | F
     """[2 n, count] by central differences."""
     sizes = np.broadcast_to(size, (count,))
     columns = []
-    for one, width in zip(np.eye(count), sizes, strict=True):
-        columns.append((pixels(one * width) - pixels(-one * width)).ravel() / (2 * width))
+    for direction, width in zip(np.eye(count), sizes, strict=True):
+        columns.append((pixels(direction * width) - pixels(-direction * width)).ravel() / (2 * width))
     return np.stack(columns, axis=1)
 
 
 def _degrees(record: Record) -> float:
     """The fewest of all parameters."""
-    return min([1e9, *(one.degrees_of_freedom for one in record.parameters)])
+    return min([1e9, *(parameter.degrees_of_freedom for parameter in record.parameters)])
 
 
 def _field_mm(cell: RandomCell) -> Floats:

@@ -92,9 +92,9 @@ def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36
         cell.world_settings.update(white_at_us=8000, material={"specimen": material}, shading="pixel")
         cell.world_settings.update(interreflection=False)
         cell.write(views=list(views), lights=lights, darks_per_view=2)
-        ended = cell.acquire()
-        if ended.code:
-            raise RuntimeError(f"{material}: {ended.err}")
+        outcome = cell.acquire()
+        if outcome.code:
+            raise RuntimeError(f"{material}: {outcome.err}")
         runs.append(cell.run_folder)
     old, new = runs
     return Acquired(material, old, new, mesh)
@@ -103,27 +103,27 @@ def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36
 def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
     """Evaluate the runs of a material with errors of a seed."""
     records = draw_records(folder / "records", seed, scale)
-    scanned, noise_um = _scan(folder, acquired.mesh, scan, seed)
-    request = RunRequest((acquired.old,), scanned, records, scan_noise_um=noise_um)
+    scan_path, noise_um = _scan(folder, acquired.mesh, scan, seed)
+    request = RunRequest((acquired.old,), scan_path, records, scan_noise_um=noise_um)
     about = reflectance_of(request, folder / "old")
     result, truth = RunResult(folder / "old"), Truth.of(acquired, folder / "old")
     inside = np.sum([_inside(result, view, noise_um, truth) for view in result.views], axis=0)
     materials = result.materials("ggx_normal")
-    known = np.isfinite(materials.alpha)
+    has_fit = np.isfinite(materials.alpha)
     true_normals = truth.normals[result.triangles]
-    fitted = materials.normals[known]
-    steps = np.array([tangents(*normal) for normal in fitted])
-    tilts = np.einsum("nki,ni->nk", steps, true_normals[known] - fitted)
-    spreads = np.sqrt(np.einsum("nii->ni", result.material_covariances("ggx_normal")[known])[:, :2])
-    held = np.abs(tilts) < QUANTILE * spreads
-    mine = _flat_normals(result.corners_mm[result.triangles].astype(float))
+    fitted_normals = materials.normals[has_fit]
+    steps = np.array([tangents(*normal) for normal in fitted_normals])
+    tilts = np.einsum("nki,ni->nk", steps, true_normals[has_fit] - fitted_normals)
+    spreads = np.sqrt(np.einsum("nii->ni", result.material_covariances("ggx_normal")[has_fit])[:, :2])
+    inside_interval = np.abs(tilts) < QUANTILE * spreads
+    scan_normals = _flat_normals(result.corners_mm[result.triangles].astype(float))
     leds = tuple(_leds_of(acquired.new))
     extract_runs(replace(request, runs=(acquired.new,), left_out=leds), folder / "new")
     return Judged(
         inside,
-        _off_deg(mine[known], true_normals[known]),
-        _off_deg(fitted, true_normals[known]),
-        (int(held.sum()), held.size),
+        _off_deg(scan_normals[has_fit], true_normals[has_fit]),
+        _off_deg(fitted_normals, true_normals[has_fit]),
+        (int(inside_interval.sum()), inside_interval.size),
         {name: float(value) for name, value in about["mae"].items()},
         float(about["mae"]["ggx_normal"]),
         _new_view_error(result, RunResult(folder / "new")),
@@ -163,20 +163,23 @@ class Truth:
 
 
 def _inside(result: RunResult, view: ViewSamples, noise_um: float, truth: Truth) -> NDArray[np.int64]:
-    found = np.zeros((3, 3, 2), np.int64)
+    counts = np.zeros((3, 3, 2), np.int64)
     for channel in range(3):
-        known = known_samples(result, view, channel, noise_um, most=_SAMPLES, of_triangles=len(view.triangles))
-        triangles = view.triangles[known.rows]
-        true = truth.reflectance(view.view, triangles, view.leds[known.leds])[:, channel]
-        low, high = bounds(known.places, known.sources, QUANTILE)
-        ratio = true / known.f
-        centres = known.places.corners_mm.mean(axis=1)
-        cosine = np.sum(_unit(known.places.led_mm - centres) * _flat_normals(known.places.corners_mm), axis=1)
+        samples = known_samples(result, view, channel, noise_um, most=_SAMPLES, of_triangles=len(view.triangles))
+        triangles = view.triangles[samples.rows]
+        true = truth.reflectance(view.view, triangles, view.leds[samples.leds])[:, channel]
+        low, high = bounds(samples.places, samples.sources, QUANTILE)
+        ratio = true / samples.f
+        centres = samples.places.corners_mm.mean(axis=1)
+        cosine = np.sum(_unit(samples.places.led_mm - centres) * _flat_normals(samples.places.corners_mm), axis=1)
         third = np.digitize(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))), THIRDS_DEG[1:3])
         for number in range(3):
-            mine = (third == number) & np.isfinite(ratio)
-            found[channel, number] += [np.count_nonzero((ratio > low) & (ratio < high) & mine), mine.sum()]
-    return found
+            in_third = (third == number) & np.isfinite(ratio)
+            counts[channel, number] += [
+                np.count_nonzero((ratio > low) & (ratio < high) & in_third),
+                in_third.sum(),
+            ]
+    return counts
 
 
 def _new_view_error(fitted: RunResult, other: RunResult) -> float:
@@ -187,35 +190,35 @@ def _new_view_error(fitted: RunResult, other: RunResult) -> float:
     frames = read_check_frames(other, view)
     rows = slice(0, len(view.triangles))
     samples = other.view_samples(view, rows, np.isin(view.leds, frames.leds))
-    made = model_values(samples, fitted.materials("ggx_normal").at(places))
-    made[~same] = np.nan
+    predictions = model_values(samples, fitted.materials("ggx_normal").at(places))
+    predictions[~same] = np.nan
     lit = lit_on(samples.centres_mm, samples.led_mm, view.led_normals, False)
-    share = made * lit[..., None] * view.full_scales
+    share = predictions * lit[..., None] * view.full_scales
     off = []
     for channel in range(3):
-        place, measured = frames.pairs(rows, channel)
-        both = share[place, :, channel] - measured
-        off.append(np.abs(both[np.isfinite(both)]))
+        place, measurements = frames.pairs(rows, channel)
+        differences = share[place, :, channel] - measurements
+        off.append(np.abs(differences[np.isfinite(differences)]))
     return float(np.concatenate(off).mean())
 
 
 def _scan(folder: Path, mesh: Path, scan: str, seed: int) -> tuple[Path, float]:
     """The mesh as a scanner with errors gives it, and the noise that is told of its vertices."""
-    found = trimesh.load(mesh, process=False)
+    scan_mesh = trimesh.load(mesh, process=False)
     random = np.random.default_rng((seed, SCANS.index(scan)))
     noise_um = VERTICES_UM
     if scan == "normals":
-        corners = np.asarray(found.vertices)[found.faces]
+        corners = np.asarray(scan_mesh.vertices)[scan_mesh.faces]
         tilts = np.einsum("nii->n", tilt_covariance(corners, np.ones(len(corners))))
         noise_um = float(np.radians(NORMALS_DEG) / np.sqrt(tilts.mean()))
-    drawn = random.standard_normal(found.vertices.shape)
+    errors = random.standard_normal(scan_mesh.vertices.shape)
     if scan == "correlated":
-        apart = np.linalg.norm(found.vertices[:, None] - found.vertices[None], axis=2) / CORRELATED_MM
+        apart = np.linalg.norm(scan_mesh.vertices[:, None] - scan_mesh.vertices[None], axis=2) / CORRELATED_MM
         values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
-        drawn = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * drawn)
-    found.vertices = found.vertices + 1e-3 * noise_um * drawn
+        errors = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * errors)
+    scan_mesh.vertices = scan_mesh.vertices + 1e-3 * noise_um * errors
     path = folder / "scan.ply"
-    found.export(path)
+    scan_mesh.export(path)
     return path, noise_um
 
 
@@ -247,8 +250,8 @@ def _flat_normals(corners_mm: Floats) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
-    found: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return found
+    unit_vectors: Floats = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit_vectors
 
 
 @numba.njit(cache=True)

@@ -46,12 +46,12 @@ def scipy_harmonics(samples: Any) -> None:
 
     for triangle in range(len(samples.values)):
         light, _, there = _frame_of(samples, triangle)
-        known = sph_harm_y_all(9, 9, np.arccos(light[:, 2]), np.arctan2(light[:, 1], light[:, 0]))
+        harmonics = sph_harm_y_all(9, 9, np.arccos(light[:, 2]), np.arctan2(light[:, 1], light[:, 0]))
         rows = np.concatenate(
             [
                 part
                 for degree in range(10)
-                for part in (known[degree, : degree + 1].real, known[degree, 1 : degree + 1].imag)
+                for part in (harmonics[degree, : degree + 1].real, harmonics[degree, 1 : degree + 1].imag)
             ]
         )
         rows *= light[:, 2]

@@ -102,26 +102,26 @@ def _rotations(axis: Floats, angles: Floats) -> Floats:
 
 def arm_of(job: Job) -> Figures:
     """The checker's parameters of the arm of a job's rig."""
-    described = described_arm(job.cell.rig)
-    assert described is not None
-    return ARMS[described.name]
+    arm_description = described_arm(job.cell.rig)
+    assert arm_description is not None
+    return ARMS[arm_description.name]
 
 
 def motion(job: Job, start_deg: Floats, goal_deg: Floats) -> Floats:
     """[n, 6] the straight motion from rest to rest in steps of 4 ms, by ruckig."""
     way_deg = goal_deg - start_deg
-    moved = np.abs(way_deg) > 0
-    if not moved.any():
+    is_moving = np.abs(way_deg) > 0
+    if not is_moving.any():
         return goal_deg[None]
-    asked, arm = job.cell.rig.motion, arm_of(job)
-    top_deg_s = asked.speed_fraction * np.array(arm.top_deg_s)
+    limits, arm = job.cell.rig.motion, arm_of(job)
+    top_deg_s = limits.speed_fraction * np.array(arm.top_deg_s)
     way = float(np.abs(way_deg).max())
     profile = InputParameter(1)
     profile.current_position, profile.target_position = [0.0], [1.0]
-    profile.max_velocity = [float(np.min(top_deg_s[moved] / np.abs(way_deg[moved])))]
-    profile.max_acceleration = [asked.acceleration_deg_s2 / way]
+    profile.max_velocity = [float(np.min(top_deg_s[is_moving] / np.abs(way_deg[is_moving])))]
+    profile.max_acceleration = [limits.acceleration_deg_s2 / way]
     if arm.has_jerk:
-        profile.max_jerk = [asked.jerk_deg_s3 / way]
+        profile.max_jerk = [limits.jerk_deg_s3 / way]
     course = Trajectory(1)
     Ruckig(1).calculate(profile, course)
     times = np.append(np.arange(0.0, course.duration, STEP_S), course.duration)
@@ -136,18 +136,18 @@ class ReplayCell:
         rig = job.cell.rig
         self._support_from_base = np.linalg.inv(rig.support.base_from_support.matrix())
         tool = [Capsule(body.name, FLANGE, body.from_mm, body.to_mm, body.radius_mm) for body in rig.tool]
-        described = described_arm(rig)
-        assert described is not None
+        arm_description = described_arm(rig)
+        assert arm_description is not None
         self._arm = arm_of(job)
-        links = _links_of_meshes(meshes) if meshes else _solids(capsules_of(described))
+        links = _links_of_meshes(meshes) if meshes else _solids(capsules_of(arm_description))
         self._moving = [*links, *_solids(tool)]
         self._around = self._surroundings(job)
         least_apart = 2 if meshes else 3  # capsules of links two apart overlap by construction
         self._own = [
             (i, j)
             for i, (_, link, _) in enumerate(self._moving)
-            for j, (_, other, _) in enumerate(self._moving[:i])
-            if abs(min(link, 6) - min(other, 6)) >= (least_apart if max(link, other) < FLANGE else 3)
+            for j, (_, other_link, _) in enumerate(self._moving[:i])
+            if abs(min(link, 6) - min(other_link, 6)) >= (least_apart if max(link, other_link) < FLANGE else 3)
         ]
 
     @staticmethod
@@ -177,23 +177,30 @@ class ReplayCell:
 
     def touches(self, joints_deg: Floats) -> list[Touch]:
         """Pairs of bodies that overlap anywhere on [n, 6]; each once, at its first overlap."""
-        found: dict[tuple[str, str], Touch] = {}
+        touch_of_pair: dict[tuple[str, str], Touch] = {}
         for joints, links in zip(
             joints_deg, self._support_from_base @ link_poses(joints_deg, self._arm), strict=True
         ):
             for _, link, solid in self._moving:
                 solid.setTransform(fcl.Transform(links[link][:3, :3], links[link][:3, 3]))
             pairs = [
-                *((name, other, a, b) for name, link, a in self._moving if link for other, b in self._around),
+                *(
+                    (name, obstacle, a, b)
+                    for name, link, a in self._moving
+                    if link
+                    for obstacle, b in self._around
+                ),
                 *(
                     (self._moving[i][0], self._moving[j][0], self._moving[i][2], self._moving[j][2])
                     for i, j in self._own
                 ),
             ]
-            for name, other, a, b in pairs:
-                if (name, other) not in found and fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()):
-                    found[name, other] = Touch(name, other, tuple(joints.tolist()))
-        return list(found.values())
+            for name, obstacle, a, b in pairs:
+                if (name, obstacle) not in touch_of_pair and fcl.collide(
+                    a, b, fcl.CollisionRequest(), fcl.CollisionResult()
+                ):
+                    touch_of_pair[name, obstacle] = Touch(name, obstacle, tuple(joints.tolist()))
+        return list(touch_of_pair.values())
 
 
 def _links_of_meshes(folder: Path) -> list[tuple[str, int, Any]]:

@@ -147,8 +147,8 @@ def replayed(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, lis
 
 def reason(refusal: str) -> str:
     """The reason by which a refusal is counted."""
-    what = next((name for name, phrase in REASONS.items() if phrase in refusal), "something else")
-    return f"no way: {what}" if "no way to it" in refusal else what
+    name_of_reason = next((name for name, phrase in REASONS.items() if phrase in refusal), "something else")
+    return f"no way: {name_of_reason}" if "no way to it" in refusal else name_of_reason
 
 
 def run(
@@ -162,25 +162,25 @@ def run(
 ) -> dict[str, Any]:
     """Results of a whole replay; `touches` lists plan, bodies and joint angles of each collision found."""
     demo = read_job(DEMO, rig)
-    passed, places = 0, 0
-    refused: Counter[str] = Counter()
+    pass_count, places = 0, 0
+    refusals: Counter[str] = Counter()
     touches: list[dict[str, Any]] = []
     for number in range(plans):
         job = random_job(np.random.default_rng([seed, number]), demo)
         itinerary = planned(job, meshes if check_meshes else None)
         if itinerary.refusals:
-            refused[reason(itinerary.refusals[0])] += 1
+            refusals[reason(itinerary.refusals[0])] += 1
             continue
-        passed += 1
-        looked_at, found = replayed(job, itinerary, ReplayCell(job, meshes))
+        pass_count += 1
+        looked_at, touches_of_plan = replayed(job, itinerary, ReplayCell(job, meshes))
         places += looked_at
-        touches += [{"plan": number, **vars(touch)} for touch in found]
+        touches += [{"plan": number, **vars(touch)} for touch in touches_of_plan]
         if tell:
-            print(f"plan {number}: {passed} passed, {len(touches)} touches", file=sys.stderr, flush=True)
+            print(f"plan {number}: {pass_count} passed, {len(touches)} touches", file=sys.stderr, flush=True)
     return {
         "plans": plans,
-        "passed": passed,
-        "refused": dict(refused.most_common()),
+        "passed": pass_count,
+        "refused": dict(refusals.most_common()),
         "places": places,
         "meshes": "links" if meshes else "capsules",
         "touches": touches,
@@ -195,11 +195,11 @@ def main() -> int:
     parser.add_argument("--check-meshes", action="store_true", help="preflight uses the links' meshes as well")
     parser.add_argument("--arm", choices=RIGS, default="kr10", help="arm of the simulated cell")
     add_smallest(parser, plans=1)
-    asked = parser.parse_args()
-    rig = ROOT / f"configs/rigs/{RIGS[asked.arm]}.yaml"
-    found = run(asked.plans, asked.seed, asked.meshes, rig, check_meshes=asked.check_meshes, tell=True)
-    print(json.dumps(found))
-    return 1 if found["touches"] else 0
+    options = parser.parse_args()
+    rig = ROOT / f"configs/rigs/{RIGS[options.arm]}.yaml"
+    report = run(options.plans, options.seed, options.meshes, rig, check_meshes=options.check_meshes, tell=True)
+    print(json.dumps(report))
+    return 1 if report["touches"] else 0
 
 
 if __name__ == "__main__":

@@ -31,11 +31,11 @@ class _Smallest(argparse.Action):
 def add_smallest(parser: argparse.ArgumentParser, **values: Any) -> None:
     """Give a parser `--smallest`, which sets other options, by their destinations; those that come after it on
     the command line still count."""
-    known = {action.dest for action in parser._actions}
-    assert known.issuperset(values), f"{sorted(set(values) - known)}: the parser has no such option"
-    told = " ".join(f"--{name.replace('_', '-')} {_shown(value)}" for name, value in values.items())
-    said = "a size of seconds: shows that it runs, no more" + (f" (with {told})" if told else "")
-    parser.add_argument("--smallest", action=_Smallest, values=values, help=said)
+    destinations = {action.dest for action in parser._actions}
+    assert destinations.issuperset(values), f"{sorted(set(values) - destinations)}: the parser has no such option"
+    options = " ".join(f"--{name.replace('_', '-')} {_shown(value)}" for name, value in values.items())
+    help_text = "a size of seconds: shows that it runs, no more" + (f" (with {options})" if options else "")
+    parser.add_argument("--smallest", action=_Smallest, values=values, help=help_text)
 
 
 def _shown(value: Any) -> str:

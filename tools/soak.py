@@ -45,26 +45,26 @@ def main() -> int:
     add_smallest(parser, shots=1)
     options = parser.parse_args()
     options.keep.parent.mkdir(parents=True, exist_ok=True)
-    kept = [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
-    done = sum(line["shots"] for line in kept)
+    lines = [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
+    shot_count = sum(line["shots"] for line in lines)
     settings = {"seed": options.seed, "faults_per_shot": options.faults_per_shot, "speed": options.speed}
-    if any(line["settings"] != settings for line in kept):
+    if any(line["settings"] != settings for line in lines):
         parser.error(f"{options.keep} holds rehearsals with other settings than {settings}: name another file")
-    if done < options.shots:
+    if shot_count < options.shots:
         with (
             tempfile.TemporaryDirectory(prefix="coupole-soak-") as folder,
             soak(Path(folder), **settings) as soaking,
             options.keep.open("a") as file,
             Progress(console=Console(stderr=True)) as bar,
         ):
-            task = bar.add_task("shots", total=options.shots, completed=done)
-            while done < options.shots:
-                kept.append({**soaking.rehearse(len(kept)).line(), "settings": settings})
-                file.write(json.dumps(kept[-1]) + "\n")
+            task = bar.add_task("shots", total=options.shots, completed=shot_count)
+            while shot_count < options.shots:
+                lines.append({**soaking.rehearse(len(lines)).line(), "settings": settings})
+                file.write(json.dumps(lines[-1]) + "\n")
                 file.flush()
-                done += kept[-1]["shots"]
-                bar.update(task, completed=done)
-    return report(kept)
+                shot_count += lines[-1]["shots"]
+                bar.update(task, completed=shot_count)
+    return report(lines)
 
 
 def report(lines: list[dict[str, Any]]) -> int:
@@ -77,16 +77,16 @@ def report(lines: list[dict[str, Any]]) -> int:
     table.add_row("sessions ended early", _counted(lines, "ended_by"))
     for name in ("told_missing", "unexplained", *WRONG):
         table.add_row(name.replace("_", " "), str(sum(len(line[name]) for line in lines)))
-    grown = False
-    for who in ("controller", "world"):
-        for growth in growths([line[who] for line in lines], lines[0]["shots"]):
-            table.add_row(f"{who} {growth.pid}", str(growth))
-            grown |= growth.bytes > GROWTH_BYTES or growth.files > GROWTH_FILES
+    any_growth = False
+    for process in ("controller", "world"):
+        for growth in growths([line[process] for line in lines], lines[0]["shots"]):
+            table.add_row(f"{process} {growth.pid}", str(growth))
+            any_growth |= growth.bytes > GROWTH_BYTES or growth.files > GROWTH_FILES
     console.print(table)
     wrong = [f"{name}: {text}" for line in lines for name in ("unexplained", *WRONG) for text in line[name]]
     for text in wrong:
         console.print(text, markup=False)
-    return int(grown or any(line[name] for line in lines for name in WRONG))
+    return int(any_growth or any(line[name] for line in lines for name in WRONG))
 
 
 def _counted(lines: list[dict[str, Any]], name: str) -> str:

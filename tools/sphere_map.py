@@ -49,7 +49,7 @@ class SphereMap:
     def at(self, normals: Array) -> Array:
         """Radiance [n, bands] of normals [n, 3], linear between nodes; 0 for those that the eye does not see."""
         total = np.zeros((len(normals), self.radiance.shape[3]))
-        seen = normals @ self.to_eye > 0.0
+        faces_eye = normals @ self.to_eye > 0.0
         for to_light, nodes in zip(self.to_lights, self.radiance, strict=True):
             cosine = normals @ to_light
             mirror = 2.0 * cosine[:, None] * normals - to_light
@@ -59,12 +59,12 @@ class SphereMap:
             theta = np.arctan2(np.hypot(across, side), along)
             phi = np.arctan2(np.abs(side), across) / np.pi * (PHI_NODES - 1)
             low = np.clip(np.searchsorted(self.theta, theta) - 1, 0, len(self.theta) - 2)
-            left = np.minimum(phi.astype(int), PHI_NODES - 2)
+            column = np.minimum(phi.astype(int), PHI_NODES - 2)
             up = np.clip((theta - self.theta[low]) / (self.theta[low + 1] - self.theta[low]), 0.0, 1.0)[:, None]
-            right = (phi - left)[:, None]
-            lower = (1.0 - right) * nodes[low, left] + right * nodes[low, left + 1]
-            upper = (1.0 - right) * nodes[low + 1, left] + right * nodes[low + 1, left + 1]
-            lit = np.where(seen, np.maximum(cosine, 0.0), 0.0)[:, None]
+            right = (phi - column)[:, None]
+            lower = (1.0 - right) * nodes[low, column] + right * nodes[low, column + 1]
+            upper = (1.0 - right) * nodes[low + 1, column] + right * nodes[low + 1, column + 1]
+            lit = np.where(faces_eye, np.maximum(cosine, 0.0), 0.0)[:, None]
             total += lit * ((1.0 - up) * lower + up * upper)
         return total
 
@@ -76,9 +76,9 @@ class SphereMap:
         inside = x**2 + y**2 < 1.0
         z = np.sqrt(1.0 - x[inside] ** 2 - y[inside] ** 2)
         normals = x[inside][:, None] * right + y[inside][:, None] * above + z[:, None] * self.to_eye
-        made = np.zeros((side_px, side_px, self.radiance.shape[3]))
-        made[inside] = self.at(normals)
-        return made
+        image = np.zeros((side_px, side_px, self.radiance.shape[3]))
+        image[inside] = self.at(normals)
+        return image
 
 
 def sphere_map(table: SpecularTable, to_eye: Array, to_lights: Array, irradiance: Array) -> SphereMap:

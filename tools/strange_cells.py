@@ -77,7 +77,7 @@ def drawn(name: str | None, seed: int, width_px: int) -> Drawn:
     """The stranger of a cell; nothing without a name."""
     if name is None:
         return {}
-    made = STRANGERS[name](np.random.default_rng((seed, 5)))
-    if "coma_px" in made.get("lens", {}):
-        made["lens"]["coma_px"] *= width_px / OF_WIDTH_PX
-    return made
+    stranger = STRANGERS[name](np.random.default_rng((seed, 5)))
+    if "coma_px" in stranger.get("lens", {}):
+        stranger["lens"]["coma_px"] *= width_px / OF_WIDTH_PX
+    return stranger

@@ -28,17 +28,17 @@ def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) ->
     """The scene for its first camera alone, as many pixels high as wide."""
     camera = scene.cameras[0]
     optics = FieldOfView(kind="field", degrees=camera.field_deg())
-    seen = camera.model_copy(update={"width_px": size_px, "height_px": size_px, "optics": optics})
+    square_camera = camera.model_copy(update={"width_px": size_px, "height_px": size_px, "optics": optics})
     bands = Bands.model_validate({"step_nm": step_nm})
-    return scene.model_copy(update={"cameras": (seen,), "bands": bands, "noise": noise, "samples": most})
+    return scene.model_copy(update={"cameras": (square_camera,), "bands": bands, "noise": noise, "samples": most})
 
 
 def timed(scene: Scene) -> tuple[Spectral, float, float]:
     """The picture, and the seconds that it took: on the clock, and of all cores together."""
     wall, cpu = time.perf_counter(), time.process_time()
     with opened(scene, SCENES) as renderer:
-        found = renderer.render(scene.cameras[0])
-    return found, time.perf_counter() - wall, time.process_time() - cpu
+        rendering = renderer.render(scene.cameras[0])
+    return rendering, time.perf_counter() - wall, time.process_time() - cpu
 
 
 def main() -> None:
@@ -48,18 +48,18 @@ def main() -> None:
     parser.add_argument("--step", type=int, nargs="+", default=[5], choices=[5, 10, 20, 40], help="nm.")
     parser.add_argument("--samples", type=int, default=512, help="Paths through a pixel, at most.")
     add_smallest(parser, size=8, step=[40], samples=4)
-    wanted = parser.parse_args()
+    options = parser.parse_args()
     print(f"{os.cpu_count()} cores; load before: {os.getloadavg()[0]:.1f}")
     print(f"| {' | '.join(_HEAD)} |\n|{'---|' * len(_HEAD)}", flush=True)
-    for text in wanted.scenes or list(NOISES)[: 1 if wanted.smallest else None]:
-        name, _, given = text.partition("=")
-        noise = float(given) if given else NOISES.get(name, 0.1)
-        for step_nm in wanted.step:
+    for text in options.scenes or list(NOISES)[: 1 if options.smallest else None]:
+        name, _, noise_text = text.partition("=")
+        noise = float(noise_text) if noise_text else NOISES.get(name, 0.1)
+        for step_nm in options.step:
             _, scene = read_scene(SCENES / f"{name}.yaml")
-            found, wall_s, cpu_s = timed(square(scene, wanted.size, step_nm, noise, wanted.samples))
-            row = (name, f"{wanted.size} x {wanted.size}", len(found.wavelengths_nm), f"{noise:g}")
-            ended = (f"{found.noise:.3f}", found.samples, f"{wall_s:.0f}", f"{cpu_s:.0f}")
-            print(f"| {' | '.join(str(cell) for cell in (*row, *ended))} |", flush=True)
+            rendering, wall_s, cpu_s = timed(square(scene, options.size, step_nm, noise, options.samples))
+            row = (name, f"{options.size} x {options.size}", len(rendering.wavelengths_nm), f"{noise:g}")
+            figures = (f"{rendering.noise:.3f}", rendering.samples, f"{wall_s:.0f}", f"{cpu_s:.0f}")
+            print(f"| {' | '.join(str(cell) for cell in (*row, *figures))} |", flush=True)
 
 
 if __name__ == "__main__":

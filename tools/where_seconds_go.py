@@ -107,8 +107,8 @@ def count(paths: list[str], workers: int) -> int:
     shutil.rmtree(KEPT, ignore_errors=True)
     KEPT.mkdir(parents=True)
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # who outlives its parent is waited for here
-    shared = ["-n", str(workers), "--dist", "loadscope", "--no-loadscope-reorder"] if workers > 1 else []
-    command = [sys.executable, "-m", "pytest", *shared, f"--account={KEPT}", *paths]
+    worker_options = ["-n", str(workers), "--dist", "loadscope", "--no-loadscope-reorder"] if workers > 1 else []
+    command = [sys.executable, "-m", "pytest", *worker_options, f"--account={KEPT}", *paths]
     # As tools/test does: hundreds of processes would each compile every module again.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     tests = subprocess.Popen(command, cwd=ROOT, env=environment)
@@ -119,10 +119,10 @@ def count(paths: list[str], workers: int) -> int:
                 code = tests.returncode = os.waitstatus_to_exitcode(status)
             else:
                 file.write(json.dumps({"what": "ended", "pid": pid, "name": name, "cpu": cpu_s}) + "\n")
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    ended = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
-    about = {"ended": ended, "arguments": paths, "workers": workers, "code": code}
-    (KEPT / "about.json").write_text(json.dumps({**about, "cpu_s": used.ru_utime + used.ru_stime}))
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    end_time = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    about = {"ended": end_time, "arguments": paths, "workers": workers, "code": code}
+    (KEPT / "about.json").write_text(json.dumps({**about, "cpu_s": usage.ru_utime + usage.ru_stime}))
     return code
 
 
@@ -130,13 +130,13 @@ def buried() -> Iterator[tuple[int, str, int, float]]:
     """Each child, and each that lost its parent, when it ends: pid, name, status, CPU seconds."""
     while True:
         try:
-            ended = os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+            exit_info = os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
         except ChildProcessError:
             return
-        assert ended is not None
-        name = Path(f"/proc/{ended.si_pid}/comm").read_text().strip()
-        pid, status, used = os.wait4(ended.si_pid, 0)
-        yield pid, name, status, used.ru_utime + used.ru_stime
+        assert exit_info is not None
+        name = Path(f"/proc/{exit_info.si_pid}/comm").read_text().strip()
+        pid, status, usage = os.wait4(exit_info.si_pid, 0)
+        yield pid, name, status, usage.ru_utime + usage.ru_stime
 
 
 # -- adding up --------------------------------------------------------------------------------------------
@@ -149,46 +149,46 @@ def lines() -> list[dict[str, Any]]:
 def processes(found: list[dict[str, Any]]) -> dict[int, Process]:
     """Return the processes of tests, by pid; a nursery belongs to no test, whichever test was its first."""
     nurseries = {line["pid"] for line in found if line["what"] == "nursery"}
-    known = {
+    process_of_pid = {
         line["pid"]: Process(line["name"], line["test"])
         for line in found
         if line["what"] == "process" and line["test"] and line["pid"] not in nurseries
     }
     for line in found:  # a command's world is of the command's test
-        if line["what"] == "fork" and line["parent"] in known:
-            known[line["pid"]] = Process("world", known[line["parent"]].test)
+        if line["what"] == "fork" and line["parent"] in process_of_pid:
+            process_of_pid[line["pid"]] = Process("world", process_of_pid[line["parent"]].test)
     for line in found:
-        if (process := known.get(line.get("pid", 0))) is None:
+        if (process := process_of_pid.get(line.get("pid", 0))) is None:
             continue
         if line["what"] == "ended":
             process.cpu_s = line["cpu"]
         if line["what"] == "kinds of process":
             process.kinds = columns(line["kinds"]["cpu_s"])
-    return known
+    return process_of_pid
 
 
 def columns(kinds: dict[str, float]) -> dict[str, float]:
     """CPU seconds by column, of what is counted by kind."""
-    found: dict[str, float] = defaultdict(float)
+    seconds_of_column: dict[str, float] = defaultdict(float)
     for kind, seconds in kinds.items():
-        found[COUNTED[kind]] += seconds
-    return dict(found)
+        seconds_of_column[COUNTED[kind]] += seconds
+    return dict(seconds_of_column)
 
 
 def add_cpu(spent: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
     """Add what was counted inside, and under `rest` the remainder of all that a process used."""
-    counted = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
-    add_up(spent.cpu_s, counted)
-    spent.cpu_s[rest] += max(0.0, total_s - sum(counted.values()))
+    seconds_of_kind = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
+    add_up(spent.cpu_s, seconds_of_kind)
+    spent.cpu_s[rest] += max(0.0, total_s - sum(seconds_of_kind.values()))
 
 
 def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
     """Return seconds by test, and those that belong to no test."""
     by_test: dict[str, Spent] = defaultdict(Spent)
     nobody = Spent()
-    owned: dict[str, list[Process]] = defaultdict(list)
+    processes_of_test: dict[str, list[Process]] = defaultdict(list)
     for process in processes(found).values():
-        owned[process.test].append(process)
+        processes_of_test[process.test].append(process)
     for line in found:
         if line["what"] == "start":
             nobody.cpu_s["imports"] += line["cpu_s"]
@@ -196,30 +196,30 @@ def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
             add_cpu(nobody, line["cpu"], columns(line["kinds"]["cpu_s"]), "imports")
         if line["what"] not in ("test", "collection", "between"):
             continue
-        spent = by_test[line["test"]] if line["test"] else nobody
-        add_cpu(spent, line["cpu"], columns(line["kinds"]["cpu_s"]), "work")
-        add_up(spent.wall_s, wall(line, owned[line["test"]]))
-        spent.tests += line["what"] == "test"
-    for test, those in owned.items():
-        for process in those:
+        account = by_test[line["test"]] if line["test"] else nobody
+        add_cpu(account, line["cpu"], columns(line["kinds"]["cpu_s"]), "work")
+        add_up(account.wall_s, wall(line, processes_of_test[line["test"]]))
+        account.tests += line["what"] == "test"
+    for test, children in processes_of_test.items():
+        for process in children:
             add_cpu(by_test[test], process.cpu_s, process.kinds, process.column)
     return by_test, nobody
 
 
 def wall(line: dict[str, Any], those: list[Process]) -> dict[str, float]:
     """The wall seconds of a test by kind; `those` are its processes."""
-    blocked = max(0.0, line["wall"] - line["main"] - line["queued"])
+    blocked_s = max(0.0, line["wall"] - line["main"] - line["queued"])
     kinds = line["kinds"]
-    browser = min(blocked, max(0.0, kinds["wall_s"].get("browser", 0.0) - kinds["cpu_s"].get("browser", 0.0)))
-    computed = min(blocked - browser, sum(process.cpu_s for process in those if process.column != "browser"))
-    rest = blocked - browser - computed
-    paced = any(process.name in FORKS for process in those)
+    browser = min(blocked_s, max(0.0, kinds["wall_s"].get("browser", 0.0) - kinds["cpu_s"].get("browser", 0.0)))
+    processes_s = min(blocked_s - browser, sum(process.cpu_s for process in those if process.column != "browser"))
+    rest = blocked_s - browser - processes_s
+    has_world = any(process.name in FORKS for process in those)
     return {
         "cpu": line["main"],
         "queue": line["queued"],
-        "processes": computed,
+        "processes": processes_s,
         "browser": browser,
-        "paced" if paced else "still": rest,
+        "paced" if has_world else "still": rest,
     }
 
 
@@ -244,22 +244,22 @@ def show() -> None:
     about = json.loads((KEPT / "about.json").read_text())
     by_test, nobody = of_tests(lines())
     rooms: dict[str, Spent] = defaultdict(Spent)
-    for test, spent in by_test.items():
-        rooms["/".join(test.split("/")[1:2])].add(spent)
+    for test, account in by_test.items():
+        rooms["/".join(test.split("/")[1:2])].add(account)
     rooms[WORKERS] = nobody
-    accounted = sum(sum(spent.cpu_s.values()) for spent in rooms.values())
-    nobody.cpu_s["others"] += max(0.0, about["cpu_s"] - accounted)
-    what = " ".join(about["arguments"]) or "all tests"
-    print(f"{what}, {about['workers']} at a time, ended {about['ended']}, exit code {about['code']}:")
-    print(f"{about['cpu_s']:.0f} s of CPU, of which {accounted:.0f} s are accounted for")
+    accounted_s = sum(sum(account.cpu_s.values()) for account in rooms.values())
+    nobody.cpu_s["others"] += max(0.0, about["cpu_s"] - accounted_s)
+    selection = " ".join(about["arguments"]) or "all tests"
+    print(f"{selection}, {about['workers']} at a time, ended {about['ended']}, exit code {about['code']}:")
+    print(f"{about['cpu_s']:.0f} s of CPU, of which {accounted_s:.0f} s are accounted for")
     for title, kinds in (("CPU seconds", CPU), ("wall seconds", WALL)):
         of = "cpu_s" if kinds is CPU else "wall_s"
-        table(title, kinds, [(room, getattr(spent, of), spent.tests) for room, spent in rooms.items()])
+        table(title, kinds, [(room, getattr(account, of), account.tests) for room, account in rooms.items()])
     print(f"\nthe {DEAREST} dearest tests: CPU s, wall s, what most of the CPU was")
-    for test, spent in sorted(by_test.items(), key=lambda one: -sum(one[1].cpu_s.values()))[:DEAREST]:
-        dearest = Counter(spent.cpu_s).most_common(3)
-        most = ", ".join(f"{kind} {used:.1f}" for kind, used in dearest if used >= 0.05)
-        print(f"{sum(spent.cpu_s.values()):7.1f}{sum(spent.wall_s.values()):7.1f}  {test}  ({most})")
+    for test, account in sorted(by_test.items(), key=lambda one: -sum(one[1].cpu_s.values()))[:DEAREST]:
+        dearest = Counter(account.cpu_s).most_common(3)
+        most = ", ".join(f"{kind} {seconds:.1f}" for kind, seconds in dearest if seconds >= 0.05)
+        print(f"{sum(account.cpu_s.values()):7.1f}{sum(account.wall_s.values()):7.1f}  {test}  ({most})")
 
 
 def main() -> int:
@@ -267,8 +267,8 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=1, help="how many tests at a time (tools/test: 6)")
     parser.add_argument("--show", action="store_true", help="print what was counted last")
     parser.add_argument("paths", nargs="*", metavar="PATH", help="tests, if not all")
-    given, options = parser.parse_known_args()
-    code = 0 if given.show else count([*given.paths, *options], given.workers)
+    known_options, options = parser.parse_known_args()
+    code = 0 if known_options.show else count([*known_options.paths, *options], known_options.workers)
     show()
     return code
 

@@ -68,19 +68,19 @@ def pixel_format(features: Features, device: str) -> PixelFormat:
 
 def frame_format(features: Features, device: str, black_dn: int | None) -> FrameFormat:
     """Format of the camera's frames; with `black_dn` None, black is `BlackLevel`. Raises DeviceRefused."""
-    sent = pixel_format(features, device)
+    pixel_type = pixel_format(features, device)
     width_px, height_px = int(features.number("Width")), int(features.number("Height"))
-    if width_px * height_px % pixels_in_a_group(sent):
+    if width_px * height_px % pixels_in_a_group(pixel_type):
         raise DeviceRefused(
             device,
-            expected=f"an image whose pixels fill whole bytes in {sent.name}",
+            expected=f"an image whose pixels fill whole bytes in {pixel_type.name}",
             happened=f"it has {width_px} x {height_px}",
             remedy="Choose another region or pixel format in the rig.",
         )
     if black_dn is None:
         black_dn = round(features.number("BlackLevel")) if features.has("BlackLevel") else 0
-    white_dn = (1 << sent.bit_depth) - 1
-    return FrameFormat(height_px, width_px, sent.bit_depth, sent.bayer_pattern, black_dn, white_dn)
+    white_dn = (1 << pixel_type.bit_depth) - 1
+    return FrameFormat(height_px, width_px, pixel_type.bit_depth, pixel_type.bayer_pattern, black_dn, white_dn)
 
 
 def readout_us(features: Features, device: str, given_us: int | None) -> int:

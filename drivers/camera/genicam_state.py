@@ -123,11 +123,11 @@ class State:
 
     def set(self, name: str, value: Value, entry: str = "") -> None:
         """Set a feature, unless it holds the value already, and keep what it then holds."""
-        held = self._features.read(name)
-        if not alike(held, value):
+        read_back = self._features.read(name)
+        if not alike(read_back, value):
             self._features.write(name, value)
-            held = self._features.read(name)
-        self.held[f"{name}[{entry}]" if entry else name] = str(held)
+            read_back = self._features.read(name)
+        self.held[f"{name}[{entry}]" if entry else name] = str(read_back)
 
     def select(self, selector: str, entry: str) -> None:
         """Select an entry, if the camera has it; raises DeviceRefused if the selector lacks it."""
@@ -146,15 +146,15 @@ class State:
 
     def use_one_region_and_component(self) -> None:
         """Switch off all regions of the sensor but the first, and all components of an image but intensity."""
-        for selector, switch, wanted in _ONE_OF_SEVERAL:
+        for selector, switch, preference in _ONE_OF_SEVERAL:
             if selector in self._rigs or switch in self._rigs or not self._features.has(selector):
                 continue
             entries = self._features.entries(selector)
-            kept = wanted if wanted in entries else entries[0]
-            for entry in sorted(entries, key=lambda entry: entry == kept):
+            entry_in_use = preference if preference in entries else entries[0]
+            for entry in sorted(entries, key=lambda entry: entry == entry_in_use):
                 self._features.write(selector, entry)
                 if self._features.has(switch):
-                    self.set(switch, self._switched(switch, on=entry == kept), entry)
+                    self.set(switch, self._switched(switch, on=entry == entry_in_use), entry)
 
     def _switched(self, name: str, *, on: bool) -> Value:
         if isinstance(self._features.read(name), bool):
@@ -212,8 +212,8 @@ class State:
         """Set the feature to the first value of the line that suits it."""
         value = line.values[min(line.names.index(name), len(line.values) - 1)]
         if isinstance(value, str):
-            offered = self._features.entries(name)
-            fitting = [one for one in line.values if one in offered]
+            entries = self._features.entries(name)
+            fitting = [candidate for candidate in line.values if candidate in entries]
             if line.if_offered and not fitting:
                 self.note(name)
                 return

@@ -37,8 +37,8 @@ def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
     of version 2; else 64."""
     if not gige:
         return (0, _LAST_WIDE_ID)
-    extended = "GevGVSPExtendedIDMode"
-    wide = features.has(extended) and features.read(extended) in {"On", True}
+    extended_id_feature = "GevGVSPExtendedIDMode"
+    wide = features.has(extended_id_feature) and features.read(extended_id_feature) in {"On", True}
     return (1, _LAST_WIDE_ID if wide else 65535)
 
 

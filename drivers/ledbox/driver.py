@@ -218,10 +218,10 @@ class LedBox:
     def presence(self) -> bool | None:
         if not self._has_enabling_switch:
             return None
-        (held,) = self._scpi.ask("INP:ENAB?", 1)
-        if held not in ("0", "1"):
-            self._scpi.unexpected("0 or 1 in the answer to INPut:ENABle?", repr(held))
-        return held == "1"
+        (switch_state,) = self._scpi.ask("INP:ENAB?", 1)
+        if switch_state not in ("0", "1"):
+            self._scpi.unexpected("0 or 1 in the answer to INPut:ENABle?", repr(switch_state))
+        return switch_state == "1"
 
     def close(self) -> None:
         """Lights off if the box still answers; never raises for a lost link."""
@@ -319,11 +319,11 @@ class LedBox:
         bank = self._banks.index(payload)
         if self._crc(bank) != zlib.crc32(payload):
             self._upload(bank, payload)
-            if (found := self._crc(bank)) != (wanted := zlib.crc32(payload)):
+            if (bank_crc := self._crc(bank)) != (payload_crc := zlib.crc32(payload)):
                 self._banks[bank] = None
                 self._refuse(
-                    f"CRC-32 {wanted} in bank {bank}",
-                    f"it is {found} after two uploads",
+                    f"CRC-32 {payload_crc} in bank {bank}",
+                    f"it is {bank_crc} after two uploads",
                     "Check the cable for interference.",
                 )
         self._scpi.ask("INIT", 0)
@@ -362,16 +362,16 @@ class LedBox:
             records = unpack_log(log, self._started)
         except ValueError as error:
             self._scpi.unexpected(f"the log of a table of {len(self._started)} steps", str(error))
-        finished = int(self._scpi.number(index))
-        if finished > len(self._started) or self._next_record + len(records) > len(self._started):
-            self._scpi.unexpected(f"at most {len(self._started)} records", f"the box claims {finished}")
+        finished_count = int(self._scpi.number(index))
+        if finished_count > len(self._started) or self._next_record + len(records) > len(self._started):
+            self._scpi.unexpected(f"at most {len(self._started)} records", f"the box claims {finished_count}")
         steps = np.arange(self._next_record, self._next_record + len(records))
         wrong = (records["step"] != steps) | (records["led"] != self._started["led"][steps])
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
             self._scpi.unexpected(f"the log's record of step {steps[first]}", f"{records[first]} came")
         self._next_record += len(records)
-        return self._next_record < finished, records
+        return self._next_record < finished_count, records
 
     def _note_state(self, state: str) -> bool:
         if state not in ("IDLE", "RUN", "ABORTED", "FAULT"):

@@ -50,16 +50,18 @@ class ScpiSession:
         Raises DeviceRefused or DeviceFault with the device's error, DeviceTimeout, DeviceLost, CallEnded.
         """
         message = (command if isinstance(command, bytes) else command.encode("ascii")) + b";:SYST:ERR?\n"
-        shown = (command if isinstance(command, str) else command[:40].split(b"#")[0].decode("ascii")).strip()
+        command_text = (
+            command if isinstance(command, str) else command[:40].split(b"#")[0].decode("ascii")
+        ).strip()
         seconds = REPLY_MARGIN_S + (len(message) + reply_bytes + _SHORT_REPLY_BYTES) / self.bytes_per_s
         with self._lock, self.call() as ends:
             clears = self._link.clears  # read before `ends` is compared: then no end of calls is overlooked
             if self._ends != ends:
-                raise CallEnded(self._name, shown)
-            units = self._exchange(message, shown, seconds, clears)
-            self._raise_errors(units[-1], shown, clears)
+                raise CallEnded(self._name, command_text)
+            units = self._exchange(message, command_text, seconds, clears)
+            self._raise_errors(units[-1], command_text, clears)
         if len(units) != replies + 1:
-            self.unexpected(f"{replies} replies to {shown}", f"{len(units) - 1} came")
+            self.unexpected(f"{replies} replies to {command_text}", f"{len(units) - 1} came")
         return tuple(units[:-1])
 
     @contextlib.contextmanager
@@ -214,10 +216,10 @@ def _error_of(unit: Unit) -> tuple[int, str]:
 
 def _text_end(data: bytearray) -> int | None:
     """Index of the end of the text unit at the start of `data`: `;` or LF outside quotes; None if not there."""
-    quoted = False
+    in_quotes = False
     for index, byte in enumerate(data):
         if byte == ord('"'):
-            quoted = not quoted
-        elif byte == ord("\n") or (byte == ord(";") and not quoted):
+            in_quotes = not in_quotes
+        elif byte == ord("\n") or (byte == ord(";") and not in_quotes):
             return index
     return None

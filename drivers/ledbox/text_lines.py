@@ -91,14 +91,14 @@ def _check_template(name: str, template: str) -> None:
     """Raise ValueError for a template that does not give one line of ASCII with the fields allowed for it."""
     must, may = _FIELDS[name]
     try:
-        found = {
+        template_fields = {
             field_name for _, field_name, _, _ in string.Formatter().parse(template) if field_name is not None
         }
-        if missing := must - found:
+        if missing := must - template_fields:
             raise ValueError(f"it lacks {{{min(missing)}}}")
-        if unknown := found - may:
-            allowed = ", ".join(f"{{{one}}}" for one in sorted(may)) or "no field"
-            raise ValueError(f"it has {{{min(unknown)}}}; allowed: {allowed}")
+        if unknown := template_fields - may:
+            allowed_fields = ", ".join(f"{{{known_field}}}" for known_field in sorted(may)) or "no field"
+            raise ValueError(f"it has {{{min(unknown)}}}; allowed: {allowed_fields}")
         line = template.format(led=0, on_ms=1)
     except (ValueError, IndexError, KeyError) as error:
         raise ValueError(f"`{name}`: `{template}` is no template of a command: {error}") from error
@@ -304,18 +304,20 @@ class TextLineBox:
         if self._settings.identify is None:
             return Identity("unknown", "box of text lines", "unknown", "unknown")
         text = self._exchange(self._settings.identify, self._ends)
-        fields = [one.strip() for one in text.split(",")]
+        fields = [part.strip() for part in text.split(",")]
         vendor, model, serial, firmware = fields if len(fields) == 4 else ("unknown", text, "unknown", "unknown")
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
     def _command(self, line: str, ends: int) -> None:
         """Have a command executed. Raises DeviceRefused for any reply but the expected one."""
-        expected = self._settings.expected_reply
+        expected_reply = self._settings.expected_reply
         reply = self._exchange(line, ends)
-        if reply != expected:
+        if reply != expected_reply:
             self._in_step = False
             self._refuse(
-                f"`{expected}` in answer to `{line}`", f"it said `{reply}`", "Check the box's reply and the rig."
+                f"`{expected_reply}` in answer to `{line}`",
+                f"it said `{reply}`",
+                "Check the box's reply and the rig.",
             )
 
     def _exchange(self, line: str, ends: int) -> str:
@@ -329,11 +331,11 @@ class TextLineBox:
         try:
             if not self._in_step:
                 link.clear()
-            elif unasked := link.waiting().strip():
+            elif stray_bytes := link.waiting().strip():
                 self._in_step = False
                 self._refuse(
                     f"silence before `{line}`",
-                    f"the box said `{_shown(unasked)}` unasked",
+                    f"the box said `{_shown(stray_bytes)}` unasked",
                     "Check whether it has restarted, and whether it answers each command with one line.",
                 )
             self._in_step = False

@@ -56,8 +56,10 @@ class UsbtmcLink:
             # ValueError: pyusb could not read a string descriptor, for lack of permission
             raise ConnectionError(str(error)) from error
         self._interface = interface.bInterfaceNumber
-        bulk = [one for one in interface if usb.util.endpoint_type(one.bmAttributes) == 2]
-        self._out, self._in = sorted((one.bEndpointAddress for one in bulk), key=lambda address: address & 0x80)
+        bulk = [endpoint for endpoint in interface if usb.util.endpoint_type(endpoint.bmAttributes) == 2]
+        self._out, self._in = sorted(
+            (endpoint.bEndpointAddress for endpoint in bulk), key=lambda address: address & 0x80
+        )
 
     def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
         """Send `data` as one message: DEV_DEP_MSG_OUT transfers, EOM on the last. During a device clear the
@@ -174,11 +176,11 @@ class UsbtmcLink:
 def _find(vendor: int, product: int, serial: str | None) -> Any:
     import usb.core
 
-    found = list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product))
-    devices = [device for device in found if serial is None or device.serial_number == serial]
+    candidates = list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product))
+    devices = [device for device in candidates if serial is None or device.serial_number == serial]
     if len(devices) != 1:
-        which = f"{vendor:04x}:{product:04x}" + (f" with serial {serial}" if serial else "")
-        raise ConnectionError(f"{len(devices)} USB devices {which} are connected")
+        device_text = f"{vendor:04x}:{product:04x}" + (f" with serial {serial}" if serial else "")
+        raise ConnectionError(f"{len(devices)} USB devices {device_text} are connected")
     return devices[0]
 
 

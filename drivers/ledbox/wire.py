@@ -48,12 +48,12 @@ def pack(table: NDArray[np.void]) -> bytes:
     _refuse_beyond(table, "led", NO_LED, _NO_LED - 1)
     for name in _TIMES:
         _refuse_beyond(table, name, 0, 2**32 - 1)
-    packed = np.zeros(len(table), _STEP)
-    packed["led"] = np.where(table["led"] == NO_LED, _NO_LED, table["led"])
-    packed["flags"] = np.where(table["sends_edge"], 0, _NO_EDGE_WANTED)
+    steps = np.zeros(len(table), _STEP)
+    steps["led"] = np.where(table["led"] == NO_LED, _NO_LED, table["led"])
+    steps["flags"] = np.where(table["sends_edge"], 0, _NO_EDGE_WANTED)
     for name in _TIMES:
-        packed[name] = table[name]
-    return packed.tobytes()
+        steps[name] = table[name]
+    return steps.tobytes()
 
 
 def unpack_log(log: bytes, started: NDArray[np.void]) -> NDArray[np.void]:

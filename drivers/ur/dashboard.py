@@ -64,8 +64,8 @@ def ready_controller(config: Config) -> tuple[str, str, str]:
         with contextlib.closing(Dashboard(config.host)) as dashboard:
             for question, fit, remedy in _CONDITIONS:
                 if (answer := dashboard.ask(question)) not in fit:
-                    said = "not in remote control" if answer == "false" else answer
-                    raise CannotBegin("fault", f"{fit[0]!r} to the question {question!r}", said, remedy)
+                    answer_text = "not in remote control" if answer == "false" else answer
+                    raise CannotBegin("fault", f"{fit[0]!r} to the question {question!r}", answer_text, remedy)
             while not (state := dashboard.ask("programState")).startswith("STOPPED"):
                 if time.monotonic() > wait_until_s:
                     raise CannotBegin("refused", "no program on the controller", state, "Stop it at the pendant")
@@ -76,9 +76,9 @@ def ready_controller(config: Config) -> tuple[str, str, str]:
                 dashboard.ask("PolyscopeVersion"),
             )
     except OSError as error:
-        happened = f"{type(error).__name__}: {error}"
+        failure = f"{type(error).__name__}: {error}"
         raise CannotBegin(
-            "lost", f"a dashboard server at {config.host}", happened, "Check address and cable"
+            "lost", f"a dashboard server at {config.host}", failure, "Check address and cable"
         ) from error
 
 

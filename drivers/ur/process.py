@@ -82,20 +82,20 @@ class UrProcess:
 
     def _take(self, when_silent: type[DeviceError]) -> State:
         """The process's next message."""
-        said = None
+        message = None
         if not self._lost:
             try:
-                said = self._receive()
+                message = self._receive()
             except TimeoutError:
                 self._lost = f"ur-rtde hung for {self._link.gettimeout():.1f} s"
             except OSError as error:
                 self._lost = str(error)
-        if isinstance(said, State):
-            return said
+        if isinstance(message, State):
+            return message
         self._end()
-        if isinstance(said, Failure):
-            kind = _FAILURES[said.kind]
-            raise kind("robot", expected=said.expected, happened=said.happened, remedy=said.remedy)
+        if isinstance(message, Failure):
+            kind = _FAILURES[message.kind]
+            raise kind("robot", expected=message.expected, happened=message.happened, remedy=message.remedy)
         self._lost = self._lost or f"the process of ur-rtde ended: {self._last_error()}"
         raise when_silent(
             "robot",
@@ -121,8 +121,8 @@ class UrProcess:
             self._rested = True
 
     def _last_error(self) -> str:
-        written = os.pread(self._errors_fd, os.fstat(self._errors_fd).st_size, 0)
-        lines = written.decode(errors="replace").strip().splitlines()
+        error_output = os.pread(self._errors_fd, os.fstat(self._errors_fd).st_size, 0)
+        lines = error_output.decode(errors="replace").strip().splitlines()
         return f"exit code {self._process.returncode}" + (f", {lines[-1]}" if lines else "")
 
 

@@ -80,11 +80,11 @@ class Link:
         try:
             self._receive: Any = RTDEReceiveInterface(config.host, config.frequency_hz, _VARIABLES)
             self._control: Any = RTDEControlInterface(config.host, config.frequency_hz)
-            watched = self._control.setWatchdog(1.0 / config.watchdog_s)
+            has_watchdog = self._control.setWatchdog(1.0 / config.watchdog_s)
             tcp_offset = self._control.getTCPOffset()
         except (RuntimeError, ValueError) as error:
             raise CannotBegin("lost", "a session of ur-rtde", str(error), "See the controller's log") from error
-        if not watched:
+        if not has_watchdog:
             raise CannotBegin("fault", "a watched program", "it took no watchdog", "See the controller's log")
         self._goal_deg: Six | None = None
         self._pending_deg: Six | None = None
@@ -255,7 +255,7 @@ def serve(driver: socket.socket, link: Link) -> None:
     """Answer the driver until it sends `leave` or ends, or until the link is lost."""
     config = link.config
     period_s = 1.0 / config.frequency_hz
-    opened, next_s = False, time.monotonic()
+    is_open, next_s = False, time.monotonic()
     while not link.state.lost:
         if select.select([driver], [], [], max(0.0, next_s - time.monotonic()))[0]:
             ask = receive(driver)
@@ -267,9 +267,9 @@ def serve(driver: socket.socket, link: Link) -> None:
         if time.monotonic() >= next_s:
             next_s = time.monotonic() + period_s
             link.tick()
-            if not opened and (link.state.samples >= config.settle_samples or link.state.fault):
+            if not is_open and (link.state.samples >= config.settle_samples or link.state.fault):
                 send(driver, link.state)
-                opened = True
+                is_open = True
     send(driver, link.state)
 
 

@@ -45,8 +45,8 @@ class ToolBody(BaseModel):
 def tool_capsules(base_from_flange: Transform, tool: Sequence[ToolBody]) -> Capsules:
     """Capsules of the tool alone."""
     ends = np.array([[body.from_mm, body.to_mm] for body in tool]).reshape(-1, 2, 3)
-    placed = ends @ base_from_flange[:3, :3].T + base_from_flange[:3, 3]
-    return np.column_stack([placed.reshape(-1, 6), [body.radius_mm for body in tool]])
+    ends_in_base = ends @ base_from_flange[:3, :3].T + base_from_flange[:3, 3]
+    return np.column_stack([ends_in_base.reshape(-1, 6), [body.radius_mm for body in tool]])
 
 
 def arm_capsules(joints_deg: Sequence[float]) -> Capsules:

@@ -191,8 +191,8 @@ class CameraBody:
             return
         triggering = self.triggering
         self._edges_of_session += 1
-        counted = self._edges_of_session - triggering.edges_to_start
-        if counted < 1 or counted % triggering.divider:
+        edge_count = self._edges_of_session - triggering.edges_to_start
+        if edge_count < 1 or edge_count % triggering.divider:
             return
         if triggering.delay_ns:
             self._expose_at(t_ns + triggering.delay_ns)
@@ -261,15 +261,15 @@ class CameraBody:
             self.counters["overflows"] += 1
             return
         every = self._settings.render_every
-        rendered = every > 0 and number % every == 0
-        shot = Shot(slot, frame_id, stamp_ns, end_ns + self.readout_ns, rendered)
+        is_rendered = every > 0 and number % every == 0
+        shot = Shot(slot, frame_id, stamp_ns, end_ns + self.readout_ns, is_rendered)
         self._pending.append(shot)
         if not shot.rendered or (self._settings.render_once and slot in self.pictured):
             shot.ready = True
             self._reactor.at(shot.deliver_ns, self.deliver)
             return
         self.pictured.add(slot)
-        exposed = Exposed(
+        exposure = Exposed(
             self._lighting.exposure_s(start_ns, end_ns),
             self._lighting.panels(start_ns),
             (end_ns - start_ns) / 1e9,
@@ -278,7 +278,7 @@ class CameraBody:
             self._pose(),
             self._arm(),
         )
-        working = self._workers.submit(self._work, shot, exposed)
+        working = self._workers.submit(self._work, shot, exposure)
         self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))
 
     def _wait_for(self, working: Future[None], session: int) -> None:

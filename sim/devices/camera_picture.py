@@ -43,8 +43,8 @@ def read_out(frame: NDArray[np.uint16], settings: PictureSettings, white_dn: int
         cells = image[: rows * down, : columns * across].reshape(rows, down, columns, across)
         image = cells.mean(axis=(1, 3)).astype(np.uint16)
     image = image[::every_row, ::every_column]
-    left, top = settings.left_px, settings.top_px
-    image = image[top : top + settings.height_px, left : left + settings.width_px]
+    left_px, top = settings.left_px, settings.top_px
+    image = image[top : top + settings.height_px, left_px : left_px + settings.width_px]
     if settings.mirrored[0]:
         image = image[:, ::-1]
     if settings.mirrored[1]:

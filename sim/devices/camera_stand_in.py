@@ -68,12 +68,12 @@ def build(
 
     `frame_format` has the fields of `coupole.devices.FrameFormat`.
     """
-    made: dict[str, Any] = {"frame_format": frame_format, "surroundings": surroundings}
+    arguments: dict[str, Any] = {"frame_format": frame_format, "surroundings": surroundings}
     match settings:
         case camera_server.Settings():
             path = folder / "camera"
-            return camera_server.CameraServer(reactor, settings, path=path, **made), {"address": str(path)}
+            return camera_server.CameraServer(reactor, settings, path=path, **arguments), {"address": str(path)}
         case gige_camera.Settings():
-            return gige_camera.GigeCamera(reactor, settings, **made), {"address": settings.address}
+            return gige_camera.GigeCamera(reactor, settings, **arguments), {"address": settings.address}
         case _:
             assert_never(settings)

@@ -101,37 +101,42 @@ class GigeCamera:
     def _power_on(self, memory_fd: int) -> subprocess.Popen[bytes]:
         """Start the camera's process. Raises DeviceRefused if its address cannot be had."""
         settings = self._settings
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        own_socket, process_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         start = gige_server.Start(
-            settings.address, theirs.fileno(), memory_fd, self._slot_bytes, _WIRE_SLOTS, settings.link_mb_per_s
+            settings.address,
+            process_socket.fileno(),
+            memory_fd,
+            self._slot_bytes,
+            _WIRE_SLOTS,
+            settings.link_mb_per_s,
         )
-        with theirs:
+        with process_socket:
             process = subprocess.Popen(
                 [sys.executable, "-S", "-m", gige_server.__name__, start.json()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(), memory_fd),
+                pass_fds=(process_socket.fileno(), memory_fd),
                 env={**os.environ, "PYTHONPATH": str(_ROOT)},
             )
-        ours.settimeout(_START_S)
+        own_socket.settimeout(_START_S)
         try:
-            said = ours.recv(1024).decode() or "its process ended"
+            message = own_socket.recv(1024).decode() or "its process ended"
         except TimeoutError:
-            said = f"its process did not start within {_START_S:g} s"
-        if said != "ready":
-            ours.close()
+            message = f"its process did not start within {_START_S:g} s"
+        if message != "ready":
+            own_socket.close()
             process.kill()
             process.wait()
             raise DeviceRefused(
                 "world",
                 expected=f"UDP port {gige_server.PORT} of {settings.address} for the simulated GigE Vision camera",
-                happened=f"it could not be bound ({said})",
+                happened=f"it could not be bound ({message})",
                 remedy="End the other world that serves a camera there, or give `world.settings.camera.address` "
                 "another address of the loopback interface.",
             )
-        ours.setblocking(False)
-        self._link = ours
-        self._reactor.add_reader(ours, self._listen)
+        own_socket.setblocking(False)
+        self._link = own_socket
+        self._reactor.add_reader(own_socket, self._listen)
         return process
 
     def _set_registers(self, frame_format: dict[str, Any]) -> None:
@@ -245,15 +250,15 @@ class GigeCamera:
         if not session:
             return
         source = registers.integer(reg.TRIGGER_SOURCE + 4)
-        triggered = registers.integer(reg.TRIGGER_MODE + 4) != 0
+        trigger_is_on = registers.integer(reg.TRIGGER_MODE + 4) != 0
         body.exposure_ns, body.gain = self._exposure()
         body.triggering = self._triggering()
-        body.hardware = triggered and source == reg.LINE0
+        body.hardware = trigger_is_on and source == reg.LINE0
         if not body.armed:
             body.arm()
-            if not triggered:
+            if not trigger_is_on:
                 self._run_free(session)
-        if triggered and source == reg.SOFTWARE:
+        if trigger_is_on and source == reg.SOFTWARE:
             for _ in range((triggers - before) % 2**32):
                 body.expose(self._reactor.now_ns)
             self._show_counters()
@@ -273,13 +278,13 @@ class GigeCamera:
         mode = registers.integer(reg.ACQUISITION_MODE)
         waits = registers.integer(reg.TRIGGER_MODE) and registers.integer(reg.TRIGGER_SOURCE) == reg.LINE0
         at_end = registers.integer(reg.TRIGGER_ACTIVATION) != registers.integer(reg.LINE_INVERTER)
-        limited = registers.integer(reg.FRAME_RATE_ENABLE)
+        has_rate_limit = registers.integer(reg.FRAME_RATE_ENABLE)
         frames = {reg.SINGLE_FRAME: 1, reg.MULTI_FRAME: registers.integer(reg.FRAME_COUNT)}
         return Triggering(
             delay_ns=round(registers.real(reg.TRIGGER_DELAY_US) * 1e3) + _PULSE_NS * at_end,
             divider=registers.integer(reg.TRIGGER_DIVIDER),
             latches=registers.integer(reg.TRIGGER_OVERLAP) == reg.OVERLAP_PREVIOUS_FRAME,
-            least_period_ns=round(1e9 / registers.real(reg.FRAME_RATE_HZ)) if limited else 0,
+            least_period_ns=round(1e9 / registers.real(reg.FRAME_RATE_HZ)) if has_rate_limit else 0,
             most_frames=frames.get(mode, 0),
             edges_to_start=int(bool(waits)),
         )

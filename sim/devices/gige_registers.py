@@ -218,6 +218,6 @@ def refusal(registers: Registers, address: int, data: bytes) -> int:
 
 def fires_test_packet(registers: Registers) -> bool:
     """True if the client's last write to PACKET_SIZE asked for a test packet; the flag is then cleared."""
-    held = registers.integer(PACKET_SIZE)
-    registers.set_integer(PACKET_SIZE, held & ~_FIRE_TEST_PACKET)
-    return bool(held & _FIRE_TEST_PACKET)
+    register = registers.integer(PACKET_SIZE)
+    registers.set_integer(PACKET_SIZE, register & ~_FIRE_TEST_PACKET)
+    return bool(register & _FIRE_TEST_PACKET)

@@ -171,27 +171,27 @@ class GigeServer:
             status, data = self._read(address, count)
             return status, content[:4] + data if status == reg.DONE else b""
         if command == _WRITE_REGISTERS and content and len(content) % 8 == 0:
-            written = 0
+            write_count = 0
             for number, (address, value) in enumerate(struct.iter_unpack(">II", content)):
                 status = self._write(address, struct.pack(">I", value), client)
                 if status != reg.DONE:
                     return status, struct.pack(">HH", 0, number)
-                written += 1
-            return reg.DONE, struct.pack(">HH", 0, written)
+                write_count += 1
+            return reg.DONE, struct.pack(">HH", 0, write_count)
         if command == _WRITE_MEMORY and len(content) > 4:
             status = self._write(int.from_bytes(content[:4], "big"), content[4:], client)
             return status, struct.pack(">HH", 0, len(content) - 4 if status == reg.DONE else 0)
-        known = command in {_READ_REGISTERS, _READ_MEMORY, _WRITE_REGISTERS, _WRITE_MEMORY}
-        return reg.INVALID_HEADER if known else reg.NOT_IMPLEMENTED, b""
+        is_known = command in {_READ_REGISTERS, _READ_MEMORY, _WRITE_REGISTERS, _WRITE_MEMORY}
+        return reg.INVALID_HEADER if is_known else reg.NOT_IMPLEMENTED, b""
 
     def _read_all(self, addresses: list[int]) -> tuple[int, bytes]:
-        found = b""
+        content = b""
         for address in addresses:
             status, data = self._read(address, 4)
             if status != reg.DONE:
-                return status, found
-            found += data
-        return reg.DONE, found
+                return status, content
+            content += data
+        return reg.DONE, content
 
     def _read(self, address: int, count: int) -> tuple[int, bytes]:
         if address % 4 or count % 4:

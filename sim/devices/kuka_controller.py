@@ -203,7 +203,7 @@ class KukaController:
 
     def _take_answer(self) -> tuple[float, ...] | None:
         """The corrections that answer the last packet; None if they are late or the client has left."""
-        awaited = self._ipoc - self._ipoc_step
+        expected_ipoc = self._ipoc - self._ipoc_step
         while True:
             try:
                 data = self._socket.recv(4096)
@@ -223,10 +223,10 @@ class KukaController:
             answer = self._read_answer(data)
             if not isinstance(answer, Answer):
                 self._refusals.refused(*answer)
-            elif answer.ipoc != awaited:
+            elif answer.ipoc != expected_ipoc:
                 self._refusals.refused(
                     "an answer with another IPOC than that of the last packet is ignored",
-                    f"{answer.ipoc}, expected {awaited}",
+                    f"{answer.ipoc}, expected {expected_ipoc}",
                 )
             else:
                 self._end_requested = answer.stops

@@ -42,8 +42,8 @@ class Corrections:
     @property
     def clamped(self) -> str:
         """Values to which the last correction was clamped, as text; empty if it was applied as it came."""
-        found: str = self._sum.clamped
-        return found
+        axis_names: str = self._sum.clamped
+        return axis_names
 
     def take(self, values: Axes6 | None) -> tuple[Axes6, str]:
         """Target axes after one cycle's correction, and the reason if RSI stops instead. `values` is None if none

@@ -303,8 +303,8 @@ class KukaEkiController:
 
     def _status(self) -> bytes:
         axes = " ".join(f'A{axis}="{angle:.4f}"' for axis, angle in enumerate(self.joints_deg, start=1))
-        believed = flange_pose(self.joints_deg)
-        pose = (*believed[:3, 3], *abc_from_rotation(believed[:3, :3]))
+        base_from_flange = flange_pose(self.joints_deg)
+        pose = (*base_from_flange[:3, 3], *abc_from_rotation(base_from_flange[:3, :3]))
         fault = _EMERGENCY_STOP if self.fault else _TARGET_REFUSED if self._refused else _NO_FAULT
         return (
             f'<Coupole><Status Session="{self._session}" Taken="{self._taken}" Done="{self._done}" '

@@ -23,12 +23,14 @@ class Messages:
     def messages(self, data: bytes) -> list[ElementTree.Element]:
         """Messages that `data` complete. Raises ParseError for what is no XML, ValueError for an endless one."""
         self._parser.feed(data)
-        found = [one for event, one in self._parser.read_events() if event == "end" and one.tag == "Coupole"]
+        elements = [
+            element for event, element in self._parser.read_events() if event == "end" and element.tag == "Coupole"
+        ]
         self._stream.clear()  # of messages that were taken, and of what is none
-        self._open_bytes = 0 if found else self._open_bytes + len(data)
+        self._open_bytes = 0 if elements else self._open_bytes + len(data)
         if self._open_bytes > _LONGEST_MESSAGE_BYTES:
             raise ValueError(f"{self._open_bytes} bytes without a message")
-        return found
+        return elements
 
 
 def _new_parser() -> Any:

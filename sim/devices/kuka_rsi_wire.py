@@ -56,8 +56,8 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
         try:
             if values := in_order.search(data):
                 return Answer(int(ipoc[1]), _finite(values.groups()), stops)
-            found = correction.search(data)
-            pairs = dict(_PAIR.findall(found[1])) if found else {}
+            correction_match = correction.search(data)
+            pairs = dict(_PAIR.findall(correction_match[1])) if correction_match else {}
             missing = [name.decode() for name in names if name not in pairs]
             remark = f"corrections without {' '.join(missing)} in {tag.decode()} are taken as 0" if missing else ""
             return Answer(int(ipoc[1]), _finite(pairs.get(name, b"0") for name in names), stops, remark)

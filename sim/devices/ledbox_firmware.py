@@ -306,8 +306,8 @@ class LedBoxFirmware:
         return "ABORTED" if self._fault else "IDLE"
 
     def _log(self, first: Argument, count: Argument) -> bytes:
-        start, wanted = integer(first, 0, 2**32 - 1), integer(count, 0, MAX_RECORDS)
-        return block(self._burst.records(start, wanted) if self._burst else b"")
+        start, record_count = integer(first, 0, 2**32 - 1), integer(count, 0, MAX_RECORDS)
+        return block(self._burst.records(start, record_count) if self._burst else b"")
 
     def _set_width(self, width_us: Argument) -> None:
         self._width_us = integer(width_us, 10, 10_000)
@@ -320,10 +320,10 @@ class LedBoxFirmware:
 
     def _set_panel(self, panel: int, on: Argument) -> None:
         _panel(panel)
-        wanted = boolean(on)
-        if wanted:
+        switch_on = boolean(on)
+        if switch_on:
             self._refuse_while_faulty()
-        self._switch_panel(panel, on=wanted)
+        self._switch_panel(panel, on=switch_on)
         self._watch()
 
     def _temperature(self, board: Argument = "") -> str:

@@ -70,8 +70,8 @@ def check_table(table: NDArray[np.void], led_count: int, edge_width_us: int) -> 
     if not faults and (hot := _cooling_fault(led, on_us, period_us)):
         faults = [hot]
     if faults:
-        record, what = min(faults)
-        raise ScpiError(-222, f"record {record}: {what}")
+        record, fault = min(faults)
+        raise ScpiError(-222, f"record {record}: {fault}")
 
 
 def _cooling_fault(

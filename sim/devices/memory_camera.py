@@ -186,13 +186,13 @@ class MemoryCamera:
             raise self._lost(str(error)) from error
         if not data:
             raise self._lost("the camera's stream was closed")
-        slot, frame_id, timestamp_ns, rendered = FRAME_MESSAGE.unpack(data)
+        slot, frame_id, timestamp_ns, is_rendered = FRAME_MESSAGE.unpack(data)
         return Frame(
             frame_id,
             timestamp_ns,
             self._frames[slot],
             partial(self._release, slot * 65536 + self._session),
-            bool(rendered),
+            bool(is_rendered),
         )
 
     def _release(self, ticket: int) -> None:

@@ -53,5 +53,5 @@ def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     sine = float(np.linalg.norm(sines))
     if sine < _TINY:
         return sines
-    turned: NDArray[np.float64] = sines / sine * math.atan2(sine, (float(np.trace(rotation)) - 1.0) / 2.0)
-    return turned
+    vector: NDArray[np.float64] = sines / sine * math.atan2(sine, (float(np.trace(rotation)) - 1.0) / 2.0)
+    return vector

@@ -135,10 +135,10 @@ class PtyPort:
     def _write(self) -> None:
         """Write what the terminal accepts of a piece; call again when the bits of the next one have passed."""
         try:
-            written = os.write(self._master, self._output[: self._piece_bytes])
+            byte_count = os.write(self._master, self._output[: self._piece_bytes])
         except BlockingIOError:
-            written = 0
-        del self._output[:written]
+            byte_count = 0
+        del self._output[:byte_count]
         self._sending = bool(self._output)
         if self._sending:
             self._write_later()

@@ -73,16 +73,16 @@ def build(
         case kuka_controller.Settings():
             alike = {name: getattr(settings, name) for name in kuka_controller.ALIKE}
             kuka = kuka_controller.KukaController(reactor, settings, tell, stranger)
-            paced = settings.lock_step or reactor.clock.speed != 1.0
-            declared = {"declared_cycle_ms": settings.cycle_ms} if paced else {}
+            paced_by_clock = settings.lock_step or reactor.clock.speed != 1.0
+            declared_cycle = {"declared_cycle_ms": settings.cycle_ms} if paced_by_clock else {}
             # Whom a rehearsed rig names as its controller is not here.
             here = {"controller": "127.0.0.1", "any_controller_by": ""}
-            endpoint = {"listen": kuka.sends_to, "sends_to": kuka.sends_to, **alike, **declared, **here}
+            endpoint = {"listen": kuka.sends_to, "sends_to": kuka.sends_to, **alike, **declared_cycle, **here}
             return kuka, endpoint
         case kuka_eki_controller.Settings():
             eki = kuka_eki_controller.KukaEkiController(reactor, settings, stranger)
-            theirs = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
-            return eki, {"address": eki.address, **theirs, "controller": "", "any_controller_by": ""}
+            eki_settings = {"controller_is": settings.controller_is, "status_ms": settings.status_ms}
+            return eki, {"address": eki.address, **eki_settings, "controller": "", "any_controller_by": ""}
         case ur_controller.Settings():
             ur = ur_controller.UrController(reactor, settings)
             return ur, {"host": ur.address}

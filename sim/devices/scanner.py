@@ -45,17 +45,17 @@ def export_scan(
     thing carried when it was scanned. Raises InputError for a thing without stickers, StorageError.
     """
     try:
-        scanned: Thing = TypeAdapter(Thing).validate_python(dict(thing))
+        sample: Thing = TypeAdapter(Thing).validate_python(dict(thing))
     except ValidationError as error:
         raise InputError(f"scanner: not a thing of the simulated world: {error}") from error
-    if not isinstance(scanned, Sample) or scanned.stickers is None:
+    if not isinstance(sample, Sample) or sample.stickers is None:
         raise InputError(f"scanner: expected a thing with `stickers`, found {thing}; it has nothing to hold on to")
     random = np.random.default_rng([seed, 2])
     frame = scanner_from_thing(seed)
-    bare = scanned.bare()
+    bare = sample.bare()
     points, faces = welded(bare.corners_mm)
     points = points @ frame[:3, :3].T + frame[:3, 3] + random.normal(0.0, accuracy_mm, points.shape)
-    poses = frame @ scanned.stickers.poses_when_scanned(bare)
+    poses = frame @ sample.stickers.poses_when_scanned(bare)
     poses = poses[random.permutation(len(poses))]
     centres_mm = poses[:, :3, 3] + random.normal(0.0, accuracy_mm, (len(poses), 3))
     mesh, targets = folder / MESH, folder / TARGETS

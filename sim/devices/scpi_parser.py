@@ -66,7 +66,7 @@ class Interpreter:
     """
 
     def __init__(self, commands: Mapping[str, Command], max_block_bytes: int) -> None:
-        own = {
+        common_commands = {
             "SYSTem:ERRor?": Command(self._next_error),
             "*CLS": Command(self._clear),
             "*ESR?": Command(self._event_status),
@@ -74,7 +74,7 @@ class Interpreter:
         }
         self._commands = {
             spelling: command
-            for pattern, command in {**commands, **own}.items()
+            for pattern, command in {**commands, **common_commands}.items()
             for spelling in _spellings(pattern)
         }
         self._splitter = _Splitter(max_block_bytes)
@@ -143,9 +143,9 @@ class Interpreter:
             path = full[: full.rfind(":") + 1]
         if full in self._commands and "#" not in full:
             return path, self._commands[full], ()
-        suffixed = re.fullmatch(r"([A-Z:]+?)([0-9]{0,9})(\??)", full)
-        if suffixed and (command := self._commands.get(f"{suffixed[1]}#{suffixed[3]}")):
-            return path, command, (int(suffixed[2] or "1"),)
+        suffix_match = re.fullmatch(r"([A-Z:]+?)([0-9]{0,9})(\??)", full)
+        if suffix_match and (command := self._commands.get(f"{suffix_match[1]}#{suffix_match[3]}")):
+            return path, command, (int(suffix_match[2] or "1"),)
         raise ScpiError(-113, full[:40])
 
     def _next_error(self) -> str:

@@ -103,14 +103,14 @@ class Motion:
     def at(self, t_ns: int) -> tuple[Six, Six, bool]:
         """Joint angles, their speeds in deg/s, and False once the motion has ended."""
         left_s = (t_ns - self.start_ns) / 1e9
-        gone, speed = 0.0, self.speed
+        distance, speed = 0.0, self.speed
         for duration_s, acceleration in self.phases:
             t_s = min(left_s, duration_s)
-            gone += speed * t_s + acceleration * t_s * t_s / 2.0
+            distance += speed * t_s + acceleration * t_s * t_s / 2.0
             speed += acceleration * t_s
             left_s -= t_s
             if left_s <= 0.0:
-                return *self._place(gone, speed), True
+                return *self._place(distance, speed), True
         return self.places_deg[-1], (0.0,) * 6, False
 
     def _place(self, gone: float, speed: float) -> tuple[Six, Six]:

@@ -62,14 +62,14 @@ class RtdeSession:
             if not 1.0 <= frequency_hz <= _FREQUENCY_HZ:
                 raise ValueError(f"{frequency_hz} Hz")
             self._every_cycles = round(_FREQUENCY_HZ / frequency_hz)
-            asked = _names(payload[8:])
-            answer = _recipe(1, asked)
-            self._outputs = asked if answer[0] else []
+            names = _names(payload[8:])
+            answer = _recipe(1, names)
+            self._outputs = names if answer[0] else []
             self._answer(kind, answer)
         elif kind == wire.SETUP_INPUTS:
-            asked = _names(payload)
-            answer = _recipe(len(self._inputs) + 1, asked)
-            self._inputs.append(asked if answer[0] else [])
+            names = _names(payload)
+            answer = _recipe(len(self._inputs) + 1, names)
+            self._inputs.append(names if answer[0] else [])
             self._answer(kind, answer)
         elif kind in {wire.START, wire.PAUSE}:
             self._started = kind == wire.START

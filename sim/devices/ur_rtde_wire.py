@@ -100,9 +100,9 @@ def unpack(names: Sequence[str], payload: bytes) -> dict[str, Value]:
         raise ValueError(f"a recipe of {whole.size} bytes came with {len(payload)}")
     values: dict[str, Value] = {}
     offset = 0
-    for name, one in zip(names, formats, strict=True):
-        fields = struct.unpack_from(">" + one, payload, offset)
-        offset += struct.calcsize(">" + one)
+    for name, field_format in zip(names, formats, strict=True):
+        fields = struct.unpack_from(">" + field_format, payload, offset)
+        offset += struct.calcsize(">" + field_format)
         values[name] = fields[0] if len(fields) == 1 else fields
     return values
 
@@ -112,7 +112,7 @@ def _zero(name: str) -> bytes:
 
 
 def _pack_one(name: str, value: Value) -> bytes:
-    one = _FORMATS[variable_type(name)]
+    field_format = _FORMATS[variable_type(name)]
     if isinstance(value, tuple):
-        return struct.pack(">" + one, *value)
-    return struct.pack(">" + one, value if one == "d" else int(value))
+        return struct.pack(">" + field_format, *value)
+    return struct.pack(">" + field_format, value if field_format == "d" else int(value))

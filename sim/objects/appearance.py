@@ -68,8 +68,8 @@ def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12
 
     `uncovered` is the fraction bared by holes and cracks; a roughness of 0.12 is well burnished (assumed).
     """
-    gilded = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), uncovered=uncovered)
-    specular, diffuse = gilding.reflectances(gilded)
+    gilt_layers = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), uncovered=uncovered)
+    specular, diffuse = gilding.reflectances(gilt_layers)
     return Material(f"gold leaf, {thickness_nm:g} nm", rgb(diffuse), rgb(specular), roughness)
 
 
@@ -81,8 +81,8 @@ def metal(name: str, index: Complex, roughness: float) -> Material:
 def metal_in_lacquer(name: str, index: Complex, depth_mm: float, roughness: float) -> Material:
     """Metal at a depth in clear urushi, with absorption along the normal on both passes."""
     absorption = lacquer.urushi_absorption()
-    passed = lacquer.transmittance(depth_mm, 1.0, absorption) ** 2 * (1.0 - _dielectric(indices.URUSHI)) ** 2
-    f0 = rgb(passed * fresnel.reflectance(1.0, index, indices.URUSHI))
+    transmission = lacquer.transmittance(depth_mm, 1.0, absorption) ** 2 * (1.0 - _dielectric(indices.URUSHI)) ** 2
+    f0 = rgb(transmission * fresnel.reflectance(1.0, index, indices.URUSHI))
     return Material(name, (0.0, 0.0, 0.0), f0, roughness)
 
 

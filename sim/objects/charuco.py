@@ -65,10 +65,10 @@ def opencv_board(board: Charuco) -> Any:
             "use one of cv2.aruco.DICT_*"
         )
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    markers, known = board.squares_x * board.squares_y // 2, len(dictionary.bytesList)
-    if not 0 < board.marker_mm < board.square_mm or markers > known:
+    markers, available = board.squares_x * board.squares_y // 2, len(dictionary.bytesList)
+    if not 0 < board.marker_mm < board.square_mm or markers > available:
         raise InputError(
-            f"board: expected at most {known} markers, smaller than the squares of {board.square_mm} mm; "
+            f"board: expected at most {available} markers, smaller than the squares of {board.square_mm} mm; "
             f"found {markers} of {board.marker_mm} mm; choose smaller markers, fewer squares or another dictionary"
         )
     return cv2.aruco.CharucoBoard((board.squares_x, board.squares_y), board.square_mm, board.marker_mm, dictionary)
@@ -98,12 +98,14 @@ def cells(board: Charuco) -> tuple[Array, Array, NDArray[np.bool_]]:
     marker = 0
     for row in range(board.squares_y):
         for column in range(board.squares_x):
-            top, left = 1 + row * per_square, 1 + column * per_square
+            top, column_start = 1 + row * per_square, 1 + column * per_square
             if (row + column) % 2 == 0:
-                black[top : top + per_square, left : left + per_square] = True
+                black[top : top + per_square, column_start : column_start + per_square] = True
                 continue
-            printed = cv2.aruco.generateImageMarker(dictionary, marker, bits)
-            black[top + 1 : top + 1 + bits, left + 1 : left + 1 + bits] = np.asarray(printed) == 0
+            marker_image = cv2.aruco.generateImageMarker(dictionary, marker, bits)
+            black[top + 1 : top + 1 + bits, column_start + 1 : column_start + 1 + bits] = (
+                np.asarray(marker_image) == 0
+            )
             marker += 1
     return lines_mm(board.squares_x), -lines_mm(board.squares_y), black
 

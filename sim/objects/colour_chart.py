@@ -84,11 +84,11 @@ def colour_chart() -> Surface:
     parts = [of_material(skirt(face), appearance.BLACK_PRINT)]
     black = np.ones(len(face), bool)
     x_mm, y_mm = face.mean(axis=1)[:, :2].T
-    for name, drawn in DRAWN.items():
+    for name, spectrum in DRAWN.items():
         row, column = ord(name[0]) - ord("A"), int(name[1]) - 1
         off_x_mm = x_mm - (column - (COLUMNS - 1) / 2.0) * PITCH_MM
         off_y_mm = y_mm - ((ROWS - 1) / 2.0 - row) * PITCH_MM
         patch = np.maximum(np.abs(off_x_mm), np.abs(off_y_mm)) < PATCH_MM / 2.0
         black &= ~patch
-        parts.append(of_material(face[patch], Material(name, appearance.rgb(drawn.at(WAVELENGTHS_NM)))))
+        parts.append(of_material(face[patch], Material(name, appearance.rgb(spectrum.at(WAVELENGTHS_NM)))))
     return joined([*parts, of_material(face[black], appearance.BLACK_PRINT)])

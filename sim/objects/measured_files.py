@@ -51,8 +51,8 @@ def alta_material(paths: tuple[Path, ...]) -> Material:
     parts = [interpolated(read_alta(path)) for path in paths]
 
     def whole(wi: Array, wo: Array) -> Array:
-        found = np.concatenate([part(wi, wo) for part in parts], axis=-1)
-        return np.repeat(found, 3, axis=-1) if found.shape[-1] == 1 else found
+        brdf = np.concatenate([part(wi, wo) for part in parts], axis=-1)
+        return np.repeat(brdf, 3, axis=-1) if brdf.shape[-1] == 1 else brdf
 
     up = np.array([0.0, 0.0, 1.0])
     if (channels := whole(up, up).shape[-1]) != 3:
@@ -68,7 +68,9 @@ def _shown(name: str, made: Brdf) -> Material:
 
 def _weights_of(wavelengths_nm: Array) -> Array:
     """[3, n] of spectra at these wavelengths, linear between them, as the camera sees them under its LEDs."""
-    between = np.stack([np.interp(WAVELENGTHS_NM, wavelengths_nm, one) for one in np.eye(len(wavelengths_nm))])
+    between = np.stack(
+        [np.interp(WAVELENGTHS_NM, wavelengths_nm, unit_vector) for unit_vector in np.eye(len(wavelengths_nm))]
+    )
     return np.asarray(camera_weights(LedModel(), light.camera()) @ between.T)
 
 

@@ -102,11 +102,11 @@ def woven_cloth() -> Brdf:
         half, _ = brdf.half_vector(wi, wo)
         total, gloss, area_lit, area_seen = (np.zeros(wi.shape[:-1]) for _ in range(4))
         for thread, share, factor in zip(threads, shares, bright, strict=True):
-            lit, seen = np.maximum(wi @ thread, 0.0), np.maximum(wo @ thread, 0.0)
-            total += factor * share * lit * seen
-            gloss += share * lit * seen * np.exp(2.0 * (half @ thread - 1.0) / _THREAD_LOBE**2)
+            lit, visible = np.maximum(wi @ thread, 0.0), np.maximum(wo @ thread, 0.0)
+            total += factor * share * lit * visible
+            gloss += share * lit * visible * np.exp(2.0 * (half @ thread - 1.0) / _THREAD_LOBE**2)
             area_lit += share * lit
-            area_seen += share * seen
+            area_seen += share * visible
         body = total[..., None] * linen + 0.04 / _THREAD_LOBE**2 * gloss[..., None]
         return np.asarray(body / (np.pi * np.maximum(area_lit * area_seen, 1e-6))[..., None])
 
@@ -135,7 +135,9 @@ def specimen(name: str) -> Material:
     name."""
     if name not in SPECIMENS:
         raise InputError(f"specimen: expected one of {', '.join(SPECIMENS)}; found {name!r}; choose one of them")
-    made = SPECIMENS[name]()
+    specimen_brdf = SPECIMENS[name]()
     weights = camera_weights(LedModel(), light.camera())
-    red, green, blue = np.clip(albedo(made, np.array([np.sqrt(0.5)]), nodes=24)[0] @ weights.T, 1e-6, 1.0).tolist()
-    return Material(name, (red, green, blue), table=tabulate(made, weights))
+    red, green, blue = np.clip(
+        albedo(specimen_brdf, np.array([np.sqrt(0.5)]), nodes=24)[0] @ weights.T, 1e-6, 1.0
+    ).tolist()
+    return Material(name, (red, green, blue), table=tabulate(specimen_brdf, weights))

@@ -55,8 +55,8 @@ def sticker(diameter_mm: float = 6.0, *, border_mm: float = 10.0) -> Surface:
 
 def stuck_on(surface: Surface, poses: Array, *, diameter_mm: float = 6.0) -> Surface:
     """The surface with a flat sticker at each of `poses` [n, 4, 4]."""
-    one = sticker(diameter_mm, border_mm=diameter_mm * _BORDER)
-    return joined([surface, *(moved(one, pose) for pose in poses)])
+    sticker_surface = sticker(diameter_mm, border_mm=diameter_mm * _BORDER)
+    return joined([surface, *(moved(sticker_surface, pose) for pose in poses)])
 
 
 def sticker_poses(
@@ -88,13 +88,13 @@ def sticker_poses(
     triangle = random.choice(len(area_mm2), size, p=area_mm2 / area_mm2.sum())
     cloud_mm = _points_in(surface.corners_mm[triangle], random)
     normals = flat_normals(surface.corners_mm)[triangle]
-    allowed = normals[:, 2] > -0.1 if where is None else (normals[:, 2] > -0.1) & where[triangle]
+    may_hold = normals[:, 2] > -0.1 if where is None else (normals[:, 2] > -0.1) & where[triangle]
     # Ridges may lie between the points: the triangles' corners are added.
     places_mm = np.concatenate([cloud_mm, surface.corners_mm.reshape(-1, 3)])
     facing = np.concatenate([normals, np.repeat(flat_normals(surface.corners_mm), 3, axis=0)])
     tree = cKDTree(places_mm)
     poses: list[Array] = []
-    for place in np.flatnonzero(allowed)[:_TRIES]:
+    for place in np.flatnonzero(may_hold)[:_TRIES]:
         centre_mm = cloud_mm[place]
         if len(poses) == count:
             break

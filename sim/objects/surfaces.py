@@ -17,14 +17,14 @@ from sim.scene.surface import Material, Surface
 def joined(parts: Sequence[Surface]) -> Surface:
     """One surface from several, with all their materials."""
     first = np.cumsum([0, *(len(part.materials) for part in parts)])
-    tinted = any(part.tint is not None for part in parts)
-    detailed = any(part.normals is not None for part in parts)
+    has_tint = any(part.tint is not None for part in parts)
+    has_normals = any(part.normals is not None for part in parts)
     return Surface(
         np.concatenate([part.corners_mm for part in parts]),
         tuple(material for part in parts for material in part.materials),
         np.concatenate([part.material + n for part, n in zip(parts, first, strict=False)]).astype(np.int32),
-        np.concatenate([tint_of(part) for part in parts]) if tinted else None,
-        np.concatenate([normals_of(part) for part in parts]) if detailed else None,
+        np.concatenate([tint_of(part) for part in parts]) if has_tint else None,
+        np.concatenate([normals_of(part) for part in parts]) if has_normals else None,
     )
 
 

@@ -41,17 +41,17 @@ def nashiji_slab(slab_of: nashiji.Slab | None = None) -> Surface:
     its face, are included in the flakes' reflectance by depth (`appearance.metal_in_lacquer`). Refraction, and the
     gloss of that face, are omitted: they require path tracing. Flakes at the rim extend beyond it.
     """
-    found = nashiji.flakes(slab_of or nashiji.Slab())
-    size_x, size_y = found.slab.size_mm
+    flakes = nashiji.flakes(slab_of or nashiji.Slab())
+    size_x, size_y = flakes.slab.size_mm
     body = slab(size_x, size_y, _BODY_MM) + np.array([0.5 * size_x, 0.5 * size_y, 0.0])
     parts = [of_material(body, appearance.black_lacquer())]
-    points, faces = nashiji.triangulate(found, around=12, along=4)
-    lift_mm = np.array([0.0, 0.0, _BODY_MM + found.slab.depth_mm])
-    corners = (points + lift_mm)[faces].reshape(len(found.centres_mm), -1, 3, 3)
-    depth_mm = -found.centres_mm[:, 2]
-    level = np.minimum((depth_mm / found.slab.depth_mm * _LEVELS).astype(int), _LEVELS - 1)
+    points, faces = nashiji.triangulate(flakes, around=12, along=4)
+    lift_mm = np.array([0.0, 0.0, _BODY_MM + flakes.slab.depth_mm])
+    corners = (points + lift_mm)[faces].reshape(len(flakes.centres_mm), -1, 3, 3)
+    depth_mm = -flakes.centres_mm[:, 2]
+    level = np.minimum((depth_mm / flakes.slab.depth_mm * _LEVELS).astype(int), _LEVELS - 1)
     for k in np.unique(level):
-        middle_mm = (k + 0.5) / _LEVELS * found.slab.depth_mm
+        middle_mm = (k + 0.5) / _LEVELS * flakes.slab.depth_mm
         metal = appearance.metal_in_lacquer(
             f"gold flakes, {middle_mm:.2f} mm deep", indices.gold(), middle_mm, roughness=0.08
         )

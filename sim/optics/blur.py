@@ -33,9 +33,9 @@ def through(
     """
     out = np.empty(image.shape[:2], np.float32)
     for channel in np.unique(channels):
-        one = _magnified(image[..., channel], 1.0 + objective.lateral_colour[channel])
+        channel_image = _magnified(image[..., channel], 1.0 + objective.lateral_colour[channel])
         spread_px = float(diffraction_px(objective, CHANNEL_UM[channel], pixel_pitch_um))
-        _blur(one, disk_px, spread_px, channels == channel, out)
+        _blur(channel_image, disk_px, spread_px, channels == channel, out)
     return out
 
 
@@ -89,10 +89,10 @@ def _magnified(image: Image, scale: float) -> Image:
     from scipy.ndimage import affine_transform
 
     middle = 0.5 * (np.array(image.shape) - 1.0)
-    enlarged: Image = affine_transform(
+    magnified_image: Image = affine_transform(
         image, np.full(2, 1.0 / scale), middle * (1.0 - 1.0 / scale), order=3, mode="nearest"
     )
-    return enlarged
+    return magnified_image
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
@@ -100,17 +100,17 @@ def _blur_tiles(image, sigma, more, variances, curves, lengths, wanted, out):  #
     height, width = image.shape
     across = -(-width // _COLUMNS)
     for tile in numba.prange(across * -(-height // _ROWS)):
-        top, left = tile // across * _ROWS, tile % across * _COLUMNS
-        bottom, right = min(height, top + _ROWS), min(width, left + _COLUMNS)
-        first, last = _layers_between(sigma[top:bottom, left:right], more, variances)
+        top, first_column = tile // across * _ROWS, tile % across * _COLUMNS
+        bottom, right = min(height, top + _ROWS), min(width, first_column + _COLUMNS)
+        first, last = _layers_between(sigma[top:bottom, first_column:right], more, variances)
         reach = lengths[last]
-        source = np.empty((bottom - top + 2 * reach, right - left + 2 * reach), np.float32)
-        dark = _copy(image, top - reach, left - reach, source) == 0.0
+        source = np.empty((bottom - top + 2 * reach, right - first_column + 2 * reach), np.float32)
+        dark = _copy(image, top - reach, first_column - reach, source) == 0.0
         columns, sums = np.empty(source.shape[1], np.float32), np.empty(source.shape[1], np.float32)
         halves = np.empty((2, source.shape[1] // 2 + 1), np.float32)
         for row in range(top, bottom):
             if dark:
-                for col in range(left, right):
+                for col in range(first_column, right):
                     if wanted[row & 1, col & 1]:
                         out[row, col] = 0.0
             elif wanted[row & 1, 0] or wanted[row & 1, 1]:
@@ -120,11 +120,11 @@ def _blur_tiles(image, sigma, more, variances, curves, lengths, wanted, out):  #
                         if wanted[row & 1, parity]:  # tiles begin at even columns
                             _along(halves, reach + parity, curves[layer], lengths[layer], sums)
                             before = np.float32(-1.0) if layer == first else variances[layer - 1]
-                            pixels, spread = (
-                                out[row, left + parity : right : 2],
-                                sigma[row, left + parity : right : 2],
+                            pixels, spread_variance = (
+                                out[row, first_column + parity : right : 2],
+                                sigma[row, first_column + parity : right : 2],
                             )
-                            _mix(pixels, sums, spread, more, before, variances[layer])
+                            _mix(pixels, sums, spread_variance, more, before, variances[layer])
 
 
 @numba.njit(cache=True, nogil=True)

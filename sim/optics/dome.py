@@ -43,14 +43,14 @@ def as_built(table: Leds, errors: DomeErrors) -> Leds:
 
     positions_mm, normals = table.positions_mm.copy(), table.normals.copy()
     for board in np.unique(table.boards):
-        mine = table.boards == board
+        on_board = table.boards == board
         turn_deg = errors.board_turn_deg * _normals(errors.seed, _TURN, int(board), 1)[0]
         turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
         shift_mm = errors.board_shift_mm * _normals(errors.seed, _SHIFT, int(board), 1)[0]
-        own_mm = errors.led_shift_mm * _normals(errors.seed, _PLACE, int(board), int(mine.sum()))
-        middle_mm = positions_mm[mine].mean(axis=0)
-        positions_mm[mine] = (positions_mm[mine] - middle_mm + own_mm) @ turn.T + middle_mm + shift_mm
-        normals[mine] = normals[mine] @ turn.T
+        own_mm = errors.led_shift_mm * _normals(errors.seed, _PLACE, int(board), int(on_board.sum()))
+        middle_mm = positions_mm[on_board].mean(axis=0)
+        positions_mm[on_board] = (positions_mm[on_board] - middle_mm + own_mm) @ turn.T + middle_mm + shift_mm
+        normals[on_board] = normals[on_board] @ turn.T
     row_of_led = {int(led): row for row, led in enumerate(table.ids)}
     at = np.arange(len(table.ids))
     for first, second in errors.swapped:

@@ -54,18 +54,18 @@ def glow(
     u, v = emitter.half_u_mm, emitter.half_v_mm
     corners = emitter.centre_mm + np.array([u + v, -u + v, -u - v, u - v])
     camera_from_base = inverse(base_from_camera)
-    seen = corners @ camera_from_base[:3, :3].T + camera_from_base[:3, 3]
-    if (seen[:, 2] < _NEAR_MM).all():
+    corners_in_camera = corners @ camera_from_base[:3, :3].T + camera_from_base[:3, 3]
+    if (corners_in_camera[:, 2] < _NEAR_MM).all():
         return None
-    depth_mm = float(seen[:, 2].mean())
+    depth_mm = float(corners_in_camera[:, 2].mean())
     disk_px = float(defocus_px(blur[0], depth_mm, blur[1])) if blur is not None and depth_mm > _NEAR_MM else 0.0
-    box = _box(seen, through, margin_px=2.0 + 0.5 * disk_px)
+    box = _box(corners_in_camera, through, margin_px=2.0 + 0.5 * disk_px)
     if box is None:
         return None
     rows, columns = box
     coverage = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-    edges = np.cross(seen, np.roll(seen, -1, axis=0))
-    if edges[0] @ seen[2] < 0.0:
+    edges = np.cross(corners_in_camera, np.roll(corners_in_camera, -1, axis=0))
+    if edges[0] @ corners_in_camera[2] < 0.0:
         edges = -edges
     shift = np.zeros((2, 1, 1), np.float32)
     if through.shift is not None:
@@ -73,7 +73,7 @@ def glow(
     focal_px, (centre_x, centre_y) = through.lens.focal_px, through.lens.centre_px
     _cover(coverage, edges, rows.start, columns.start, focal_px, centre_x, centre_y, shift)
     if unevenness > 0.0:
-        coverage *= _evenness(unevenness, seen, rows, columns, through)
+        coverage *= _evenness(unevenness, corners_in_camera, rows, columns, through)
     if disk_px > _LEAST_DISK_PX:
         coverage = _spread(coverage, disk_px)
     if not coverage.any():
@@ -93,12 +93,12 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
     # Distortion bends the edges outwards by less than it moves the corners.
     straight = seen_mm[:, :2] / seen_mm[:, 2:] * lens.focal_px + lens.centre_px
     points = np.concatenate([at, straight])
-    left, top = np.floor(points.min(axis=0) - margin_px).astype(int)
+    left_px, top = np.floor(points.min(axis=0) - margin_px).astype(int)
     right, bottom = np.ceil(points.max(axis=0) + margin_px).astype(int) + 1
-    left, top, right, bottom = max(left, 0), max(top, 0), min(right, width), min(bottom, height)
-    if left >= right or top >= bottom:
+    left_px, top, right, bottom = max(left_px, 0), max(top, 0), min(right, width), min(bottom, height)
+    if left_px >= right or top >= bottom:
         return None
-    return slice(int(top), int(bottom)), slice(int(left), int(right))
+    return slice(int(top), int(bottom)), slice(int(left_px), int(right))
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
@@ -108,16 +108,16 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
     Within a pixel rays are linear in position, so the fraction is the area of a square cut by straight lines.
     """
     height, width = coverage.shape
-    bent = shift.shape[1] > 1
+    has_distortion = shift.shape[1] > 1
     for row in numba.prange(height):
         at, lines = np.empty((3, 3)), np.empty((4, 3))
-        square, cut = np.empty((8, 2)), np.empty((8, 2))
+        square, clip_buffer = np.empty((8, 2)), np.empty((8, 2))
         for col in range(width):
             # The ray at the pixel's centre, and its change to the next pixel along the row and down the column.
             at[:] = 0.0
             at[0, 0], at[0, 1], at[0, 2] = (left + col - centre_x) / focal, (top + row - centre_y) / focal, 1.0
             at[1, 0] = at[2, 1] = 1.0 / focal
-            if bent:
+            if has_distortion:
                 _bend(at, shift, top + row, left + col)
             for k in range(4):
                 for i in range(3):
@@ -130,7 +130,7 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
             if inside:
                 coverage[row, col] = 1.0
             elif not outside:
-                coverage[row, col] = _area_within(lines, square, cut)
+                coverage[row, col] = _area_within(lines, square, clip_buffer)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -155,19 +155,19 @@ def _area_within(lines, square, cut):  # type: ignore[no-untyped-def]
         square[k, 0], square[k, 1] = (-0.5, 0.5, 0.5, -0.5)[k], (-0.5, -0.5, 0.5, 0.5)[k]
     for line in range(4):
         a, b, c = lines[line]
-        kept = 0
+        corner_count = 0
         for k in range(count):
             x, y = square[k]
             to_x, to_y = square[(k + 1) % count]
             here, there = a + b * x + c * y, a + b * to_x + c * to_y
             if here > 0.0:
-                cut[kept, 0], cut[kept, 1] = x, y
-                kept += 1
+                cut[corner_count, 0], cut[corner_count, 1] = x, y
+                corner_count += 1
             if (here > 0.0) != (there > 0.0):
                 share = here / (here - there)
-                cut[kept, 0], cut[kept, 1] = x + share * (to_x - x), y + share * (to_y - y)
-                kept += 1
-        count = kept
+                cut[corner_count, 0], cut[corner_count, 1] = x + share * (to_x - x), y + share * (to_y - y)
+                corner_count += 1
+        count = corner_count
         square[:count] = cut[:count]
     twice = 0.0
     for k in range(count):
@@ -204,7 +204,7 @@ def _spread(coverage: NDArray[np.float32], disk_px: float) -> NDArray[np.float32
     reach = int(np.ceil(0.5 * disk_px + 1.0))
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disk = np.clip(0.5 * disk_px + 0.5 - np.hypot(x, y), 0.0, 1.0)
-    spread = fftconvolve(coverage, disk / disk.sum(), mode="same")
+    blurred_coverage = fftconvolve(coverage, disk / disk.sum(), mode="same")
     # The FFT leaves rounding errors where there is no light, which a bright lamp would make visible.
-    spread[spread < 1e-6] = 0.0
-    return np.asarray(spread, np.float32)
+    blurred_coverage[blurred_coverage < 1e-6] = 0.0
+    return np.asarray(blurred_coverage, np.float32)

@@ -88,11 +88,15 @@ class Flashes:
 
 def led_power(model: LedModel, led: int) -> Array:
     """Relative spectral power [81] of one LED with its own pump wavelength; the sum is 1."""
-    own = model.spectrum
+    model_spectrum = model.spectrum
     shift_nm = model.pump_spread_nm * _normal(model.seed, _OWN_PUMP, led)
     return spectral_power(
         LedSpectrum(
-            own.pump_nm + shift_nm, own.pump_fwhm_nm, own.phosphor_nm, own.phosphor_fwhm_nm, own.pump_share
+            model_spectrum.pump_nm + shift_nm,
+            model_spectrum.pump_fwhm_nm,
+            model_spectrum.phosphor_nm,
+            model_spectrum.phosphor_fwhm_nm,
+            model_spectrum.pump_share,
         )
     )
 

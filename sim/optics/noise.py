@@ -72,13 +72,13 @@ def philox(counter, frame, seed):  # type: ignore[no-untyped-def]
     Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011; 7 rounds are the fewest
     that pass BigCrush there.
     """
-    left, right, k = np.uint32(counter), np.uint32(frame), np.uint32(seed)
+    left_word, right, k = np.uint32(counter), np.uint32(frame), np.uint32(seed)
     for _ in range(7):
-        product = np.uint64(left) * np.uint64(0xD256D193)
-        left = np.uint32(product >> np.uint64(32)) ^ k ^ right
+        product = np.uint64(left_word) * np.uint64(0xD256D193)
+        left_word = np.uint32(product >> np.uint64(32)) ^ k ^ right
         right = np.uint32(product)
         k = np.uint32(k + np.uint32(0x9E3779B9))
-    return left, right
+    return left_word, right
 
 
 @numba.njit(inline="always")
@@ -120,11 +120,11 @@ def poisson_exact(mean, word, cumulative, start):  # type: ignore[no-untyped-def
     low = cumulative[row, count]
     rest = mean - np.float32(row) * np.float32(1.0 / _MEANS_PER_ELECTRON)
     none = 1.0 - rest * (1.0 - rest * (0.5 - rest * (1.0 / 6.0 - rest * (1.0 / 24.0))))
-    left = np.float64(word - low) + 0.5
+    remainder = np.float64(word - low) + 0.5
     probability = np.float64(cumulative[row, count + 1] - low) * none
     more = np.int32(0)
-    while left > probability and more < 12:
-        left -= probability
+    while remainder > probability and more < 12:
+        remainder -= probability
         more += 1
         probability *= rest / more
     return np.float32(count + more)

@@ -33,12 +33,12 @@ class Panel(BaseModel):
 def whole(panel: Panel, base_from_support: Transform, lux: float) -> Emitter:
     """The panel in the base frame as if it were uniform: the flux is pi times area times luminance of its centre.
     It gives `lux` on a horizontal surface at the support's centre."""
-    one = _one_lumen(panel, base_from_support)
-    given = sum(
+    one_lumen = _one_lumen(panel, base_from_support)
+    lux_of_one_lumen = sum(
         float(irradiance(piece, base_from_support[:3, 3], base_from_support[:3, 2])[0])
-        for piece in pieces(one, panel.unevenness)
+        for piece in pieces(one_lumen, panel.unevenness)
     )
-    return replace(one, flux_lm=lux / given if given > 0.0 else 0.0)
+    return replace(one_lumen, flux_lm=lux / lux_of_one_lumen if lux_of_one_lumen > 0.0 else 0.0)
 
 
 def pieces(panel: Emitter, unevenness: float) -> list[Emitter]:

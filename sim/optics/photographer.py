@@ -147,8 +147,8 @@ class Photographer:
         self._obstacles = Obstacles(self._scene.corners_mm)
         self._shadows = Shadows(self._obstacles, places_mm, _SHADOW_BYTES)
         self._look: Look | None = None
-        self._interreflection = asked = settings.light_between_surfaces
-        self._exchange = None if asked is None else exchange(self._scene, self._obstacles, asked.rays)
+        self._interreflection = config = settings.light_between_surfaces
+        self._exchange = None if config is None else exchange(self._scene, self._obstacles, config.rays)
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
 
@@ -174,7 +174,7 @@ class Photographer:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
         look = self._look_from(exposed.base_from_flange, exposed.arm_mm)
         radiance, seconds = self._lit(look, exposed)
-        sensed: dict[str, Any] = {
+        sensor_arguments: dict[str, Any] = {
             "model": self.sensor,
             "frame": exposed.number,
             "exposure_s": exposed.exposure_s,
@@ -188,7 +188,7 @@ class Photographer:
             mean_e = self._blurred(look, sharp)
             if glows is not None:
                 mean_e += glows
-            expose_electrons(out, mean_e, **sensed)
+            expose_electrons(out, mean_e, **sensor_arguments)
         else:
             expose(
                 out,
@@ -197,7 +197,7 @@ class Photographer:
                 self._falloff,
                 electrons_per_radiance=scale,
                 more_e=glows,
-                **sensed,
+                **sensor_arguments,
             )
         self._strangers.sensor.add_tails(out, exposed.number, self.sensor.white_dn)
 
@@ -227,8 +227,8 @@ class Photographer:
             return lights[0]
         count = len(look.view.points_mm)
         radiance = np.zeros((max(1, count), 3), np.float32)
-        for each, lit_s in lights:
-            radiance[:count] += each * np.float32(lit_s)
+        for led_light, lit_s in lights:
+            radiance[:count] += led_light * np.float32(lit_s)
         return radiance, 1.0
 
     def _look_from(self, base_from_flange: Transform, arm_mm: Capsules = NONE) -> Look:
@@ -287,8 +287,8 @@ class Photographer:
         view, emission = look.view, emission or self._emission
         matter = self._scene.materials, self._scene.tables
         if look.places is not None:
-            reached = self._shadows.reached(row)
-            radiance = led_radiance(view, *matter, emitter, emission, look.places, reached)
+            visibility = self._shadows.reached(row)
+            radiance = led_radiance(view, *matter, emitter, emission, look.places, visibility)
         else:
             radiance = led_radiance(view, *matter, emitter, emission)
             self._obstacles.cast(radiance, view.points_mm, view.triangle, view.normals, emitter.centre_mm)
@@ -299,12 +299,12 @@ class Photographer:
 
     def _add_indirect(self, radiance: Radiance, look: Look, emitter: Emitter, emission: str) -> None:
         """Add what interreflection makes of a light, if it is on."""
-        between, asked = self._exchange, self._interreflection
-        if between is None or asked is None or len(radiance) == 0:
+        between, config = self._exchange, self._interreflection
+        if between is None or config is None or len(radiance) == 0:
             return
         if look.around is None:
             look.around = neighbourhood(between, self._scene.corners_mm, look.view.sides, look.view.normals)
-        lux = indirect_lux(between, self._obstacles, emitter, emission, look.arm_mm, asked.bounces)
+        lux = indirect_lux(between, self._obstacles, emitter, emission, look.arm_mm, config.bounces)
         add_indirect(radiance, lux, look.around, look.albedo, look.view.triangle)
 
     def _colour_of(self, led: int) -> NDArray[np.float32]:
@@ -319,22 +319,22 @@ class Photographer:
 
     def _glows(self, look: Look, exposed: Exposed) -> NDArray[np.float32] | None:
         """[h, w] mean electrons from lamps in the picture, or None if there are none."""
-        seen: list[tuple[Glow, NDArray[np.float32]]] = []
+        glows: list[tuple[Glow, NDArray[np.float32]]] = []
         for led, lit_s in exposed.seconds_of_led.items():
             die = self._emitters[self._row_of_led[led]]
             if self._strangers.light.primary_lens_mm:
                 die = self._strangers.light.seen_from(die, look.base_from_camera[:3, 3])
             if spot := self._glow(look, led, die, self._emission):
-                seen.append((spot, self._colour_of(led) * np.float32(lit_s)))
+                glows.append((spot, self._colour_of(led) * np.float32(lit_s)))
         for panel in exposed.panels:
             if panel <= len(self._panels):
                 whole, unevenness = self._panels[panel - 1]
                 if area := self._glow(look, -panel, whole, "lambertian", unevenness):
-                    seen.append((area, np.full(3, exposed.exposure_s, np.float32)))
-        if not seen:
+                    glows.append((area, np.full(3, exposed.exposure_s, np.float32)))
+        if not glows:
             return None
         mean_e = np.zeros(self._falloff.shape, np.float32)
-        for lamp, seconds in seen:
+        for lamp, seconds in glows:
             of_row, of_column = np.ogrid[lamp.rows, lamp.columns]
             weights = seconds[self.sensor.channels()[of_row & 1, of_column & 1]]
             mean_e[lamp.rows, lamp.columns] += lamp.radiance * weights
@@ -371,18 +371,18 @@ def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> flo
 
 
 def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
-    given = mesh.material or settings.material
-    match given:
+    config = mesh.material or settings.material
+    match config:
         case None:
             material = None
         case SpecimenConfig():
             from sim.objects.specimens import specimen
 
-            material = specimen(given.specimen)
+            material = specimen(config.specimen)
         case MeasuredConfig():
-            material = _measured(given)
+            material = _measured(config)
         case MaterialConfig():
-            material = Material(mesh.path.stem, given.diffuse, given.f0, given.roughness)
+            material = Material(mesh.path.stem, config.diffuse, config.f0, config.roughness)
     surface = load_surface(mesh.path, mesh.unit, material, settings.detail, mesh.pictures_beside)
     return settings.stickers.on(surface) if settings.stickers else surface
 

@@ -140,8 +140,8 @@ def _settings(
     ambient_e = np.asarray(model.ambient_e_per_s, np.float32)[model.channels()] * np.float32(exposure_s)
     dn_per_e = gain / model.electrons_per_dn
     dark_s = exposure_s * model.dark_factor(temperature_c)
-    well, read, row = model.full_well_e, model.read_noise_e, model.row_noise_e
-    readout = np.array([dark_s, well, read, row, dn_per_e, model.black_dn, model.white_dn], np.float32)
+    well, read_e, row = model.full_well_e, model.read_noise_e, model.row_noise_e
+    readout = np.array([dark_s, well, read_e, row, dn_per_e, model.black_dn, model.white_dn], np.float32)
     return (
         pattern.response,
         pattern.offset_e,
@@ -160,7 +160,7 @@ def _settings(
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key, table):  # type: ignore[no-untyped-def]
     height, width = response.shape
-    prnu, dsnu_e, dark_median, spread, hot_share, hot_factor = figures
+    prnu, dsnu_e, dark_median, dark_spread, hot_share, hot_factor = figures
     for row in numba.prange(height):
         for col in range(width):
             first, second = noise.philox(col, row, response_key)
@@ -168,7 +168,7 @@ def _fill_pattern(response, offset_e, dark, hot, figures, response_key, dark_key
             offset_e[row, col] = dsnu_e * noise.normal(second, table)
             first, second = noise.philox(col, row, dark_key)
             hot[row, col] = np.float64(second) < hot_share * 2.0**32
-            rate = dark_median * np.exp(spread * noise.normal(first, table))
+            rate = dark_median * np.exp(dark_spread * noise.normal(first, table))
             dark[row, col] = rate * hot_factor if hot[row, col] else rate
 
 
@@ -234,7 +234,11 @@ def _develop(  # type: ignore[no-untyped-def]
     height, width = out.shape
     dark_s, full_well, read_e, row_e, dn_per_e, black, white = readout
     for row in numba.prange(height):
-        mean, count, read = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
+        mean, count, read_noise = (
+            np.empty(width, np.float32),
+            np.empty(width, np.float32),
+            np.empty(width, np.float32),
+        )
         shot_word = np.empty(width, np.uint32)
         row_word, _ = noise.philox(row, frame, row_key)
         common = row_e * noise.normal(row_word, inverse_normal)
@@ -244,12 +248,12 @@ def _develop(  # type: ignore[no-untyped-def]
         for col in range(width):
             pixel = np.uint32(row) * np.uint32(width) + np.uint32(col)
             shot_word[col], second = noise.philox(pixel, frame, pixel_key)
-            read[col] = read_e * noise.normal(second, inverse_normal) + offset_e[row, col] + common
+            read_noise[col] = read_e * noise.normal(second, inverse_normal) + offset_e[row, col] + common
             bright = max(mean[col], np.float32(noise.POISSON_EXACT_BELOW))
             count[col] = noise.poisson_quantile(bright, noise.normal(shot_word[col], inverse_normal))
         for col in range(width):
             if mean[col] < np.float32(noise.POISSON_EXACT_BELOW):
                 count[col] = noise.poisson_exact(mean[col], shot_word[col], small_means, small_starts)
         for col in range(width):
-            dn = black + (min(count[col], full_well) + read[col]) * dn_per_e + np.float32(0.5)
+            dn = black + (min(count[col], full_well) + read_noise[col]) * dn_per_e + np.float32(0.5)
             out[row, col] = np.uint16(min(max(dn, np.float32(0.0)), white))

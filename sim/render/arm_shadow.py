@@ -87,10 +87,10 @@ def _near(points, capsules, light):  # type: ignore[no-untyped-def]
         middle[k] = 0.5 * (low + high)
         reach += 0.25 * (high - low) ** 2
     reach = np.sqrt(reach)
-    kept = np.empty(len(capsules), np.int64)
+    indices = np.empty(len(capsules), np.int64)
     count = 0
     for k in range(len(capsules)):
         if distance_mm(middle, light, capsules[k, :3], capsules[k, 3:6]) < capsules[k, 6] + reach:
-            kept[count] = k
+            indices[count] = k
             count += 1
-    return kept[:count]
+    return indices[:count]

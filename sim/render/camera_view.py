@@ -78,21 +78,21 @@ class Viewer:
     def look(self, base_from_camera: Transform) -> View:
         """Rasterise from a pose."""
         scene = self._scene
-        site, seen = visible_triangles(scene.corners_mm, self._sight, base_from_camera)
+        site, triangles = visible_triangles(scene.corners_mm, self._sight, base_from_camera)
         eye = base_from_camera[:3, 3].copy()
-        sides, triangle, fine = np.empty(len(seen), np.int64), np.arange(len(seen), dtype=np.int32), None
-        points, normals = (np.empty((len(seen), 3), np.float32) for _ in range(2))
-        _gather(scene.corners_mm, seen, eye, sides, points, normals)
+        sides, triangle, fine = np.empty(len(triangles), np.int64), np.arange(len(triangles), dtype=np.int32), None
+        points, normals = (np.empty((len(triangles), 3), np.float32) for _ in range(2))
+        _gather(scene.corners_mm, triangles, eye, sides, points, normals)
         shading = normals
         if scene.normals is not None:
-            shading = scene.normals[seen] * np.where(sides & 1, np.float32(-1), np.float32(1))[:, None]
-        material = scene.material[seen]
+            shading = scene.normals[triangles] * np.where(sides & 1, np.float32(-1), np.float32(1))[:, None]
+        material = scene.material[triangles]
         if self._shading == "pixel":
             points, triangle = pixel_sites(site, points, normals, self._sight, base_from_camera)
             fine = fine_surface(scene.waves, points, triangle, shading, material, sides)
         diffuse = scene.materials[material, :3].astype(np.float32)
         if scene.tint is not None:
-            diffuse *= scene.tint[seen]
+            diffuse *= scene.tint[triangles]
         return View(site, points, triangle, fine, eye, sides, normals, shading, diffuse, material)
 
 
@@ -103,8 +103,8 @@ def slopes(through: Sight) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     y = (np.arange(lens.height_px)[:, None] - lens.centre_px[1]) / lens.focal_px
     if through.shift is not None:
         x, y = x + through.shift[0, :, : lens.width_px], y + through.shift[1, :, : lens.width_px]
-    both = np.array(np.broadcast_arrays(x, y))
-    return both[0], both[1]
+    pair = np.array(np.broadcast_arrays(x, y))
+    return pair[0], pair[1]
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

@@ -128,10 +128,10 @@ class Obstacles:
     def first_met(self, origins_mm: NDArray[np.float32], ways: NDArray[np.float32]) -> NDArray[np.int32]:
         """[n] side of a triangle, as in `trace`, that rays from points [n, 3] in directions [n, 3] meet first, or
         -1."""
-        met = np.empty(len(origins_mm), np.int32)
+        sides = np.empty(len(origins_mm), np.int32)
         address, scene = self._library.intersect, np.uint64(self._scene)
-        _meet(address, scene, self.corners_mm, origins_mm, ways, met, _SCATTERED)
-        return met
+        _meet(address, scene, self.corners_mm, origins_mm, ways, sides, _SCATTERED)
+        return sides
 
     def __del__(self) -> None:
         if hasattr(self, "_scene"):

@@ -40,8 +40,8 @@ def square(centre_mm: ArrayLike, normal: ArrayLike, *, side_mm: float, flux_lm: 
 
     The LED table does not give the orientation of squares; at 1 m it changes the irradiance by at most 1e-5.
     """
-    (one,) = squares(np.atleast_2d(centre_mm), np.atleast_2d(normal), side_mm=side_mm, fluxes_lm=[flux_lm])
-    return one
+    (emitter,) = squares(np.atleast_2d(centre_mm), np.atleast_2d(normal), side_mm=side_mm, fluxes_lm=[flux_lm])
+    return emitter
 
 
 def squares(centres_mm: ArrayLike, normals: ArrayLike, *, side_mm: float, fluxes_lm: ArrayLike) -> list[Emitter]:
@@ -53,7 +53,7 @@ def squares(centres_mm: ArrayLike, normals: ArrayLike, *, side_mm: float, fluxes
     u = np.where(length > 1e-9, u / np.where(length > 1e-9, length, 1.0), [1.0, 0.0, 0.0])
     half_u, half_v = 0.5 * side_mm * u, 0.5 * side_mm * np.cross(n, u)
     centres, fluxes = np.asarray(centres_mm, dtype=np.float64), np.asarray(fluxes_lm, dtype=np.float64)
-    return [Emitter(*one) for one in zip(centres, n, half_u, half_v, fluxes.tolist(), strict=True)]
+    return [Emitter(*geometry) for geometry in zip(centres, n, half_u, half_v, fluxes.tolist(), strict=True)]
 
 
 def irradiance(

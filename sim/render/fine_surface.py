@@ -53,11 +53,15 @@ def _look_closer(  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(points) // _CHUNK)):
         slope = np.empty(3)
         for i in range(chunk * _CHUNK, min(len(points), (chunk + 1) * _CHUNK)):
-            seen = triangle[i]
-            nx, ny, nz = np.float64(normals[seen, 0]), np.float64(normals[seen, 1]), np.float64(normals[seen, 2])
+            site_triangle = triangle[i]
+            nx, ny, nz = (
+                np.float64(normals[site_triangle, 0]),
+                np.float64(normals[site_triangle, 1]),
+                np.float64(normals[site_triangle, 2]),
+            )
             factor = 1.0
             slope[:] = 0.0
-            for w in range(first[material[seen]], first[material[seen] + 1]):
+            for w in range(first[material[site_triangle]], first[material[site_triangle] + 1]):
                 kx, ky, kz = waves[w, 0], waves[w, 1], waves[w, 2]
                 phase = kx * points[i, 0] + ky * points[i, 1] + kz * points[i, 2] + waves[w, 3]
                 factor += waves[w, 4] * np.cos(phase)
@@ -68,7 +72,7 @@ def _look_closer(  # type: ignore[no-untyped-def]
                         slope[1] + steep * ky,
                         slope[2] + steep * kz,
                     )
-            out = -1.0 if sides[seen] & 1 else 1.0  # heights are above the front
+            out = -1.0 if sides[site_triangle] & 1 else 1.0  # heights are above the front
             along = slope[0] * nx + slope[1] * ny + slope[2] * nz
             nx, ny, nz = (
                 nx - out * (slope[0] - along * nx),

@@ -76,9 +76,9 @@ def exchange(scene: Scene, obstacles: Obstacles, rays: int) -> Exchange:
     patch[order] = np.repeat(np.arange(len(starts), dtype=np.int32), counts)
     # Evenly among the patch's triangles, in the order of the mesh.
     shares = (np.arange(POINTS) + 0.5) / POINTS
-    chosen = order[starts[:, None] + (shares * counts[:, None]).astype(np.int64)]
+    members = order[starts[:, None] + (shares * counts[:, None]).astype(np.int64)]
     points, normals = np.empty((2, len(starts), 2, POINTS, 3), np.float32)
-    _place(scene.corners_mm, chosen, points, normals)
+    _place(scene.corners_mm, members, points, normals)
     facing = normals[:, 0].sum(axis=1)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), np.float32(1e-9))
     material = scene.material[order[starts]]
@@ -87,13 +87,13 @@ def exchange(scene: Scene, obstacles: Obstacles, rays: int) -> Exchange:
         diffuse = diffuse * np.add.reduceat(scene.tint[order].astype(np.float64), starts, axis=0) / counts[:, None]
     albedo = np.repeat((diffuse + scene.materials[material, 3:6]).astype(np.float32), 2, axis=0)
     centres = points[:, 0].mean(axis=1)
-    seen = _seen(obstacles, points.reshape(-1, 3), normals.reshape(-1, 3), patch, -(-rays // POINTS))
+    side_seen = _seen(obstacles, points.reshape(-1, 3), normals.reshape(-1, 3), patch, -(-rays // POINTS))
     return Exchange(
         patch,
         points.reshape(-1, 3),
         normals.reshape(-1, 3),
         albedo,
-        seen.reshape(2 * len(starts), -1),
+        side_seen.reshape(2 * len(starts), -1),
         _neighbours(centres, material),
         centres,
         facing,
@@ -107,7 +107,7 @@ def neighbourhood(
     """Return the neighbourhood in which light from other surfaces is interpolated, for sides [seen] of triangles
     as in `View`."""
     shape = (len(sides), _NEIGHBOURS)
-    found = Neighbourhood(np.empty(shape, np.int32), np.empty(shape, np.float32))
+    table = Neighbourhood(np.empty(shape, np.int32), np.empty(shape, np.float32))
     _weigh(
         corners_mm,
         sides,
@@ -117,10 +117,10 @@ def neighbourhood(
         between.centres_mm,
         between.facing,
         between.cells_mm,
-        found.sides,
-        found.weights,
+        table.sides,
+        table.weights,
     )
-    return found
+    return table
 
 
 def indirect_lux(
@@ -137,13 +137,13 @@ def indirect_lux(
     rows = np.arange(len(lit), dtype=np.int32)
     obstacles.cast(lit, between.points_mm, rows, between.normals, emitter.centre_mm)
     arm_shadow.cast(lit, between.points_mm, arm_mm, emitter.centre_mm)
-    sent = lit.reshape(-1, POINTS, 3).mean(axis=1) * between.albedo
-    total: NDArray[np.float32] = np.zeros_like(sent)
+    sent_lux = lit.reshape(-1, POINTS, 3).mean(axis=1) * between.albedo
+    total: NDArray[np.float32] = np.zeros_like(sent_lux)
     for _ in range(bounces - 1):
-        received = np.empty_like(sent)
-        _gather_light(between.seen, sent, received)
-        total += received
-        sent = received * between.albedo
+        received_lux = np.empty_like(sent_lux)
+        _gather_light(between.seen, sent_lux, received_lux)
+        total += received_lux
+        sent_lux = received_lux * between.albedo
     return total
 
 
@@ -178,13 +178,15 @@ def _keys(scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 def _neighbours(centres_mm: NDArray[np.float32], material: NDArray[np.int32]) -> NDArray[np.int32]:
     from scipy.spatial import cKDTree
 
-    found = np.repeat(np.arange(len(centres_mm), dtype=np.int32)[:, None], _NEIGHBOURS, axis=1)
-    for one in np.unique(material):
-        mine = np.flatnonzero(material == one)
-        near = cKDTree(centres_mm[mine]).query(centres_mm[mine], k=np.arange(1, _NEIGHBOURS + 1))[1]
+    neighbours = np.repeat(np.arange(len(centres_mm), dtype=np.int32)[:, None], _NEIGHBOURS, axis=1)
+    for number in np.unique(material):
+        members = np.flatnonzero(material == number)
+        near = cKDTree(centres_mm[members]).query(centres_mm[members], k=np.arange(1, _NEIGHBOURS + 1))[1]
         # cKDTree numbers what is missing by the number of points.
-        found[mine] = np.where(near < len(mine), mine[np.minimum(near, len(mine) - 1)], mine[:, None])
-    return found
+        neighbours[members] = np.where(
+            near < len(members), members[np.minimum(near, len(members) - 1)], members[:, None]
+        )
+    return neighbours
 
 
 def _seen(
@@ -195,16 +197,16 @@ def _seen(
     rays: int,
 ) -> NDArray[np.int32]:
     """[points, rays] side of a patch that each ray meets, or -1."""
-    seen = np.empty((len(points), rays), np.int32)
+    side_of_ray = np.empty((len(points), rays), np.int32)
     block = max(1, (1 << 22) // rays)
     for first in range(0, len(points), block):
         part = slice(first, min(len(points), first + block))
         origins, ways = np.empty((2, (part.stop - first) * rays, 3), np.float32)
         _aim(points[part], normals[part], first, rays, origins, ways)
-        met = obstacles.first_met(origins, ways)
-        side = np.where(met >= 0, 2 * patch[met >> 1] + (met & 1), -1)
-        seen[part] = side.reshape(-1, rays)
-    return seen
+        hits = obstacles.first_met(origins, ways)
+        side = np.where(hits >= 0, 2 * patch[hits >> 1] + (hits & 1), -1)
+        side_of_ray[part] = side.reshape(-1, rays)
+    return side_of_ray
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
@@ -213,9 +215,11 @@ def _areas(corners, area):  # type: ignore[no-untyped-def]
         square = 0.0
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-            one = np.float64(corners[t, 1, i] - corners[t, 0, i]) * np.float64(corners[t, 2, j] - corners[t, 0, j])
+            first_product = np.float64(corners[t, 1, i] - corners[t, 0, i]) * np.float64(
+                corners[t, 2, j] - corners[t, 0, j]
+            )
             two = np.float64(corners[t, 1, j] - corners[t, 0, j]) * np.float64(corners[t, 2, i] - corners[t, 0, i])
-            square += (one - two) * (one - two)
+            square += (first_product - two) * (first_product - two)
         area[t] = 0.5 * np.sqrt(square)
 
 
@@ -276,9 +280,13 @@ def _gather_light(seen, sent, received):  # type: ignore[no-untyped-def]
     for side in numba.prange(len(seen)):
         red, green, blue = 0.0, 0.0, 0.0
         for ray in range(seen.shape[1]):
-            other = seen[side, ray]
-            if other >= 0:
-                red, green, blue = red + sent[other, 0], green + sent[other, 1], blue + sent[other, 2]
+            source_side = seen[side, ray]
+            if source_side >= 0:
+                red, green, blue = (
+                    red + sent[source_side, 0],
+                    green + sent[source_side, 1],
+                    blue + sent[source_side, 2],
+                )
         rays = seen.shape[1]
         received[side, 0], received[side, 1], received[side, 2] = red / rays, green / rays, blue / rays
 
@@ -291,18 +299,18 @@ def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, f
         for i in range(chunk * _CHUNK, min(len(sides), (chunk + 1) * _CHUNK)):
             centroid_and_normal(corners, sides[i] >> 1, centroid, normal)
             back = sides[i] & 1
-            own, total = patch[sides[i] >> 1], 0.0
+            own_patch, total = patch[sides[i] >> 1], 0.0
             for n in range(neighbours.shape[1]):
-                other = neighbours[own, n]
-                squared, agree = 0.0, 0.0
+                neighbour = neighbours[own_patch, n]
+                squared_distance, agree = 0.0, 0.0
                 for k in range(3):
-                    squared += (centroid[k] - centres[other, k]) ** 2
-                    agree += normal[k] * facing[other, k]
-                reach = 2.0 * np.float64(cells[own])
-                weight = max(0.0, 1.0 - squared / (reach * reach)) ** 2 * max(0.0, agree) ** 4
-                if n > 0 and other == own:
+                    squared_distance += (centroid[k] - centres[neighbour, k]) ** 2
+                    agree += normal[k] * facing[neighbour, k]
+                reach = 2.0 * np.float64(cells[own_patch])
+                weight = max(0.0, 1.0 - squared_distance / (reach * reach)) ** 2 * max(0.0, agree) ** 4
+                if n > 0 and neighbour == own_patch:
                     weight = 0.0
-                found[i, n], weights[i, n] = 2 * other + back, weight
+                found[i, n], weights[i, n] = 2 * neighbour + back, weight
                 total += weight
             if total < _LEAST_WEIGHT:
                 weights[i, :] = 0.0

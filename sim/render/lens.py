@@ -186,7 +186,7 @@ def bend(x, y, terms):  # type: ignore[no-untyped-def]
 def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[no-untyped-def]
     """Fill `shift` by fixed-point iteration, to 1e-7 pixel; False if it does not converge."""
     height, width = shift.shape[1], shift.shape[2] - LANES
-    settled = np.ones(height, np.bool_)
+    row_is_settled = np.ones(height, np.bool_)
     for row in numba.prange(height):
         for col in range(width):
             goal_x, goal_y = (col + rooks[row] - centre_x) / focal, (row - rooks[col] - centre_y) / focal
@@ -199,7 +199,7 @@ def _undistort(focal, centre_x, centre_y, terms, rooks, shift):  # type: ignore[
                 if change * focal < 1e-7:
                     break
             if not change * focal < 1e-7:
-                settled[row] = False
+                row_is_settled[row] = False
             shift[0, row, col] = x - (col - centre_x) / focal
             shift[1, row, col] = y - (row - centre_y) / focal
-    return settled.all()
+    return row_is_settled.all()

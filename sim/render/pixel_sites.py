@@ -59,9 +59,9 @@ def pixel_sites(
 @numba.njit(cache=True, nogil=True)
 def _is_first(triangle, k, row, col):  # type: ignore[no-untyped-def]
     """True if no earlier ray of the same pixel met the triangle."""
-    top, left = row - row % k, col - col % k
+    top, first_column = row - row % k, col - col % k
     for y in range(top, row + 1):
-        for x in range(left, left + k if y < row else col):
+        for x in range(first_column, first_column + k if y < row else col):
             if triangle[y, x] == triangle[row, col]:
                 return False
     return True
@@ -86,20 +86,20 @@ def _fill(  # type: ignore[no-untyped-def]
 ):
     height, width = triangle.shape
     for line in numba.prange(len(first) - 1):
-        site, rays, met = first[line], np.empty((k * k, 3)), np.empty(k * k, np.int64)
+        site, rays, hits = first[line], np.empty((k * k, 3)), np.empty(k * k, np.int64)
         for block in range(0, width, _BLOCK * k):
             for top in range(line * _BLOCK * k, min(height, (line + 1) * _BLOCK * k), k):
-                for left in range(block, min(width, block + _BLOCK * k), k):
-                    _look_through(triangle, k, top, left, pose, centre, rooks, shift, rays, met)
+                for first_column in range(block, min(width, block + _BLOCK * k), k):
+                    _look_through(triangle, k, top, first_column, pose, centre, rooks, shift, rays, hits)
                     for part in range(k * k):
-                        if met[part] >= 0:
-                            seen = met[part]
-                            _mean_point(rays, met, seen, centroids, normals, pose, points[site])
-                            of_triangle[site] = seen
-                            for other in range(part, k * k):
-                                if met[other] == seen:
-                                    triangle[top + other // k, left + other % k] = site
-                                    met[other] = -1
+                        if hits[part] >= 0:
+                            hit_triangle = hits[part]
+                            _mean_point(rays, hits, hit_triangle, centroids, normals, pose, points[site])
+                            of_triangle[site] = hit_triangle
+                            for other_part in range(part, k * k):
+                                if hits[other_part] == hit_triangle:
+                                    triangle[top + other_part // k, first_column + other_part % k] = site
+                                    hits[other_part] = -1
                             site += 1
 
 

@@ -98,12 +98,15 @@ def _shade(  # type: ignore[no-untyped-def]
             out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, 0.0
             if reached is not None and not (reached[places[i] >> 3] >> (places[i] & 7)) & 1:
                 continue
-            seen, factor = triangle[i], 1.0
+            hit_triangle, factor = triangle[i], 1.0
             px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
             tx, ty, tz = led[0] - px, led[1] - py, led[2] - pz
-            if tx * normals[seen, 0] + ty * normals[seen, 1] + tz * normals[seen, 2] <= 0.0:
+            if (
+                tx * normals[hit_triangle, 0] + ty * normals[hit_triangle, 1] + tz * normals[hit_triangle, 2]
+                <= 0.0
+            ):
                 continue
-            normal = shading_normals[seen]
+            normal = shading_normals[hit_triangle]
             if turned is not None:
                 factor, normal = texture[i], turned[i]
             nx, ny, nz = np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2])
@@ -112,15 +115,15 @@ def _shade(  # type: ignore[no-untyped-def]
             lux = led[12] * per_lumen(px, py, pz, nx, ny, nz, led, shares, work)
             if paper:
                 lux *= -(tx * led[3] + ty * led[4] + tz * led[5]) / np.sqrt(tx * tx + ty * ty + tz * tz)
-            surface = materials[material[seen]]
+            surface = materials[material[hit_triangle]]
             if surface[7] >= 0.0:
                 table = tables[int(surface[7])]
                 _shade_by_table(px, py, pz, tx, ty, tz, nx, ny, nz, eye, table, lux * factor, out[i])
                 for k in range(3):
-                    out[i, k] *= diffuse[seen, k] / surface[k]
+                    out[i, k] *= diffuse[hit_triangle, k] / surface[k]
                 continue
             for k in range(3):
-                out[i, k] = lux * factor * diffuse[seen, k] / np.pi
+                out[i, k] = lux * factor * diffuse[hit_triangle, k] / np.pi
             if surface[6] > 0.0 and lux > 0.0:
                 _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lux, out[i])
 
@@ -147,26 +150,26 @@ def _add_gloss(px, py, pz, tx, ty, tz, nx, ny, nz, eye, surface, led, shares, lu
     if vx * nx + vy * ny + vz * nz <= 0.0:
         return
     if alpha >= FINE_ROUGHNESS:
-        fixed, grazing = _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha)
+        base_lobe, grazing = _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha)
     else:
-        fixed, grazing = _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares)
+        base_lobe, grazing = _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares)
     for k in range(3):
-        out[k] += lux * (surface[3 + k] * fixed + (1.0 - surface[3 + k]) * grazing)
+        out[k] += lux * (surface[3 + k] * base_lobe + (1.0 - surface[3 + k]) * grazing)
 
 
 @numba.njit(cache=True, nogil=True)
 def _mean_lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha, led, shares):  # type: ignore[no-untyped-def]
     """`_lobe` towards the Gauss points of an emitter centred at (tx, ty, tz), weighted by `shares` [4]."""
-    fixed, grazing = 0.0, 0.0
+    base_lobe, grazing = 0.0, 0.0
     total = shares[0] + shares[1] + shares[2] + shares[3]
     for k in range(4):
         if shares[k] > 0.0:
             u, v = (_GAUSS, -_GAUSS)[k & 1], (_GAUSS, -_GAUSS)[k >> 1]
             x, y, z = tx + u * led[6] + v * led[9], ty + u * led[7] + v * led[10], tz + u * led[8] + v * led[11]
-            one, other = _lobe(x, y, z, nx, ny, nz, vx, vy, vz, alpha)
-            fixed += one * shares[k] / total
-            grazing += other * shares[k] / total
-    return fixed, grazing
+            base_part, grazing_part = _lobe(x, y, z, nx, ny, nz, vx, vy, vz, alpha)
+            base_lobe += base_part * shares[k] / total
+            grazing += grazing_part * shares[k] / total
+    return base_lobe, grazing
 
 
 @numba.njit(cache=True, nogil=True)
@@ -184,8 +187,8 @@ def _lobe(tx, ty, tz, nx, ny, nz, vx, vy, vz, alpha):  # type: ignore[no-untyped
     alpha2 = alpha * alpha
     # sin^2 from the cross product: 1 - cos^2 would distort the peak of a smooth surface by rounding.
     cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
-    spread = cos_h * cos_h * alpha2 + (cx * cx + cy * cy + cz * cz) / (length * length)
-    d = alpha2 / (np.pi * spread * spread)
+    width = cos_h * cos_h * alpha2 + (cx * cx + cy * cy + cz * cz) / (length * length)
+    d = alpha2 / (np.pi * width * width)
     # G1 / (2 n.l) = 1 / (n.l + sqrt(alpha^2 + (1 - alpha^2) n.l^2)), and the same for v.
     masked_l = 1.0 / (cos_l + np.sqrt(alpha2 + (1.0 - alpha2) * cos_l * cos_l))
     masked_v = 1.0 / (cos_v + np.sqrt(alpha2 + (1.0 - alpha2) * cos_v * cos_v))

@@ -85,9 +85,9 @@ def visible_triangles(
         firsts,
         firsts_in_band,
     )
-    seen = _merge(firsts, bounds, firsts_in_band, np.zeros(len(corners_mm), np.int32))
+    triangles = _merge(firsts, bounds, firsts_in_band, np.zeros(len(corners_mm), np.int32))
     _renumber(pixels, firsts, bounds)
-    return pixels, seen
+    return pixels, triangles
 
 
 @numba.njit(cache=True, nogil=True)
@@ -183,7 +183,7 @@ def _fill_bands(  # type: ignore[no-untyped-def]
             else:
                 _fill_triangle(v, boxes[t], member, lens, shift, rooks, top, nearest)
         number_of_member = np.full(count, -1, np.int32)
-        seen, last, number = 0, -1, -1
+        first_count, last, number = 0, -1, -1
         for row in range(np.uint64(len(nearest))):
             for col in range(np.uint64(width)):
                 key = nearest[row, col]
@@ -193,27 +193,27 @@ def _fill_bands(  # type: ignore[no-untyped-def]
                     if member >= 0:
                         number = number_of_member[member]
                         if number < 0:
-                            number = number_of_member[member] = seen
-                            firsts[start + seen] = members[start + member]
-                            seen += 1
+                            number = number_of_member[member] = first_count
+                            firsts[start + first_count] = members[start + member]
+                            first_count += 1
                 pixels[top + row, col] = number
-        firsts_in_band[band] = seen
+        firsts_in_band[band] = first_count
 
 
 @numba.njit(cache=True, nogil=True)
 def _merge(firsts, bounds, firsts_in_band, number_of_triangle):  # type: ignore[no-untyped-def]
     """All triangles seen, once each, in the order of bands; `firsts` gets their numbers in this list instead."""
-    seen = np.empty(firsts_in_band.sum(), np.int32)
+    triangles = np.empty(firsts_in_band.sum(), np.int32)
     count = 0
     for band in range(len(firsts_in_band)):
         for place in range(bounds[band], bounds[band] + firsts_in_band[band]):
             triangle = firsts[place]
             if number_of_triangle[triangle] == 0:  # numbers start at 1 here, as zeroed memory is cheap
-                seen[count] = triangle
+                triangles[count] = triangle
                 count += 1
                 number_of_triangle[triangle] = count
             firsts[place] = number_of_triangle[triangle] - 1
-    return seen[:count].copy()
+    return triangles[:count].copy()
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)

@@ -48,10 +48,10 @@ class Shadows:
     def reached(self, led: int) -> _Bits:
         """Bit p % 8 of byte p // 8 is 1 if the LED in row `led` reaches the side in place p."""
         places = len(self._side_of_place)
-        known, bits = self._kept.get(led, (0, np.empty(0, np.uint8)))
-        if known < places:
+        known_places, bits = self._kept.get(led, (0, np.empty(0, np.uint8)))
+        if known_places < places:
             bits = np.concatenate([bits, np.zeros((places + 7) // 8 - len(bits), np.uint8)])
-            self._obstacles.trace(self._side_of_place, self._leds_mm[led], known, bits)
+            self._obstacles.trace(self._side_of_place, self._leds_mm[led], known_places, bits)
             if led in self._kept or (len(self._kept) + 1) * len(bits) <= self._memory_bytes:
                 self._kept[led] = places, bits
         return bits

@@ -30,8 +30,8 @@ def tabulate(brdf: Brdf, weights: NDArray[np.float64]) -> NDArray[np.float32]:
     parts = []
     for first in range(0, NODES[0], _CHUNK):
         light, view = _directions(*np.ix_(theta_h[first : first + _CHUNK], theta_d, phi_d))
-        both = 0.5 * (brdf(_lifted(light), _lifted(view)) + brdf(_lifted(view), _lifted(light)))
-        parts.append(np.asarray(both @ weights.T, np.float32))
+        reciprocal_mean = 0.5 * (brdf(_lifted(light), _lifted(view)) + brdf(_lifted(view), _lifted(light)))
+        parts.append(np.asarray(reciprocal_mean @ weights.T, np.float32))
     return np.concatenate(parts)
 
 

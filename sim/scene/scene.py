@@ -88,15 +88,15 @@ def load_surface(
     plain = PAINTED if tint is not None else STONE
     corners = np.asarray(mesh.vertices)[faces]
     corners *= _UNIT_MM[unit]
-    made = replace(material or plain, detail=detail)
-    brightest = max(made.diffuse) * (1.0 if tint is None else float(tint.max()))
+    final_material = replace(material or plain, detail=detail)
+    brightest = max(final_material.diffuse) * (1.0 if tint is None else float(tint.max()))
     texture = sum(layer.texture for layer in detail)
     if texture > 1.0 or texture * brightest > max(0.0, 1.0 - brightest):
         raise InputError(
             f"{path}: expected textures in `detail` that keep its diffuse reflectance of up to {brightest:.2f} "
             f"between 0 and 1; found changes of {texture:g} in all; make them weaker, or the material darker"
         )
-    return Surface(corners, (made,), np.zeros(len(faces), np.int32), tint)
+    return Surface(corners, (final_material,), np.zeros(len(faces), np.int32), tint)
 
 
 def _tint(mesh: Any) -> NDArray[np.float32] | None:
@@ -152,8 +152,8 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
     corners = np.zeros(9 * total + 1, np.float32)[:-1].reshape(total, 3, 3)
     material = np.empty(total, np.int32)
     tint = np.ones((total, 3), np.float32) if any(s.tint is not None for s, _ in things) else None
-    detailed = any(surface.normals is not None for surface, _ in things)
-    normals = np.empty((total, 3), np.float32) if detailed else None
+    has_normals = any(surface.normals is not None for surface, _ in things)
+    normals = np.empty((total, 3), np.float32) if has_normals else None
     materials: list[Material] = []
     waves: list[NDArray[np.float64]] = []
     first = 0
@@ -162,19 +162,19 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
         # In chunks: a scan of 40 million triangles must not be in memory twice in float64.
         for start in range(0, count, _CHUNK):
             piece = surface.corners_mm[start : start + _CHUNK]
-            placed = piece.reshape(-1, 3) @ base_from_surface[:3, :3].T + base_from_surface[:3, 3]
-            corners[first + start : first + start + len(piece)] = placed.reshape(-1, 3, 3)
+            points_in_base = piece.reshape(-1, 3) @ base_from_surface[:3, :3].T + base_from_surface[:3, 3]
+            corners[first + start : first + start + len(piece)] = points_in_base.reshape(-1, 3, 3)
         material[part] = surface.material + len(materials)
         materials += surface.materials
-        waves += [_waves(one, base_from_surface) for one in surface.materials]
+        waves += [_waves(surface_material, base_from_surface) for surface_material in surface.materials]
         if tint is not None and surface.tint is not None:
             tint[part] = surface.tint
         if normals is not None:
-            own = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
-            normals[part] = own @ base_from_surface[:3, :3].T
+            surface_normals = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
+            normals[part] = surface_normals @ base_from_surface[:3, :3].T
         first += count
     table, tables = _packed(materials)
-    firsts = np.cumsum([0, *(len(own) for own in waves)])
+    firsts = np.cumsum([0, *(len(surface_normals) for surface_normals in waves)])
     fine = Waves(np.concatenate(waves), firsts) if firsts[-1] else None
     return Scene(corners, material, table, tables, tint, normals, fine)
 

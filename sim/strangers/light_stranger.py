@@ -46,12 +46,12 @@ class LightStranger(BaseModel):
         """Unit normals [n, 3] of the dies of LEDs `ids` on boards with these normals."""
         if not self.die_tilt_deg:
             return normals
-        turned = normals.copy()
+        tilted_normals = normals.copy()
         for row, led in enumerate(ids):
             off = np.tan(np.radians(self.die_tilt_deg))
             lean = off * np.random.default_rng((self.seed, _TILT, int(led))).standard_normal(3)
-            turned[row] += lean - (lean @ normals[row]) * normals[row]
-        return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+            tilted_normals[row] += lean - (lean @ normals[row]) * normals[row]
+        return np.asarray(tilted_normals / np.linalg.norm(tilted_normals, axis=1, keepdims=True))
 
     def over_cosine(self, emitter: Emitter, points_mm: NDArray[np.float32]) -> NDArray[np.float32]:
         """[n] factor of the light at points [n, 3] over that of the same flux by the cosine."""
@@ -63,11 +63,11 @@ class LightStranger(BaseModel):
         """Relative to pi times the flux: the cosine without a lobe, and of the same flux with it."""
         if not self.lobe:
             return np.asarray(np.cos(np.radians(angle_deg)))
-        at_deg, given = np.array(self.lobe).T
+        at_deg, relative_intensity = np.array(self.lobe).T
         grid = np.linspace(0.0, np.pi / 2, 1801)
-        lobe = np.interp(np.degrees(grid), at_deg, given, right=0.0)
+        lobe = np.interp(np.degrees(grid), at_deg, relative_intensity, right=0.0)
         flux = 2.0 * np.trapezoid(lobe * np.sin(grid), grid)
-        return np.asarray(np.interp(angle_deg, at_deg, given, right=0.0) / flux)
+        return np.asarray(np.interp(angle_deg, at_deg, relative_intensity, right=0.0) / flux)
 
     def seen_from(self, emitter: Emitter, eye_mm: Floats) -> Emitter:
         """The die's image that the primary lens shows an eye."""

@@ -48,7 +48,9 @@ class TargetStranger(BaseModel):
         if not self.tile_lobe:
             return surface
         f0 = (self.tile_lobe, self.tile_lobe, self.tile_lobe)
-        materials = tuple(replace(one, f0=f0, roughness=self.tile_lobe_roughness) for one in surface.materials)
+        materials = tuple(
+            replace(material, f0=f0, roughness=self.tile_lobe_roughness) for material in surface.materials
+        )
         return replace(surface, materials=materials)
 
     def _stained(self, surface: Surface) -> Surface:

@@ -126,8 +126,8 @@ class SharedClock:
     def _read(self) -> tuple[Pace, int, bool, int]:
         while True:
             sequence, *pace, horizon_ns, alive, pid = _BLOCK.unpack_from(self._memory)
-            written = sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence
-            if written or self._gone_since_ns is not None:
+            is_consistent = sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence
+            if is_consistent or self._gone_since_ns is not None:
                 return Pace(*pace), horizon_ns, bool(alive), pid
             self._look()
 

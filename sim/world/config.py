@@ -75,10 +75,10 @@ class MeasuredConfig(_Model):
 
     @model_validator(mode="after")
     def _one_of_them(self) -> MeasuredConfig:
-        given = [path for path in (self.merl, self.bsdf, *self.alta_files) if path is not None]
+        paths = [path for path in (self.merl, self.bsdf, *self.alta_files) if path is not None]
         if sum(kind is not None for kind in (self.merl, self.bsdf, self.alta)) != 1:
             raise ValueError("expected one of `merl`, `bsdf` and `alta`")
-        if not all(path.is_absolute() for path in given):
+        if not all(path.is_absolute() for path in paths):
             raise ValueError("expected an absolute path, as the world does not know from where the rig was read")
         return self
 
@@ -204,8 +204,8 @@ class Settings(_Model):
         """Interreflection, or None if it is off."""
         if isinstance(self.interreflection, InterreflectionConfig):
             return self.interreflection
-        asked = self.shading == "pixel" if self.interreflection is None else self.interreflection
-        return InterreflectionConfig() if asked else None
+        is_enabled = self.shading == "pixel" if self.interreflection is None else self.interreflection
+        return InterreflectionConfig() if is_enabled else None
 
     @model_validator(mode="after")
     def _possible(self) -> Settings:

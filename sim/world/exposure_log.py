@@ -46,4 +46,4 @@ class ExposureLog:
 
     def since(self, first: int, count: int) -> list[LitExposure]:
         """Return at most `count` exposures, from number `first` on."""
-        return [one for one in self._last if one.number >= first][:count]
+        return [exposure for exposure in self._last if exposure.number >= first][:count]

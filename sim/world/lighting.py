@@ -32,7 +32,7 @@ class Lighting:
     def darken_one(self, led: int, t_ns: int) -> None:
         """One LED is switched off now."""
         self._lit = deque(
-            (one, on, min(off, t_ns) if one == led else off, flux) for one, on, off, flux in self._lit
+            (lit_led, on, min(off, t_ns) if lit_led == led else off, flux) for lit_led, on, off, flux in self._lit
         )
 
     def panel(self, panel: int, on: bool, t_ns: int) -> None:

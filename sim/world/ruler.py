@@ -29,7 +29,7 @@ class Ruler:
         ends = np.array([(0.0, 0.0, 0.0, 0.0), *tool])
         pose = self._support_from_base @ base_from_flange
         centre_mm = np.array(self._scene.base_from_support)[:3, 3]
-        found = {
+        lengths = {
             "tool_over_support_mm": float((ends[:, :3] @ pose[2, :3] + pose[2, 3] - ends[:, 3]).min()),
             "tool_reach_mm": float((ends[:, 2] + ends[:, 3]).max()),
             "tool_width_mm": float((np.hypot(ends[:, 0], ends[:, 1]) + ends[:, 3]).max()),
@@ -38,5 +38,5 @@ class Ruler:
         }
         if self._board is not None:
             x_mm, y_mm, z_mm = self._board.translation_mm
-            found |= {"board_x_mm": x_mm, "board_y_mm": y_mm, "board_top_mm": z_mm + self._board.thickness_mm}
-        return found
+            lengths |= {"board_x_mm": x_mm, "board_y_mm": y_mm, "board_top_mm": z_mm + self._board.thickness_mm}
+        return lengths

@@ -19,10 +19,10 @@ class Stills:
     """A camera at any pose; `config` is that of the world (`sim.world.config.Config`)."""
 
     def __init__(self, config: Mapping[str, Any]) -> None:
-        checked = Config.model_validate(config)
-        self._photographer = Photographer(checked.scene, checked.photographed, checked.settings)
-        self._tool, self._arm_shadows = checked.scene.tool, checked.settings.arm_shadows
-        self._shape = (checked.camera.height_px, checked.camera.width_px)
+        valid_config = Config.model_validate(config)
+        self._photographer = Photographer(valid_config.scene, valid_config.photographed, valid_config.settings)
+        self._tool, self._arm_shadows = valid_config.scene.tool, valid_config.settings.arm_shadows
+        self._shape = (valid_config.camera.height_px, valid_config.camera.width_px)
         self._taken = 0
 
     def take(
@@ -38,7 +38,7 @@ class Stills:
         pixels = np.empty(self._shape, np.uint16)
         shining = dict.fromkeys(leds, exposure_s)
         tool = tool_capsules(base_from_flange, self._tool) if self._arm_shadows else NONE
-        exposed = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange, tool)
-        self._photographer.render(pixels, exposed)
+        exposure = Exposed(shining, list(panels), exposure_s, gain, self._taken, base_from_flange, tool)
+        self._photographer.render(pixels, exposure)
         self._taken += 1
         return pixels

@@ -49,15 +49,15 @@ def name_of(device: str, address: str) -> str:
     nothing, the camera that matches it. Raises DeviceLost if none matches, DeviceRefused if several do."""
     with contextlib.suppress(ValueError):
         return str(ipaddress.IPv4Address(address))
-    found = discover()
-    fitting = [camera for camera in found if address in {"", camera.id, camera.serial, camera.address}]
+    cameras = discover()
+    fitting = [camera for camera in cameras if address in {"", camera.id, camera.serial, camera.address}]
     if len(fitting) == 1:
         return fitting[0].id
-    seen = ", ".join(f"{c.vendor} {c.model} {c.serial} ({c.address})" for c in found) or "none"
+    descriptions = ", ".join(f"{c.vendor} {c.model} {c.serial} ({c.address})" for c in cameras) or "none"
     raise (DeviceRefused if fitting else DeviceLost)(
         device,
         expected=f"one camera {address}" if address else "exactly one camera",
-        happened=f"cameras that answer: {seen}",
+        happened=f"cameras that answer: {descriptions}",
         remedy="Check cable and power, or give `address` in the camera's settings of the rig.",
     )
 
@@ -86,7 +86,7 @@ def open_controlled(library: Any, device: str, name: str) -> int:
 
 def _owner(library: Any, device: str, handle: int) -> str:
     address = ctypes.c_uint32()
-    read = library.arv_device_read_register
+    read_register = library.arv_device_read_register
     with contextlib.suppress(DeviceError):
-        call(device, "the client's address", read, handle, _PRIMARY_APPLICATION_IP, ctypes.byref(address))
+        call(device, "the client's address", read_register, handle, _PRIMARY_APPLICATION_IP, ctypes.byref(address))
     return str(ipaddress.IPv4Address(address.value)) if address.value else "another client"

@@ -115,7 +115,7 @@ class AravisCamera:
         """Raises DeviceError if the camera does not answer."""
         self._check_link()
         report = {"protocol": "GigE Vision" if self._is_gige else "USB3 Vision"}
-        for what, names in (
+        for quantity, names in (
             ("temperature_c", ("DeviceTemperature", "DeviceTemperatureRaw")),
             ("pixel_format", ("PixelFormat",)),
             ("payload_bytes", ("PayloadSize",)),
@@ -123,7 +123,7 @@ class AravisCamera:
         ):
             name = self._features.first_of(*names)
             if name is not None:
-                report[what] = str(self._features.read(name))
+                report[quantity] = str(self._features.read(name))
         return report
 
     # -- exposure -----------------------------------------------------------------------------------------
@@ -190,10 +190,10 @@ class AravisCamera:
             if stream is None:
                 self._armed.wait(max(0.0, left_s))
                 stream = self._stream
-            taken = stream.next(max(0.0, end_s - time.monotonic()), *self.id_modulus) if stream else None
-            if taken is not None:
+            image = stream.next(max(0.0, end_s - time.monotonic()), *self.id_modulus) if stream else None
+            if image is not None:
                 assert stream is not None
-                return self._frame(stream, taken.buffer, taken.slot, taken.frame_id, taken.timestamp_ns)
+                return self._frame(stream, image.buffer, image.slot, image.frame_id, image.timestamp_ns)
             if time.monotonic() >= end_s:
                 return None
 
@@ -249,13 +249,13 @@ class AravisCamera:
         return self._statistics(stream) if stream is not None else self._last
 
     def _statistics(self, stream: Stream) -> CameraStatistics:
-        exposed, over_triggers = counts(self._features, self._settings)
-        found = stream.statistics()
-        overflows = max(0, found.skipped - found.failed) if found.underruns else 0
+        exposures, over_triggers = counts(self._features, self._settings)
+        statistics = stream.statistics()
+        overflows = max(0, statistics.skipped - statistics.failed) if statistics.underruns else 0
         return CameraStatistics(
-            since(exposed, self._counted_before[0]),
-            found.completed,
-            found.skipped - overflows,
+            since(exposures, self._counted_before[0]),
+            statistics.completed,
+            statistics.skipped - overflows,
             since(over_triggers, self._counted_before[1]),
             overflows,
         )

@@ -71,9 +71,9 @@ class Features:
             getattr(self, f"_write_{kind}")(name, value)
             if kind == "command":
                 return
-            held = self.read(name)
-        if not alike(held, value):
-            self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
+            read_back = self.read(name)
+        if not alike(read_back, value):
+            self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {read_back!r}")
 
     def write_all(self, values: Mapping[str, Value]) -> None:
         """Set features in their order."""

@@ -132,9 +132,9 @@ class Stream:
             self._library.g_object_unref(handle)
             if not buffer:
                 return None
-            taken = self._evaluate(buffer, first_id, last_id)
-            if taken is not None:
-                return taken
+            image = self._evaluate(buffer, first_id, last_id)
+            if image is not None:
+                return image
 
     def _evaluate(self, buffer: int, first_id: int, last_id: int) -> Taken | None:
         """A complete image, or None after its buffer was queued again."""
@@ -176,10 +176,10 @@ class Stream:
             return self._final or self._count()
 
     def _count(self) -> StreamStatistics:
-        completed, failed, underruns = (ctypes.c_uint64() for _ in range(3))
-        self._library.arv_stream_get_statistics(self._handle, completed, failed, underruns)
+        completed_count, failed_count, underruns = (ctypes.c_uint64() for _ in range(3))
+        self._library.arv_stream_get_statistics(self._handle, completed_count, failed_count, underruns)
         return StreamStatistics(
-            completed.value,
+            completed_count.value,
             self._failed,
             self._skipped + self._failed_since,
             underruns.value - self._underruns_before,

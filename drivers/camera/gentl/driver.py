@@ -91,7 +91,7 @@ class GenTLCamera:
 
     def identify(self) -> Identity:
         vendor, model, serial, version = (
-            self._info[what] or "unknown" for what in ("vendor", "model", "serial", "version")
+            self._info[key] or "unknown" for key in ("vendor", "model", "serial", "version")
         )
         return Identity(vendor, model, serial, version, settings=self._state)
 
@@ -134,8 +134,8 @@ class GenTLCamera:
         if self._format is None:
             raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
-        wanted = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
-        slots = min(wanted, _IN_HAND)
+        buffer_count = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
+        slots = min(buffer_count, _IN_HAND)
         if (self._pool.slots, self._pool.slot_bytes) != (slots, self._format.frame_bytes):
             self._pool = FramePool(slots, self._format.frame_bytes)
         self._pool.begin()
@@ -144,7 +144,7 @@ class GenTLCamera:
             self._gaps.begin(self.id_modulus)
             self._counted_before = counts(self._features, self._settings)
             with reporting(self._name, "the acquisition to start"):
-                self._acquirer.num_buffers = wanted
+                self._acquirer.num_buffers = buffer_count
                 self._acquirer.start()
             self._heard_s = time.monotonic()
             self._armed.set()
@@ -206,11 +206,11 @@ class GenTLCamera:
         return self._last
 
     def _statistics(self) -> CameraStatistics:
-        exposed, over_triggers = counts(self._features, self._settings)
+        exposures, over_triggers = counts(self._features, self._settings)
         missing = self._gaps.missing
         overflows = min(missing, int(optional_int(self._acquirer.data_streams[0].module, "num_underrun") or 0))
         return CameraStatistics(
-            exposed=since(exposed, self._counted_before[0]),
+            exposed=since(exposures, self._counted_before[0]),
             delivered=self._gaps.delivered,
             lost_transfers=missing - overflows,
             over_triggers=since(over_triggers, self._counted_before[1]),

@@ -106,11 +106,11 @@ class Features:
                 node.execute()
                 return
             node.value = value
-            held = node.value
+            read_back = node.value
         except self._errors as error:
             self._failed(f"`{name}` to take {value!r}", error)
-        if not alike(held, value):
-            self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {held!r}")
+        if not alike(read_back, value):
+            self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {read_back!r}")
 
     def write_all(self, values: Mapping[str, Value]) -> None:
         """Set features in their order."""

@@ -23,20 +23,20 @@ def copy_pixels(
 
     Raises DeviceRefused for an image that differs from the format which `configure` returned.
     """
-    wanted = {
+    expectations = {
         "payload_type": _PLAIN_IMAGE,
         "height": promised.height_px,
         "width": promised.width_px,
         "pixel_format": wire.code,
         "padding_x": 0,
     }
-    for what, value in wanted.items():
-        seen = optional_int(buffer, what)
-        if seen not in {None, value}:
+    for attribute, value in expectations.items():
+        actual = optional_int(buffer, attribute)
+        if actual not in {None, value}:
             raise DeviceRefused(
                 device,
-                expected=f"images with {what} {value}",
-                happened=f"one came with {seen}",
+                expected=f"images with {attribute} {value}",
+                happened=f"one came with {actual}",
                 remedy="Set the camera up in the rig so that it sends plain images of one size and format.",
             )
     offset = optional_int(buffer, "image_offset") or 0

@@ -37,17 +37,19 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         if not harvester.device_info_list:
             harvester.reset()
             _raise_opening_error(str(settings.producer))
-        found = [(one, _describe(one)) for one in harvester.device_info_list]
-        wanted = {"serial": settings.serial, "model": settings.model}
+        devices = [(device, _describe(device)) for device in harvester.device_info_list]
+        criteria = {"serial": settings.serial, "model": settings.model}
         fitting = [
-            one for one in found if all(not value or one[1][what] == value for what, value in wanted.items())
+            device
+            for device in devices
+            if all(not value or device[1][key] == value for key, value in criteria.items())
         ]
         if len(fitting) != 1:
-            known = ", ".join(f"{one['model']} {one['serial']}" for _, one in found) or "none"
+            device_list = ", ".join(f"{device['model']} {device['serial']}" for _, device in devices) or "none"
             raise _lost(
                 name,
                 "exactly one camera of that model and serial number",
-                f"{len(fitting)} of the producer's fit; it finds: {known}",
+                f"{len(fitting)} of the producer's fit; it finds: {device_list}",
                 "Check cable and power, that no other program uses the producer, and `serial` and `model`.",
             )
         acquirer = harvester.create(fitting[0][0])
@@ -104,7 +106,7 @@ def _describe(device: Any) -> dict[str, str]:
             return ""
 
     names = {"vendor": "vendor", "model": "model", "serial": "serial_number", "version": "version"}
-    return {what: text(attribute) for what, attribute in names.items()} | {"tl_type": text("tl_type")}
+    return {key: text(attribute) for key, attribute in names.items()} | {"tl_type": text("tl_type")}
 
 
 def _lost(

@@ -242,7 +242,9 @@ class RawFiles:
             )
         command = self._settings.release_command
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_RELEASE_TIMEOUT_S, check=False)
+            process = subprocess.run(
+                command, capture_output=True, text=True, timeout=_RELEASE_TIMEOUT_S, check=False
+            )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise DeviceTimeout(
                 self._name,
@@ -250,19 +252,23 @@ class RawFiles:
                 happened=str(error),
                 remedy="Check `release_command` in the rig.",
             ) from error
-        if done.returncode:
+        if process.returncode:
             raise DeviceRefused(
                 self._name,
                 expected=f"`{command[0]}` to release the shutter",
-                happened=f"it ended with code {done.returncode}: {done.stderr.strip()[-200:]}",
+                happened=f"it ended with code {process.returncode}: {process.stderr.strip()[-200:]}",
                 remedy="Check the camera's USB cable and `release_command` in the rig.",
             )
 
     def statistics(self) -> CameraStatistics:
         """A picture counts as exposed once its own number or a later one has arrived."""
-        counted, taken = self._order.counted, self._order.taken
+        release_count, file_count = self._order.counted, self._order.taken
         return CameraStatistics(
-            exposed=counted, delivered=taken, lost_transfers=counted - taken, over_triggers=-1, overflows=0
+            exposed=release_count,
+            delivered=file_count,
+            lost_transfers=release_count - file_count,
+            over_triggers=-1,
+            overflows=0,
         )
 
     def disarm(self) -> None:

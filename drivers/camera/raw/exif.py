@@ -39,14 +39,14 @@ def read_exif(path: Path) -> Exif:
     main = _main_tags(path)
     if not isinstance(exif := main.get("ExifTag"), dict):
         raise ValueError("it has no Exif directory (tag 34665)")  # noqa: TRY004  # the file is wrong, not a call
-    taken = _text(exif, "DateTimeOriginal")
+    date_time = _text(exif, "DateTimeOriginal")
     subseconds = _text(exif, "SubsecTimeOriginal")
     return Exif(
         make=_text(main, "Make"),
         model=_text(main, "Model"),
         serial=_text(exif, "BodySerialNumber"),
         firmware=_text(main, "Software"),
-        taken_ns=_taken_ns(taken, subseconds),
+        taken_ns=_taken_ns(date_time, subseconds),
         resolution_us=10 ** (6 - len(subseconds[:6])),
         exposure_us=_exposure_us(exif),
         iso=_iso(exif),

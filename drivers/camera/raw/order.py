@@ -15,8 +15,8 @@ _NUMBER = re.compile(r"(\d+)$")
 
 def file_number(path: Path, device: str, last_number: int) -> int:
     """The trailing digits of a file's name: 42 of `IMG_0042.CR2`. Raises DeviceFault if there are none."""
-    found = _NUMBER.search(path.stem)
-    number = int(found[1]) if found else 0
+    digits = _NUMBER.search(path.stem)
+    number = int(digits[1]) if digits else 0
     if not 1 <= number <= last_number:
         raise DeviceFault(
             device,
@@ -117,13 +117,13 @@ class Order:
                 remedy="Let the camera write one RAW file per picture, and only one program fetch it.",
             )
         steps, path = waiting[0]
-        seen, now_s = self._waiting[path], time.monotonic()
-        patient = steps > 1 and now_s - seen.first_s < patience_s
-        return None if patient or now_s - seen.still_s < still_s else path
+        sighting, now_s = self._waiting[path], time.monotonic()
+        patient = steps > 1 and now_s - sighting.first_s < patience_s
+        return None if patient or now_s - sighting.still_s < still_s else path
 
     def _look(self) -> None:
         now_s = time.monotonic()
-        found: dict[Path, _Seen] = {}
+        sightings: dict[Path, _Seen] = {}
         for path in self.files():
             if path in self._old or path in self._taken:
                 continue
@@ -133,10 +133,10 @@ class Order:
                 continue
             before = self._waiting.get(path)
             if before is None or before.size != size or not size:
-                found[path] = _Seen(size, now_s if before is None else before.first_s, now_s)
+                sightings[path] = _Seen(size, now_s if before is None else before.first_s, now_s)
             else:
-                found[path] = before
-        self._waiting = found
+                sightings[path] = before
+        self._waiting = sightings
 
     def take(self, path: Path) -> None:
         """Mark `path`, which `next` has returned, as taken."""

@@ -41,14 +41,16 @@ class XiDevice:
         self._open(serial)
 
     def _open(self, serial: str) -> None:
-        found = ctypes.c_uint32()
-        self._check(self._library.xiGetNumberDevices(found), "a list of the XIMEA cameras")
-        if found.value == 0 or (found.value > 1 and not serial):
+        camera_count = ctypes.c_uint32()
+        self._check(self._library.xiGetNumberDevices(camera_count), "a list of the XIMEA cameras")
+        if camera_count.value == 0 or (camera_count.value > 1 and not serial):
             raise DeviceLost(
                 self.name,
                 expected=f"XIMEA camera {serial}" if serial else "exactly one XIMEA camera",
-                happened=f"{found.value} are connected",
-                remedy="Give the camera's `serial` in the rig." if found.value else "Check cable, power, driver.",
+                happened=f"{camera_count.value} are connected",
+                remedy="Give the camera's `serial` in the rig."
+                if camera_count.value
+                else "Check cable, power, driver.",
             )
         if serial:
             code = self._library.xiOpenDeviceBy(OPEN_BY_SERIAL, serial.encode(), self._handle)

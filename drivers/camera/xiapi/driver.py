@@ -111,9 +111,9 @@ class XiCamera:
         if settings.ready_output is not None:
             device.set("gpo_selector", settings.ready_output)
             device.set("gpo_mode", GPO_TRIGGER_WAIT_NEGATED if settings.ready_inverted else GPO_TRIGGER_WAIT)
-        for parameter, given in settings.parameters.items():
-            device.set(parameter, given)
-        state.note(*(name for name, given in settings.parameters.items() if not isinstance(given, str)))
+        for parameter, setting in settings.parameters.items():
+            device.set(parameter, setting)
+        state.note(*(name for name, setting in settings.parameters.items() if not isinstance(setting, str)))
         state.note("width", "height", "offsetX", "offsetY", "image_black_level", "framerate")
 
     def _set_region(self, region: Region) -> None:
@@ -151,8 +151,8 @@ class XiCamera:
     def identify(self) -> Identity:
         device = self._device
         versions = [
-            f"{what} {device.text(parameter)}"
-            for what, parameter in (("API", "api_version"), ("FPGA", "version_fpga1"))
+            f"{part} {device.text(parameter)}"
+            for part, parameter in (("API", "api_version"), ("FPGA", "version_fpga1"))
             if device.has(parameter)
         ]
         firmware = ", ".join(versions) or "unknown"
@@ -163,13 +163,13 @@ class XiCamera:
         """Raises DeviceLost if the camera is gone."""
         self._check_presence()
         report = {"readout_us": str(self._readout_us)}
-        for what, parameter in (
+        for quantity, parameter in (
             ("sensor_c", "chip_temp"),
             ("sensor_board_c", "sensor_board_temp"),
             ("housing_c", "hous_temp"),
         ):
             if self._device.has(parameter):
-                report[what] = f"{self._device.number(parameter):.1f}"
+                report[quantity] = f"{self._device.number(parameter):.1f}"
         return report
 
     def _check_presence(self) -> None:
@@ -244,10 +244,10 @@ class XiCamera:
             raise misused(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._check_presence()
-        wanted = max(buffers, self._settings.buffers)
+        buffer_count = max(buffers, self._settings.buffers)
         image_bytes = self._device.whole("imgpayloadsize")
-        queued = self._queue(wanted, image_bytes)
-        slots = max(min(wanted, _IN_HAND), wanted - queued)
+        queue_length = self._queue(buffer_count, image_bytes)
+        slots = max(min(buffer_count, _IN_HAND), buffer_count - queue_length)
         if (self._pool.slots, self._pool.slot_bytes) != (slots, image_bytes):
             self._pool = FramePool(slots, image_bytes)
         self._pool.begin()
@@ -266,9 +266,9 @@ class XiCamera:
             device.set("acq_buffer_size", math.ceil(images * image_bytes / _KIB))
         else:
             device.set("acq_buffer_size", images * image_bytes)
-        queued = int(min(images, device.bounds("buffers_queue_size")[1]))
-        device.set("buffers_queue_size", queued)
-        return queued
+        queue_length = int(min(images, device.bounds("buffers_queue_size")[1]))
+        device.set("buffers_queue_size", queue_length)
+        return queue_length
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         end_s = time.monotonic() + timeout_s
@@ -299,16 +299,18 @@ class XiCamera:
     def _frame(self, image: Image, slot: Slot) -> Frame:
         """Raises DeviceRefused for an image that differs from the format which `configure` returned."""
         assert self._format is not None
-        promised = self._format
-        seen = (image.height, image.width, image.frm)
-        if seen != (promised.height_px, promised.width_px, RAW16):
-            raise self._unexpected_image(f"{promised.height_px} x {promised.width_px} pixels, RAW16", str(seen))
-        if self._settings.black_dn is None and image.black_level != promised.black_dn:
-            raise self._unexpected_image(f"a black level of {promised.black_dn} DN", f"{image.black_level} DN")
+        frame_format = self._format
+        actual_format = (image.height, image.width, image.frm)
+        if actual_format != (frame_format.height_px, frame_format.width_px, RAW16):
+            raise self._unexpected_image(
+                f"{frame_format.height_px} x {frame_format.width_px} pixels, RAW16", str(actual_format)
+            )
+        if self._settings.black_dn is None and image.black_level != frame_format.black_dn:
+            raise self._unexpected_image(f"a black level of {frame_format.black_dn} DN", f"{image.black_level} DN")
         return Frame(
             frame_id=image.acq_nframe,
             timestamp_ns=self._timestamp_ns(image),
-            pixels=_pixels(slot.memory, promised, image.padding_x),
+            pixels=_pixels(slot.memory, frame_format, image.padding_x),
             release=slot.release,
         )
 
@@ -335,15 +337,15 @@ class XiCamera:
         counts = {
             counter: count - self._counted_before.get(counter, 0) for counter, count in self._count().items()
         }
-        transferred, skipped = counts.get(TRANSFERRED, -1), counts.get(API_SKIPPED, 0)
-        lost = counts.get(TRANSPORT_SKIPPED, 0) + counts.get(BUFFER_OVERFLOWS, 0)
-        missed = [counts[counter] for counter in (MISSED_OVERLAP, MISSED_BUFFER_FULL) if counter in counts]
+        transfers, skip_count = counts.get(TRANSFERRED, -1), counts.get(API_SKIPPED, 0)
+        losses = counts.get(TRANSPORT_SKIPPED, 0) + counts.get(BUFFER_OVERFLOWS, 0)
+        trigger_misses = [counts[counter] for counter in (MISSED_OVERLAP, MISSED_BUFFER_FULL) if counter in counts]
         return CameraStatistics(
-            exposed=-1 if transferred < 0 else transferred + lost,
-            delivered=-1 if transferred < 0 else transferred - skipped,
-            lost_transfers=lost,
-            over_triggers=sum(missed) if missed else -1,
-            overflows=skipped,
+            exposed=-1 if transfers < 0 else transfers + losses,
+            delivered=-1 if transfers < 0 else transfers - skip_count,
+            lost_transfers=losses,
+            over_triggers=sum(trigger_misses) if trigger_misses else -1,
+            overflows=skip_count,
         )
 
     def _count(self) -> dict[int, int]:

@@ -133,8 +133,8 @@ def load(name: str, device: str) -> Any:
     try:
         library = ctypes.CDLL(name)
         for function, arguments in _FUNCTIONS.items():
-            declared = getattr(library, function)
-            declared.argtypes, declared.restype = arguments, ctypes.c_int
+            entry_point = getattr(library, function)
+            entry_point.argtypes, entry_point.restype = arguments, ctypes.c_int
     except (OSError, AttributeError) as error:
         raise DeviceLost(
             device,

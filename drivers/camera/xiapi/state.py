@@ -108,15 +108,15 @@ class State:
         """Set a parameter, unless it holds the value already; raises DeviceRefused if it then holds another."""
         if self._held(parameter, value) != value:
             self._device.set(parameter, value)
-        held = self._held(parameter, value)
-        if held != value:
+        read_back = self._held(parameter, value)
+        if read_back != value:
             raise DeviceRefused(
                 self._device.name,
                 expected=f"`{parameter}` to hold {value:g} once it is set",
-                happened=f"it holds {held:g}",
+                happened=f"it holds {read_back:g}",
                 remedy="Name it under `leave` in the camera's settings of the rig if it may stay as it is.",
             )
-        self.held[f"{parameter}[{entry}]" if entry else parameter] = f"{held:g}"
+        self.held[f"{parameter}[{entry}]" if entry else parameter] = f"{read_back:g}"
 
     def _held(self, parameter: str, value: int | float) -> float:
         return self._device.number(parameter) if isinstance(value, float) else self._device.whole(parameter)

@@ -321,8 +321,8 @@ class KukaEki:
         if status.pose is None:
             return "the controller reports none"
         x, y, z, *abc_deg = status.pose
-        reported = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
-        apart = np.abs(reported - forward(self.arm, status.joints_deg))
+        reported_pose = transform((x, y, z), (abc_deg[0], abc_deg[1], abc_deg[2]))
+        apart = np.abs(reported_pose - forward(self.arm, status.joints_deg))
         if apart[:3, 3].max() > _SAME_POSE_MM or apart[:3, :3].max() > _SAME_ROTATION:
             raise DeviceError(
                 "robot",
@@ -356,5 +356,5 @@ def _slower(status: Status) -> float:
 def _condition(status: Status) -> ArmCondition:
     """Return the arm's condition, from the only fault that the controller's program reports: the most serious."""
     mode = "T1" if status.t1 else "automatic or T2"
-    released = status.fault not in (wire.EMERGENCY_STOP, wire.DRIVES_OFF)
-    return ArmCondition(mode, emergency_stop=status.fault == wire.EMERGENCY_STOP, brakes_released=released)
+    brakes_released = status.fault not in (wire.EMERGENCY_STOP, wire.DRIVES_OFF)
+    return ArmCondition(mode, emergency_stop=status.fault == wire.EMERGENCY_STOP, brakes_released=brakes_released)

@@ -108,9 +108,9 @@ class Link:
         """
         give_up_s = math.inf if patience_s is None else time.monotonic() + patience_s
         with self.changed:
-            while not (found := outcome()) and (left_s := give_up_s - time.monotonic()) > 0.0:
+            while not (reached_outcome := outcome()) and (left_s := give_up_s - time.monotonic()) > 0.0:
                 self.changed.wait(min(LOOK_S, left_s))
-            return found
+            return reached_outcome
 
     def close(self) -> None:
         """End the connection and the thread. Safe to call again."""
@@ -121,11 +121,11 @@ class Link:
         self._link.close()
 
     def _read(self) -> None:
-        silence, heard = Silence(), 1
+        silence, message_count = Silence(), 1
         while not self._closing:
             try:
                 ready = select.select([self._link], [], [], _LOOK_S)[0]
-                if (silent_s := silence.after(heard)) > self._timeout_s:
+                if (silent_s := silence.after(message_count)) > self._timeout_s:
                     self._lose(f"link lost: no status for {silent_s:.2f} s")
                     return
                 if not ready:  # or this process was frozen: `select` then says so without another look
@@ -137,7 +137,7 @@ class Link:
             if not data:
                 self._lose("link lost: the connection was closed")
                 return
-            heard += 1
+            message_count += 1
             with self.changed:
                 for status in self.reader.feed(data):
                     self._watch.take(status)

@@ -92,8 +92,8 @@ class Watch:
         elapsed_ms = status.time_ms - last.time_ms if last else 0
         self.max_gap_ms = max(self.max_gap_ms, elapsed_ms)
         if last and elapsed_ms > 0:
-            turned = map(float.__sub__, status.joints_deg, last.joints_deg)
-            self.speed_deg_s = max(map(abs, turned)) * 1e3 / elapsed_ms
+            steps_deg = map(float.__sub__, status.joints_deg, last.joints_deg)
+            self.speed_deg_s = max(map(abs, steps_deg)) * 1e3 / elapsed_ms
         if status.taken >= self._asked and self.taken_ms is None:
             self.taken_ms = status.time_ms
             self.settled_cycles = self._astray_cycles = 0
@@ -109,8 +109,8 @@ class Watch:
         if self._rest_deg is None or self.lapsed:
             self._rest_deg = status.joints_deg
         error_deg = max(map(abs, map(float.__sub__, status.joints_deg, self._rest_deg)))
-        settled = known_speed and error_deg <= self._tolerances.settle_deg
-        self.settled_cycles = self.settled_cycles + 1 if settled else 0
+        is_settled = known_speed and error_deg <= self._tolerances.settle_deg
+        self.settled_cycles = self.settled_cycles + 1 if is_settled else 0
         self._astray_cycles = self._astray_cycles + 1 if error_deg > self._tolerances.follow_deg else 0
         if self._astray_cycles >= self._tolerances.follow_cycles:
             self.fail(

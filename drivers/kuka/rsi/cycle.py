@@ -78,8 +78,8 @@ class CycleMeter:
         return ""
 
     def _mismatch(self, cycle_ms: float, step: int) -> str:
-        what = "its packets come every" if self._declared_ms is None else "its simulated world declares"
-        return f"{what} {cycle_ms:.2f} ms and its IPOC counts {step} a packet; `cycle_ms` is {self._cycle_ms:g}"
+        source = "its packets come every" if self._declared_ms is None else "its simulated world declares"
+        return f"{source} {cycle_ms:.2f} ms and its IPOC counts {step} a packet; `cycle_ms` is {self._cycle_ms:g}"
 
     def _step(self) -> int:
         """The step of the IPOC: the smallest advance that is no exception. Lost packets make larger ones."""

@@ -167,9 +167,9 @@ class KukaRsi:
         deadline = Deadline(self._clock, 2.0 * self._stop_s() + 1.0)
 
         def stands(state: shared_state.State) -> bool:
-            ended = state.fault != shared_state.NO_FAULT and state.phase == shared_state.STANDING
-            obeyed = state.command >= number and not self._moves(state)
-            return state.fault == shared_state.LINK_LOST or ended or obeyed
+            has_ended = state.fault != shared_state.NO_FAULT and state.phase == shared_state.STANDING
+            has_obeyed = state.command >= number and not self._moves(state)
+            return state.fault == shared_state.LINK_LOST or has_ended or has_obeyed
 
         self._wait(stands, deadline, "the arm at rest", faults=False)
 
@@ -323,9 +323,13 @@ def _refuse_normal_priority(settings: Settings) -> None:
 
 def _no_session_reason(state: shared_state.State) -> str:
     if state.foreign:
-        other, heard = state.other_sender.decode(), state.sender.decode()
-        listened = f"the driver listens to {heard}, of which {state.packets} came" if heard else "no others came"
-        return f"{state.foreign} packets of other senders were ignored, the last of {other}; {listened}"
+        other_sender, own_sender = state.other_sender.decode(), state.sender.decode()
+        own_packets = (
+            f"the driver listens to {own_sender}, of which {state.packets} came"
+            if own_sender
+            else "no others came"
+        )
+        return f"{state.foreign} packets of other senders were ignored, the last of {other_sender}; {own_packets}"
     if state.astray:
         return f"{state.astray} packets came that do not continue the session, and {state.packets} that do"
     if state.refused:
@@ -341,7 +345,7 @@ def _no_session_reason(state: shared_state.State) -> str:
 def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], shared_state.Block]:
     """Bind the port and start the loop; raises DeviceLost if the port cannot be bound."""
     host, port = settings.listen.rsplit(":", 1)
-    derived: dict[str, Any] = {
+    derived_fields: dict[str, Any] = {
         "cycle_s": settings.cycle_ms / 1e3,
         "declared_cycle_s": settings.declared_cycle_ms and settings.declared_cycle_ms / 1e3,
         "controller": str(settings.controller),
@@ -351,7 +355,7 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
         "acceleration_deg_s2": arm.acceleration_deg_s2,
         "jerk_deg_s3": arm.jerk_deg_s3,
     }
-    passed_on = {f.name: getattr(settings, f.name) for f in fields(Config) if f.name not in derived}
+    passed_on = {f.name: getattr(settings, f.name) for f in fields(Config) if f.name not in derived_fields}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         try:
             link.bind((host, int(port)))
@@ -365,13 +369,13 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
         memory_fd = os.memfd_create("coupole-rsi")
         try:
             os.truncate(memory_fd, shared_state.BLOCK_BYTES)
-            shared = shared_state.Block(memory_fd)
+            block = shared_state.Block(memory_fd)
             process = subprocess.Popen(
                 [
                     sys.executable,
                     *("-m", "drivers.kuka.rsi.loop"),
                     *map(str, (link.fileno(), memory_fd, os.getpid())),
-                    json.dumps(derived | passed_on),
+                    json.dumps(derived_fields | passed_on),
                 ],
                 pass_fds=(link.fileno(), memory_fd),
                 stdin=subprocess.DEVNULL,
@@ -379,4 +383,4 @@ def _spawn(settings: Settings, arm: Arm) -> tuple[subprocess.Popen[bytes], share
             )
         finally:
             os.close(memory_fd)
-    return process, shared
+    return process, block

@@ -72,14 +72,14 @@ class StandInController:
             time.sleep(max(0.0, next_s - time.perf_counter()))
             next_s = max(next_s, time.perf_counter())
             self._ipoc += round(1e3 * self._cycle_s)
-            told = _AXES, max(0, self._late), self._ipoc
-            packet = b'<Rob Type="KUKA">%b<Delay D="%d"/><IPOC>%d</IPOC></Rob>' % told
+            packet_fields = _AXES, max(0, self._late), self._ipoc
+            packet = b'<Rob Type="KUKA">%b<Delay D="%d"/><IPOC>%d</IPOC></Rob>' % packet_fields
             sent_s = time.perf_counter()
             self._link.send(packet)
-            answered = self._await(sent_s + self._cycle_s)
-            if self._late >= 0 or answered:
-                self._late = max(0, self._late) + (not answered)
-            self.latencies_us.append((time.perf_counter() - sent_s) * 1e6 if answered else float("inf"))
+            has_answer = self._await(sent_s + self._cycle_s)
+            if self._late >= 0 or has_answer:
+                self._late = max(0, self._late) + (not has_answer)
+            self.latencies_us.append((time.perf_counter() - sent_s) * 1e6 if has_answer else float("inf"))
 
     def _await(self, until_s: float) -> bool:
         while (left_s := until_s - time.perf_counter()) > 0:
@@ -103,12 +103,12 @@ def asked(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
     port = free_port()
     here = {"listen": f"127.0.0.1:{port}", "controller": "", "delay_limit": 10**9, "link_timeout_s": 1e6}
     settings = settings.model_copy(update=here | {"unaccounted_s": 0.0, "connect_timeout_s": 20.0})
-    opened: list[KukaRsi] = []
+    robots: list[KukaRsi] = []
     trouble: list[BaseException] = []
 
     def open_driver() -> None:
         try:
-            opened.append(KukaRsi(settings, SystemClock()))
+            robots.append(KukaRsi(settings, SystemClock()))
         except BaseException as error:  # noqa: BLE001  raised below, in the caller's thread
             trouble.append(error)
 
@@ -120,7 +120,7 @@ def asked(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
         if trouble:
             raise trouble[0]
         controller.latencies_us.clear()
-        with closing(opened[0]) as robot:
+        with closing(robots[0]) as robot:
             yield controller, robot.statistics()["realtime"] > 0
 
 
@@ -148,10 +148,10 @@ def measured(settings: Settings, seconds: float, tell: Callable[[float], object]
     cycles = max(1, round(seconds / cycle_s))
     chunk = max(1, round(_TOLD_EVERY_S / cycle_s))
     with asked(settings) as (controller, realtime):
-        for done in range(0, cycles, chunk):
+        for cycle in range(0, cycles, chunk):
             with above_the_loop():
-                controller.ask(min(chunk, cycles - done))
-            tell(min(cycles, done + chunk) * cycle_s)
+                controller.ask(min(chunk, cycles - cycle))
+            tell(min(cycles, cycle + chunk) * cycle_s)
     return judged(controller.latencies_us, settings.cycle_ms, realtime=realtime)
 
 

@@ -21,11 +21,11 @@ def become_realtime() -> bool:
 
 def may_be_realtime() -> bool:
     """Tell whether a process that this one starts may run under SCHED_FIFO, by trying it in a thread that ends."""
-    tried: list[bool] = []
-    thread = threading.Thread(target=lambda: tried.append(become_realtime()))
+    outcomes: list[bool] = []
+    thread = threading.Thread(target=lambda: outcomes.append(become_realtime()))
     thread.start()
     thread.join()
-    return tried == [True]
+    return outcomes == [True]
 
 
 def how_to_give_the_right() -> str:

@@ -179,14 +179,14 @@ class RsiSession:
         self.packets += 1
         self.late += rose
         # Packets lost on the network also raise the delay counter, but do not concern the answer before them.
-        applied = rose == 0 or rose < cycles
-        if applied:
+        was_applied = rose == 0 or rose < cycles
+        if was_applied:
             self._corrections.taken()
         strays = self._witness.strays(packet.joints_deg)
         self._watch(packet, strays=strays)
         self._held_in_row = self._held_in_row + 1 if rose or strays else 0
-        rested = self.motion.phase == shared_state.STANDING
-        advances = applied and not strays
+        was_standing = self.motion.phase == shared_state.STANDING
+        advances = was_applied and not strays
         if not advances:  # repeat the last answer instead of advancing ahead of the arm
             if self._held_in_row >= _HALTED_PACKETS:
                 self.motion.halted()
@@ -195,7 +195,7 @@ class RsiSession:
             self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
         self._last_answer = (
-            None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=rested)
+            None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=was_standing)
         )
         self.answers += self._last_answer is not None
         return self._last_answer
@@ -204,11 +204,11 @@ class RsiSession:
         """Tell whether this packet's corrections still count from the session's start, as far as can be seen; else
         nothing is answered."""
         self.behind = False
-        if broken := self._witness.broken(packet, now_ns):
-            self.fail(shared_state.RESTARTED, broken)
+        if reason := self._witness.broken(packet, now_ns):
+            self.fail(shared_state.RESTARTED, reason)
         else:
             self.behind = self._witness.waits(packet, now_ns)
-        return not broken and not self.behind
+        return not reason and not self.behind
 
     def _formed(self, packet: Packet, now_ns: int, *, advances: bool, rested: bool) -> bytes | None:
         """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
@@ -360,8 +360,8 @@ class RsiSession:
             speed_deg_s = max(map(abs, self._velocity_deg_s))
             self._measured_deg = packet.joints_deg
         error_deg = max(map(abs, map(float.__sub__, packet.joints_deg, motion.commanded_deg)))
-        settled = motion.phase == shared_state.STANDING and error_deg <= config.settle_deg
-        self.settled_cycles = self.settled_cycles + 1 if settled and speed_deg_s <= config.settle_deg_s else 0
+        is_settled = motion.phase == shared_state.STANDING and error_deg <= config.settle_deg
+        self.settled_cycles = self.settled_cycles + 1 if is_settled and speed_deg_s <= config.settle_deg_s else 0
 
         allowed_deg = config.follow_deg + config.follow_lag_s * max(map(abs, motion.velocity_deg_s))
         self._astray_cycles = self._astray_cycles + 1 if strays or error_deg > allowed_deg else 0

@@ -113,12 +113,12 @@ class Settings(BaseModel):
     @property
     def wrist(self) -> SphericalWrist:
         """The arm's lengths. Raises ValueError for an arm without a spherical wrist."""
-        found = structure_of(self.arm_model)
-        if not isinstance(found, SphericalWrist):
+        structure = structure_of(self.arm_model)
+        if not isinstance(structure, SphericalWrist):
             raise ValueError(  # noqa: TRY004  pydantic adds the field's name to a ValueError only
                 f"expected an arm with a spherical wrist, as KUKA's have; {self.arm_model.name} has none"
             )
-        return found
+        return structure
 
     def arm(self) -> Arm:
         """The arm with the speeds that this driver uses; preflight computes durations with it."""

@@ -34,11 +34,11 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
     It returns None if IPOC or an axis is missing, or if one of them, or the delay counter, is not a possible
     number.
     """
-    measured, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
+    axes_tag, delay = re.escape(measured_tag).encode(), re.escape(delay_tag).encode()
     usual_axes = re.compile(
-        rb"<%s " % measured + rb" ".join(rb'A%d="([^"]+)"' % axis for axis in range(1, 7)) + rb"\s*/>"
+        rb"<%s " % axes_tag + rb" ".join(rb'A%d="([^"]+)"' % axis for axis in range(1, 7)) + rb"\s*/>"
     )
-    any_axes = re.compile(rb"<%s\b([^>]*)>" % measured)
+    any_axes = re.compile(rb"<%s\b([^>]*)>" % axes_tag)
     usual_tail = re.compile(rb'<%s D="(\d+)"\s*/>\s*<IPOC>(\d+)</IPOC>' % delay)
     any_delay = re.compile(rb"""<%s\b(?:[^>]*?\bD\s*=\s*["']\s*(\d+)\s*["'])?""" % delay)
     any_ipoc = re.compile(rb"<IPOC>\s*(\d+)\s*</IPOC>")
@@ -60,11 +60,11 @@ def packet_parser(measured_tag: str, delay_tag: str) -> Callable[[bytes], Packet
         if match := usual_tail.search(packet):
             late, ipoc = match[1], match[2]
         else:
-            found = any_ipoc.search(packet)
-            counted = any_delay.search(packet)
-            if found is None or (counted and counted[1] is None):
+            ipoc_match = any_ipoc.search(packet)
+            delay_match = any_delay.search(packet)
+            if ipoc_match is None or (delay_match and delay_match[1] is None):
                 return None
-            late, ipoc = counted[1] if counted else None, found[1]
+            late, ipoc = delay_match[1] if delay_match else None, ipoc_match[1]
         if int(ipoc) > _LARGEST_IPOC or (late is not None and int(late) > _LARGEST_DELAY):
             return None
         return Packet(ipoc, joints_deg, None if late is None else int(late))

@@ -75,21 +75,23 @@ class ArmWitness:
             return f"its IPOC went back from {int(last.ipoc)} to {int(packet.ipoc)}: RSI was started anew"
         if advance % (self._step or step) and self._answered > _SURE:
             return f"its IPOC went on by {advance}, {self._step} is its step: its cycle has changed"
-        missed = advance // step - 1
+        missing_cycles = advance // step - 1
         if last.delay is None or packet.delay is None:
-            return f"{missed} cycles are missing, and no counter tells whether RSI was started anew" * (missed > 0)
+            return f"{missing_cycles} cycles are missing, and no counter tells whether RSI was started anew" * (
+                missing_cycles > 0
+            )
         rise = packet.delay - last.delay
-        in_a_row = packet.delay == missed or rise == missed + 1
-        told = in_a_row if self._in_a_row else rise >= missed
-        if not told and rise < 0:
+        in_a_row = packet.delay == missing_cycles or rise == missing_cycles + 1
+        is_counted = in_a_row if self._in_a_row else rise >= missing_cycles
+        if not is_counted and rise < 0:
             return (
                 f"its counter of late answers fell from {last.delay} to {packet.delay}: RSI was started anew, or "
                 "the controller counts late answers in a row (`delay_counts`)"
             )
-        if not told:
+        if not is_counted:
             return (
-                f"{missed} cycles passed without an answer, but its counter of late answers rose by {rise}: RSI "
-                "was started anew, or its cycle has changed"
+                f"{missing_cycles} cycles passed without an answer, but its counter of late answers "
+                f"rose by {rise}: RSI was started anew, or its cycle has changed"
             )
         silent_s = (now_ns - self._last_ns) / 1e9 - advance // step * self._cycle_s
         if not 0 < self._unaccounted_s < silent_s:
@@ -140,6 +142,4 @@ class ArmWitness:
         """Tell, for each number of a place, whether the arm is neither there nor where it lags behind."""
         off = self._between(arm, place)
         behind = self._between(self._led[0], self._led[-1]) if self._led else _NOWHERE
-        return [
-            not abs(away) <= allowed + abs(lag) for away, lag, allowed in zip(off, behind, within, strict=True)
-        ]
+        return [not abs(away) <= limit + abs(lag) for away, lag, limit in zip(off, behind, within, strict=True)]

@@ -79,10 +79,10 @@ class ArmSupervisor:
     def itinerary(self, views: Sequence[ViewPose]) -> Itinerary:
         """Paths to views from the arm's actual posture. Raises PreflightRefused if there is none."""
         self.begin_here()
-        found = self._paths.itinerary(views, self._from_deg.tolist())
-        if found.refusals:
-            raise PreflightRefused(found.refusals)
-        return found
+        itinerary = self._paths.itinerary(views, self._from_deg.tolist())
+        if itinerary.refusals:
+            raise PreflightRefused(itinerary.refusals)
+        return itinerary
 
     def begin_here(self) -> Joints:
         """The next leg begins where the arm stands; returns its joint angles."""
@@ -101,21 +101,21 @@ class ArmSupervisor:
         stands on its checked line: by itself after a short lapse, by a person's word after all else."""
         self._settled = None
         path = (self._from_deg, *visit.leg.waypoints)
-        from_deg, allowed, when = path[0], path, "before it started"
+        from_deg, allowed_path, when = path[0], path, "before it started"
         targets = list(path[1:])
         while targets:
             try:
                 self._before = None
-                self._keep_to(allowed, self._watched(), when)
+                self._keep_to(allowed_path, self._watched(), when)
                 self._follow(from_deg, targets[0], meanwhile, speed)
                 if len(targets) == 1:
                     self._settle()
             except (ArmUnattended, Held, DeviceError) as error:
                 self._stand_after(error)
-                allowed, when = (from_deg, targets[0]), "while it stood"
+                allowed_path, when = (from_deg, targets[0]), "while it stood"
             else:
                 from_deg = targets.pop(0)
-                allowed, when = (from_deg, *targets), "between two motions"
+                allowed_path, when = (from_deg, *targets), "between two motions"
         self._from_deg = path[-1]
         return self._settled or self._settle()
 

@@ -140,8 +140,8 @@ class BurstRunner:
                 remedy="Lower `max_frames_per_s`, or raise `exposure_gap_us`, in the rig.",
             )
         period_s = burst.timing.period_us * 1e-6
-        wanted = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s, self._buffer_memory_bytes)
-        self._buffers = max(self._buffers, wanted)
+        buffers = buffers_for(len(burst.labels), frame_format.frame_bytes, period_s, self._buffer_memory_bytes)
+        self._buffers = max(self._buffers, buffers)
         return self._by_cable(burst, following, self._buffers)
 
     def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
@@ -195,12 +195,13 @@ class BurstRunner:
         last_frames: Deadline | None = None
         edges = 0
         judged_at = (-1, -1)
-        taken, confirmed, heard_ns = 0, 0, 0
+        taken_frames, confirmed_frames, heard_ns = 0, 0, 0
         while True:
             if (news_ns := self._arm.heard_at_rest()) > heard_ns:
                 # frames that had arrived in the last round were taken at rest
-                heard_ns, confirmed = news_ns, taken
-            taken = len(grabber)  # before the log is read: the proof needs frames that are older than the log
+                heard_ns, confirmed_frames = news_ns, taken_frames
+            # before the log is read: the proof needs frames that are older than the log
+            taken_frames = len(grabber)
             steps = box.poll_log()
             if len(steps):
                 running.log = np.concatenate([running.log, steps])
@@ -208,15 +209,15 @@ class BurstRunner:
             if len(running.log) == len(burst.table) and last_frames is None:
                 last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
-            complete = last_frames is not None and (taken >= edges or last_frames.expired)
+            complete = last_frames is not None and (taken_frames >= edges or last_frames.expired)
             if complete:
                 clock.sleep(readout_s)  # a surplus frame may still be in transfer
-                taken = confirmed = len(grabber)
+                taken_frames = confirmed_frames = len(grabber)
                 running.arm_after = self._arm.await_news()
-            if complete or (confirmed, len(running.log)) != judged_at:
-                judged_at = (confirmed, len(running.log))
-                running.judged = self._match(running, taken, complete=complete)
-                self._prove(running, confirmed, complete=complete)
+            if complete or (confirmed_frames, len(running.log)) != judged_at:
+                judged_at = (confirmed_frames, len(running.log))
+                running.judged = self._match(running, taken_frames, complete=complete)
+                self._prove(running, confirmed_frames, complete=complete)
                 self._tell(burst, len(running.log))
             if complete:
                 return
@@ -244,12 +245,12 @@ class BurstRunner:
 
     def _prove(self, running: _RunningBurst, confirmed: int, *, complete: bool) -> None:
         """Pass newly proven frames among the first `confirmed` to the recorder, once their bytes are written."""
-        judged, grabber, log = running.judged, running.grabber, running.log
-        assert judged is not None
-        for frame in np.flatnonzero(judged.step_of_frame != UNLABELLED).tolist():
+        frame_match, grabber, log = running.judged, running.grabber, running.log
+        assert frame_match is not None
+        for frame in np.flatnonzero(frame_match.step_of_frame != UNLABELLED).tolist():
             if frame in running.proven or frame >= confirmed or not (complete or grabber.kept(frame)):
                 continue
-            record = StepRecord(*log[judged.step_of_frame[frame]].tolist())
+            record = StepRecord(*log[frame_match.step_of_frame[frame]].tolist())
             label = running.burst.labels[record.step]
             if label and not record.invalid_exposure:
                 shot = ShotId(running.burst.view, label)
@@ -329,8 +330,8 @@ def _since_s(begun_ns: int | None, ended_ns: int) -> float:
 
 def _hottest_c(log: NDArray[np.void]) -> float | None:
     """The highest temperature in a log; None if it has none."""
-    known = log["board_temperature_c"][np.isfinite(log["board_temperature_c"])]
-    return float(known.max()) if len(known) else None
+    temperatures_c = log["board_temperature_c"][np.isfinite(log["board_temperature_c"])]
+    return float(temperatures_c.max()) if len(temperatures_c) else None
 
 
 def _rounded(arm: ArmState) -> Joints:

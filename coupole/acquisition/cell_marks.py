@@ -84,8 +84,8 @@ def _lock(fd: int, *, alone: bool) -> None:
 def _is_locked(place: Path) -> bool:
     try:
         with named_after(place, _KIND).open("rb") as file:
-            asked = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
-            found = fcntl.fcntl(file, fcntl.F_OFD_GETLK, asked)
+            query = struct.pack(_LOCK, fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
+            reply = fcntl.fcntl(file, fcntl.F_OFD_GETLK, query)
     except OSError:  # nobody has ever opened them
         return False
-    return bool(struct.unpack(_LOCK, found)[0] != fcntl.F_UNLCK)
+    return bool(struct.unpack(_LOCK, reply)[0] != fcntl.F_UNLCK)

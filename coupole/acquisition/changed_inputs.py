@@ -15,11 +15,11 @@ _LONGEST_S = 5.0
 
 def tell_changes(files: InputFiles, recorder: Recorder, console: Console) -> None:
     """One line for the operator for each file that changed since the last call, and one in the journal for all."""
-    changed: list[str] = []
-    looking = threading.Thread(target=lambda: changed.extend(files.changes()), daemon=True)
+    changes: list[str] = []
+    looking = threading.Thread(target=lambda: changes.extend(files.changes()), daemon=True)
     looking.start()
     looking.join(_LONGEST_S)  # a disk that does not answer must not hold up a session's end
-    for sentence in changed:
+    for sentence in changes:
         console.print(f"{sentence} since it was read; the run uses and keeps what was read", markup=False)
-    if changed:
-        recorder.note(InputsChanged(files=tuple(changed)))
+    if changes:
+        recorder.note(InputsChanged(files=tuple(changes)))

@@ -36,20 +36,20 @@ def _align(  # type: ignore[no-untyped-def]
         last = step = anchor_step
         frame = anchor_frame + way
         while 0 <= frame < n_frames:
-            elapsed = frame_ns[frame] - frame_ns[anchor_frame]
-            predicted = step_ns[anchor_step] + elapsed
-            window = 2 * jitter_ns + drift * abs(elapsed)
-            while 0 <= step < n_steps and way * (predicted - step_ns[step]) > window:
+            elapsed_ns = frame_ns[frame] - frame_ns[anchor_frame]
+            predicted_ns = step_ns[anchor_step] + elapsed_ns
+            window = 2 * jitter_ns + drift * abs(elapsed_ns)
+            while 0 <= step < n_steps and way * (predicted_ns - step_ns[step]) > window:
                 step += way
             if step >= n_steps and in_flight > 0:
                 pending += 1
                 steps_out[frame] = PENDING
-            elif step < 0 or step >= n_steps or abs(step_ns[step] - predicted) > window:
+            elif step < 0 or step >= n_steps or abs(step_ns[step] - predicted_ns) > window:
                 surplus += 1
                 steps_out[frame] = SURPLUS
             else:
                 beyond = step + way
-                if 0 <= beyond < n_steps and abs(step_ns[beyond] - predicted) <= window:
+                if 0 <= beyond < n_steps and abs(step_ns[beyond] - predicted_ns) <= window:
                     steps_out[0] = UNDECIDABLE
                     return 0
                 surplus += step == last
@@ -67,14 +67,14 @@ def _misfit(box_ns, excess_ns, left_out, jitter_ns, triple):  # type: ignore[no-
     points that prove it. Exchange algorithm for the best line in the maximum norm, stopped at the first proof.
     """
     n = len(box_ns)
-    kept = 0
+    count = 0
     for k in range(n):
         if not left_out[k]:
-            if kept < 3:
-                triple[kept] = k
+            if count < 3:
+                triple[count] = k
             triple[2] = k
-            kept += 1
-    if kept < 3:
+            count += 1
+    if count < 3:
         return False
     for _ in range(n):
         i, j, k = triple

@@ -30,8 +30,8 @@ def open_for_session(run: Run) -> None:
 def complete_views(run: Run) -> list[str]:
     """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more."""
     proven = run.proven()
-    left = {shot.view for shot in run.expected_shots() if shot not in proven}
-    files = (run.view_path(view) for view in run.about["views"] if view not in left)
+    incomplete_views = {shot.view for shot in run.expected_shots() if shot not in proven}
+    files = (run.view_path(view) for view in run.about["views"] if view not in incomplete_views)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
 
 
@@ -81,20 +81,20 @@ def conclude(run: Run, console: Console) -> None:
     except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
-        told = f"the report or {manifest.NAME} could not be written:"
+        message = f"the report or {manifest.NAME} could not be written:"
         if left_behind():
-            alarm(f"{told} {error}")
+            alarm(f"{message} {error}")
         else:
-            console.print(f"  [yellow]{told}[/] {error}")
+            console.print(f"  [yellow]{message}[/] {error}")
 
 
 def _report(run: Run) -> tuple[list[str], int]:
     """Write the report, list what is small and complete; complete views that are not listed, and their bytes."""
     report.write(run, in_use=False)
-    changed = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
-    manifest.enter(run.folder, sorted(changed))
-    listed = manifest.read(run.folder)
-    views = [name for name in complete_views(run) if name not in listed]
+    unlisted_files = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
+    manifest.enter(run.folder, sorted(unlisted_files))
+    digests = manifest.read(run.folder)
+    views = [name for name in complete_views(run) if name not in digests]
     return views, sum((run.folder / name).stat().st_size for name in views)
 
 
@@ -106,12 +106,12 @@ def _enter(run: Run, views: list[str], size: int) -> None:
 
 def note_unread(recorder: RunRecorder) -> None:
     """The journal's line, if the session's text was not read: it was not waited for."""
-    if found := unread():
+    if unread_text := unread():
         recorder.note(
             TextUnread(
-                lost_lines=found.lost_lines,
-                lost_bytes=found.lost_bytes,
-                waiting_bytes=found.waiting_bytes,
-                stalled_s=round(found.stalled_s, 1),
+                lost_lines=unread_text.lost_lines,
+                lost_bytes=unread_text.lost_bytes,
+                waiting_bytes=unread_text.waiting_bytes,
+                stalled_s=round(unread_text.stalled_s, 1),
             )
         )

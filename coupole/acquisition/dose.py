@@ -61,14 +61,14 @@ class LightOnObject:
     ) -> None:
         """`before_lux_h` [points] was given by earlier sessions of the same run. Raises StorageError if the ledger
         cannot be read and written."""
-        measured = job.plan.object
-        self._ledger = ledger_of(job.cell, measured.id, only_grows=True) if measured else None
+        plan_object = job.plan.object
+        self._ledger = ledger_of(job.cell, plan_object.id, only_grows=True) if plan_object else None
         self._enters = self._ledger is not None and not cell.simulated
         if self._ledger is not None and self._enters:
             _answered(self._ledger, self._ledger.prove_writable)
-        self._id, self._what_for = measured.id if measured else "", what_for
+        self._id, self._what_for = plan_object.id if plan_object else "", what_for
         self._asked = Asked(
-            0.0, measured.dose_budget_lux_h if measured else None, plan=job.plan.name, name=user_name()
+            0.0, plan_object.dose_budget_lux_h if plan_object else None, plan=job.plan.name, name=user_name()
         )
         points = len(job.shape.dose_points_mm)
         self._given_lux_h = np.array(before_lux_h) if len(before_lux_h) else np.zeros(points)
@@ -123,14 +123,14 @@ class LightOnObject:
 
         Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
         """
-        asked = replace(self._asked, lux_h=self.more_lux_h(at_most if expected is None else expected))
+        request = replace(self._asked, lux_h=self.more_lux_h(at_most if expected is None else expected))
         plan_id = ""
         if self._ledger is not None and self._enters:
             entry = self._entry(at_most, w_per_lm)
-            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry, asked))
+            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry, request))
         elif self._ledger is not None:
             newest = _answered(self._ledger, self._ledger.newest)
-            asked.refuse_beyond(self._id, newest, self._unentered_lux_h)
+            request.refuse_beyond(self._id, newest, self._unentered_lux_h)
         self._planned = _Planned(at_most, w_per_lm, plan_id)
 
     def ask_again(self, so_far: LuxHours) -> None:
@@ -138,22 +138,22 @@ class LightOnObject:
         Raises DoseBudgetReached, StorageError."""
         if self._ledger is None or self._planned is None:
             return
-        asked = replace(self._asked, lux_h=self.more_lux_h(so_far))
+        request = replace(self._asked, lux_h=self.more_lux_h(so_far))
         if self._enters:
-            _answered(self._ledger, partial(self._ledger.ask_again, asked, self._planned.plan_id))
+            _answered(self._ledger, partial(self._ledger.ask_again, request, self._planned.plan_id))
         else:
             newest = _answered(self._ledger, self._ledger.newest)
-            asked.refuse_beyond(self._id, newest, self._unentered_lux_h)
+            request.refuse_beyond(self._id, newest, self._unentered_lux_h)
 
     def end(self, given: LuxHours | None) -> LuxHours:
         """The light of the last `begin` is over; `given` None: what was planned stands. Returns what counts."""
-        planned = self._planned
-        if planned is None:
+        plan = self._planned
+        if plan is None:
             return np.zeros_like(self._given_lux_h)
-        counts = planned.at_most if given is None else given
+        counts = plan.at_most if given is None else given
         if self._ledger is not None and self._enters and given is not None:
-            entry = self._entry(counts, planned.w_per_lm)
-            _answered(self._ledger, partial(self._ledger.correct, planned.plan_id, *entry))
+            entry = self._entry(counts, plan.w_per_lm)
+            _answered(self._ledger, partial(self._ledger.correct, plan.plan_id, *entry))
         if not self._enters:
             self._unentered_lux_h += self.more_lux_h(counts)
         self._given_lux_h, self._planned = self._given_lux_h + counts, None
@@ -268,22 +268,22 @@ class DoseMeter:
         Raises DoseBudgetReached and StorageError: no light may then be given.
         """
         rig, cell = self._job.cell.rig, self._job.cell
-        expected = self._of_leds(burst.table["led"], burst.table["on_us"])
-        at_most = expected
+        expected_lux_h = self._of_leds(burst.table["led"], burst.table["on_us"])
+        at_most = expected_lux_h
         if burst.panel:
-            expected = expected + self._of_panel(burst.duration_s + BURST_OVERHEAD_S)
-            at_most = expected + self._of_panel(watchdog_s(rig))
+            expected_lux_h = expected_lux_h + self._of_panel(burst.duration_s + BURST_OVERHEAD_S)
+            at_most = expected_lux_h + self._of_panel(watchdog_s(rig))
         elif not burst.hardware:
             lit = np.flatnonzero(burst.table["led"] != NO_LED)
             over_us = longest_light_s(rig, burst.timing.on_us) * 1e6 - burst.timing.on_us
             rows = [self._row_of_led[int(led)] for led in burst.table["led"][lit]]
             if rows:
-                at_most = expected + self._lux[:, rows].max(axis=1) * max(0.0, over_us) / 3.6e9
+                at_most = expected_lux_h + self._lux[:, rows].max(axis=1) * max(0.0, over_us) / 3.6e9
         w_per_lm = cell.panel_damage_w_per_lm if burst.panel else cell.led_damage_w_per_lm
-        self._light.begin(at_most, expected, w_per_lm)
+        self._light.begin(at_most, expected_lux_h, w_per_lm)
         self._under_way_lux_h = self._course(burst.table["led"], burst.table["on_us"])
-        planned = tuple(np.round(at_most, _DIGITS).tolist())
-        self._recorder.note(BurstBegun(view=burst.view, planned_lux_h=planned))
+        planned_lux_h = tuple(np.round(at_most, _DIGITS).tolist())
+        self._recorder.note(BurstBegun(view=burst.view, planned_lux_h=planned_lux_h))
         self._recorder.commit(now=True)
 
     def ask_again(self, burst: Burst, step: int) -> None:
@@ -305,13 +305,15 @@ class DoseMeter:
         """
         if not self._cell.lights_confirmed:
             return tuple(np.round(self._light.planned_lux_h, _DIGITS).tolist())
-        given = self._of_leds(log["led"], log["on_us"])
+        given_lux_h = self._of_leds(log["led"], log["on_us"])
         begins_us = np.cumsum(burst.table["period_us"]) - burst.table["period_us"]
         allowed_us = table_ran_s * (1e6 + _CLOCKS_PPM) + _START_US
-        begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
-        unlogged = burst.table[begun & ~np.isin(np.arange(len(begun)), log["step"])]
-        given = given + self._of_leds(unlogged["led"], unlogged["on_us"]) + self._of_panel(panel_s)
-        return tuple(np.round(given, _DIGITS).tolist())
+        has_begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
+        unlogged_steps = burst.table[has_begun & ~np.isin(np.arange(len(has_begun)), log["step"])]
+        given_lux_h = (
+            given_lux_h + self._of_leds(unlogged_steps["led"], unlogged_steps["on_us"]) + self._of_panel(panel_s)
+        )
+        return tuple(np.round(given_lux_h, _DIGITS).tolist())
 
     def end(self, given_lux_h: tuple[float, ...]) -> None:
         """Enter what `count` has found, once the journal has it. Until then all that was planned counts: so

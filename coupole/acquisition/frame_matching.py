@@ -117,19 +117,19 @@ def match(
     """
     model = model or FaultModel()
     n_frames, n_steps = len(frame_ids), len(log)
-    edged = np.flatnonzero(log["edge_sent"])
+    edge_steps = np.flatnonzero(log["edge_sent"])
     if n_frames == 0:
-        return _unlabelled(n_frames, n_steps, missing=edged)
+        return _unlabelled(n_frames, n_steps, missing=edge_steps)
     in_flight = 0 if complete else model.in_flight
     id_steps = np.diff(frame_ids) % (id_modulus[1] - id_modulus[0] + 1)
-    obstacle = _obstacle(edged, id_steps, (id_modulus[1] - id_modulus[0]) // 2, timestamps_ns)
+    obstacle = _obstacle(edge_steps, id_steps, (id_modulus[1] - id_modulus[0]) // 2, timestamps_ns)
     if not obstacle and n_frames <= model.max_surplus + in_flight:
         obstacle = "too few frames: all of them may be surplus, or of steps that are not in the log yet"
     if obstacle:
         return _unlabelled(n_frames, n_steps, reason=obstacle)
 
-    step_ns = log["t_trigger_ns"][edged]
-    aligned = _Aligned(edged, np.full(n_frames, UNLABELLED, np.int64), np.zeros(n_frames, np.bool_))
+    step_ns = log["t_trigger_ns"][edge_steps]
+    alignment = _Aligned(edge_steps, np.full(n_frames, UNLABELLED, np.int64), np.zeros(n_frames, np.bool_))
     candidates = agree_on_steps(
         timestamps_ns - timestamps_ns[0],
         step_ns - step_ns[0],
@@ -137,8 +137,8 @@ def match(
         model.drift_ppm * 1e-6,
         model.max_surplus,
         in_flight,
-        aligned.agreed,
-        aligned.agrees,
+        alignment.agreed,
+        alignment.agrees,
     )
     if candidates == 0:
         reason = f"no alignment of box and camera leaves {model.max_surplus} frames or fewer unexplained"
@@ -146,7 +146,7 @@ def match(
     if candidates < 0:
         reason = "a gap is so long that the clocks' drift hides which step comes next"
         return _unlabelled(n_frames, n_steps, reason=reason)
-    return _verdict(log, timestamps_ns, id_steps, aligned)
+    return _verdict(log, timestamps_ns, id_steps, alignment)
 
 
 def _obstacle(
@@ -185,30 +185,30 @@ def _verdict(
     log: NDArray[np.void], timestamps_ns: NDArray[np.int64], id_steps: NDArray[np.int64], aligned: _Aligned
 ) -> Match:
     """Labels on which all candidates agree and that one frame alone claims; missing steps; what stays open."""
-    edged, agreed, agrees = aligned.edged, aligned.agreed, aligned.agrees
-    steps = np.full(len(agreed), UNLABELLED, np.int64)
-    claimed = np.bincount(agreed[agreed >= 0], minlength=len(edged))
-    labelled = agrees & (agreed >= 0)
-    labelled[labelled] = claimed[agreed[labelled]] == 1
-    steps[labelled] = edged[agreed[labelled]]
-    surplus = agrees & (agreed == SURPLUS)
-    undecided = ~labelled & ~surplus & ~(agrees & (agreed == PENDING))
+    edge_steps, agreed_steps, agrees = aligned.edged, aligned.agreed, aligned.agrees
+    steps = np.full(len(agreed_steps), UNLABELLED, np.int64)
+    claims = np.bincount(agreed_steps[agreed_steps >= 0], minlength=len(edge_steps))
+    is_labelled = agrees & (agreed_steps >= 0)
+    is_labelled[is_labelled] = claims[agreed_steps[is_labelled]] == 1
+    steps[is_labelled] = edge_steps[agreed_steps[is_labelled]]
+    surplus = agrees & (agreed_steps == SURPLUS)
+    is_undecided = ~is_labelled & ~surplus & ~(agrees & (agreed_steps == PENDING))
     missing = np.zeros(len(log), np.bool_)
     reasons = []
     if not agrees.all():
         reasons.append("more than one alignment of box and camera is possible")
-    if np.any(agreed == DOUBTFUL):
+    if np.any(agreed_steps == DOUBTFUL):
         reasons.append("some frames do not fit the clocks")
     if not reasons:
-        missing[edged[claimed == 0]] = True
-    if np.any(claimed > 1):
-        reasons.append(f"steps {edged[claimed > 1].tolist()} have more than one frame each")
+        missing[edge_steps[claims == 0]] = True
+    if np.any(claims > 1):
+        reasons.append(f"steps {edge_steps[claims > 1].tolist()} have more than one frame each")
     return Match(
         steps,
         surplus,
         missing,
         _lost_in_transfer(steps, id_steps, missing),
-        ambiguous=bool(undecided.any()),
+        ambiguous=bool(is_undecided.any()),
         reason="; ".join(reasons),
         clocks=_fit_clocks(log["t_trigger_ns"], timestamps_ns, steps),
     )
@@ -227,26 +227,26 @@ def _lost_in_transfer(
     steps: NDArray[np.int64], id_steps: NDArray[np.int64], missing: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """[steps] where a gap in the ids is as wide as the run of missing steps between two labelled frames."""
-    lost = np.zeros_like(missing)
-    counted = np.concatenate([[0], np.cumsum(id_steps)])
-    labelled = np.flatnonzero(steps >= 0)
-    gaps = np.flatnonzero(np.diff(steps[labelled]) > 1)
-    for before, after in zip(labelled[gaps], labelled[gaps + 1], strict=True):
+    is_lost = np.zeros_like(missing)
+    ids_so_far = np.concatenate([[0], np.cumsum(id_steps)])
+    labelled_frames = np.flatnonzero(steps >= 0)
+    gaps = np.flatnonzero(np.diff(steps[labelled_frames]) > 1)
+    for before, after in zip(labelled_frames[gaps], labelled_frames[gaps + 1], strict=True):
         inside = slice(steps[before] + 1, steps[after])
-        ids_unseen = counted[after] - counted[before] - (after - before)
+        ids_unseen = ids_so_far[after] - ids_so_far[before] - (after - before)
         if ids_unseen and ids_unseen == np.count_nonzero(missing[inside]):
-            lost[inside] = missing[inside]
-    return lost
+            is_lost[inside] = missing[inside]
+    return is_lost
 
 
 def _fit_clocks(
     t_trigger_ns: NDArray[np.int64], timestamps_ns: NDArray[np.int64], steps: NDArray[np.int64]
 ) -> ClockFit | None:
     """Least-squares line through the labelled pairs; None for fewer than three."""
-    labelled = np.flatnonzero(steps >= 0)
-    if len(labelled) < 3:
+    labelled_frames = np.flatnonzero(steps >= 0)
+    if len(labelled_frames) < 3:
         return None
-    box_ns, camera_ns = t_trigger_ns[steps[labelled]], timestamps_ns[labelled]
+    box_ns, camera_ns = t_trigger_ns[steps[labelled_frames]], timestamps_ns[labelled_frames]
     x = (box_ns - box_ns[0]).astype(np.float64)
     y = (camera_ns - camera_ns[0]).astype(np.float64) - x
     slope, intercept = np.polyfit(x / x[-1], y, 1)

@@ -93,10 +93,10 @@ class HostBurst:
     def fire(self, burst: Burst, frame_format: FrameFormat) -> Verdict:
         """Fire one light after the other; the dose is recorded even if this raises, that of the light which was on
         then included. Raises ArmMovedError."""
-        given: list[StepRecord] = []
+        records: list[StepRecord] = []
         taken_frames = 0
         dead: list[ShotId] = []
-        kept: list[_Kept] = []
+        kept_frames: list[_Kept] = []
         marks = set(range(len(burst.labels))) - set(burst.inner)
         reason = ""
         arm_before, arm_after = self._cell.robot.measured(), None
@@ -108,33 +108,33 @@ class HostBurst:
                 self._wait_while_paused()
                 if _gives_light(burst, index):
                     self._dose.ask_again(burst, index)
-                taken = self._fire_one(burst, index, given)
+                picture = self._fire_one(burst, index, records)
                 taken_frames += 1
-                if shot is not None and taken.record.invalid_exposure:
+                if shot is not None and picture.record.invalid_exposure:
                     dead.append(shot)
                 arm_after = None
                 arm_after = self._arm.await_news()
-                if taken.frame is not None:
-                    if index in marks and taken.alone:
+                if picture.frame is not None:
+                    if index in marks and picture.alone:
                         marks.remove(index)
-                        reason = reason or too_bright(taken.frame, frame_format)
-                    kept += self._keep(taken, taken.frame, burst, shot)
+                        reason = reason or too_bright(picture.frame, frame_format)
+                    kept_frames += self._keep(picture, picture.frame, burst, shot)
                 if burst.marks == "none":
-                    self._prove(kept)
+                    self._prove(kept_frames)
                 self._tell(burst, index)
                 self._recorder.commit(now=False)
             reason = reason or ("a dark mark was not seen" if marks else "")
             if not reason:
-                self._prove(kept)
+                self._prove(kept_frames)
         except BaseException as error:
             if isinstance(error, ArmMovedError) or self._arm.was_held(error):
                 raise  # `_fire_one` has switched the light off
             self._cell.make_safe()
             raise
         finally:
-            for one in kept:
-                self._recorder.free(one.slot)
-            log = np.array([astuple(record) for record in given], STEP_RECORD_DTYPE)
+            for kept_frame in kept_frames:
+                self._recorder.free(kept_frame.slot)
+            log = np.array([astuple(record) for record in records], STEP_RECORD_DTYPE)
             self._note(burst, log, arm_before, arm_after, panel_s=self._panel_s, frames=taken_frames)
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
@@ -149,8 +149,8 @@ class HostBurst:
 
     def _prove(self, kept: list[_Kept]) -> None:
         while kept:
-            one = kept.pop(0)
-            self._recorder.prove(one.slot, one.shot, one.fields)
+            kept_frame = kept.pop(0)
+            self._recorder.prove(kept_frame.slot, kept_frame.shot, kept_frame.fields)
 
     def _fire_one(self, burst: Burst, index: int, given: list[StepRecord]) -> _Taken:
         """Light one step, trigger the camera, wait for the light's end, and keep the burst's period. The light is
@@ -185,13 +185,13 @@ class HostBurst:
 
     def _alone(self) -> bool:
         """True if the camera made exactly one exposure since it was armed."""
-        exposed = self._cell.camera.statistics().exposed
-        if exposed != _UNCOUNTED:
-            return exposed == 1
-        other = self._cell.camera.next_frame(0.0)
-        if other is not None:
-            other.release()
-        return other is None
+        exposed_frames = self._cell.camera.statistics().exposed
+        if exposed_frames != _UNCOUNTED:
+            return exposed_frames == 1
+        other_frame = self._cell.camera.next_frame(0.0)
+        if other_frame is not None:
+            other_frame.release()
+        return other_frame is None
 
 
 def _gives_light(burst: Burst, index: int) -> bool:

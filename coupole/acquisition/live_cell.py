@@ -39,7 +39,7 @@ class CellSource:
             shot = self._shots.take(NO_LED if choice.led is None else choice.led, choice.exposure_us)
             number += 1
             light = "no light" if choice.led is None else f"LED {choice.led}"
-            seen, dose_lux_h = figures(shot.raw, shot.coding), float(self._shots.given_lux_h.max())
+            frame_figures, dose_lux_h = figures(shot.raw, shot.coding), float(self._shots.given_lux_h.max())
             studio.show(
                 Shown(
                     number,
@@ -48,7 +48,7 @@ class CellSource:
                     shot.coding,
                     choice.exposure_us,
                     choice.led,
-                    seen,
+                    frame_figures,
                     pace.beat(),
                     dose_lux_h,
                 )

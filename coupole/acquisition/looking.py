@@ -107,8 +107,8 @@ def watch_cell(
     rig_cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     rig, leds = rig_cell.rig, rig_cell.leds
     longest_us = longest_exposure_us(rig)
-    wanted = Wanted(led=choice.led, exposure_us=choice.exposure_us)
-    studio = Studio(choice_from(wanted, choice, tuple(leds.ids.tolist()), longest_us))
+    request = Wanted(led=choice.led, exposure_us=choice.exposure_us)
+    studio = Studio(choice_from(request, choice, tuple(leds.ids.tolist()), longest_us))
     if job is None or job.plan.object is None:
         console.print("no object is known, so no light is counted; to have it counted, give a plan")
     else:
@@ -164,7 +164,7 @@ def _show_live(
     page = threading.Thread(target=server.serve_forever, name="page", daemon=True)
     page.start()
     console.print(f"live at {server.url}  (Ctrl-C ends it)", soft_wrap=True)
-    said = ""
+    last_remark = ""
     with obeyed_by(control, halt):
         began_s = time.monotonic()
         filling = run_source(source, studio, failures.append)
@@ -173,9 +173,9 @@ def _show_live(
                 while not studio.closing.is_set() and not control.stop.is_set():
                     refuse_overdue(began_s)
                     figures.show(studio.shown)
-                    if studio.remark != said:
-                        said = studio.remark
-                        console.print(said or "a page is open", markup=False)
+                    if studio.remark != last_remark:
+                        last_remark = studio.remark
+                        console.print(last_remark or "a page is open", markup=False)
                     studio.closing.wait(_FIGURES_EVERY_S)
         finally:
             studio.closing.set()

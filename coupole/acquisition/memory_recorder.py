@@ -86,9 +86,9 @@ class DryRecorder(MemoryRecorder):
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         super().prove(slot, shot, fields)
-        judged = self._slots[slot]
-        if judged is not None and shot.is_shot:
-            self.exposures.setdefault(self._view, ViewExposure()).add_figures(*judged)
+        slot_figures = self._slots[slot]
+        if slot_figures is not None and shot.is_shot:
+            self.exposures.setdefault(self._view, ViewExposure()).add_figures(*slot_figures)
 
     def end_view(self) -> None:
         self._slots.clear()

@@ -83,8 +83,8 @@ class OpenedCell:
         or hangs. Signals wait. Only the first call acts, others wait for it: nothing may be lit or moved after
         it."""
         with self._first:
-            mine, self.made_safe = not self.made_safe, True
-        if not mine:
+            is_first, self.made_safe = not self.made_safe, True
+        if not is_first:
             self._done.wait()  # each safeguard is given up after its time
             return
         try:
@@ -94,15 +94,15 @@ class OpenedCell:
 
     def _make_safe(self) -> None:
         with held():
-            done = self.halt()
-            for safeguard in done:
+            safeguards = self.halt()
+            for safeguard in safeguards:
                 safeguard.wait()
-            done.append(Safeguard("camera disarmed", self.camera.disarm))
-            done[-1].wait()
-        for safeguard in done:
+            safeguards.append(Safeguard("camera disarmed", self.camera.disarm))
+            safeguards[-1].wait()
+        for safeguard in safeguards:
             if safeguard.trouble:
                 self.trouble.append(f"not sure that it is safe ({safeguard.what}): {safeguard.trouble}")
-        self.lights_confirmed, self.arm_confirmed = not done[0].trouble, not done[1].trouble
+        self.lights_confirmed, self.arm_confirmed = not safeguards[0].trouble, not safeguards[1].trouble
 
 
 @contextmanager
@@ -129,20 +129,20 @@ def open_cell(
             world = bounded(begin, unwanted=lambda late: late.close())
             stack.callback(world.close)
             clock, endpoints = world.clock, world.endpoints
-        opened: dict[str, Any] = {}
+        devices: dict[str, Any] = {}
         identities: dict[str, Identity] = {}
         for kind in ("ledbox", "camera", "robot"):
             begin = partial(_open_device, cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
             device = bounded(begin, unwanted=lambda late: late.close())
-            opened[kind] = NotedDevice(device, kind, cell.rig)
-            stack.push(partial(_close, opened[kind], NAMES[kind]))
-            identities[kind] = bounded(opened[kind].identify)
+            devices[kind] = NotedDevice(device, kind, cell.rig)
+            stack.push(partial(_close, devices[kind], NAMES[kind]))
+            identities[kind] = bounded(devices[kind].identify)
             on_opened(kind, identities[kind])
         if not dry_run:
             remember_controller(cell, identities["robot"])
         opened_cell = OpenedCell(
             clock,
-            **opened,
+            **devices,
             sensor=sensor,
             simulated=endpoints is not None,
             world_endpoints=endpoints,
@@ -162,11 +162,11 @@ def _open_device(
         # World time may run faster than the host's: the box's watchdog must not trip because of that.
         settings["watchdog_s"] = min(_LONGEST_WATCHDOG_S, settings.get("watchdog_s", 2.0) * speed)
     if endpoints is not None:
-        known = settings_class(driver).model_fields
-        settings |= {name: value for name, value in endpoints[kind].items() if name in known}
-    chosen = settings_class(driver)(**settings)
-    with under_way(NAMES[kind], "open", _OPENS_S + getattr(chosen, "connect_timeout_s", 0.0)):
-        return load_class(driver)(chosen, clock)
+        fields = settings_class(driver).model_fields
+        settings |= {name: value for name, value in endpoints[kind].items() if name in fields}
+    device_settings = settings_class(driver)(**settings)
+    with under_way(NAMES[kind], "open", _OPENS_S + getattr(device_settings, "connect_timeout_s", 0.0)):
+        return load_class(driver)(device_settings, clock)
 
 
 def _close(device: Any, name: str, _: object, failing: BaseException | None, __: object) -> None:

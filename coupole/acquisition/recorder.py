@@ -132,9 +132,9 @@ class RunRecorder:
     ) -> None:
         self._file = str(path.relative_to(self._run.folder))
         if self._writer is None:
-            own = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
+            view_slots = {str(shot): slot for shot, slot in self._proven.items() if shot.view == view}
             if not path.exists():
-                if own:
+                if view_slots:
                     raise StorageError(f"{path}: the journal lists proven frames of it, but the file is missing")
                 metadata = {**self._metadata, "title": view}
                 create(
@@ -145,7 +145,7 @@ class RunRecorder:
                     {**self._described, **collections},
                     packed=self._packed,
                 )
-            self._writer = ViewWriter(path, own)
+            self._writer = ViewWriter(path, view_slots)
 
     @property
     def _view(self) -> ViewWriter:
@@ -252,9 +252,11 @@ class RunRecorder:
                 return
         except StorageError:
             pass
-        others = [line for line in lines if not line.startswith(FRAME_LINE)]
+        other_lines = [line for line in lines if not line.startswith(FRAME_LINE)]
         with contextlib.suppress(StorageError):
-            on_disk(str(self._run.journal_path), lambda: append_lines(self._run.journal_path, others), stop=NOW)
+            on_disk(
+                str(self._run.journal_path), lambda: append_lines(self._run.journal_path, other_lines), stop=NOW
+            )
 
     def _commit_last(self, lines: list[str], shots: list[ShotId]) -> None:
         if self._committing is not None:

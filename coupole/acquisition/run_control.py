@@ -64,12 +64,12 @@ class RunControl:
         self.trouble = ""
 
     def __enter__(self) -> RunControl:
-        served = contextlib.ExitStack()
+        stack = contextlib.ExitStack()
         try:
-            served.enter_context(UserSocket(named_after(self._run, "sock"), self._answer))
+            stack.enter_context(UserSocket(named_after(self._run, "sock"), self._answer))
         except (OSError, InputError) as error:
             self.trouble = f"`coupole pause` and `coupole stop` will not reach this run: {reason(error)}"
-        self._served = served
+        self._served = stack
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -155,7 +155,7 @@ def _running() -> Iterator[State]:
 def _exchange(
     path: Path, command: Command, patience_s: float = PATIENCE_S, say: Callable[[str], object] = lambda _: None
 ) -> State:
-    found = exchange(path, {"version": VERSION, "command": command}, patience_s, say)
-    if "error" in found:
-        raise ValueError(found["error"])
-    return found
+    state = exchange(path, {"version": VERSION, "command": command}, patience_s, say)
+    if "error" in state:
+        raise ValueError(state["error"])
+    return state

@@ -33,7 +33,7 @@ def described_cell(job: Job) -> Collections:
 def _lens(job: Job) -> dict[str, Quantity]:
     rig = job.cell.rig
     flange_from_camera = rig.flange_from_camera.matrix()
-    found = {
+    quantities = {
         "focal_length": Quantity(rig.lens.focal_length_mm, "mm"),
         "f_number": Quantity(rig.lens.f_number),
         "focus_distance": Quantity(rig.lens.focus_distance_mm, "mm", "from the projection centre"),
@@ -43,12 +43,12 @@ def _lens(job: Job) -> dict[str, Quantity]:
     }
     records = [item for item in job.calibrations or () if item.record.kind == "camera"]
     if not records:
-        return {**found, **_nominal(rig)}
+        return {**quantities, **_nominal(rig)}
     from coupole.calibration.record import intrinsics_of
 
     intrinsics, _ = intrinsics_of(records[0].record)
     return {
-        **found,
+        **quantities,
         **_pinhole(vars(intrinsics)),
         "source": Quantity(f"calibration record {Path(records[0].path).name}, {records[0].record.sha256}"),
     }

@@ -17,8 +17,8 @@ def runtime_folder() -> Path:
     """The folder, made if it is missing. Raises InputError: another user owns it or may enter it; OSError."""
     folder = _BASE / f"coupole-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.stat(follow_symlinks=False)
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+    status = folder.stat(follow_symlinks=False)
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise InputError(f"{folder}: expected a folder of this user that nobody else may enter (mode 0700)")
     return folder
 

@@ -99,11 +99,15 @@ class Sequencer:
         CoupoleError."""
         schedule = self._job.schedule
         proven = self._recorder.proven()
-        left = {n: found for n, bursts in enumerate(schedule.bursts) if (found := bursts_left(bursts, proven))}
-        numbers = list(left)
+        remaining_bursts = {
+            n: view_bursts
+            for n, bursts in enumerate(schedule.bursts)
+            if (view_bursts := bursts_left(bursts, proven))
+        }
+        numbers = list(remaining_bursts)
         itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
         self._ahead_s = sum(
-            self._motion_s(itinerary.visits[index]) + sum(map(_expected_s, left[numbers[index]]))
+            self._motion_s(itinerary.visits[index]) + sum(map(_expected_s, remaining_bursts[numbers[index]]))
             for index in itinerary.order
         )
         start_ns = self._cell.clock.now_ns()
@@ -114,8 +118,11 @@ class Sequencer:
                     number, visit = numbers[index], itinerary.visits[index]
                     assert visit is not None
                     view = schedule.views[number]
-                    self._view_number, self._view_name = len(schedule.views) - len(left) + count, view.name
-                    self._acquire_view(view, visit, left[number], schedule.bursts[number])
+                    self._view_number, self._view_name = (
+                        len(schedule.views) - len(remaining_bursts) + count,
+                        view.name,
+                    )
+                    self._acquire_view(view, visit, remaining_bursts[number], schedule.bursts[number])
         except BaseException:
             self._cell.make_safe()
             raise
@@ -132,9 +139,9 @@ class Sequencer:
         self.outcome.dose_lux_h = self._dose.lux_h_in_all
         self.outcome.proven = sum(shot.is_shot for shot in done)
         bursts = (burst for bursts in self._job.schedule.bursts for burst in bursts)
-        expected = [shot for burst in bursts for shot in burst.shots if shot]
-        self.outcome.missing = [shot for shot in expected if shot.is_shot and shot not in done]
-        self.outcome.missing_darks = [shot for shot in expected if not shot.is_shot and shot not in done]
+        expected_shots = [shot for burst in bursts for shot in burst.shots if shot]
+        self.outcome.missing = [shot for shot in expected_shots if shot.is_shot and shot not in done]
+        self.outcome.missing_darks = [shot for shot in expected_shots if not shot.is_shot and shot not in done]
 
     def give_up(self, done: set[ShotId]) -> None:
         """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
@@ -154,7 +161,7 @@ class Sequencer:
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
         self._recorder.commit(now=True)  # what the arm is about to do is on the disk before it moves
         self._burst_runner.prepare(left[0])
-        settled = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
+        settled_pose = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
         self._ahead_s -= self._motion_s(visit)
         frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
         self._check_format(frame_format)
@@ -172,7 +179,7 @@ class Sequencer:
                 view.name, frames, frame_format, settled.arm, settled.base_from_camera, collections
             )
 
-        begin(settled)
+        begin(settled_pose)
         try:
             for index, burst in enumerate(left):
                 following = left[index + 1] if index + 1 < len(left) else None
@@ -222,13 +229,13 @@ class Sequencer:
                 if not self._arm.was_held(error) or self._control.stop.is_set():
                     raise
                 verdict = Verdict(NOTHING_TO_MATCH, [])  # what was cut short is no attempt
-            done = self._recorder.proven()
-            left = [shot for shot in todo.shots if shot and shot not in done]
-            if not left:
+            proven_shots = self._recorder.proven()
+            missing_shots = [shot for shot in todo.shots if shot and shot not in proven_shots]
+            if not missing_shots:
                 return
-            self._note_gap(burst, verdict, left)
+            self._note_gap(burst, verdict, missing_shots)
             self.outcome.bad |= set(verdict.dead)
-            todo = burst.only({shot.label for shot in left})
+            todo = burst.only({shot.label for shot in missing_shots})
 
     def _note_fault(self, kind: str, message: str) -> None:
         self._observer.note(message)
@@ -242,24 +249,24 @@ class Sequencer:
         return leg_s + self._job.cell.rig.motion.settle_dwell_s + SETTLE_CHECK_S
 
     def _note_gap(self, burst: Burst, verdict: Verdict, left: Sequence[ShotId]) -> None:
-        judged = verdict.match
-        missing = int(judged.missing.sum())
-        lost = int(judged.lost_in_transfer.sum())
+        frame_match = verdict.match
+        missing_frames = int(frame_match.missing.sum())
+        lost_frames = int(frame_match.lost_in_transfer.sum())
         self._recorder.note(
             GapFound(
                 view=burst.view,
                 shots=tuple(left),
-                missing=missing,
-                lost_in_transfer=lost,
-                surplus=int(judged.surplus.sum()),
+                missing=missing_frames,
+                lost_in_transfer=lost_frames,
+                surplus=int(frame_match.surplus.sum()),
                 dead_leds=tuple(verdict.dead),
-                reason=judged.reason,
+                reason=frame_match.reason,
             )
         )
-        why = [f"{lost} lost in transfer"] if lost else []
-        why += [f"{missing - lost} never exposed"] if missing > lost else []
+        why = [f"{lost_frames} lost in transfer"] if lost_frames else []
+        why += [f"{missing_frames - lost_frames} never exposed"] if missing_frames > lost_frames else []
         why += [f"{len(verdict.dead)} with an LED that draws no current"] if verdict.dead else []
-        why += [judged.reason] if judged.reason else []
+        why += [frame_match.reason] if frame_match.reason else []
         self._observer.note(f"{burst.view}: {len(left)} frames not proven ({'; '.join(why) or 'aborted'})")
 
     def _say_missing(self) -> str:
@@ -284,10 +291,10 @@ class Sequencer:
         control = self._control
         if not control.pause.is_set():
             return
-        held = control.stands
+        was_held = control.stands
         while control.halting.is_set():
             self._cell.clock.sleep(_PAUSE_NAP_S, _PAUSE_NAP_S)
-        if held:
+        if was_held:
             self._note_fault("Held", control.held_because)
             control.held.clear()
         self._recorder.note(Paused())
@@ -307,13 +314,13 @@ class Sequencer:
                 if control.held.is_set():  # again, while it stands
                     self._note_fault("Held", control.held_because)
                     control.held.clear()
-                    held = True
+                    was_held = True
                 with contextlib.suppress(Held):  # it is held already
                     self._arm.attend()
                 self._cell.clock.sleep(_PAUSE_NAP_S)
         finally:
             control.paused.clear()
-        if held:  # the box may have switched off by its watchdog, which it keeps as a fault
+        if was_held:  # the box may have switched off by its watchdog, which it keeps as a fault
             self._burst_runner.forget_upload()
             self._cell.ledbox.acknowledge()
         self._recorder.note(Continued())

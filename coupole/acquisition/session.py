@@ -82,15 +82,15 @@ def acquire_plan(
 
     A mesh of more than 100 MB is copied into the folder only `with_mesh`.
     """
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         run = Run(resume) if resume else None
         if run is not None:
-            held.callback(os.close, run.lock())
+            stack.callback(os.close, run.lock())
             run.refuse_old_journal()
             run.refuse_changes(job.inputs)
         job = without_hidden(job, run.hidden_leds if run else None)
         _acquire_into(
-            run, job, console, parent=parent, confirm=confirm, found=found, held=held, with_mesh=with_mesh
+            run, job, console, parent=parent, confirm=confirm, found=found, held=stack, with_mesh=with_mesh
         )
 
 
@@ -105,7 +105,7 @@ def _acquire_into(
     held: contextlib.ExitStack,
     with_mesh: bool,
 ) -> None:
-    resumed = run is not None
+    is_resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
     job, preflight = preflight_of(
         job,
@@ -137,15 +137,15 @@ def _acquire_into(
         on_disk(str(run.folder), partial(open_for_session, run))
         held.callback(conclude, run, console)  # when the devices are closed
         console.print(f"run {run.folder}")
-        packed = job.cell.rig.storage.pixels == "packed12"
+        is_packed = job.cell.rig.storage.pixels == "packed12"
         about = metadata_of_views(job, cell), described_cell(job)
-        recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, packed=packed))
+        recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, packed=is_packed))
         try:
-            begun = SessionResumed if resumed else SessionStarted
-            heard = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
-            said = begun(simulated=cell.simulated, room_c=room_c, acknowledged=heard)
-            known = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
-            recorder.note(said.model_copy(update=known))
+            event_class = SessionResumed if is_resumed else SessionStarted
+            acknowledgement = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
+            event = event_class(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledgement)
+            fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
+            recorder.note(event.model_copy(update=fields))
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
@@ -161,8 +161,8 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
     """
     boards = np.unique(job.cell.leds.boards)
     some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
-    known = [c for board in some if (c := cell.ledbox.board_temperature_c(int(board))) is not None]
-    room_c = min(known, default=None)
+    temperatures_c = [c for board in some if (c := cell.ledbox.board_temperature_c(int(board))) is not None]
+    room_c = min(temperatures_c, default=None)
     if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
         raise PreflightRefused(reasons)
     return room_c
@@ -239,7 +239,7 @@ def _acquire(
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
     sequencer = bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
-    ended: Literal["done", "interrupted", "failed"] = "failed"
+    outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
     remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
 
@@ -252,18 +252,18 @@ def _acquire(
         if remote.trouble:
             console.print(remote.trouble, markup=False)
         try:
-            with obeyed(keys) as read, observer.showing(job.schedule.frames, len(job.schedule.views)):
-                if read:
+            with obeyed(keys) as keys_read, observer.showing(job.schedule.frames, len(job.schedule.views)):
+                if keys_read:
                     console.print("keys: p pauses after the burst, and goes on; q stops")
                 try:
                     bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
                 finally:
                     cell.make_safe()
                 _refuse_unsafe_end(cell)
-                ended = "done"
+                outcome = "done"
         except BaseException as error:
             failure = control.interrupted() if control.stop.is_set() else error
-            ended = "interrupted" if isinstance(failure, Interrupted) else "failed"
+            outcome = "interrupted" if isinstance(failure, Interrupted) else "failed"
             if isinstance(failure, Interrupted):
                 note_what_hangs(error, cell, run, recorder)
                 raise failure from error
@@ -276,11 +276,11 @@ def _acquire(
                 alarm(trouble)
             tell_changes(job.cell.files, recorder, console)
             note_unread(recorder)
-            recorder.note(SessionStopped(outcome=ended, reason=str(failure or ""), robot=statistics(cell)))
+            recorder.note(SessionStopped(outcome=outcome, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
             (sequencer.give_up if left_behind() else sequencer.conclude)(recorder.committed)
             found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
-            _say_outcome(console, run, sequencer.outcome, ended)
+            _say_outcome(console, run, sequencer.outcome, outcome)
             _say_what_comes_first(job, faults)
 
 
@@ -376,12 +376,12 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
                     "exposure_scale": preflight.exposure_scale,
                     "exposure": {
                         view: {
-                            "pictures": seen.pictures,
-                            "brightest": round(seen.brightest, 4) if preflight.exposure_scale else None,
-                            "saturated": round(seen.saturated, 6) if preflight.exposure_scale else None,
-                            "verdict": seen.verdict() if preflight.exposure_scale else "not known",
+                            "pictures": exposure.pictures,
+                            "brightest": round(exposure.brightest, 4) if preflight.exposure_scale else None,
+                            "saturated": round(exposure.saturated, 6) if preflight.exposure_scale else None,
+                            "verdict": exposure.verdict() if preflight.exposure_scale else "not known",
                         }
-                        for view, seen in recorder.exposures.items()
+                        for view, exposure in recorder.exposures.items()
                     },
                 }
             )

@@ -48,11 +48,11 @@ def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: 
 
 def note_faults_of_the_arm(failure: BaseException | None, cell: OpenedCell, run: Run, faults: ArmFaults) -> None:
     """They stay with the cell until a person confirms that the arm may move again."""
-    found = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
-    if not found and not cell.arm_confirmed:
-        found = "; ".join(cell.trouble)
-    if found:
+    fault = str(failure) if isinstance(failure, DeviceError) and failure.device == "robot" else ""
+    if not fault and not cell.arm_confirmed:
+        fault = "; ".join(cell.trouble)
+    if fault:
         try:
-            on_disk(faults.where, partial(faults.note, found, run.folder.name), stop=NOW)
+            on_disk(faults.where, partial(faults.note, fault, run.folder.name), stop=NOW)
         except StorageError as error:
             cell.trouble.append(f"the arm's fault could not be recorded: {error}")

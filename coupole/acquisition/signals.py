@@ -77,15 +77,15 @@ def unheard_end() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    ours, pythons = os.pipe()
-    os.set_blocking(pythons, False)
-    before = signal.set_wakeup_fd(pythons, warn_on_full_buffer=False)
-    threading.Thread(target=_end_unheard, args=(ours,), name="unheard signals", daemon=True).start()
+    read_fd, write_fd = os.pipe()
+    os.set_blocking(write_fd, False)
+    before = signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
+    threading.Thread(target=_end_unheard, args=(read_fd,), name="unheard signals", daemon=True).start()
     try:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        os.close(pythons)
+        os.close(write_fd)
 
 
 def _end_unheard(ours: int) -> None:
@@ -95,7 +95,7 @@ def _end_unheard(ours: int) -> None:
             if not (numbers := os.read(ours, 64)):
                 os.close(ours)
                 return
-            if since_s == math.inf and (ending := [one for one in numbers if one in ENDING]):
+            if since_s == math.inf and (ending := [signum for signum in numbers if signum in ENDING]):
                 number, since_s = ending[0], time.monotonic()
         if _heard_s[-1] > since_s - ASKS_FROM_S:  # the handler may have been faster than this thread
             heard_s, since_s = min(heard_s, since_s), math.inf
@@ -123,11 +123,11 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    ours, pythons = os.pipe()
-    os.set_blocking(pythons, False)
+    read_fd, write_fd = os.pipe()
+    os.set_blocking(write_fd, False)
 
-    thread = threading.Thread(target=_obey, args=(ours, control, act), name="signals", daemon=True)
-    before = signal.set_wakeup_fd(pythons, warn_on_full_buffer=False)
+    thread = threading.Thread(target=_obey, args=(read_fd, control, act), name="signals", daemon=True)
+    before = signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
     thread.start()
     try:
         with _handlers(
@@ -138,15 +138,15 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
             yield
     finally:
         signal.set_wakeup_fd(before)
-        os.close(pythons)
+        os.close(write_fd)
         thread.join()
-        os.close(ours)
+        os.close(read_fd)
         control.pulse_s = math.inf
 
 
 def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
     """Obey the signals whose numbers come through a pipe, until it is closed; and prove that the process runs."""
-    acted, stood_s, noticed_s = False, 0.0, 0.0
+    has_acted, stood_s, noticed_s = False, 0.0, 0.0
     slept_s = _slept_s()
     control.pulse_s = time.monotonic()
     while True:
@@ -164,8 +164,8 @@ def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
         if not (numbers := os.read(ours, 64)):
             return
         for number in numbers:
-            if number in ENDING and not acted:  # whether or not the main thread's handler was first
-                acted = True
+            if number in ENDING and not has_acted:  # whether or not the main thread's handler was first
+                has_acted = True
                 control.stop_by(number)
                 act()
             elif number == signal.SIGTSTP:
@@ -185,8 +185,12 @@ def _hold(control: Control, act: Callable[[], object], why: str) -> None:
     control.halting.set()
     try:
         control.hold(why)
-        begun = act()
-        safeguards = [one for one in begun if isinstance(one, Safeguard)] if isinstance(begun, list) else []
+        answer = act()
+        safeguards = (
+            [safeguard for safeguard in answer if isinstance(safeguard, Safeguard)]
+            if isinstance(answer, list)
+            else []
+        )
         control.unsure = unsure(safeguards, _SAFE_WITHIN_S)
     finally:
         control.halting.clear()

@@ -62,13 +62,13 @@ class SingleShots:
     def take(self, led: int, exposure_us: int, gain_db: float = 0.0, panel: int = 0) -> Shot:
         """A picture under an LED (NO_LED: none) or a panel (0: none), not both. Raises DeviceError, and
         DoseBudgetReached or StorageError before the light is given."""
-        opened, timing = self._opened, self._timing(exposure_us)
-        self._arm(Exposure(exposure_us, gain_db, opened.ledbox.runs_tables))
+        opened_cell, timing = self._opened, self._timing(exposure_us)
+        self._arm(Exposure(exposure_us, gain_db, opened_cell.ledbox.runs_tables))
         cooling_us = int(timing.on_us * (1.0 + self._rig.led_limits.cooldown_ratio)) if not panel else 0
         period_us = max(timing.period_us, cooling_us, int(self._every_s * 1e6) if not panel else 0)
         self._period_s = period_us * 1e-6
-        self._rest_until_ns = opened.clock.now_ns() + period_us * 1000
-        fire = self._by_cable if opened.ledbox.runs_tables else self._by_host
+        self._rest_until_ns = opened_cell.clock.now_ns() + period_us * 1000
+        fire = self._by_cable if opened_cell.ledbox.runs_tables else self._by_host
         if panel:
             frame = self._under_panel(panel, lambda: fire(NO_LED, timing, period_us), timing)
         else:
@@ -96,8 +96,8 @@ class SingleShots:
             return
         camera = self._opened.camera
         self.disarm()
-        made = camera.configure(exposure)
-        self._coding = Coding(made.bayer_pattern, made.black_dn, made.white_dn)
+        frame_format = camera.configure(exposure)
+        self._coding = Coding(frame_format.bayer_pattern, frame_format.black_dn, frame_format.white_dn)
         camera.arm(_BUFFERS)
         self._armed_for = exposure
 
@@ -127,10 +127,10 @@ class SingleShots:
         """The picture while a panel is on, whose light is counted from command to confirmation."""
         box, clock = self._opened.ledbox, self._opened.clock
         points, lux = len(self._lux), self._rig.dome.panel_lux
-        expected = np.full(points, lux * (timing.on_us * 1e-6 + _PANEL_OVERHEAD_S) / 3600.0)
+        expected_lux_h = np.full(points, lux * (timing.on_us * 1e-6 + _PANEL_OVERHEAD_S) / 3600.0)
         if self._meter is not None:
-            at_most = expected + lux * watchdog_s(self._rig) / 3600.0
-            self._meter.begin(expected, at_most, self._cell.panel_damage_w_per_lm)
+            at_most = expected_lux_h + lux * watchdog_s(self._rig) / 3600.0
+            self._meter.begin(expected_lux_h, at_most, self._cell.panel_damage_w_per_lm)
         since_ns = clock.now_ns()
         try:
             box.panel(panel, True)
@@ -140,10 +140,10 @@ class SingleShots:
             return frame
         finally:
             box.panel(panel, False)
-            given = np.full(points, lux * (clock.now_ns() - since_ns) / 3.6e12)
+            given_lux_h = np.full(points, lux * (clock.now_ns() - since_ns) / 3.6e12)
             if self._meter is not None:
-                self._meter.add(given - expected)
-            self.given_lux_h = self.given_lux_h + given
+                self._meter.add(given_lux_h - expected_lux_h)
+            self.given_lux_h = self.given_lux_h + given_lux_h
 
     def _by_cable(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
         """The box lights the LED and triggers the camera."""
@@ -156,12 +156,12 @@ class SingleShots:
 
     def _by_host(self, led: int, timing: BurstTiming, period_us: int) -> Frame:
         """The box switches the LED on command, and the host triggers the camera."""
-        opened = self._opened
-        opened.ledbox.flash(led, timing.on_us)
-        opened.clock.sleep(timing.trigger_delay_us * 1e-6)
-        opened.camera.trigger()
+        opened_cell = self._opened
+        opened_cell.ledbox.flash(led, timing.on_us)
+        opened_cell.clock.sleep(timing.trigger_delay_us * 1e-6)
+        opened_cell.camera.trigger()
         frame = self._frame(timing, "Check the camera.")
-        over_us = opened.ledbox.end_flash().on_us - timing.on_us
+        over_us = opened_cell.ledbox.end_flash().on_us - timing.on_us
         if self._meter is not None and led != NO_LED and over_us > 0:
             self._meter.add(self._lux[:, self._row_of_led[led]] * over_us / 3.6e9)
         return frame

@@ -40,14 +40,14 @@ class UserSocket:
         self.path, self._answer = path, answer
 
     def __enter__(self) -> UserSocket:
-        hidden = self.path.with_suffix(".new")
-        hidden.unlink(missing_ok=True)
+        hidden_path = self.path.with_suffix(".new")
+        hidden_path.unlink(missing_ok=True)
         self._socket = socket.socket(socket.AF_UNIX)
         try:
-            self._socket.bind(str(hidden))
-            hidden.chmod(0o600)
+            self._socket.bind(str(hidden_path))
+            hidden_path.chmod(0o600)
             self._socket.listen(16)
-            hidden.replace(self.path)
+            hidden_path.replace(self.path)
         except BaseException:
             self._socket.close()
             raise
@@ -100,7 +100,7 @@ def _hung_up(connection: socket.socket) -> bool:
     """Tell whether the other end is closed; one that only sends nothing more is not."""
     poll = select.poll()
     poll.register(connection, 0)
-    return any(what & (select.POLLHUP | select.POLLERR) for _, what in poll.poll(0))
+    return any(events & (select.POLLHUP | select.POLLERR) for _, events in poll.poll(0))
 
 
 def exchange(
@@ -124,10 +124,10 @@ def exchange(
         except TimeoutError as error:
             raise TimeoutError(_silence(_peer(connection)[0], patience_s)) from error
     try:
-        found: dict[str, Any] = json_of(answer, str(path), allow_nan=True)
+        fields: dict[str, Any] = json_of(answer, str(path), allow_nan=True)
     except InputError as error:
         raise ValueError(str(error)) from error
-    return found
+    return fields
 
 
 @contextmanager
@@ -154,7 +154,7 @@ def _silence(pid: int, patience_s: float) -> str:
 
 
 def _line(connection: socket.socket, longest_bytes: int) -> bytes:
-    found = bytearray()
-    while b"\n" not in found and len(found) < longest_bytes and (more := connection.recv(65536)):
-        found += more
-    return bytes(found)
+    line = bytearray()
+    while b"\n" not in line and len(line) < longest_bytes and (more := connection.recv(65536)):
+        line += more
+    return bytes(line)

@@ -33,17 +33,17 @@ class Archived:
 
     def figures(self) -> dict[str, Any]:
         """Content of `--json`: sizes in bytes, speeds in MB/s of uncompressed frames."""
-        pixels, stored = sum(v.pixel_bytes for v in self.views), sum(v.stored_bytes for v in self.views)
+        pixel_bytes, stored_bytes = sum(v.pixel_bytes for v in self.views), sum(v.stored_bytes for v in self.views)
         seconds = sum((v.compress_s + v.read_back_s for v in self.views), 0.0)
         return {
             "views": [view.figures() for view in self.views],
             "already": self.already,
             "incomplete": self.incomplete,
             "frames": sum(v.frames for v in self.views),
-            "bytes": pixels,
-            "stored_bytes": stored,
-            "ratio": round(pixels / stored, 4) if stored else None,
-            "mb_s": round(pixels / seconds / 1e6, 1) if seconds else None,
+            "bytes": pixel_bytes,
+            "stored_bytes": stored_bytes,
+            "ratio": round(pixel_bytes / stored_bytes, 4) if stored_bytes else None,
+            "mb_s": round(pixel_bytes / seconds / 1e6, 1) if seconds else None,
             "duration_s": round(seconds, 3),
             "freed_bytes": sum(v.freed_bytes for v in self.views),
         }
@@ -83,11 +83,13 @@ def archive_run(
             if frame_file.read_layout(path).archived:
                 result.already.append(view)
                 continue
-            name, kept = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"
+            name, kept_name = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"
             manifest.forget(run.folder, [name])
             frames = [frame for frame in proven.values() if run.folder / frame.file == path]
-            done = archive_view(path, frames, codec, progress, keep_in=run.folder / KEPT_FOLDER if keep else None)
-            manifest.enter(run.folder, [name, kept] if keep else [name])
-            result.views.append(done)
-            on_view(done)
+            archived_view = archive_view(
+                path, frames, codec, progress, keep_in=run.folder / KEPT_FOLDER if keep else None
+            )
+            manifest.enter(run.folder, [name, kept_name] if keep else [name])
+            result.views.append(archived_view)
+            on_view(archived_view)
     return result

@@ -165,11 +165,11 @@ def _write(path: Path, partial: Path, frames: list[FrameProven], codec: Codec, p
                 return list(bitshuffle.compressed_tiles(pixels, tile, codec))
 
         compressed_frames = _in_order(pool, compress, frames, ahead=2 * workers)
-        for done, (frame, tiles) in enumerate(compressed_frames, start=1):
-            _reserve(on_disk.fileno(), after, sum(len(compressed) for _, compressed in tiles))
-            for (top, left), compressed in tiles:
-                data.id.write_direct_chunk((frame.index, top, left), compressed)
-            progress(f"{path.stem}: compress", done, len(frames))
+        for count, (frame, tiles) in enumerate(compressed_frames, start=1):
+            _reserve(on_disk.fileno(), after, sum(len(tile_bytes) for _, tile_bytes in tiles))
+            for (row, column), tile_bytes in tiles:
+                data.id.write_direct_chunk((frame.index, row, column), tile_bytes)
+            progress(f"{path.stem}: compress", count, len(frames))
         stored_bytes = int(data.id.get_storage_size())
         after.flush()
         size = after.id.get_filesize()
@@ -233,10 +233,10 @@ def _in_order(
     for frame in frames:
         pending.append((frame, pool.submit(work, frame)))
         if len(pending) > ahead:
-            first, made = pending.popleft()
-            yield first, made.result()
-    for first, made in pending:
-        yield first, made.result()
+            first, future = pending.popleft()
+            yield first, future.result()
+    for first, future in pending:
+        yield first, future.result()
 
 
 class _Source:
@@ -257,9 +257,9 @@ class _Source:
         memory = self._spare.get()
         try:
             offset = self._layout.data_offset + frame.index * self._layout.frame_bytes
-            read = os.preadv(self._fd, [memory], offset)
+            read_bytes = os.preadv(self._fd, [memory], offset)
             pixels = frame_file.pixels_of(memory, self._layout)
-            if read != self._layout.frame_bytes or f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
+            if read_bytes != self._layout.frame_bytes or f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
                 raise ChecksumMismatch(
                     f"{self._path}: {frame.shot} is not what was proven. `coupole verify` lists all that is "
                     "wrong; nothing was changed."
@@ -294,17 +294,17 @@ def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: P
     with partial.open("rb") as on_disk:
         os.posix_fadvise(on_disk.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
     with h5py.File(path, "r") as before, h5py.File(partial, "r") as after:
-        kept = [frame.index for frame in frames]
-        same = before[frame_file.FRAMES][:][kept].tobytes() == after[frame_file.FRAMES][:][kept].tobytes()
+        slots = [frame.index for frame in frames]
+        same = before[frame_file.FRAMES][:][slots].tobytes() == after[frame_file.FRAMES][:][slots].tobytes()
         if not same or before[frame_file.POSES][:].tobytes() != after[frame_file.POSES][:].tobytes():
             raise _not_the_same(path, "a table")
         data = after[frame_file.DATA]
         pixels = np.empty(data.shape[1:], data.dtype)
-        for done, frame in enumerate(frames, start=1):
+        for count, frame in enumerate(frames, start=1):
             data.read_direct(pixels, np.s_[frame.index])
             if f"{frame_file.checksum(pixels):016x}" != frame.xxh3:
                 raise _not_the_same(path, str(frame.shot))
-            progress(f"{path.stem}: read back", done, len(frames))
+            progress(f"{path.stem}: read back", count, len(frames))
 
 
 def _not_the_same(path: Path, what: str) -> ChecksumMismatch:
@@ -317,10 +317,10 @@ def _not_the_same(path: Path, what: str) -> ChecksumMismatch:
 def _replace(path: Path, partial: Path, keep_in: Path | None) -> None:
     if keep_in is not None:
         keep_in.mkdir(exist_ok=True)
-        kept = keep_in / path.name
-        linked = kept.exists() and kept.samefile(path)  # by an interrupted call
-        if not linked:
-            os.link(path, kept)
+        kept_path = keep_in / path.name
+        is_linked = kept_path.exists() and kept_path.samefile(path)  # by an interrupted call
+        if not is_linked:
+            os.link(path, kept_path)
         sync_folder(keep_in)
         sync_folder(keep_in.parent)
     partial.rename(path)

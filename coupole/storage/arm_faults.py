@@ -75,15 +75,19 @@ class ArmFaults:
     def standing(self) -> list[ArmFault]:
         """Faults that nobody has confirmed yet, oldest first. A line that cannot be read counts as one."""
         files = [_lines(path) for path in self._paths]
-        confirmed = {
-            one for lines in files for line in lines if isinstance(line, Confirmation) for one in line.faults
+        confirmed_ids = {
+            fault_id
+            for lines in files
+            for line in lines
+            if isinstance(line, Confirmation)
+            for fault_id in line.faults
         }
-        found: dict[tuple[str, str], ArmFault] = {}
+        faults: dict[tuple[str, str], ArmFault] = {}
         for lines in files:
             for fault in _unconfirmed(lines):
-                if not fault.id or fault.id not in confirmed:
-                    found.setdefault((fault.t, fault.id or fault.message), fault)
-        return sorted(found.values(), key=lambda fault: fault.t)
+                if not fault.id or fault.id not in confirmed_ids:
+                    faults.setdefault((fault.t, fault.id or fault.message), fault)
+        return sorted(faults.values(), key=lambda fault: fault.t)
 
     def refuse(self, rig: Path) -> None:
         """Raise DeviceFault if a fault stands. `rig` is the file that the message names."""
@@ -102,14 +106,14 @@ class ArmFaults:
 
     def confirm(self, name: str, note: str = "") -> None:
         """Confirm all faults that stand."""
-        known = tuple(fault.id for fault in self.standing() if fault.id)
-        self._append(Confirmation(name=name, note=note, faults=known))
+        fault_ids = tuple(fault.id for fault in self.standing() if fault.id)
+        self._append(Confirmation(name=name, note=note, faults=fault_ids))
 
     def begin_session(self, run: str) -> str:
         """A session of this run begins; returns the words that no earlier session has begun with, empty if there
         are none."""
         files = [_lines(path) for path in self._paths]
-        words = next((found for lines in files if (found := _new_words(lines)) is not None), None)
+        words = next((confirmation for lines in files if (confirmation := _new_words(lines)) is not None), None)
         if words is None:
             return ""
         self._append(SessionOfArm(run=run))
@@ -131,13 +135,13 @@ def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
 
 def _unconfirmed(lines: list[Line]) -> list[ArmFault]:
     """Faults after the last confirmation in the same file."""
-    found: list[ArmFault] = []
+    faults: list[ArmFault] = []
     for line in lines:
         if isinstance(line, ArmFault):
-            found.append(line)
+            faults.append(line)
         elif isinstance(line, Confirmation):
-            found.clear()
-    return found
+            faults.clear()
+    return faults
 
 
 def _new_words(lines: list[Line]) -> Confirmation | None:

@@ -48,14 +48,17 @@ class AsPlanned:
 
     def problems_of_the_list(self, run: Run) -> Iterator[str]:
         """Shots under a light that are in `run.json` but not in the plan, and the other way round."""
-        planned = {
+        planned_shots = {
             ShotId(view.name, label)
             for view, labels in zip(self.schedule.views, self.schedule.labels, strict=True)
             for label in labels
             if label.is_shot and getattr(label.light, "id", None) not in run.hidden_leds.get(view.name, ())
         }
-        listed = {shot for shot in run.expected_shots() if shot.is_shot}
-        for shots, have, lack in ((listed - planned, "run.json", "plan"), (planned - listed, "plan", "run.json")):
+        listed_shots = {shot for shot in run.expected_shots() if shot.is_shot}
+        for shots, have, lack in (
+            (listed_shots - planned_shots, "run.json", "plan"),
+            (planned_shots - listed_shots, "plan", "run.json"),
+        ):
             if shots:
                 first = min(map(str, shots))
                 yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
@@ -63,13 +66,13 @@ class AsPlanned:
     def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
         """Say how a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do
         not."""
-        asked = self._asked(shot.view).get(shot.label)
-        if asked is None:
+        planned_light = self._asked(shot.view).get(shot.label)
+        if planned_light is None:
             return f"{shot}: the run's plan has no such shot" if shot.is_shot else ""
-        led, exposure_us = asked
+        led, exposure_us = planned_light
         if int(record["exposure_us"]) != exposure_us:
-            found = int(record["exposure_us"])
-            return f"{shot}: exposed for {found} us, where the run's plan has {exposure_us} us"
+            recorded_us = int(record["exposure_us"])
+            return f"{shot}: exposed for {recorded_us} us, where the run's plan has {exposure_us} us"
         if int(record["led"]) != led:
             return f"{shot}: lit by {_words(int(record['led']))}, where the run's plan has {_words(led)}"
         return f"{shot}: {off}" if (off := self._off(shot.view, pose["joints_deg"].tobytes())) else ""
@@ -77,31 +80,31 @@ class AsPlanned:
     @lru_cache(maxsize=1)  # noqa: B019  an object of one `verify`
     def _asked(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
         """LED and exposure, us, of each frame of a view."""
-        found: dict[ShotLabel, tuple[int, int]] = {}
+        light_of_label: dict[ShotLabel, tuple[int, int]] = {}
         for pose, bursts in zip(self.schedule.views, self.schedule.bursts, strict=True):
             for burst in bursts if pose.name == view else ():
                 for label, led in zip(burst.labels, burst.table["led"], strict=True):
                     if label is not None:
-                        stored = STORED_NO_LED if led == NO_LED else int(led)
-                        found[label] = (stored, burst.timing.exposure_us)
-        return found
+                        led_number = STORED_NO_LED if led == NO_LED else int(led)
+                        light_of_label[label] = (led_number, burst.timing.exposure_us)
+        return light_of_label
 
     @lru_cache(maxsize=16)  # noqa: B019
     def _off(self, view: str, joints: bytes) -> str:
         """Say how far the arm was from a view; empty if it was there."""
         joints_deg = np.frombuffer(joints)
-        planned = next(pose for pose in self.schedule.views if pose.name == view)
+        planned_pose = next(pose for pose in self.schedule.views if pose.name == view)
         allowed_deg = _SETTLED_DEG + self.rig.motion.still_deg
-        if planned.joints_deg is not None:
-            off_deg = float(np.abs(joints_deg - planned.joints_deg).max())
+        if planned_pose.joints_deg is not None:
+            off_deg = float(np.abs(joints_deg - planned_pose.joints_deg).max())
             return f"an axis was {off_deg:.2f} deg from the plan's posture" if off_deg > allowed_deg else ""
-        if self.arm is None or planned.support_from_camera is None:
+        if self.arm is None or planned_pose.support_from_camera is None:
             return ""
         support_from_base = inverse(self.rig.support.base_from_support.matrix())
         flange_from_camera = self.rig.flange_from_camera.matrix()
-        found = support_from_base @ forward(self.arm, joints_deg) @ flange_from_camera
-        off_mm = float(np.linalg.norm(found[:3, 3] - planned.support_from_camera[:3, 3]))
-        off_deg = rotation_angle_deg(found, planned.support_from_camera)
+        support_from_camera = support_from_base @ forward(self.arm, joints_deg) @ flange_from_camera
+        off_mm = float(np.linalg.norm(support_from_camera[:3, 3] - planned_pose.support_from_camera[:3, 3]))
+        off_deg = rotation_angle_deg(support_from_camera, planned_pose.support_from_camera)
         if off_mm <= math.radians(allowed_deg) * _REACH_MM and off_deg <= 3 * allowed_deg:
             return ""
         return f"the camera was {off_mm:.1f} mm and {off_deg:.2f} deg from where the run's plan has it"
@@ -116,7 +119,7 @@ def as_planned(run: Run) -> AsPlanned:
     document = yamlfile.read(run.rig_path, files)
     rig = document.validate(Rig)
     leds = read_led_table(document.resolve(rig.dome.leds), files)
-    described, _ = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)
+    description, _ = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)
     schedule = build_schedule(
         plan,
         leds,
@@ -125,7 +128,7 @@ def as_planned(run: Run) -> AsPlanned:
         readout_us=1e6 / rig.sensor.max_frames_per_s,
         exposure_gap_us=rig.sensor.exposure_gap_us,
     )
-    return AsPlanned(rig, schedule, described.arm if described else None)
+    return AsPlanned(rig, schedule, description.arm if description else None)
 
 
 def _words(led: int) -> str:

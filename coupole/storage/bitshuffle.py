@@ -74,13 +74,13 @@ def compressed_tiles(
     rows, columns = tile
     block = np.full(tile, FILL_DN, np.dtype("<u2"))
     out = np.empty(12 + _bound(block.size, codec), np.uint8)
-    for top in range(0, pixels.shape[0], rows):
-        for left in range(0, pixels.shape[1], columns):
-            part = pixels[top : top + rows, left : left + columns]
+    for row in range(0, pixels.shape[0], rows):
+        for column in range(0, pixels.shape[1], columns):
+            part = pixels[row : row + rows, column : column + columns]
             if part.shape != tile:
                 block[:] = FILL_DN
             block[: part.shape[0], : part.shape[1]] = part
-            yield (top, left), _compress(block, out, codec)
+            yield (row, column), _compress(block, out, codec)
 
 
 def _compress(block: NDArray[np.uint16], out: NDArray[np.uint8], codec: Codec) -> bytes:

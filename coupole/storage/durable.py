@@ -27,10 +27,10 @@ def sync_folder(folder: Path) -> None:
 
 def make_folder(folder: Path) -> None:
     """Make a folder and its parents; their names are on the disk afterwards."""
-    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    for one in reversed(missing):
-        sync_folder(one.parent)
+    for path in reversed(missing):
+        sync_folder(path.parent)
 
 
 def write_synced(path: Path, content: str | bytes) -> None:

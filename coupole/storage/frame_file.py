@@ -114,7 +114,7 @@ def read_layout(path: Path) -> Layout:
     with opened(path) as file:
         inode = os.fstat(file.id.get_vfd_handle()).st_ino
         data, frames, poses = file[DATA], file[FRAMES], file[POSES]
-        packed = data.dtype == np.uint8
+        is_packed = data.dtype == np.uint8
         slots, height_px, columns = data.shape
         if data.dtype not in (np.uint8, np.uint16) or frames.dtype != FRAME_DTYPE or poses.dtype != POSE_DTYPE:
             raise ValueError("pixels or tables have another type")
@@ -123,12 +123,12 @@ def read_layout(path: Path) -> Layout:
         return Layout(
             slots,
             height_px,
-            columns * 2 // 3 if packed else columns,
+            columns * 2 // 3 if is_packed else columns,
             data.id.get_offset() or 0,
             frames.id.get_offset(),
             poses.id.get_offset(),
             archived=data.chunks is not None,
-            packed=packed,
+            packed=is_packed,
             inode=inode,
         )
 
@@ -137,14 +137,14 @@ def read_facts(path: Path) -> dict[str, Any]:
     """`pattern`, `black_dn` and `white_dn` of a view's frames. Raises StorageError."""
     with opened(path) as file:
         detector = file["entry/instrument/detector"]
-        found = {
+        facts = {
             "pattern": detector["bayer_pattern"][()].decode("ascii"),
             "black_dn": int(detector["black_level"][()]),
             "white_dn": int(detector["saturation_value"][()]),
         }
-        if found["pattern"] not in PATTERNS or not 0 <= found["black_dn"] < found["white_dn"] <= 65535:
-            raise ValueError(f"impossible levels or colours: {found}")
-        return found
+        if facts["pattern"] not in PATTERNS or not 0 <= facts["black_dn"] < facts["white_dn"] <= 65535:
+            raise ValueError(f"impossible levels or colours: {facts}")
+        return facts
 
 
 def read_poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
@@ -175,10 +175,10 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
     with path.open("rb") as file:
         if os.fstat(file.fileno()).st_ino == layout.inode:
             file.seek(layout.data_offset + slot * layout.frame_bytes)
-            stored = file.read(layout.frame_bytes)
-            if len(stored) != layout.frame_bytes:
+            frame_bytes = file.read(layout.frame_bytes)
+            if len(frame_bytes) != layout.frame_bytes:
                 raise StorageError(f"{path}: ends within slot {slot}")
-            return pixels_of(stored, layout)
+            return pixels_of(frame_bytes, layout)
     return read_frame(path, read_layout(path), slot)
 
 

@@ -127,8 +127,8 @@ def _describe(
     poses.attrs.update(_POSES_ATTRIBUTES)
     sample = _group(entry, "sample", "NXsample")
     sample["name"] = metadata["sample"]
-    shown = _group(entry, "data", "NXdata", signal="data")
-    shown["data"] = h5py.SoftLink(f"/{DATA}")
+    default_plot = _group(entry, "data", "NXdata", signal="data")
+    default_plot["data"] = h5py.SoftLink(f"/{DATA}")
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h5py.Group:
@@ -140,10 +140,10 @@ def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h
 
 
 def _store(group: h5py.Group, name: str, value: Quantity | NDArray[np.generic]) -> None:
-    given = value if isinstance(value, Quantity) else Quantity(value)
-    group[name] = given.values
+    quantity = value if isinstance(value, Quantity) else Quantity(value)
+    group[name] = quantity.values
     for key in ("units", "frame"):
-        if text := getattr(given, key):
+        if text := getattr(quantity, key):
             group[name].attrs[key] = text
 
 

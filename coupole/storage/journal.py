@@ -101,14 +101,14 @@ def tail(path: Path, most_bytes: int) -> list[Event]:
     """The events in the last `most_bytes` of a journal; none if there is no journal."""
     try:
         with path.open("rb") as file:
-            begun = max(0, path.stat().st_size - most_bytes)
-            file.seek(begun)
+            offset = max(0, path.stat().st_size - most_bytes)
+            file.seek(offset)
             lines = file.read(most_bytes).splitlines()
     except FileNotFoundError:
         return []
     except OSError as error:
         raise StorageError(f"{path}: cannot read the journal: {error.strerror}") from error
-    return list(_events(path, lines[1:] if begun else lines))
+    return list(_events(path, lines[1:] if offset else lines))
 
 
 class Follower:
@@ -150,10 +150,11 @@ def _events(path: Path, lines: Iterable[bytes]) -> Iterator[Event]:
         try:
             event = _EVENT.validate_python(_of_today(fields))
         except ValidationError as error:
-            what = error.errors()[0]
+            problem = error.errors()[0]
             raise StorageError(
                 f"{path}: line {number} is not an event of a journal that this version knows "
-                f"({'.'.join(map(str, what['loc']))}: {what['msg']}). Was it changed, or is it of a later version?"
+                f"({'.'.join(map(str, problem['loc']))}: {problem['msg']}). Was it changed, or is it of a later "
+                "version?"
             ) from error
         if isinstance(event, JournalBegun) and event.version > JOURNAL_VERSION:
             raise StorageError(

@@ -93,7 +93,7 @@ class Ledger:
                 asked.refuse_beyond(self.object_id, history)
                 if asked.budget_lux_h is not None and history.budget_lux_h is None:
                     lines.insert(0, asked.as_the_objects())
-            file.append([one.model_dump_json() + "\n" for one in lines])
+            file.append([new_line.model_dump_json() + "\n" for new_line in lines])
         return line.id
 
     def ask_again(self, asked: Asked, plan_id: str) -> None:
@@ -137,8 +137,8 @@ class Ledger:
         """Lines of the former place that are not in the present one too."""
         if self._former_folder is None:
             return []
-        known = set(texts)
-        return [text for text in read_lines(self._former_folder / self.path.name) if text not in known]
+        known_texts = set(texts)
+        return [text for text in read_lines(self._former_folder / self.path.name) if text not in known_texts]
 
     def _append(self, line: Line) -> None:
         with self._locked() as file:
@@ -193,10 +193,10 @@ def ledger_of(cell: Cell, object_id: str, *, only_grows: bool = False) -> Ledger
 def similar_ids(folder: Path, object_id: str) -> list[str]:
     """Ids of other objects in a folder of ledgers that differ only in case, blanks, dots, hyphens, underscores."""
     try:
-        others = sorted(path.stem for path in folder.glob("*.jsonl"))
+        ids = sorted(path.stem for path in folder.glob("*.jsonl"))
     except OSError as error:
         raise StorageError(f"{folder}: cannot read the dose ledgers: {error.strerror}") from error
-    return [other for other in others if other != object_id and _plain(other) == _plain(object_id)]
+    return [listed_id for listed_id in ids if listed_id != object_id and _plain(listed_id) == _plain(object_id)]
 
 
 def _plain(object_id: str) -> str:
@@ -210,8 +210,8 @@ def _did_you_mean(ids: list[str]) -> str:
 def _sync_folders(folders: list[Path]) -> None:
     """Sync the folders' entries, so that a new file is still there after a power cut."""
     for folder in folders:
-        opened = os.open(folder, os.O_RDONLY)
+        fd = os.open(folder, os.O_RDONLY)
         try:
-            os.fsync(opened)
+            os.fsync(fd)
         finally:
-            os.close(opened)
+            os.close(fd)

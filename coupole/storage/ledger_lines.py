@@ -117,8 +117,10 @@ class History:
     def allowed_lux_h(self, plans_lux_h: float | None) -> float | None:
         """Return the light that the object may receive in its life: the smaller of its budget and a plan's; None
         without both."""
-        known = [one for one in (self.budget_lux_h, plans_lux_h) if one is not None]
-        return min(known, default=None)
+        budgets_lux_h = [
+            budget_lux_h for budget_lux_h in (self.budget_lux_h, plans_lux_h) if budget_lux_h is not None
+        ]
+        return min(budgets_lux_h, default=None)
 
     @property
     def damage_wh_m2(self) -> float:
@@ -241,13 +243,13 @@ class Reading:
         file.seek(begin)
         if file.read(len(self._tail)) != self._tail:
             self._refuse_loss(path, "lost lines, or is another file,")
-            found = Reading(only_grows=self._only_grows)
+            reading = Reading(only_grows=self._only_grows)
             file.seek(0)
         elif inode != self._inode and not self._only_grows:
-            found = Reading()
+            reading = Reading()
             file.seek(0)
         else:
-            found = self
+            reading = self
         rest, _, _ = (file.read()).rpartition(b"\n")
         if self._only_grows and b"\0" in rest:
             raise StorageError(
@@ -256,10 +258,10 @@ class Reading:
             )
         if rest:
             for text in rest.split(b"\n"):
-                found.take(text)
-            found._inode, found._read_bytes = inode, found._read_bytes + len(rest) + 1
-            found._tail = (found._tail + rest + b"\n")[-_TAIL_BYTES:]
-        return found
+                reading.take(text)
+            reading._inode, reading._read_bytes = inode, reading._read_bytes + len(rest) + 1
+            reading._tail = (reading._tail + rest + b"\n")[-_TAIL_BYTES:]
+        return reading
 
     def take(self, text: bytes) -> None:
         """One more line."""

@@ -71,8 +71,8 @@ class LineFile:
         """Path where the file is now, as the kernel has it (proc(5)); None if it was removed, or that is not
         told."""
         try:
-            found = Path(f"/proc/self/fd/{self._fd}").readlink()
-            return found if os.path.samestat(os.fstat(self._fd), found.stat()) else None
+            path = Path(f"/proc/self/fd/{self._fd}").readlink()
+            return path if os.path.samestat(os.fstat(self._fd), path.stat()) else None
         except OSError:
             return None
 

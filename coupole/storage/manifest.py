@@ -43,22 +43,22 @@ def read(run: Path) -> dict[str, str]:
         return {}
     except (OSError, UnicodeDecodeError) as error:
         raise StorageError(f"{path}: cannot be read: {reason(error)}") from error
-    found = {}
+    digests = {}
     for number, line in enumerate(lines, 1):
         digest, _, name = line.partition("  ")
         if not _DIGEST.fullmatch(digest) or not name:
             raise StorageError(f"{path}: line {number} is not a SHA-256, two spaces, and a file")
         try:
-            found[inner(name)] = digest
+            digests[inner(name)] = digest
         except ValueError as error:
             raise StorageError(f"{path}: line {number}: {error}, found {name!r:.200}") from error
-    return found
+    return digests
 
 
 def files(run: Path) -> list[str]:
     """Every file that a manifest can list, sorted; unfinished ones and the manifest itself are left out."""
-    found = [str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()]
-    return sorted(name for name in found if name != NAME and not name.endswith(_UNFINISHED))
+    names = [str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()]
+    return sorted(name for name in names if name != NAME and not name.endswith(_UNFINISHED))
 
 
 def begin(run: Path) -> None:
@@ -69,15 +69,15 @@ def begin(run: Path) -> None:
 def open_for_session(run: Path, complete_views: Iterable[str]) -> None:
     """Take out what a session may write, before it begins. `complete_views` are files of views that it will not
     open."""
-    kept = set(complete_views)
-    forget(run, [name for name in read(run) if _written_by_sessions(name) and name not in kept])
+    kept_names = set(complete_views)
+    forget(run, [name for name in read(run) if _written_by_sessions(name) and name not in kept_names])
 
 
 def forget(run: Path, names: Iterable[str]) -> None:
     """Take files out of the list before they change. Nothing happens without a manifest."""
-    listed, gone = read(run), set(names)
-    if gone & listed.keys():
-        _write(run, {name: digest for name, digest in listed.items() if name not in gone})
+    digests, forgotten_names = read(run), set(names)
+    if forgotten_names & digests.keys():
+        _write(run, {name: digest for name, digest in digests.items() if name not in forgotten_names})
 
 
 def _written_by_sessions(name: str) -> bool:
@@ -92,18 +92,18 @@ def enter(
 ) -> None:
     """Hash these files at low priority and list them; `on_read` is called after every 4 MiB. Raises
     StorageError."""
-    wanted = list(names)
-    listed = read(run)
+    entered_names = list(names)
+    digests = read(run)
     stop = threading.Event()
     with ThreadPoolExecutor(1, "manifest", initializer=_yield_to_others) as hashing:
         try:
-            for done, name in enumerate(wanted):
-                progress(done, len(wanted))
-                listed[name] = hashing.submit(_synced_sha256, run / name, stop, on_read).result()
+            for count, name in enumerate(entered_names):
+                progress(count, len(entered_names))
+                digests[name] = hashing.submit(_synced_sha256, run / name, stop, on_read).result()
         finally:
             stop.set()
-    _write(run, listed)
-    progress(len(wanted), len(wanted))
+    _write(run, digests)
+    progress(len(entered_names), len(entered_names))
 
 
 def _yield_to_others() -> None:
@@ -130,24 +130,24 @@ def problems(
     run: Path, progress: Progress = lambda done, total: None, *, only: AbstractSet[str] | None = None
 ) -> dict[str, str]:
     """Say what is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
-    listed, found = read(run), {}
-    listed = {name: digest for name, digest in listed.items() if only is None or name in only}
-    for done, (name, digest) in enumerate(listed.items()):
-        progress(done, len(listed))
+    digests, messages = read(run), {}
+    digests = {name: digest for name, digest in digests.items() if only is None or name in only}
+    for count, (name, digest) in enumerate(digests.items()):
+        progress(count, len(digests))
         try:
             same = sha256(run / name) == digest
         except OSError as error:
-            found[name] = f"{name}: is in {NAME}, but cannot be read: {error.strerror}"
+            messages[name] = f"{name}: is in {NAME}, but cannot be read: {error.strerror}"
         else:
             if not same:
-                found[name] = f"{name}: is not what {NAME} lists: it was changed, or the disk failed"
-    return found
+                messages[name] = f"{name}: is not what {NAME} lists: it was changed, or the disk failed"
+    return messages
 
 
 def unlisted(run: Path) -> list[str]:
     """Files that the manifest does not cover (yet)."""
-    listed = read(run)
-    return [name for name in files(run) if name not in listed]
+    digests = read(run)
+    return [name for name in files(run) if name not in digests]
 
 
 def _write(run: Path, listed: dict[str, str]) -> None:

@@ -32,11 +32,11 @@ def pack12(
     """
     if pixels.size % 2:
         raise ValueError(f"expected an even number of pixels, found {pixels.size}")
-    packed = np.empty(pixels.size // 2 * 3, np.uint8) if out is None else out
-    highest = _pack(np.ascontiguousarray(pixels).reshape(-1), packed, order == "msb")
+    packed_bytes = np.empty(pixels.size // 2 * 3, np.uint8) if out is None else out
+    highest = _pack(np.ascontiguousarray(pixels).reshape(-1), packed_bytes, order == "msb")
     if highest > 0x0FFF:
         raise ValueError(f"expected pixels of 12 bits, found a bit above them in {int(pixels.max())}")
-    return packed
+    return packed_bytes
 
 
 def unpack12(packed: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint16]:
@@ -51,10 +51,10 @@ def unpack12(packed: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint
 @numba.njit(cache=True, nogil=True)
 def _pack(pixels, packed, msb_first):  # type: ignore[no-untyped-def]
     """Returns the bitwise or of all pixels."""
-    seen = np.uint16(0)
+    all_bits = np.uint16(0)
     for pair in range(len(packed) // 3):
         a, b = pixels[2 * pair], pixels[2 * pair + 1]
-        seen |= a | b
+        all_bits |= a | b
         if msb_first:
             packed[3 * pair] = a >> 4
             packed[3 * pair + 1] = (a & 0xF) << 4 | b >> 8
@@ -63,7 +63,7 @@ def _pack(pixels, packed, msb_first):  # type: ignore[no-untyped-def]
             packed[3 * pair] = a & 0xFF
             packed[3 * pair + 1] = (b & 0xF) << 4 | a >> 8
             packed[3 * pair + 2] = b >> 4
-    return seen
+    return all_bits
 
 
 @numba.njit(cache=True, nogil=True)

@@ -63,7 +63,7 @@ class Run:
             make_folder(parent)
             folder = _new_folder(parent, f"{stamp}-{name}")
             (folder / "views").mkdir()
-            described = {
+            record = {
                 "schema_version": SCHEMA_VERSION,
                 "software": {"name": "coupole", "version": coupole.__version__},
                 "created": utc_now(),
@@ -72,8 +72,8 @@ class Run:
                 **about,
                 **keep(inputs, folder),
             }
-            write_synced(folder / "README.txt", readme(folder.name, described))
-            write_synced(folder / RUN_JSON, json.dumps(described, indent=2, ensure_ascii=False))
+            write_synced(folder / "README.txt", readme(folder.name, record))
+            write_synced(folder / RUN_JSON, json.dumps(record, indent=2, ensure_ascii=False))
             sync_folder(parent)
             manifest.begin(folder)
         except OSError as error:
@@ -100,16 +100,16 @@ class Run:
         """All shots and dark frames of the plan, without those whose LEDs are occluded in their view."""
         labels: list[str] | dict[str, list[str]] = self.about["labels"]
         for view in self.about["views"]:
-            hidden = set(map(Led, self.hidden_leds.get(view, ())))
+            hidden_lights = set(map(Led, self.hidden_leds.get(view, ())))
             for text in labels[view] if isinstance(labels, dict) else labels:
-                if (label := ShotLabel.parse(text)).light not in hidden:
+                if (label := ShotLabel.parse(text)).light not in hidden_lights:
                     yield ShotId(view, label)
 
     @property
     def hidden_leds(self) -> dict[str, list[int]]:
         """LEDs that were left out of views, by name of view, because arm, camera or object occlude them."""
-        found: dict[str, list[int]] = self.about.get("hidden_leds", {})
-        return found
+        leds_by_view: dict[str, list[int]] = self.about.get("hidden_leds", {})
+        return leds_by_view
 
     @property
     def simulated(self) -> bool:
@@ -119,8 +119,8 @@ class Run:
     @property
     def proof(self) -> str:
         """Basis of the identity of the run's frames, in the words of run.json."""
-        found: str = self.about.get("proof", "not recorded")
-        return found
+        proof: str = self.about.get("proof", "not recorded")
+        return proof
 
     def proven(self) -> dict[ShotId, FrameProven]:
         """Proven shots, by the journal."""
@@ -143,11 +143,11 @@ class Run:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """The lock while the context lasts."""
-        held = self.lock()
+        fd = self.lock()
         try:
             yield
         finally:
-            os.close(held)
+            os.close(fd)
 
     @property
     def in_use(self) -> bool:
@@ -182,8 +182,8 @@ class Run:
         return self._input("rig")
 
     def _input(self, what: str) -> Path:
-        described = self.about[what]
-        return self.folder / described["stored"] if "stored" in described else Path(described["path"])
+        record = self.about[what]
+        return self.folder / record["stored"] if "stored" in record else Path(record["path"])
 
     @property
     def go_on_command(self) -> str:
@@ -193,27 +193,27 @@ class Run:
 
     def refuse_old_journal(self) -> None:
         """Raise InputError if the journal has an old version, which can be read but not continued."""
-        if (found := journal.version(self.journal_path)) != JOURNAL_VERSION:
+        if (version := journal.version(self.journal_path)) != JOURNAL_VERSION:
             raise InputError(
                 f"{self.folder}: begun by coupole {self.about['software']['version']}, whose journal (version "
-                f"{found}) cannot be continued: it cannot be resumed. It can be verified, exported, archived "
+                f"{version}) cannot be continued: it cannot be resumed. It can be verified, exported, archived "
                 "and used for calibrations; acquire its missing frames in a new run."
             )
 
     def refuse_changes(self, inputs: Inputs) -> None:
         """Raise InputError unless plan, rig and the files they name mean what those meant that the run began
         with."""
-        if changed := changes_since(self.about, self.folder, inputs):
-            own = {RUN_JSON, *(name for name in manifest.read(self.folder) if name.startswith("inputs/"))}
-            if altered := manifest.problems(self.folder, only=own):
+        if changes := changes_since(self.about, self.folder, inputs):
+            own_files = {RUN_JSON, *(name for name in manifest.read(self.folder) if name.startswith("inputs/"))}
+            if altered_files := manifest.problems(self.folder, only=own_files):
                 raise InputError(
                     f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
-                    f"{'; '.join(altered.values())}. What the plan and the rig were is known from them alone: put "
-                    "back what was there (from a copy of the run), or start a new run."
+                    f"{'; '.join(altered_files.values())}. What the plan and the rig were is known from them "
+                    "alone: put back what was there (from a copy of the run), or start a new run."
                 )
             raise InputError(
                 f"{self.folder}: cannot be resumed, because this changed since the run began: "
-                f"{'; '.join(changed)}. Put the old value or file back, go on with the run's own copies by "
+                f"{'; '.join(changes)}. Put the old value or file back, go on with the run's own copies by "
                 f"`{self.go_on_command}`, or start a new run."
             )
 

@@ -14,13 +14,13 @@ from coupole.storage.journal_events import BurstBegun, BurstEnded, Event
 def lux_h_of_points(events: Iterable[Event]) -> tuple[float, ...]:
     """Lux hours at each of the object's dose points; empty if no light is recorded."""
     total: tuple[float, ...] = ()
-    planned: tuple[float, ...] = ()
+    burst_lux_h: tuple[float, ...] = ()
     for event in events:
         if isinstance(event, BurstBegun):
-            total, planned = _sum(total, planned), event.planned_lux_h
+            total, burst_lux_h = _sum(total, burst_lux_h), event.planned_lux_h
         elif isinstance(event, BurstEnded) and event.given_lux_h is not None:
-            total, planned = _sum(total, event.given_lux_h), ()
-    return _sum(total, planned)
+            total, burst_lux_h = _sum(total, event.given_lux_h), ()
+    return _sum(total, burst_lux_h)
 
 
 def highest_lux_h(events: Iterable[Event]) -> float:

@@ -68,23 +68,23 @@ def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
     the disk afterwards."""
     keeper = _Keeper(run, inputs.files, inputs.copy_large)
     make_folder(run / FOLDER)
-    described = {
-        what: {**_described(path, inputs.files), "text": _text(path, inputs.files), "stored": stored}
-        for what, path, stored in (("plan", inputs.plan, PLAN), ("rig", inputs.rig, RIG))
+    plan_and_rig = {
+        kind: {**_described(path, inputs.files), "text": _text(path, inputs.files), "stored": copy}
+        for kind, path, copy in (("plan", inputs.plan, PLAN), ("rig", inputs.rig, RIG))
     }
     write_synced(run / PLAN, keeper.plan_text(inputs))
     write_synced(run / RIG, keeper.rig_text(inputs))
-    others = {path.absolute() for path in inputs.others}
+    other_paths = {path.absolute() for path in inputs.others}
     files = [{**_described(path, inputs.files), "stored": keeper.file(path, "others")} for path in inputs.others]
     files += [
-        {**_described(path, inputs.files), "stored": stored}
-        for path, stored in keeper.stored.items()
-        if path not in others and path in inputs.files
+        {**_described(path, inputs.files), "stored": copy}
+        for path, copy in keeper.stored.items()
+        if path not in other_paths and path in inputs.files
     ]
-    for folder in {run / FOLDER, *((run / stored).parent for stored in keeper.stored.values() if stored)}:
+    for folder in {run / FOLDER, *((run / copy).parent for copy in keeper.stored.values() if copy)}:
         sync_folder(folder)
     arm = {} if inputs.arm is None else {"arm_sha256": _arm_sha256(inputs.arm)}
-    return {**described, **arm, "files": files}
+    return {**plan_and_rig, **arm, "files": files}
 
 
 def _arm_sha256(arm: ArmDescription) -> str:
@@ -120,27 +120,27 @@ class _Keeper:
     """Place in the run, by absolute path; None for a file that is too large."""
 
     def plan_text(self, inputs: Inputs) -> str:
-        read = _read(inputs.plan, self.files, Plan)
-        if read is None:
+        plan_file = _read(inputs.plan, self.files, Plan)
+        if plan_file is None:
             return _text(inputs.plan, self.files)
-        return self._with_copies(*read, {("rig",): Path(RIG).name})
+        return self._with_copies(*plan_file, {("rig",): Path(RIG).name})
 
     def rig_text(self, inputs: Inputs) -> str:
-        read = _read(inputs.rig, self.files, Rig)
-        if read is None:
+        rig_file = _read(inputs.rig, self.files, Rig)
+        if rig_file is None:
             return _text(inputs.rig, self.files)
         changes: dict[KeyPath, str] = {}
-        document, rig = read
+        document, rig = rig_file
         if inputs.arm is not None and not isinstance(document.data.get("arm"), dict):
             changes[("arm",)] = self._arm(document, inputs.arm)
         return self._with_copies(document, rig, changes)
 
     def _with_copies(self, document: Document, model: BaseModel, changes: dict[KeyPath, str]) -> str:
-        for at, written in named_paths(model):
+        for at, named_path in named_paths(model):
             if at not in changes:
-                path = document.resolve(written)
-                stored = self._copy(at, path)
-                changes[at] = str(path) if stored is None else str(Path(stored).relative_to(FOLDER))
+                path = document.resolve(named_path)
+                copy = self._copy(at, path)
+                changes[at] = str(path) if copy is None else str(Path(copy).relative_to(FOLDER))
         return rewritten(document, document.text, changes)
 
     def _copy(self, at: KeyPath, path: Path) -> str | None:
@@ -175,21 +175,23 @@ class _Keeper:
         write_synced(self.run / stored, self.files.read(path))
 
     def _new_place(self, folder: str, name: str) -> str:
-        taken = set(self.stored.values())
-        places = (f"{folder}/{name}" if n == 1 else f"{folder}/{n}/{name}" for n in range(1, len(taken) + 2))
-        return next(place for place in places if place not in taken)
+        taken_places = set(self.stored.values())
+        places = (
+            f"{folder}/{name}" if n == 1 else f"{folder}/{n}/{name}" for n in range(1, len(taken_places) + 2)
+        )
+        return next(place for place in places if place not in taken_places)
 
     def _record(self, path: Path) -> str | None:
         """A calibration record, and beside it the files that it names."""
         folder = f"calibrations/{re.sub(r'[^A-Za-z0-9._-]', '_', path.stem)}"
-        stored = self.file(path, folder)
-        if stored is not None:
+        copy = self.file(path, folder)
+        if copy is not None:
             for name in _files_of_record(path, self.files):
-                beside = self.run / Path(stored).with_name(name)
+                beside = self.run / Path(copy).with_name(name)
                 if not beside.exists():
-                    self.stored[(path.parent / name).absolute()] = str(Path(stored).with_name(name))
-                    self._write(path.parent / name, str(Path(stored).with_name(name)))
-        return stored
+                    self.stored[(path.parent / name).absolute()] = str(Path(copy).with_name(name))
+                    self._write(path.parent / name, str(Path(copy).with_name(name)))
+        return copy
 
     def _link_meshes(self, folder: Path) -> str | None:
         places = [self.file(link_mesh_path(folder, link), "arm/link_meshes") for link in range(LINKS)]
@@ -197,30 +199,30 @@ class _Keeper:
 
     def _arm(self, document: Document, arm: ArmDescription) -> str:
         """The arm's file, or a new one for the arm that comes with Coupole for the robot's driver."""
-        named = document.data.get("arm")
-        place = f"{FOLDER}/arm/{Path(named).name if named else 'arm.yaml'}"
+        arm_name = document.data.get("arm")
+        place = f"{FOLDER}/arm/{Path(arm_name).name if arm_name else 'arm.yaml'}"
         meshes = self._link_meshes(arm.link_meshes) if arm.link_meshes else None
         beside = None if meshes is None else str(Path(meshes).relative_to(f"{FOLDER}/arm"))
         make_folder(self.run / FOLDER / "arm")
-        if named:
-            source = yamlfile.read(document.resolve(Path(named)), self.files)
+        if arm_name:
+            source = yamlfile.read(document.resolve(Path(arm_name)), self.files)
             link_meshes = beside or (str(arm.link_meshes) if arm.link_meshes else None)
             changes: dict[KeyPath, str] = {("link_meshes",): link_meshes} if link_meshes else {}
             text = rewritten(source, source.text, changes)
             self.stored[source.path.absolute()] = place
         else:
-            shipped = arm.model_copy(update={"link_meshes": Path(beside) if beside else arm.link_meshes})
-            text = shipped.model_dump_json(indent=1, exclude_none=True) + "\n"
+            shipped_arm = arm.model_copy(update={"link_meshes": Path(beside) if beside else arm.link_meshes})
+            text = shipped_arm.model_dump_json(indent=1, exclude_none=True) + "\n"
         write_synced(self.run / place, text)
         return str(Path(place).relative_to(FOLDER))
 
 
 def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
     try:
-        listed = yamlfile.read(path, files).data.get("files", [])
+        entries = yamlfile.read(path, files).data.get("files", [])
     except InputError:
         return
-    for entry in listed if isinstance(listed, list) else []:
+    for entry in entries if isinstance(entries, list) else []:
         name = entry.get("name") if isinstance(entry, dict) else None
         if isinstance(name, str) and Path(name).name == name and files.there(path.parent / name):
             yield name
@@ -235,22 +237,26 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
     Comments, the order of keys, and the place of a file are no change; any other byte of a mesh or a record is.
     """
     arm_known = now.arm is not None and "arm_sha256" in about
-    found = [
+    changes = [
         *_changes_of(about["plan"], now.plan, now.files, Plan, "plan"),
         *_changes_of(about["rig"], now.rig, now.files, Rig, "rig", {"arm"} if arm_known else set()),
     ]
     before = {entry["sha256"] for entry in about["files"]}
-    kept = InputFiles()
+    kept_files = InputFiles()
     copies = [(run / entry["stored"], entry["sha256"]) for entry in about["files"] if entry.get("stored")]
-    before |= {_meaning(path, kept) for path, digest in copies if path.is_file() and kept.sha256(path) == digest}
-    found += [
+    before |= {
+        _meaning(path, kept_files)
+        for path, digest in copies
+        if path.is_file() and kept_files.sha256(path) == digest
+    }
+    changes += [
         f"{path} is another file"
         for path in now.others
         if now.files.sha256(path) not in before and _meaning(path, now.files) not in before
     ]
     if now.arm is not None and arm_known and about["arm_sha256"] != _arm_sha256(now.arm):
-        found.append("the description of the arm")
-    return found
+        changes.append("the description of the arm")
+    return changes
 
 
 def _changes_of(
@@ -269,8 +275,8 @@ def _changes_of(
         yield f"the {what} {path} is another file, and the old one is not understood any more"
         return
     now = yamlfile.read(path, files).validate(model)
-    if found := differences(then, now, apart):
-        yield f"the {what} {path}: {'; '.join(found)}"
+    if changes := differences(then, now, apart):
+        yield f"the {what} {path}: {'; '.join(changes)}"
 
 
 def _plain(text: str) -> str:

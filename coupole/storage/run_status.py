@@ -97,41 +97,41 @@ class Status:
     @property
     def frames_left(self) -> int:
         """Shots and dark frames that are not proven."""
-        return sum(expected - proven for proven, expected in self.views.values())
+        return sum(shots - proven for proven, shots in self.views.values())
 
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""
-        sessions = [{**vars(one), "duration_s": round(one.duration_s, 3)} for one in self.sessions]
+        sessions = [{**vars(session), "duration_s": round(session.duration_s, 3)} for session in self.sessions]
         return {**vars(self), "sessions": sessions, "missing": self.missing, "frames_left": self.frames_left}
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
     """Progress of a run, also of one that is running. Whoever holds its lock says whether it is `in_use`."""
-    found = Status(proof=run.proof)
-    expected = list(run.expected_shots())
-    found.shots = sum(shot.is_shot for shot in expected)
-    per_view = Counter(shot.view for shot in expected)
+    status = Status(proof=run.proof)
+    shots = list(run.expected_shots())
+    status.shots = sum(shot.is_shot for shot in shots)
+    per_view = Counter(shot.view for shot in shots)
     in_use = run.in_use if in_use is None else in_use
     proven = set()
     events = list(journal.read(run.journal_path))
-    found.dose_lux_h = run_dose.highest_lux_h(events)
+    status.dose_lux_h = run_dose.highest_lux_h(events)
     for event in events:
         if isinstance(event, FrameProven):
             proven.add(event.shot)
-        _note_event(found, event)
-    found.proven = sum(shot.is_shot for shot in proven)
-    found.darks_proven = len(proven) - found.proven
+        _note_event(status, event)
+    status.proven = sum(shot.is_shot for shot in proven)
+    status.darks_proven = len(proven) - status.proven
     proven_per_view = Counter(shot.view for shot in proven)
-    found.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
-    if in_use and found.state == CREATED:
-        found.state = RUNNING
-    if not in_use and found.state in (RUNNING, PAUSED):
-        found.state, found.reason = "interrupted", KILLED
+    status.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
+    if in_use and status.state == CREATED:
+        status.state = RUNNING
+    if not in_use and status.state in (RUNNING, PAUSED):
+        status.state, status.reason = "interrupted", KILLED
     holder = run.holder if in_use else None
-    found.stopped_pid = holder if holder and is_stopped(holder) else None
-    if found.frames_left and not in_use:
-        found.go_on = run.go_on_command
-    return found
+    status.stopped_pid = holder if holder and is_stopped(holder) else None
+    if status.frames_left and not in_use:
+        status.go_on = run.go_on_command
+    return status
 
 
 def _note_event(found: Status, event: Event) -> None:

@@ -41,8 +41,8 @@ def board_temperature_c(record: np.void) -> float | None:
 
 def temperature_range_c(records: Iterable[np.void]) -> tuple[float, float] | None:
     """Lowest and highest of the boards' temperatures; None if none is known."""
-    known = [celsius for record in records if (celsius := board_temperature_c(record)) is not None]
-    return (min(known), max(known)) if known else None
+    temperatures_c = [celsius for record in records if (celsius := board_temperature_c(record)) is not None]
+    return (min(temperatures_c), max(temperatures_c)) if temperatures_c else None
 
 
 def _whole(value: float) -> int:

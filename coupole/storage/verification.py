@@ -46,8 +46,8 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         by_file.setdefault(frame.file, []).append(frame)
     lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
-    planned = _planned(run, result)
-    done = 0
+    plan = _planned(run, result)
+    count = 0
     for name, frames in sorted(by_file.items()):
         path = run.folder / name
         try:
@@ -56,20 +56,22 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
         except StorageError as error:
             result.bad.append(str(error))
             continue
-        claimed = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
+        claims = Counter(record["shot"] for record in table if record["state"] == frame_file.PROVEN)
         shots = {str(frame.shot).encode() for frame in frames}  # what the journal does not know, a crash left
-        twice = [shot for shot in sorted(shots) if claimed[shot] > 1]
-        result.bad += [f"{name}: {shot.decode()} is in {claimed[shot]} slots" for shot in twice]
+        twice = [shot for shot in sorted(shots) if claims[shot] > 1]
+        result.bad += [f"{name}: {shot.decode()} is in {claims[shot]} slots" for shot in twice]
         for frame in sorted(frames, key=lambda f: f.index):
             if problem := _frame_problem(path, layout, table, frame) or _other_than_planned(
-                planned, table[frame.index], poses, frame
+                plan, table[frame.index], poses, frame
             ):
                 result.bad.append(problem)
             result.frames += 1
-            done += 1
-            progress(done, len(proven))
-    told = {name for name in by_file if any(Path(name).name in problem for problem in result.bad)}
-    result.bad += [problem for name, problem in manifest.problems(run.folder).items() if name not in told]
+            count += 1
+            progress(count, len(proven))
+    reported_files = {name for name in by_file if any(Path(name).name in problem for problem in result.bad)}
+    result.bad += [
+        problem for name, problem in manifest.problems(run.folder).items() if name not in reported_files
+    ]
     result.listed = len(manifest.read(run.folder))
     result.unlisted = manifest.unlisted(run.folder)
     return result
@@ -77,12 +79,12 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
 
 def _planned(run: Run, result: Verification) -> AsPlanned | None:
     try:
-        planned = as_planned(run)
+        plan = as_planned(run)
     except InputError as error:
         result.not_compared = str(error)
         return None
-    result.bad += planned.problems_of_the_list(run)
-    return planned
+    result.bad += plan.problems_of_the_list(run)
+    return plan
 
 
 def _other_than_planned(planned: AsPlanned | None, record: Any, poses: Any, frame: FrameProven) -> str:
@@ -98,12 +100,12 @@ def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: Fra
         return f"{frame.shot}: slot {frame.index} is not in {path.name}"
     record = table[frame.index]
     if record["state"] != frame_file.PROVEN or record["shot"] != str(frame.shot).encode():
-        shown = record["shot"].decode(errors="replace")
-        return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{shown}`"
+        recorded_shot = record["shot"].decode(errors="replace")
+        return f"{frame.shot}: slot {frame.index} of {path.name} is recorded as `{recorded_shot}`"
     try:
-        found = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
+        checksum = frame_file.checksum(frame_file.read_frame(path, layout, frame.index))
     except StorageError as error:
         return f"{frame.shot}: {error}"
-    if not f"{found:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
-        return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {found:016x}, not {frame.xxh3}"
+    if not f"{checksum:016x}" == f"{int(record['xxh3']):016x}" == frame.xxh3:
+        return f"{frame.shot}: slot {frame.index} of {path.name} has checksum {checksum:016x}, not {frame.xxh3}"
     return ""

@@ -56,12 +56,12 @@ class View:
         if (value := self.attributes.get(name)) is None:
             return None
         try:
-            found = float(value)
+            number = float(value)
         except (TypeError, ValueError):
-            found = math.nan
-        if not math.isfinite(found):
+            number = math.nan
+        if not math.isfinite(number):
             raise StorageError(f"{self.path}: `{name}` is no number: {value!r:.40}")
-        return found
+        return number
 
 
 def read_view(path: Path, frames: Iterable[FrameProven]) -> View:

@@ -54,8 +54,8 @@ class ViewWriter:
             )
         self._table = read_frames(path)
         self._lock = threading.Lock()
-        taken = set(proven_slots.values())
-        self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken)
+        taken_slots = set(proven_slots.values())
+        self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken_slots)
         self._packed: queue.SimpleQueue[mmap.mmap] = queue.SimpleQueue()
         """Memory to pack frames in, page-aligned as direct writing requires."""
         if self._layout.packed:
@@ -181,8 +181,8 @@ class ViewWriter:
         view = memoryview(data)
         try:
             while view:
-                written = os.pwrite(fd, view, offset)
-                view, offset = view[written:], offset + written
+                count = os.pwrite(fd, view, offset)
+                view, offset = view[count:], offset + count
         except OSError as error:
             raise disk_error(self.path, error) from error
 

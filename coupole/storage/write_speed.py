@@ -40,10 +40,10 @@ def measure_write_speed(folder: Path, *, frame_bytes: int = 0, room_bytes: int) 
             os.posix_fallocate(fd, 0, total_bytes)
             with ThreadPoolExecutor(WRITERS) as pool:
                 start = time.perf_counter()
-                for written in pool.map(
+                for written_bytes in pool.map(
                     lambda offset: os.pwrite(fd, block, offset), range(0, total_bytes, _BLOCK_BYTES)
                 ):
-                    if written < _BLOCK_BYTES:
+                    if written_bytes < _BLOCK_BYTES:
                         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 os.fdatasync(fd)
                 return total_bytes / (time.perf_counter() - start)

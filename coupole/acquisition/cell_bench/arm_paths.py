@@ -50,14 +50,14 @@ class ArmPaths:
         another cell or object."""
         if isinstance(to, ViewOf):
             job = self.job_of(Path(to.plan))
-            view = next((one for one in job.schedule.views if one.name == to.view), None)
+            view = next((pose for pose in job.schedule.views if pose.name == to.view), None)
             if view is None:
-                names = ", ".join(one.name for one in job.schedule.views[:20])
+                names = ", ".join(pose.name for pose in job.schedule.views[:20])
                 raise InputError(f"{to.plan}: expected one of its views ({names}), found {to.view!r}")
-            found = job.motion.itinerary([view], start_deg.tolist())
-            (visit,) = found.visits
+            itinerary = job.motion.itinerary([view], start_deg.tolist())
+            (visit,) = itinerary.visits
             if visit is None:
-                raise InputError("\n".join(found.refusals))
+                raise InputError("\n".join(itinerary.refusals))
             return ShownPath(number, f"view {to.view}", start_deg, visit, job.motion)
         goal_deg, name = self._posture(to)
         visit = self._straight_to(goal_deg, name, start_deg)
@@ -88,8 +88,8 @@ class ArmPaths:
 
     def _cameras_mm(self, joints_deg: NDArray[np.float64]) -> list[list[float]]:
         poses = link_frames(self.arm, joints_deg)[:, -1] @ self._flange_from_camera
-        found: list[list[float]] = np.round(poses[:, :3, 3], 2).tolist()
-        return found
+        positions_mm: list[list[float]] = np.round(poses[:, :3, 3], 2).tolist()
+        return positions_mm
 
     def _posture(self, to: str | Posture) -> tuple[Joints, str]:
         motion = self._cell.rig.motion
@@ -132,14 +132,14 @@ def shown_postures(corners_deg: Sequence[Joints]) -> NDArray[np.float64]:
     """Postures [n, 6] along straight motions, so close together that a picture of them is continuous."""
     longest_deg = sum(float(np.abs(b - a).max()) for a, b in pairwise(corners_deg))
     step_deg = max(_SHOWN_EVERY_DEG, longest_deg / _MOST_SHOWN)
-    found = [np.asarray(corners_deg[0], dtype=np.float64)]
+    postures_deg = [np.asarray(corners_deg[0], dtype=np.float64)]
     for a, b in pairwise(corners_deg):
         count = max(1, int(np.ceil(np.abs(b - a).max() / step_deg)))
-        found += [a + (b - a) * (k + 1) / count for k in range(count)]
-    return np.array(found)
+        postures_deg += [a + (b - a) * (k + 1) / count for k in range(count)]
+    return np.array(postures_deg)
 
 
 def links_mm(arm: Arm, joints_deg: NDArray[np.float64]) -> list[Any]:
     """Origins [..., 8, 3] in the base frame of base, six links and flange, for postures [..., 6]."""
-    found: list[Any] = np.round(link_frames(arm, joints_deg)[..., :3, 3], 2).tolist()
-    return found
+    origins_mm: list[Any] = np.round(link_frames(arm, joints_deg)[..., :3, 3], 2).tolist()
+    return origins_mm

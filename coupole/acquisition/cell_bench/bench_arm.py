@@ -159,7 +159,7 @@ class BenchArm:
         rig, bodies = self._cell.rig, self._paths.motion.bodies
         supervisor = ArmSupervisor(rig, self._paths.motion, self._opened, control)
 
-        camera, asked = rig.flange_from_camera.matrix(), hold.asked
+        camera, jog = rig.flange_from_camera.matrix(), hold.asked
         try:
             with self._switch.held() as check, self._stopped_at_the_end():
 
@@ -169,9 +169,7 @@ class BenchArm:
 
                 while True:
                     here_deg = supervisor.begin_here()
-                    step = jog_step(
-                        self._paths.arm, bodies, camera, here_deg, asked.axis, asked.direction, asked.share
-                    )
+                    step = jog_step(self._paths.arm, bodies, camera, here_deg, jog.axis, jog.direction, jog.share)
                     hold.check()
                     self._switch.refuse_released()
                     supervisor.go(step.visit, meanwhile=go_on, speed=step.speed)

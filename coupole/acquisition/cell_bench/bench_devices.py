@@ -41,14 +41,14 @@ class BenchDevices:
         its temperature now and then, unless it is busy."""
         self._ask_the_box()
         now_s = time.monotonic()
-        heard = {kind: round(now_s - heard_s, 3) for kind, heard_s in self._heard_s.items()}
+        heard_s_ago = {kind: round(now_s - heard_s, 3) for kind, heard_s in self._heard_s.items()}
         if robot_heard_s_ago is not None:
-            heard["robot"] = robot_heard_s_ago
+            heard_s_ago["robot"] = robot_heard_s_ago
         return {
             kind: {
                 "identity": {**vars(identity), "settings": dict(identity.settings)},
                 "link": self._links[kind],
-                "heard_s_ago": heard[kind],
+                "heard_s_ago": heard_s_ago[kind],
                 "temperature_c": self._box_c if kind == "ledbox" else None,
                 "last_error": self._errors.get(kind),
                 "self_test": self._tested.get(kind),
@@ -60,16 +60,16 @@ class BenchDevices:
         """Have a device test itself; the report stays in the state. Box and camera must not be at work."""
         device = getattr(self._opened, kind)
         test: Callable[[], Mapping[str, str]] = device.self_test
-        found: dict[str, Any] = {"t": utc_now(), "passed": True, "report": {}}
+        outcome: dict[str, Any] = {"t": utc_now(), "passed": True, "report": {}}
         try:
             with self.in_use:
-                found["report"] = dict(test())
+                outcome["report"] = dict(test())
             self.heard(kind)
         except DeviceError as error:
             self.failed(error)
-            found |= {"passed": False, "report": {"error": str(error)}}
-        self._tested[kind] = found
-        return {"device": kind, **found}
+            outcome |= {"passed": False, "report": {"error": str(error)}}
+        self._tested[kind] = outcome
+        return {"device": kind, **outcome}
 
     def heard(self, *kinds: str) -> None:
         """These devices have just answered."""
@@ -89,8 +89,8 @@ class BenchDevices:
             self._asked_s = time.monotonic()
             boards = np.unique(self._cell.leds.boards)
             some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
-            found = [self._opened.ledbox.board_temperature_c(int(board)) for board in some]
-            self._box_c = max((c for c in found if c is not None), default=None)
+            temperatures_c = [self._opened.ledbox.board_temperature_c(int(board)) for board in some]
+            self._box_c = max((c for c in temperatures_c if c is not None), default=None)
             if self._box_c is not None:
                 self.heard("ledbox")
         except DeviceError as error:
@@ -101,5 +101,9 @@ class BenchDevices:
     def _link(self, kind: str) -> str:
         _, settings = device_for(self._cell.rig, kind, dry_run=False)
         endpoints = self._opened.world_endpoints
-        told = {**settings, **(endpoints[kind] if endpoints else {})}
-        return ", ".join(f"{name} {told[name]}" for name in _ADDRESSES if isinstance(told.get(name), str | int))
+        link_settings = {**settings, **(endpoints[kind] if endpoints else {})}
+        return ", ".join(
+            f"{name} {link_settings[name]}"
+            for name in _ADDRESSES
+            if isinstance(link_settings.get(name), str | int)
+        )

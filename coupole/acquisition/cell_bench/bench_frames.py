@@ -142,8 +142,8 @@ class BenchFrames:
             self._meter.settle()
 
     def _figures_of(self, shot: Shot, region: Sequence[int]) -> dict[str, Any]:
-        found, _ = _region(shot, region)
-        return {**vars(figures(found, shot.coding)), "white_point": white_point(found, shot.coding)}
+        pixels, _ = _region(shot, region)
+        return {**vars(figures(pixels, shot.coding)), "white_point": white_point(pixels, shot.coding)}
 
     def _refuse_what_there_is_not(self, asked: FrameAsked) -> None:
         leds, panels = set(self._cell.leds.ids.tolist()), self._opened.ledbox.panel_count
@@ -175,9 +175,9 @@ def _region(shot: Shot, region: Sequence[int]) -> tuple[NDArray[np.uint16], tupl
     """[h, w], widened to whole Bayer cells; and x, y of its first pixel."""
     height_px, width_px = shot.raw.shape
     x, y, width, height = _within(region, width_px, height_px)
-    left, top = x - x % 2, y - y % 2
-    right, bottom = (-(-(at) // 2) * 2 for at in (x + width, y + height))
-    return shot.raw[top:bottom, left:right], (left, top)
+    left_px, top_px = x - x % 2, y - y % 2
+    right_px, bottom_px = (-(-(at) // 2) * 2 for at in (x + width, y + height))
+    return shot.raw[top_px:bottom_px, left_px:right_px], (left_px, top_px)
 
 
 def _within(region: Sequence[int], width_px: int, height_px: int) -> tuple[int, int, int, int]:

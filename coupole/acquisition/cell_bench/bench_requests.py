@@ -144,5 +144,8 @@ def read_request(line: bytes) -> Request:
     try:
         return _REQUEST.validate_json(line)
     except ValidationError as error:
-        said = [(".".join(map(str, one["loc"])) or "request", one["msg"]) for one in error.errors()[:_MOST_SAID]]
-        raise InputError("; ".join(f"{where}: {what}" for where, what in said)) from error
+        problems = [
+            (".".join(map(str, problem["loc"])) or "request", problem["msg"])
+            for problem in error.errors()[:_MOST_SAID]
+        ]
+        raise InputError("; ".join(f"{where}: {message}" for where, message in problems)) from error

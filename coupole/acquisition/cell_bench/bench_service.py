@@ -155,13 +155,13 @@ class BenchService:
     def _begin_metering(self, asked: MeterAsked, stops: int) -> dict[str, Any]:
         small = metering_job(self._arm.job_of(Path(asked.plan)))
         self._arm.refuse_motion()
-        wanted = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
+        request = exposure_advice.Request(asked.saturated, asked.snr, asked.share)
 
         def meter(control: Control) -> dict[str, Any]:
             with self._devices.in_use:
                 self._frames.release()
                 try:
-                    advice = metered(small, self._opened, wanted, control)
+                    advice = metered(small, self._opened, request, control)
                 finally:
                     self._frames.begin_counting()
             return advice.figures()
@@ -189,12 +189,12 @@ class BenchService:
             arm = self._arm.state()
         except DeviceError as error:
             self._devices.failed(error)
-        measured = self._job.plan.object if self._job else None
+        plan_object = self._job.plan.object if self._job else None
         return {
             "rig": str(self._cell.document.path.resolve()),
             "pid": os.getpid(),
             "simulated": self._opened.simulated,
-            "object": measured.id if measured else None,
+            "object": plan_object.id if plan_object else None,
             "devices": self._devices.state(arm["heard_s_ago"] if arm else None),
             "arm": arm,
             "dose": self._frames.dose(),
@@ -226,17 +226,17 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
             "calibrate, commission); end it first"
         )
     ask_to_begin(cell, confirm=confirm)
-    with open_cell(cell, job=job, on_opened=identity_printer(console)) as opened:
-        service = BenchService(cell, opened, job)
-        with obeyed_by(control, opened.halt):
+    with open_cell(cell, job=job, on_opened=identity_printer(console)) as opened_cell:
+        service = BenchService(cell, opened_cell, job)
+        with obeyed_by(control, opened_cell.halt):
             try:
                 yield service
             finally:
                 service.end()
-                for trouble in opened.trouble:
+                for trouble in opened_cell.trouble:
                     alarm(trouble)
-                if not opened.arm_confirmed:
-                    faults_of(cell, opened.identities["robot"]).note("; ".join(opened.trouble), "bench")
+                if not opened_cell.arm_confirmed:
+                    faults_of(cell, opened_cell.identities["robot"]).note("; ".join(opened_cell.trouble), "bench")
 
 
 def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool) -> None:
@@ -246,9 +246,9 @@ def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_afte
     """
     control = Control()
     path = bench_socket(what.cell if isinstance(what, Job) else what)
-    with bench_of(what, console, control, confirm=confirm) as service, contextlib.ExitStack() as served:
+    with bench_of(what, console, control, confirm=confirm) as service, contextlib.ExitStack() as stack:
         try:
-            served.enter_context(UserSocket(path, service.answer))
+            stack.enter_context(UserSocket(path, service.answer))
         except OSError as error:
             raise InputError(f"{path}: cannot serve the bench there: {error}") from error
         console.print(f"bench at {path}  (Ctrl-C ends it)", soft_wrap=True)

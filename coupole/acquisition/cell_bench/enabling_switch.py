@@ -90,10 +90,10 @@ class _Watch:
                 continue
             asked_s = time.monotonic()
             try:
-                held = self._box.presence()
+                is_held = self._box.presence()
             except DeviceError:  # another thread has darkened the box, or it is lost: the news get old
                 continue
-            if held:
+            if is_held:
                 self._heard_s = asked_s
             else:
                 self._released = "the enabling switch was released"

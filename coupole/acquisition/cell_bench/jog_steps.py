@@ -113,8 +113,8 @@ def _posture_at(
         goal[:3, :3] = Rotation.from_rotvec(np.radians(amount * _STEP_DEG) * unit).as_matrix() @ start[:3, :3]
     else:
         goal[:3, 3] += amount * _STEP_MM * unit
-    found = postures_of(arm, goal @ inverse(flange_from_camera))
-    return nearest(arm, found, here_deg) if len(found) else None
+    postures = postures_of(arm, goal @ inverse(flange_from_camera))
+    return nearest(arm, postures, here_deg) if len(postures) else None
 
 
 def _off_line_mm(
@@ -136,18 +136,18 @@ def _clear_part(bodies: CellBodies, here_deg: Joints, there_deg: Joints) -> Join
         return _outwards(bodies, here_deg, there_deg)
     if bodies.is_clear(here_deg, there_deg):
         return there_deg
-    clear, blocked = 0.0, 1.0
+    clear_share, blocked_share = 0.0, 1.0
     for _ in range(_HALVINGS):
-        middle = 0.5 * (clear + blocked)
+        middle = 0.5 * (clear_share + blocked_share)
         if bodies.is_clear(here_deg, here_deg + middle * (there_deg - here_deg)):
-            clear = middle
+            clear_share = middle
         else:
-            blocked = middle
+            blocked_share = middle
     turn_deg = np.abs(there_deg - here_deg)
-    clear -= _KEPT_MM / float(np.radians(turn_deg) @ bodies.reach_mm)
-    if clear * float(turn_deg.max()) < _LEAST_DEG:
+    clear_share -= _KEPT_MM / float(np.radians(turn_deg) @ bodies.reach_mm)
+    if clear_share * float(turn_deg.max()) < _LEAST_DEG:
         raise InputError(str(bodies.contact_on_the_way(here_deg, there_deg)))
-    part_deg: Joints = here_deg + clear * (there_deg - here_deg)
+    part_deg: Joints = here_deg + clear_share * (there_deg - here_deg)
     return part_deg
 
 

@@ -39,14 +39,14 @@ def cycle(bench: Bench) -> None:
         "Set the driver's cycle to that of the controller's program, or mend the network between them."
     )
     bench.ask_before("Step cycle: the arm stands still while the controller's reports are counted.")
-    driver, given = device_for(bench.cell.rig, "robot", dry_run=False)
+    driver, settings = device_for(bench.cell.rig, "robot", dry_run=False)
     model = settings_class(driver)
     setting = next((name for name in CYCLES if name in model.model_fields), None)
     if setting is None:
         findings.remarks.append(f"{driver} does not say how often its controller reports; nothing was compared")
         return
-    said = float(given.get(setting, model.model_fields[setting].default))
-    expected_ms = 1e3 / said if setting == "frequency_hz" else said
+    rig_cycle = float(settings.get(setting, model.model_fields[setting].default))
+    expected_ms = 1e3 / rig_cycle if setting == "frequency_hz" else rig_cycle
     before, begun_ns = robot.statistics()[CYCLES[setting]], clock.now_ns()
     bench.pause(_CYCLE_S)
     after, ended_ns = robot.statistics()[CYCLES[setting]], clock.now_ns()
@@ -83,11 +83,11 @@ def axes(bench: Bench) -> None:
         right = findings.at_most(f"A{axis + 1}: error of its measured turn", off_deg[axis], _TURNED_DEG, "deg")
         others_deg = np.delete(off_deg, axis).max()
         right &= findings.at_most(f"A{axis + 1}: turn of the other axes", others_deg, _OTHERS_DEG, "deg")
-        seen = bench.ask_whether(
+        is_as_described = bench.ask_whether(
             f"A{axis + 1} was turned by {turned_deg[axis]:+.2f} deg. {_described(bench, before_deg, turned_deg)} "
             "Did you see just that?"
         )
-        if not (right and seen):
+        if not (right and is_as_described):
             findings.remedy = (
                 f"Compare A{axis + 1} in the arm's description (`arm:` in the rig: axis and sense of rotation), "
                 "in the "
@@ -148,12 +148,12 @@ def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np
         bench.control.go_on()
         robot.move_to(begun_deg + change_deg)
         deadline = Deadline(clock, 2.0 * _CRUISE_S + 5.0)
-        seen: list[tuple[int, NDArray[np.float64]]] = []
+        samples: list[tuple[int, NDArray[np.float64]]] = []
         pacing = int(np.argmax(shares))
-        while not seen or abs(seen[-1][1] - begun_deg)[pacing] < 0.4 * abs(change_deg[pacing]):
+        while not samples or abs(samples[-1][1] - begun_deg)[pacing] < 0.4 * abs(change_deg[pacing]):
             state = robot.measured()
-            if not seen or state.t_ns > seen[-1][0]:
-                seen.append((state.t_ns, np.array(state.joints_deg)))
+            if not samples or state.t_ns > samples[-1][0]:
+                samples.append((state.t_ns, np.array(state.joints_deg)))
             if state.fault or deadline.expired:
                 robot.stop()
                 raise StepFailedError(f"the arm did not go where it was sent: {state.fault or 'too slow'}")
@@ -162,11 +162,12 @@ def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np
         robot.stop()
         at_rest_deg = _at_rest(bench)
         t_ns, then_deg = next(
-            (one for one in reversed(seen) if seen[-1][0] - one[0] >= _SPEED_OVER_S * 1e9), seen[0]
+            (sample for sample in reversed(samples) if samples[-1][0] - sample[0] >= _SPEED_OVER_S * 1e9),
+            samples[0],
         )
-        elapsed_s = (seen[-1][0] - t_ns) / 1e9
+        elapsed_s = (samples[-1][0] - t_ns) / 1e9
         if elapsed_s > 0.0:
-            speeds_deg_s = np.abs(seen[-1][1] - then_deg) / elapsed_s
+            speeds_deg_s = np.abs(samples[-1][1] - then_deg) / elapsed_s
             if speeds_deg_s[pacing] > 0.5 * shares[pacing] * bench.velocity_deg_s[pacing]:
                 return speeds_deg_s, np.abs(at_rest_deg - commanded_deg)
         bench.go_to(begun_deg)

@@ -68,14 +68,16 @@ class Findings:
 
     def at_most(self, what: str, found: float, limit: float, unit: str) -> bool:
         """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""
-        known = float(found) if np.isfinite(found) else 1e9
-        self.limits.append(Limit(what=what, found=round(known, 6), limit=round(float(limit), 6), unit=unit))
+        finite_figure = float(found) if np.isfinite(found) else 1e9
+        self.limits.append(
+            Limit(what=what, found=round(finite_figure, 6), limit=round(float(limit), 6), unit=unit)
+        )
         return self.limits[-1].passed
 
     @property
     def passed(self) -> bool:
         """True if all is well so far."""
-        return all(one.passed for one in self.limits) and all(one.yes for one in self.answers)
+        return all(entry.passed for entry in self.limits) and all(entry.yes for entry in self.answers)
 
 
 @dataclass
@@ -100,12 +102,12 @@ class Bench:
     def each(self, what: str, numbers: Iterable[int]) -> Iterator[int]:
         """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
         stop."""
-        left = list(numbers)
+        all_numbers = list(numbers)
         with self.bars() as say:
-            for k, number in enumerate(left):
+            for k, number in enumerate(all_numbers):
                 self.control.go_on()
                 yield number
-                say(what, k + 1, len(left))
+                say(what, k + 1, len(all_numbers))
 
     def ask_before(self, announcement: str) -> None:
         """Raises Interrupted unless the person agrees."""
@@ -149,9 +151,9 @@ class Bench:
                 f"{contact}: jog the arm to where it has room on all sides, then repeat the step"
             )
         self.opened.robot.move_to(joints_deg)
-        measured = np.array(self.opened.robot.wait_settled().joints_deg)
+        measured_deg = np.array(self.opened.robot.wait_settled().joints_deg)
         self.control.go_on()
-        return measured
+        return measured_deg
 
     def clear_change(self, change_deg: NDArray[np.float64]) -> NDArray[np.float64]:
         """The change [6] of the axes, or its opposite, whichever touches nothing and stays within the axes'

@@ -36,13 +36,13 @@ def emergency_stop(bench: Bench) -> None:
     rested_deg = _last_known_deg(bench, at_press_deg)
     turned_deg = float(np.max(np.abs(rested_deg - at_press_deg) - promised_deg))
     findings.at_most("turn after the fault was seen, beyond the promise", max(turned_deg, 0.0), 0.0, "deg")
-    obeyed = True
+    is_accepted = True
     try:
         robot.move_to(at_press_deg)
     except DeviceError as error:
-        obeyed = False
+        is_accepted = False
         findings.remarks.append(f"a motion was refused: {error}")
-    findings.at_most("motions that are accepted after the emergency stop", int(obeyed), 0, "")
+    findings.at_most("motions that are accepted after the emergency stop", int(is_accepted), 0, "")
     bench.opened.clock.sleep(_WATCHED_S)
     further_deg = float(np.abs(_last_known_deg(bench, rested_deg) - rested_deg).max())
     findings.at_most("turn of the axes at rest", further_deg, _STILL_DEG, "deg")
@@ -58,7 +58,7 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
     change_deg[0] = _PACE_S * bench.velocity_deg_s[0]
     change_deg = bench.clear_change(change_deg)
     deadline, out = Deadline(clock, _PRESSED_WITHIN_S), False
-    asked = False
+    is_asked = False
     while not deadline.expired:
         out = not out
         bench.pause(_POLL_S)
@@ -71,9 +71,9 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
             if state.fault:
                 bench.findings.remarks.append(f"the arm's fault: {state.fault}")
                 return np.array(state.joints_deg)
-            if not asked:
+            if not is_asked:
                 bench.person.press_emergency_stop()
-                asked = True
+                is_asked = True
             bench.pause(_POLL_S)
     robot.stop()
     raise StepFailedError(

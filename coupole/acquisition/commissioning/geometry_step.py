@@ -57,7 +57,7 @@ def geometry(bench: Bench) -> None:
         "the arm standing as it stands now and its drives off. The board lies flat on the support, in the "
         "camera's view."
     )
-    place_mm = np.array([bench.measured(*one) for one in _BOARD])
+    place_mm = np.array([bench.measured(*question) for question in _BOARD])
     _measure_bodies(bench)
     _ask_for_volumes(bench)
     if not bench.findings.passed:
@@ -83,7 +83,7 @@ def _measure_bodies(bench: Bench) -> None:
     said_mm = _lowest_mm(rig, forward(arm_of(rig), bench.joints_deg()))
     findings.at_most("room above the disk that only the rig has", said_mm - over_mm, MOST_TOO_NEAR_MM, "mm")
     reach_mm, width_mm = _extent_mm(rig)
-    for what, question, said in (
+    for name, question, rig_mm in (
         (
             "tool_reach_mm",
             "from the flange's face to the foremost point of what it carries, along its axis",
@@ -95,8 +95,8 @@ def _measure_bodies(bench: Bench) -> None:
             width_mm,
         ),
     ):
-        sticks_out_mm = bench.measured(what, question) - said
-        findings.at_most(f"{what}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
+        sticks_out_mm = bench.measured(name, question) - rig_mm
+        findings.at_most(f"{name}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
     diameter_mm = bench.measured("support_diameter_mm", "diameter of the disk")
     findings.at_most(
         "diameter of the disk, beyond the rig's", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
@@ -162,7 +162,7 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
     home_deg, ids = bench.joints_deg(), bench.cell.leds.ids
     leds = ids[np.unique(np.linspace(0, len(ids) - 1, _METERED).astype(int))].tolist()
     exposure_us, led = good_exposure_us(bench, leds)
-    leds = [led, *(one for one in leds if one != led)]
+    leds = [led, *(other_led for other_led in leds if other_led != led)]
     middle_mm = board.points_mm.mean(axis=0)
     intrinsics = nominal_intrinsics(rig)
     sights = [_sighted(bench, board, home_deg, exposure_us, leds)]
@@ -173,18 +173,18 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
         sights.append(_sighted(bench, board, bench.go_to(joints_deg), exposure_us, leds))
         bench.go_to(home_deg)
     start = sights[0].support_from_camera @ camera_from_board
-    found = deviations(sights, intrinsics, middle_mm, place_mm, start)
+    deviation = deviations(sights, intrinsics, middle_mm, place_mm, start)
     findings.remarks.append(
-        f"{len(sights)} sights; the board is seen {found.height_mm:+.1f} mm above where the rig has it, "
-        f"{found.sideways_mm:.1f} mm aside, tilted by {found.tilt_deg:.1f} deg; the sights disagree by "
-        f"{found.disagreement_mm:.1f} mm"
+        f"{len(sights)} sights; the board is seen {deviation.height_mm:+.1f} mm above where the rig has it, "
+        f"{deviation.sideways_mm:.1f} mm aside, tilted by {deviation.tilt_deg:.1f} deg; the sights disagree by "
+        f"{deviation.disagreement_mm:.1f} mm"
     )
-    right = findings.at_most("height of the board", abs(found.height_mm), MOST_HEIGHT_MM, "mm")
-    right &= findings.at_most("place of the board", found.sideways_mm, MOST_SIDEWAYS_MM, "mm")
-    right &= findings.at_most("tilt of the board", found.tilt_deg, MOST_TILT_DEG, "deg")
-    right &= findings.at_most("disagreement of the sights", found.disagreement_mm, MOST_DISAGREEMENT_MM, "mm")
+    right = findings.at_most("height of the board", abs(deviation.height_mm), MOST_HEIGHT_MM, "mm")
+    right &= findings.at_most("place of the board", deviation.sideways_mm, MOST_SIDEWAYS_MM, "mm")
+    right &= findings.at_most("tilt of the board", deviation.tilt_deg, MOST_TILT_DEG, "deg")
+    right &= findings.at_most("disagreement of the sights", deviation.disagreement_mm, MOST_DISAGREEMENT_MM, "mm")
     if not right:
-        findings.remarks.append(found.cause)
+        findings.remarks.append(deviation.cause)
 
 
 _AROUND = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -192,7 +192,9 @@ _AROUND = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 
 
 def _motion(rig: Rig, from_deg: Floats, to_deg: Floats) -> str:
-    before, after = (forward(arm_of(rig), one) @ rig.flange_from_camera.matrix() for one in (from_deg, to_deg))
+    before, after = (
+        forward(arm_of(rig), joints_deg) @ rig.flange_from_camera.matrix() for joints_deg in (from_deg, to_deg)
+    )
     return described_motion(rig.support.base_from_support.matrix(), before, after)
 
 
@@ -202,7 +204,7 @@ def _postures_about(bench: Bench, home_deg: Floats, in_camera_mm: Floats) -> lis
     flange_from_camera = rig.flange_from_camera.matrix()
     base_from_camera = forward(arm, home_deg) @ flange_from_camera
     for tilt_deg in _TILTS_DEG:
-        found = []
+        postures = []
         for about_x, about_y in _AROUND:
             # KUKA's A, B, C turn about z, y, x: B about the camera's y, C about its x.
             turn = transform((0.0, 0.0, 0.0), (0.0, about_y * tilt_deg, about_x * tilt_deg))
@@ -210,9 +212,9 @@ def _postures_about(bench: Bench, home_deg: Floats, in_camera_mm: Floats) -> lis
             possible = postures_of(arm, base_from_camera @ turn @ inverse(flange_from_camera))
             posture = nearest(arm, possible, home_deg) if len(possible) else None
             if posture is not None and _has_room(bench, home_deg, posture):
-                found.append(posture)
-        if len(found) == len(_AROUND):
-            return found
+                postures.append(posture)
+        if len(postures) == len(_AROUND):
+            return postures
     raise StepFailedError(
         f"the arm has no room to go round the board by {_TILTS_DEG[-1]:g} degrees without turning an axis by more "
         f"than {_MOST_TURN_DEG:g}: jog it to where it has room on all sides, then repeat the step"
@@ -233,13 +235,13 @@ def _sighted(bench: Bench, board: Board, joints_deg: Floats, exposure_us: int, l
     for led in leds:
         values = photograph(bench, led, exposure_us)[0] - rig.sensor.black_dn
         picture = Picture(values, rig.sensor.bayer_pattern, float(rig.sensor.white_dn - rig.sensor.black_dn))
-        seen = detect(board, picture)
-        if isinstance(seen, Sighting):
+        sighting = detect(board, picture)
+        if isinstance(sighting, Sighting):
             bench.opened.camera.disarm()
             base_from_camera = forward(arm_of(rig), joints_deg) @ rig.flange_from_camera.matrix()
             support_from_camera = inverse(rig.support.base_from_support.matrix()) @ base_from_camera
-            return Sight(support_from_camera, seen.board_mm, seen.pixels)
-        why = seen
+            return Sight(support_from_camera, sighting.board_mm, sighting.pixels)
+        why = sighting
     raise StepFailedError(
         f"the board is not seen: {why}. Lay the board of `--board` flat into the middle of the picture "
         "(`coupole live`), in focus; then repeat the step"

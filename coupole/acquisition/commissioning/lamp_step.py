@@ -52,27 +52,27 @@ def lamps(bench: Bench) -> None:
         f"Step lamps: {len(table.ids)} LEDs are lit one by one. Take every object that light can harm out of the "
         "dome; the camera must see a matte white ball, or another matte body, on the support."
     )
-    spread = table.ids[np.unique(np.linspace(0, len(table.ids) - 1, _METERED).astype(int))]
-    exposure_us, _ = good_exposure_us(bench, spread.tolist())
-    seen = _photographed(bench, exposure_us)
-    findings.remarks.append(f"{len(seen.ids)} LEDs at {exposure_us} us")
-    _judge_currents(bench, seen)
-    dark = _dark_leds(seen)
-    dark_and_on = [led for led in dark if led not in seen.open_leds]
-    lit = ~np.isin(seen.ids, dark)
+    metered_ids = table.ids[np.unique(np.linspace(0, len(table.ids) - 1, _METERED).astype(int))]
+    exposure_us, _ = good_exposure_us(bench, metered_ids.tolist())
+    pictures = _photographed(bench, exposure_us)
+    findings.remarks.append(f"{len(pictures.ids)} LEDs at {exposure_us} us")
+    _judge_currents(bench, pictures)
+    dark = _dark_leds(pictures)
+    dark_and_on = [led for led in dark if led not in pictures.open_leds]
+    lit = ~np.isin(pictures.ids, dark)
     if lit.sum() < FEWEST_LEDS:
         raise StepFailedError(
             f"only {lit.sum()} of {len(lit)} LEDs brighten the picture: jog the arm so that the camera sees the "
             "matte ball, then repeat"
         )
-    rows = table.rows(seen.ids[lit])
-    off_deg, spread_found = deviations_deg(seen.pictures[lit], light_vectors(bench, table)[rows], bench.each)
+    rows = table.rows(pictures.ids[lit])
+    off_deg, spread_found = deviations_deg(pictures.pictures[lit], light_vectors(bench, table)[rows], bench.each)
     if spread_found < _LEAST_SPREAD:
         raise StepFailedError(
             f"what the camera sees is too flat to tell directions of light ({spread_found:.3f}; "
             f"{_LEAST_SPREAD} are needed): put a matte ball on the support, then repeat"
         )
-    for led, angle_deg in zip(seen.ids[lit], off_deg, strict=True):
+    for led, angle_deg in zip(pictures.ids[lit], off_deg, strict=True):
         if angle_deg > MOST_DEVIATION_DEG:
             findings.at_most(f"LED {led}: from its place in the table", angle_deg, MOST_DEVIATION_DEG, "deg")
     findings.at_most("largest deviation from the LED table", float(off_deg.max()), MOST_DEVIATION_DEG, "deg")
@@ -132,8 +132,8 @@ def _judge_currents(bench: Bench, seen: Pictures) -> None:
 def _dark_leds(seen: Pictures) -> list[int]:
     means_dn = seen.pictures.mean(axis=1)
     least_dn = max(_LEAST_SIGNAL_SIGMA * seen.noise_dn, _LEAST_SIGNAL_SHARE * float(np.median(means_dn)))
-    found: list[int] = seen.ids[means_dn < least_dn].tolist()
-    return found
+    dark_ids: list[int] = seen.ids[means_dn < least_dn].tolist()
+    return dark_ids
 
 
 def _ask_for_dark_ones(bench: Bench, leds: list[int]) -> None:

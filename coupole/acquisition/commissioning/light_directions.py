@@ -55,8 +55,8 @@ def deviations_deg(
         if angles_deg[worst] <= MOST_DEVIATION_DEG or good.sum() <= FEWEST_LEDS:
             break
         good = good & (angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst]))
-    spread = np.linalg.svd(Normals(pictures, lights, lit, good).all(), compute_uv=False)
-    return angles_deg, float(spread[-1] / max(spread[0], 1e-12))
+    singular_values = np.linalg.svd(Normals(pictures, lights, lit, good).all(), compute_uv=False)
+    return angles_deg, float(singular_values[-1] / max(singular_values[0], 1e-12))
 
 
 class Normals:
@@ -84,26 +84,26 @@ class Normals:
         1950; Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8).
         """
         light = self._lights[led]
-        found = self._solved.copy()
+        normals = self._solved.copy()
         at = np.flatnonzero(self._used[led])
-        turned = self._inverses[at] @ light
-        rest = 1.0 - turned @ light
+        gains = self._inverses[at] @ light
+        rest = 1.0 - gains @ light
         residual = self._pictures[led, at] - light @ self._solved[:, at]
         well = rest > _LEAST_REST
-        found[:, at[well]] -= (turned[well] * (residual[well] / rest[well])[:, None]).T
+        normals[:, at[well]] -= (gains[well] * (residual[well] / rest[well])[:, None]).T
         counts = self._counts - self._used[led]
         for pixel in at[~well & (counts[at] >= _FEWEST_LIGHTS)]:
-            found[:, pixel] = self._anew(int(pixel), led)
-        return np.where(counts < _FEWEST_LIGHTS, 0.0, found)
+            normals[:, pixel] = self._anew(int(pixel), led)
+        return np.where(counts < _FEWEST_LIGHTS, 0.0, normals)
 
     def _anew(self, pixel: int, led: int) -> Floats:
-        used = self._used[:, pixel].copy()
-        used[led] = False
-        lights = self._lights[used]
-        solved: Floats = np.linalg.solve(
-            lights.T @ lights + _RIDGE * np.eye(3), lights.T @ self._pictures[used, pixel]
+        led_mask = self._used[:, pixel].copy()
+        led_mask[led] = False
+        lights = self._lights[led_mask]
+        normal: Floats = np.linalg.solve(
+            lights.T @ lights + _RIDGE * np.eye(3), lights.T @ self._pictures[led_mask, pixel]
         )
-        return solved
+        return normal
 
 
 def _direction(picture: Floats, normals: Floats, lit: NDArray[np.bool_]) -> Floats:

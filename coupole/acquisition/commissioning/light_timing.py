@@ -104,11 +104,11 @@ def _delays_us(bench: Bench, led: int, exposure_us: int) -> NDArray[np.float64]:
     whole: list[float] = []
     half: list[float] = []
     for _ in range(_PAIRS):
-        for found, lit_us in ((whole, exposure_us + exposure_us // 4), (half, exposure_us // 2)):
+        for sums_dn, lit_us in ((whole, exposure_us + exposure_us // 4), (half, exposure_us // 2)):
             step = _flash(bench, led, exposure_us, lit_us)
             if not limits.on_us[0] <= step.on_us <= limits.on_us[1]:
                 raise StepFailedError(f"an LED would be on for {step.on_us} us, out of `led_limits: on_us`")
-            found.append(float((triggered_by_box(bench, step)[0] - dark).sum()))
+            sums_dn.append(float((triggered_by_box(bench, step)[0] - dark).sum()))
     delays: NDArray[np.float64] = exposure_us * (0.5 - np.array(half) / np.array(whole))
     return delays
 
@@ -123,7 +123,7 @@ def _flash(bench: Bench, led: int, exposure_us: int, lit_us: int) -> Step:
 
 def watchdog(bench: Bench) -> None:
     """Light LEDs by a long table, say nothing more to the box, and see with the camera when the light goes out."""
-    findings, opened = bench.findings, bench.opened
+    findings, opened_cell = bench.findings, bench.opened
     findings.remedy = (
         "The box must switch off by itself: check its firmware's watchdog. Do not leave it unattended."
     )
@@ -138,32 +138,32 @@ def watchdog(bench: Bench) -> None:
         f"{seconds:g} s."
     )
     ids = bench.cell.leds.ids
-    metered = ids[np.unique(np.linspace(0, len(ids) - 1, _METERED).astype(int))].tolist()
-    exposure_us, led = good_exposure_us(bench, metered)
+    metered_ids = ids[np.unique(np.linspace(0, len(ids) - 1, _METERED).astype(int))].tolist()
+    exposure_us, led = good_exposure_us(bench, metered_ids)
     lit_s, dark_s = _last_light_s(bench, led, exposure_us, seconds)
     findings.remarks.append(f"silent at 0 s; light was last seen at {lit_s:.2f} s, dark first at {dark_s:.2f} s")
     findings.at_most("last light after the host fell silent", lit_s, seconds + _DARK_LATE_S, "s")
     findings.at_most("light until the end of the test", int(not np.isfinite(dark_s)), 0, "")
-    told = ""
+    report = ""
     try:
-        opened.ledbox.self_test()
+        opened_cell.ledbox.self_test()
     except DeviceError as error:
-        told = str(error)
-    findings.at_most("watchdogs that the box does not report", 0 if told else 1, 0, "")
-    findings.remarks.append(f"the box says: {told or 'nothing'}")
-    opened.ledbox.lights_off()
+        report = str(error)
+    findings.at_most("watchdogs that the box does not report", 0 if report else 1, 0, "")
+    findings.remarks.append(f"the box says: {report or 'nothing'}")
+    opened_cell.ledbox.lights_off()
 
 
 def _last_light_s(bench: Bench, led: int, exposure_us: int, watchdog_s: float) -> tuple[float, float]:
     """Seconds from the last command to the last frame with light, and to the first dark one after it: infinite if
     there is none. Both are taken before the frame's exposure, so a slow machine never makes the box look late."""
-    opened, clock = bench.opened, bench.opened.clock
+    opened_cell, clock = bench.opened, bench.opened.clock
     arm_camera(bench, exposure_us, hardware=False)
     darks = [_by_software(bench, exposure_us) for _ in range(3)]
     dark = darks[0]
     noise_dn = max(float(np.std(darks[1] - dark)), 1e-6) / np.sqrt(dark.size)
     table = _lasting_table(bench, led, watchdog_s + _WATCH_BEYOND_S)
-    box = table_box(opened.ledbox)
+    box = table_box(opened_cell.ledbox)
     box.load(table)
     silent_ns = clock.now_ns()
     box.start(table)
@@ -172,7 +172,7 @@ def _last_light_s(bench: Bench, led: int, exposure_us: int, watchdog_s: float) -
         bench.control.go_on()
         bright_dn = float((_by_software(bench, exposure_us) - dark).mean())
         lit.append((since_s, bright_dn > _LEAST_SIGNAL_SIGMA * noise_dn))
-    opened.camera.disarm()
+    opened_cell.camera.disarm()
     if not any(on for _, on in lit):
         raise StepFailedError(
             "the camera saw none of the light: jog the arm so that it sees a matte ball, then repeat"
@@ -189,7 +189,7 @@ def _lasting_table(bench: Bench, led: int, seconds: float) -> NDArray[np.void]:
     on_us = int(np.clip(_SEGMENT_US, *limits.on_us))
     count = int(np.ceil(seconds * 1e6 / on_us))
     leds = [int(turn[k % len(turn)]) for k in range(count)]
-    steps = [Step(one, on_us, 0, on_us + LED_GAP_US, sends_edge=False) for one in leds]
+    steps = [Step(lit_led, on_us, 0, on_us + LED_GAP_US, sends_edge=False) for lit_led in leds]
     return np.array([astuple(step) for step in steps], STEP_DTYPE)
 
 

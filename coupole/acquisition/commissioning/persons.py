@@ -49,9 +49,9 @@ class SimulatedPerson:
 
     def measures(self, what: str, question: str) -> float | None:
         """Measure with a ruler that the simulated cell has: it knows nothing of the rig."""
-        found = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
-        self._console.print(f"{question}: {found} mm (measured in the simulation)", markup=False)
-        return found if found is None else float(found)
+        length_mm = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
+        self._console.print(f"{question}: {length_mm} mm (measured in the simulation)", markup=False)
+        return length_mm if length_mm is None else float(length_mm)
 
     def told(self, message: str) -> None:
         self._console.print(message, markup=False)

@@ -16,8 +16,8 @@ def presence(bench: Bench) -> None:
     findings.remedy = (
         "See the enabling switch and its cable to the LED box. Until it works, move the arm from no console."
     )
-    held = box.presence()
-    if held is None:
+    input_state = box.presence()
+    if input_state is None:
         if bench.cell.rig.console.enabling_switch:
             raise StepFailedError(
                 "the rig has `console: enabling_switch: true`, but the LED box tells of no input for one: see its "
@@ -30,12 +30,12 @@ def presence(bench: Bench) -> None:
         return
     bench.ask_before("Step presence: nothing moves. Do not hold the enabling switch at the cell yet.")
     findings.at_most("switches that are held although nobody holds them", int(bool(box.presence())), 0, "")
-    for wanted, what in ((True, "held"), (False, "released"), (True, "held"), (False, "released")):
+    for is_held, state in ((True, "held"), (False, "released"), (True, "held"), (False, "released")):
         if not findings.passed:
             return
-        bench.person.hold_enabling_switch(held=wanted)
-        seen = _seen(bench, held=wanted)
-        findings.at_most(f"the switch was not seen to be {what} within {_WITHIN_S:g} s", int(not seen), 0, "")
+        bench.person.hold_enabling_switch(held=is_held)
+        is_seen = _seen(bench, held=is_held)
+        findings.at_most(f"the switch was not seen to be {state} within {_WITHIN_S:g} s", int(not is_seen), 0, "")
 
 
 def _seen(bench: Bench, *, held: bool) -> bool:

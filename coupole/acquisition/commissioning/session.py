@@ -90,24 +90,24 @@ def commission(
     slow = replace(cell, rig=at_reduced_speed(cell.rig, bodies))
     record = _record_so_far(cell, console)
     control = Control()
-    with open_cell(slow, on_opened=identity_printer(console)) as opened:
-        faults_of(cell, opened.identities["robot"]).refuse(cell.document.path)
+    with open_cell(slow, on_opened=identity_printer(console)) as opened_cell:
+        faults_of(cell, opened_cell.identities["robot"]).refuse(cell.document.path)
         record = _record_so_far(cell, console)  # of this controller, wherever it was reached before
         bench = replace(
-            bounded(lambda: _bench(slow, opened, bodies, person_at(opened), control)),
+            bounded(lambda: _bench(slow, opened_cell, bodies, person_at(opened_cell), control)),
             bars=lambda: step_bars(console),
             board=board,
         )
-        due = [only] if only else _due(cell, record, opened)
+        due = [only] if only else _due(cell, record, opened_cell)
         if not due:
             console.print("every step has passed and fits this cell; `--only STEP` repeats one")
         try:
-            with obeyed_by(control, opened.halt):
+            with obeyed_by(control, opened_cell.halt):
                 if due:
                     bench.ask_before(_BEGIN)
                 for step in due:
                     do = partial(_done, step, bench, cell, name)
-                    result, failure = bounded(do, stop=control.stop, rescue=opened.make_safe)
+                    result, failure = bounded(do, stop=control.stop, rescue=opened_cell.make_safe)
                     record = record.with_result(result)
                     write_commissioning(cell, record)
                     commissioning_page.write(record_path(cell), record)
@@ -118,26 +118,28 @@ def commission(
                         raise CommissioningFailed(step, shortcomings(result))
         except DeviceError as error:
             if error.device == "robot":
-                faults_of(cell, opened.identities["robot"]).note(str(error), "commissioning")
+                faults_of(cell, opened_cell.identities["robot"]).note(str(error), "commissioning")
             raise
         finally:
-            opened.make_safe()
-            for trouble in opened.trouble:
+            opened_cell.make_safe()
+            for trouble in opened_cell.trouble:
                 alarm(trouble)
-            if not opened.arm_confirmed:
-                faults_of(cell, opened.identities["robot"]).note("; ".join(opened.trouble), "commissioning")
+            if not opened_cell.arm_confirmed:
+                faults_of(cell, opened_cell.identities["robot"]).note(
+                    "; ".join(opened_cell.trouble), "commissioning"
+                )
     return record
 
 
 def shortcomings(result: StepResult) -> list[str]:
     """List in words what did not pass in a step."""
-    missed = [
-        f"{one.what}: {one.found:.4g} {one.unit}, at most {one.limit:.4g}".replace(" ,", ",")
-        for one in result.limits
-        if not one.passed
+    sentences = [
+        f"{entry.what}: {entry.found:.4g} {entry.unit}, at most {entry.limit:.4g}".replace(" ,", ",")
+        for entry in result.limits
+        if not entry.passed
     ]
-    missed += [f"answered with no: {one.question}" for one in result.answers if not one.yes]
-    return [*missed, *([result.failure] if result.failure else [])]
+    sentences += [f"answered with no: {entry.question}" for entry in result.answers if not entry.yes]
+    return [*sentences, *([result.failure] if result.failure else [])]
 
 
 def _bench(cell: Cell, opened: OpenedCell, bodies: CellBodies, person: Person, control: Control) -> Bench:
@@ -145,18 +147,17 @@ def _bench(cell: Cell, opened: OpenedCell, bodies: CellBodies, person: Person, c
 
 
 def _record_so_far(cell: Cell, console: Console) -> CommissioningRecord:
-    found = read_commissioning(cell)
-    simulated = in_world(cell.rig, dry_run=False)
-    if found is None:
+    record = read_commissioning(cell)
+    is_simulated = in_world(cell.rig, dry_run=False)
+    if record is None:
         return empty_record(cell)
-    if (found.rig, found.simulated) != (cell.rig.name, simulated):
-        kind = "simulated" if found.simulated else "real"
+    if (record.rig, record.simulated) != (cell.rig.name, is_simulated):
+        kind = "simulated" if record.simulated else "real"
         raise InputError(
-            f"{record_path(cell)}: is of the {kind} cell {found.rig}; expected that of {cell.rig.name}. Give each "
-            "cell "
-            "its own `storage: state:`, or move the file away"
+            f"{record_path(cell)}: is of the {kind} cell {record.rig}; expected that of {cell.rig.name}. Give "
+            "each cell its own `storage: state:`, or move the file away"
         )
-    return found
+    return record
 
 
 def _due(cell: Cell, record: CommissioningRecord, opened: OpenedCell) -> list[Step]:

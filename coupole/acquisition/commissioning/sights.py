@@ -54,17 +54,17 @@ def deviations(
     off_mm = support_from_board[:3, :3] @ middle_mm + support_from_board[:3, 3] - expected_mm
     # If the camera alone is wrong, the board lies flat where it was measured; how it is turned there is not known.
     flat = _laid_flat(support_from_board, middle_mm, expected_mm)
-    shifted = _fitted(lambda x: sees.residuals_mm(_turned(flat, expected_mm, x[3]), x[:3]), 4)
+    shift_and_turn = _fitted(lambda x: sees.residuals_mm(_turned(flat, expected_mm, x[3]), x[:3]), 4)
     left_free = sees.residuals_mm(support_from_board, np.zeros(3))
-    left_shifted = sees.residuals_mm(_turned(flat, expected_mm, shifted[3]), shifted[:3])
-    ends = np.cumsum([2 * len(one.pixels) for one in sights])[:-1]
+    left_shifted = sees.residuals_mm(_turned(flat, expected_mm, shift_and_turn[3]), shift_and_turn[:3])
+    ends = np.cumsum([2 * len(sight.pixels) for sight in sights])[:-1]
     worst_mm = max(float(np.sqrt(2.0 * np.mean(part**2))) for part in np.split(left_free, ends))
     return Deviations(
         height_mm=float(off_mm[2]),
         sideways_mm=float(np.hypot(*off_mm[:2])),
         tilt_deg=float(np.degrees(np.arccos(np.clip(abs(support_from_board[2, 2]), 0.0, 1.0)))),
         disagreement_mm=worst_mm,
-        cause=_cause(off_mm, shifted[:3], np.linalg.norm(left_free) <= np.linalg.norm(left_shifted)),
+        cause=_cause(off_mm, shift_and_turn[:3], np.linalg.norm(left_free) <= np.linalg.norm(left_shifted)),
     )
 
 
@@ -75,13 +75,13 @@ class _Model:
     def residuals_mm(self, support_from_board: Transform, camera_shift_mm: Floats) -> Floats:
         """[2 corners] predicted less seen, as lengths at the board's distance; the projection centre is shifted in
         the camera's frame."""
-        found = []
-        for one in self._sights:
-            camera_from_board = inverse(one.support_from_camera) @ support_from_board
-            points = one.board_mm @ camera_from_board[:3, :3].T + camera_from_board[:3, 3] - camera_shift_mm
-            off_px = project(points, self._intrinsics.vector()).pixels - one.pixels
-            found.append((off_px * points[:, 2:] / self._intrinsics.fx).ravel())
-        return np.concatenate(found)
+        residuals = []
+        for sight in self._sights:
+            camera_from_board = inverse(sight.support_from_camera) @ support_from_board
+            points = sight.board_mm @ camera_from_board[:3, :3].T + camera_from_board[:3, 3] - camera_shift_mm
+            off_px = project(points, self._intrinsics.vector()).pixels - sight.pixels
+            residuals.append((off_px * points[:, 2:] / self._intrinsics.fx).ravel())
+        return np.concatenate(residuals)
 
 
 def _fitted(residuals: Callable[[Floats], Floats], count: int) -> Floats:

@@ -88,18 +88,18 @@ def read_alta(path: Path) -> AltaSamples:
 
 def _head(path: Path, lines: Sequence[str]) -> tuple[dict[str, tuple[str, int]], int]:
     """Values of the head's keys with their lines, and how many lines there are before the samples."""
-    found: dict[str, tuple[str, int]] = {}
+    fields: dict[str, tuple[str, int]] = {}
     for number, line in enumerate(lines, start=1):
         key = _HEAD.match(line)
-        if line.lstrip("# ").startswith(_END) and found:
-            return found, number
+        if line.lstrip("# ").startswith(_END) and fields:
+            return fields, number
         if key is not None:
-            found[key[1].upper()] = key[2].strip().strip('"'), number
-        elif found and line.strip() and not line.startswith("#"):
-            return found, number - 1
-    if "DIM" not in found:
+            fields[key[1].upper()] = key[2].strip().strip('"'), number
+        elif fields and line.strip() and not line.startswith("#"):
+            return fields, number - 1
+    if "DIM" not in fields:
         raise InputError(f"{path}: expected ALTA's text with a line `#DIM inputs outputs`; found none")
-    return found, len(lines)
+    return fields, len(lines)
 
 
 def _dim(path: Path, head: dict[str, tuple[str, int]]) -> tuple[int, int]:
@@ -258,10 +258,10 @@ def interpolated(samples: AltaSamples) -> Brdf:
 
 def _merged(points: Array, values: Array) -> tuple[Array, Array]:
     """Points that differ, and the means of the values there."""
-    _, first, which = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    _, first, group = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     total = np.zeros((len(first), values.shape[1]))
-    np.add.at(total, which.ravel(), values)
-    return points[first], total / np.bincount(which.ravel())[:, None]
+    np.add.at(total, group.ravel(), values)
+    return points[first], total / np.bincount(group.ravel())[:, None]
 
 
 def _place(light: Array, eye: Array) -> Array:
@@ -285,7 +285,7 @@ def _between(
 ) -> Array:
     wi, wo = np.broadcast_arrays(wi, wo)
     at = _place(wi, wo)
-    found = between(at)
-    found = np.where(np.isnan(found), nearest(at), found)
+    values = between(at)
+    values = np.where(np.isnan(values), nearest(at), values)
     above = (wi[..., 2] > 0.0) & (wo[..., 2] > 0.0)
-    return np.where(above[..., None], found, 0.0)
+    return np.where(above[..., None], values, 0.0)

@@ -48,12 +48,12 @@ class BakedTable:
 
     def encode(self, wavelengths_nm: Sequence[float], bands: Sequence[int]) -> bytes:
         """A file with the values of `bands` at `wavelengths_nm`."""
-        mixed = np.einsum("ptcrk,cb->ptbrk", self.values, self.to_bands[:, list(bands)].astype(np.float32))
+        band_values = np.einsum("ptcrk,cb->ptbrk", self.values, self.to_bands[:, list(bands)].astype(np.float32))
         return tensors(
             {
                 **self.fields,
                 "wavelengths": np.asarray(wavelengths_nm, np.float32),
-                "spectra": np.ascontiguousarray(mixed, np.float32),
+                "spectra": np.ascontiguousarray(band_values, np.float32),
             }
         )
 
@@ -92,11 +92,11 @@ def bake(source: Brdf, to_bands: Array | None = None, *, thetas: int = THETAS, s
 
 def from_file(path: Path, table: RglTable, to_bands: Array) -> BakedTable:
     """An isotropic file of the format as it is, with its own grid. Raises InputError."""
-    found = read_fields(path)
-    if "luminance" not in found:
+    file_fields = read_fields(path)
+    if "luminance" not in file_fields:
         raise InputError(f"{path}: expected a field `luminance`, by which directions are drawn; found none")
     names = ("phi_i", "theta_i", "ndf", "sigma", "vndf", "luminance")
-    fields: dict[str, NDArray[Any]] = {name: np.asarray(found[name], np.float32) for name in names}
+    fields: dict[str, NDArray[Any]] = {name: np.asarray(file_fields[name], np.float32) for name in names}
     fields["description"] = np.frombuffer(b"from a file", np.uint8)
     fields["jacobian"] = np.array([table.jacobian], np.uint8)
     return BakedTable(fields, np.ascontiguousarray(np.moveaxis(table.values, -1, 2)), to_bands)
@@ -106,12 +106,12 @@ def _back(source: Brdf) -> Array:
     """[nodes] the channels' mean of the reflectance back to the light."""
     theta = 0.5 * np.pi * np.linspace(0.0, 1.0, _NDF_NODES) ** 2
     ways = directions(np.cos(np.minimum(theta, _STEEPEST)), np.zeros(_NDF_NODES))
-    found = source(ways, ways).mean(axis=-1)
-    return np.asarray(np.maximum(found, _FLOOR * max(float(found.max()), 1e-9)))
+    reflectance = source(ways, ways).mean(axis=-1)
+    return np.asarray(np.maximum(reflectance, _FLOOR * max(float(reflectance.max()), 1e-9)))
 
 
 def wavelengths_of(table: RglTable) -> Array:
     """[channels, 81] straight between the table's own wavelengths, ends held."""
     assert table.wavelengths_nm is not None
     nodes_nm = table.wavelengths_nm
-    return np.stack([np.interp(WAVELENGTHS_NM, nodes_nm, one) for one in np.eye(len(nodes_nm))])
+    return np.stack([np.interp(WAVELENGTHS_NM, nodes_nm, node_weights) for node_weights in np.eye(len(nodes_nm))])

@@ -66,17 +66,17 @@ class Face:
         """Return the reflectance of the layer under this face. Raises InputError where no layer can be the reason
         of what is seen."""
         r = np.asarray(measured.values, dtype=float) - self.gloss
-        found = np.asarray(r / (self.passing + self.inner * r))
-        found = np.where((found > 1.0) & (found < 1.0 + _ROUNDING), 1.0, found)
-        wrong = ~((found >= 0.0) & (found <= 1.0))
+        internal = np.asarray(r / (self.passing + self.inner * r))
+        internal = np.where((internal > 1.0) & (internal < 1.0 + _ROUNDING), 1.0, internal)
+        wrong = ~((internal >= 0.0) & (internal <= 1.0))
         if wrong.any():
-            low, high = (np.broadcast_to(v, found.shape)[wrong][0] for v in (self.gloss, self.brightest))
+            low, high = (np.broadcast_to(v, internal.shape)[wrong][0] for v in (self.gloss, self.brightest))
             raise InputError(
                 f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
                 f"{np.asarray(measured.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: see "
                 "whether gloss is included, and whether the sample has a glossy face"
             )
-        return InternalReflectance(found)
+        return InternalReflectance(internal)
 
     @property
     def brightest(self) -> Array:

@@ -29,10 +29,10 @@ def albedo(brdf: Brdf, cosines: Array, *, nodes: int = 64) -> Array:
     for cosine in np.atleast_1d(cosines):
         wi = directions(np.asarray(cosine), np.asarray(0.0))
         widest = 0.5 * np.pi + np.arccos(cosine)
-        theta, spread = widest * u**3, weight * widest * 3.0 * u**2
+        theta, theta_weight = widest * u**3, weight * widest * 3.0 * u**2
         local = directions(np.cos(theta)[:, None], phi)
         wo = _about(np.array([-wi[0], 0.0, wi[2]]), local)
-        solid_angle = (spread * np.sin(theta))[:, None] * (2.0 * np.pi / nodes)
+        solid_angle = (theta_weight * np.sin(theta))[:, None] * (2.0 * np.pi / nodes)
         share = brdf(np.broadcast_to(wi, wo.shape), wo) * (solid_angle * np.maximum(wo[..., 2], 0.0))[..., None]
         totals.append(share.sum(axis=(0, 1)))
     return np.asarray(totals)

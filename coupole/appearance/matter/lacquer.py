@@ -23,9 +23,13 @@ def absorption_from(transmittance: ArrayLike, thickness_mm: float, index: float 
 
     Without interference, T = (1 - F)^2 t/(1 - F^2 t^2), solved for t = exp(-absorption h).
     """
-    measured = within("transmittance", transmittance, 1e-9, 1.0)
+    transmittance_with_faces = within("transmittance", transmittance, 1e-9, 1.0)
     f = float(fresnel.reflectance(1.0, index))
-    inside = 2.0 * measured / ((1.0 - f) ** 2 + np.sqrt((1.0 - f) ** 4 + 4.0 * (f * measured) ** 2))
+    inside = (
+        2.0
+        * transmittance_with_faces
+        / ((1.0 - f) ** 2 + np.sqrt((1.0 - f) ** 4 + 4.0 * (f * transmittance_with_faces) ** 2))
+    )
     return -np.log(within("transmittance inside the film", inside, 0.0, 1.0)) / thickness_mm
 
 

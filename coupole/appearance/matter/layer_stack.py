@@ -74,17 +74,17 @@ class Binder:
     def four_flux(self, ground: Ground, layer: four_flux.Layer) -> Ground:
         """A layer of four fluxes; its directed coefficients hold along the path."""
         longer = 1.0 / self.cosines
-        slanted = replace(
+        slanted_layer = replace(
             layer,
             direct_absorption=np.asarray(layer.direct_absorption) * longer,
             forward=np.asarray(layer.forward) * longer,
             backward=np.asarray(layer.backward) * longer,
         )
         background = four_flux.Background(ground.diffuse, ground.directed, ground.mirror)
-        directed, mirror = four_flux.reflectances(slanted, background)
+        directed_reflectance, mirror = four_flux.reflectances(slanted_layer, background)
         rho, tau = kubelka_munk.layer(layer.absorption, layer.scattering, layer.thickness_mm)
         diffuse = np.broadcast_to(kubelka_munk.over(rho, tau, ground.diffuse), BANDS)
-        return Ground(diffuse, directed, mirror, ground.roughness)
+        return Ground(diffuse, directed_reflectance, mirror, ground.roughness)
 
     def clear(self, ground: Ground, absorption: ArrayLike, thickness_mm: float) -> Ground:
         """A layer without scattering; the path of diffuse light is twice as long, as Kubelka and Munk's is."""
@@ -103,13 +103,13 @@ class Binder:
         all_back, all_through = stack_power(mu, WAVELENGTHS_NM, films, outside=index, substrate=index)
         share = 2.0 * mu * weight
         rho, tau = share @ all_back, share @ all_through
-        directed = through * tau * ground.directed / (1.0 - rho * ground.diffuse)
+        directed_reflectance = through * tau * ground.directed / (1.0 - rho * ground.diffuse)
         mirror = back + through**2 * ground.mirror / (1.0 - back * ground.mirror)
         diffuse = rho + tau**2 * ground.diffuse / (1.0 - rho * ground.diffuse)
         f = float(within("uncovered", uncovered, 0.0, 1.0))
         return Ground(
             (1.0 - f) * diffuse + f * ground.diffuse,
-            (1.0 - f) * directed + f * ground.directed,
+            (1.0 - f) * directed_reflectance + f * ground.directed,
             (1.0 - f) * mirror + f * ground.mirror,
             roughness,
         )
@@ -157,16 +157,16 @@ def stack(binder: Binder, ground: Ground, roughness: float, films: Sequence[Film
 def stack_brdf(wi: Array, wo: Array, *, stack: Stack) -> Array:
     """The face's gloss, the mirror image of a ground, and diffuse light: f [..., bands], 1/sr."""
     coat = stack.coat
-    found = brdf.ggx(
+    total = brdf.ggx(
         wi, wo, roughness=coat.roughness, fresnel=lambda c: layered.at_cosine(coat.sheet.reflectance, c)
     )
     if stack.mirror.any():
-        found = found + brdf.ggx(
+        total = total + brdf.ggx(
             wi, wo, roughness=stack.mirror_roughness, fresnel=lambda c: layered.at_cosine(stack.mirror, c)
         )
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     parts = layered.at_cosine(stack.body, wi[..., 2]) * layered.at_cosine(stack.body, wo[..., 2])
-    return np.asarray(found + above * parts / (np.pi * np.maximum(stack.mean_body, 1e-12)))
+    return np.asarray(total + above * parts / (np.pi * np.maximum(stack.mean_body, 1e-12)))
 
 
 def _seen_roughness(mirror: float, face: float, index: float) -> float:

@@ -69,17 +69,17 @@ def sheet(films: Sequence[thin_film.Film], body_index: float) -> Sheet:
     # Diffuse light from within: 2 mu dmu over the cosines in the body. Below the critical angle it goes over the
     # cosines in air, beyond it over the square root of what is missing to that angle: smooth in both parts.
     critical = np.sqrt(1.0 - 1.0 / body_index**2)
-    passing, passed = from_body(np.sqrt(critical**2 + (mu / body_index) ** 2))
+    passing, escaping = from_body(np.sqrt(critical**2 + (mu / body_index) ** 2))
     caught, _ = from_body(np.sqrt(critical**2 - (critical * mu) ** 2))
     share = 2.0 * mu * weight
     at_grazing = np.maximum(COSINES, 1e-9)
-    reflected, transmitted = from_air(at_grazing)
+    reflectance, transmittance = from_air(at_grazing)
     return Sheet(
-        reflectance=reflected,
-        transmittance=transmitted,
-        normal_reflectance=reflected[-1],
+        reflectance=reflectance,
+        transmittance=transmittance,
+        normal_reflectance=reflectance[-1],
         internal_reflectance=share @ passing / body_index**2 + critical**2 * (share @ caught),
-        internal_transmittance=share @ passed / body_index**2,
+        internal_transmittance=share @ escaping / body_index**2,
     )
 
 
@@ -88,17 +88,17 @@ def coat(smooth: Sheet, roughness: float) -> Coat:
 
     Of the light that it does not reflect at an angle, the rough sheet transmits the same share as the smooth one.
     """
-    lost = 1.0 - _facets(roughness) @ smooth.reflectance
-    entering = lost * smooth.transmittance / np.maximum(1.0 - smooth.reflectance, 1e-12)
+    remainder = 1.0 - _facets(roughness) @ smooth.reflectance
+    entering = remainder * smooth.transmittance / np.maximum(1.0 - smooth.reflectance, 1e-12)
     return Coat(smooth, roughness, entering, entering / np.maximum(_over_angles(entering), 1e-300))
 
 
 def layered(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance) -> Array:
     """The coat's gloss, and the light of the body [bands] through it."""
     gloss = brdf.ggx(wi, wo, roughness=coat.roughness, fresnel=lambda c: at_cosine(coat.sheet.reflectance, c))
-    exchanged = at_cosine(coat.entering, wi[..., 2]) * at_cosine(coat.leaving, wo[..., 2])
+    exchange = at_cosine(coat.entering, wi[..., 2]) * at_cosine(coat.leaving, wo[..., 2])
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
-    return gloss + above * exchanged * emerging(coat.sheet, body) / np.pi
+    return gloss + above * exchange * emerging(coat.sheet, body) / np.pi
 
 
 def emerging(sheet: Sheet, body: InternalReflectance) -> Array:
@@ -136,15 +136,19 @@ def _facets(roughness: float) -> Array:
     table = np.zeros((_ANGLES, _ANGLES))
     for row, z in enumerate(np.maximum(COSINES, 1e-6)):
         wi = np.array([np.sqrt(1.0 - z * z), 0.0, z])
-        stretched = np.array([alpha * wi[0], 0.0, z]) / np.hypot(alpha * wi[0], z)
+        stretched_way = np.array([alpha * wi[0], 0.0, z]) / np.hypot(alpha * wi[0], z)
         t1 = np.sqrt(radius2)[:, None] * np.cos(phi)
         t2 = np.sqrt(radius2)[:, None] * np.sin(phi)
-        tilt = 0.5 * (1.0 + stretched[2])
+        tilt = 0.5 * (1.0 + stretched_way[2])
         t2 = (1.0 - tilt) * np.sqrt(np.maximum(0.0, 1.0 - t1**2)) + tilt * t2
         t3 = np.sqrt(np.maximum(0.0, 1.0 - t1**2 - t2**2))
         # The disk's axes: t1 along y, t2 perpendicular to it and to the stretched direction.
         h = np.stack(
-            [alpha * (t3 * stretched[0] - t2 * stretched[2]), alpha * t1, t3 * stretched[2] + t2 * stretched[0]]
+            [
+                alpha * (t3 * stretched_way[0] - t2 * stretched_way[2]),
+                alpha * t1,
+                t3 * stretched_way[2] + t2 * stretched_way[0],
+            ]
         )
         h /= np.linalg.norm(h, axis=0)
         cos_h = np.clip(np.tensordot(wi, h, 1), 0.0, 1.0)

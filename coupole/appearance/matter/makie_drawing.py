@@ -55,12 +55,12 @@ def _shares(path: Path) -> Array:
     from PIL import Image
 
     try:
-        with Image.open(path) as opened:
-            if "A" in opened.getbands():
-                return np.asarray(opened.getchannel("A"), dtype=float) / 255.0
-            if opened.mode.startswith("I"):
-                return np.asarray(opened, dtype=float) / 65535.0
-            return np.asarray(opened.convert("L"), dtype=float) / 255.0
+        with Image.open(path) as image:
+            if "A" in image.getbands():
+                return np.asarray(image.getchannel("A"), dtype=float) / 255.0
+            if image.mode.startswith("I"):
+                return np.asarray(image, dtype=float) / 65535.0
+            return np.asarray(image.convert("L"), dtype=float) / 255.0
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a picture (PNG, TIFF), white where metal is; {error}") from error
 
@@ -68,15 +68,15 @@ def _shares(path: Path) -> Array:
 def _waves(place: Array) -> Array:
     """Distance to the line, negative in it, both in periods: rows of ringed disks, each over the one above it."""
     lowest = np.floor(4.0 * place[:, 1]) - 2.0
-    distance, covered = np.full(len(place), np.inf), np.zeros(len(place), bool)
+    distance, is_covered = np.full(len(place), np.inf), np.zeros(len(place), bool)
     for row in range(5):
         level = lowest + row
         across = np.mod(place[:, 0] - 0.5 * np.mod(level, 2.0) + 0.5, 1.0) - 0.5
         radius = np.hypot(across, place[:, 1] - 0.25 * level)
-        takes = (radius <= 0.5) & ~covered
+        takes = (radius <= 0.5) & ~is_covered
         to_ring = np.abs(np.mod((0.48 - radius) * 2.0 * _RINGS + 0.5, 1.0) - 0.5) / (2.0 * _RINGS)
         distance = np.where(takes, to_ring - _HALF_LINE, distance)
-        covered |= takes
+        is_covered |= takes
     return distance
 
 

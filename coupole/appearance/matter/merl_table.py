@@ -46,9 +46,9 @@ def _looked_up(wi: Array, wo: Array, *, planes: NDArray[np.float64]) -> Array:
     half = wi + wo
     half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
     cosine_h, sine_h = half[..., 2], np.hypot(half[..., 0], half[..., 1])
-    turned = sine_h > 1e-9
-    cosine_p = np.where(turned, half[..., 0] / np.maximum(sine_h, 1e-12), 1.0)
-    sine_p = np.where(turned, half[..., 1] / np.maximum(sine_h, 1e-12), 0.0)
+    is_tilted = sine_h > 1e-9
+    cosine_p = np.where(is_tilted, half[..., 0] / np.maximum(sine_h, 1e-12), 1.0)
+    sine_p = np.where(is_tilted, half[..., 1] / np.maximum(sine_h, 1e-12), 0.0)
     along = cosine_p * wi[..., 0] + sine_p * wi[..., 1]
     y = cosine_p * wi[..., 1] - sine_p * wi[..., 0]
     x = cosine_h * along - sine_h * wi[..., 2]

@@ -100,8 +100,8 @@ def triangulate(found: Flakes, *, around: int = 24, along: int = 6) -> tuple[Arr
     unit = np.concatenate([[[0.0, 0.0, -1.0]], (level[:, None] * ring).reshape(-1, 3), [[0.0, 0.0, 1.0]]])
     local = unit * found.half_axes_mm[:, None, :]
     corners = np.einsum("nij,nmj->nmi", found.slab_from_flake, local) + found.centres_mm[:, None, :]
-    one = _faces(around, along)
-    faces = one + (np.arange(len(corners)) * len(unit))[:, None, None]
+    flake_faces = _faces(around, along)
+    faces = flake_faces + (np.arange(len(corners)) * len(unit))[:, None, None]
     return corners.reshape(-1, 3), faces.reshape(-1, 3)
 
 

@@ -70,8 +70,10 @@ class PaintFile:
 
     def uncertainties_on_grid(self) -> tuple[Array, Array]:
         """Standard uncertainties [81] of K and S."""
-        found = [np.interp(WAVELENGTHS_NM, self.wavelengths_nm, u) for u in (self.u_absorption, self.u_scattering)]
-        return found[0], found[1]
+        u_on_grid = [
+            np.interp(WAVELENGTHS_NM, self.wavelengths_nm, u) for u in (self.u_absorption, self.u_scattering)
+        ]
+        return u_on_grid[0], u_on_grid[1]
 
 
 def encode(paint: PaintFile) -> str:
@@ -132,9 +134,9 @@ def _head(text: str, path: Path) -> tuple[dict[str, Any], int, list[str]]:
     """The head, the number of the line of names, and the lines from there."""
     lines = text.splitlines()
     end = next((at for at, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
-    told = "\n".join(line[1:].strip(" ") for line in lines[1:end])
+    head_text = "\n".join(line[1:].strip(" ") for line in lines[1:end])
     try:
-        head: Any = yaml_of(told, str(path), line=2)
+        head: Any = yaml_of(head_text, str(path), line=2)
     except InputError as error:
         first = error.problems[0]
         raise _wrong(path, 2, f"expected YAML in the lines that begin with #: {first.message}") from error

@@ -32,14 +32,14 @@ def read_result(
         kd, ks, alpha = _read(folder, "clusters")[1:]
         if not 0 <= cluster < len(kd):
             raise InputError(f"{folder}: cluster: expected 0 to {len(kd) - 1}, found {cluster}")
-        chosen = np.array([cluster])
+        rows = np.array([cluster])
     else:
         numbers, kd, ks, alpha = _read(folder, fit)
-        known = np.isfinite(alpha) & np.isfinite(kd).all(axis=1) & np.isfinite(ks).all(axis=1)
-        chosen = np.flatnonzero(known if triangles is None else known & np.isin(numbers, triangles))
-        if not len(chosen):
+        is_known = np.isfinite(alpha) & np.isfinite(kd).all(axis=1) & np.isfinite(ks).all(axis=1)
+        rows = np.flatnonzero(is_known if triangles is None else is_known & np.isin(numbers, triangles))
+        if not len(rows):
             raise InputError(f"{folder}: expected triangles with a material, found none; choose other triangles")
-    order = chosen[np.argsort(alpha[chosen])]
+    order = rows[np.argsort(alpha[rows])]
     lobes = [
         (ks[part].sum(axis=0) / len(order), float(np.average(alpha[part], weights=ks[part].sum(axis=1) + 1e-12)))
         for part in np.array_split(order, min(_LOBES, len(order)))
@@ -48,10 +48,10 @@ def read_result(
 
 
 def _mixed(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array, float]]) -> Array:
-    found = brdf.lambert(wi, wo, reflectance=np.pi * kd)
+    total = brdf.lambert(wi, wo, reflectance=np.pi * kd)
     for ks, alpha in lobes:
-        found = found + ks * brdf.ggx(wi, wo, roughness=alpha, fresnel=lambda c: np.ones((*np.shape(c), 1)))
-    return found
+        total = total + ks * brdf.ggx(wi, wo, roughness=alpha, fresnel=lambda c: np.ones((*np.shape(c), 1)))
+    return total
 
 
 def _read(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:

@@ -62,12 +62,12 @@ class RglTable:
         wi, wo = np.broadcast_arrays(np.asarray(wi, np.float64), np.asarray(wo, np.float64))
         shape = wi.shape[:-1]
         wi, wo = wi.reshape(-1, 3), wo.reshape(-1, 3)
-        found = np.zeros((len(wi), self.values.shape[-1]))
+        reflectance = np.zeros((len(wi), self.values.shape[-1]))
         above = np.flatnonzero((wi[:, 2] > 0.0) & (wo[:, 2] > 0.0))
         for first in range(0, len(above), _CHUNK):
-            mine = above[first : first + _CHUNK]
-            found[mine] = self._looked_up(wi[mine], wo[mine])
-        return found.reshape(*shape, -1)
+            chunk = above[first : first + _CHUNK]
+            reflectance[chunk] = self._looked_up(wi[chunk], wo[chunk])
+        return reflectance.reshape(*shape, -1)
 
     @property
     def isotropic(self) -> bool:
@@ -89,7 +89,7 @@ class RglTable:
             phi_m = phi_m - phi_i
         u_m = np.stack([_of_theta(theta_m), _of_phi(phi_m) % 1.0], axis=1)
         slices = self._slices(phi_i, theta_i)
-        found = _bilinear(self.values, slices, self._unwarped(u_m, slices))
+        values = _bilinear(self.values, slices, self._unwarped(u_m, slices))
         if self.jacobian:
             u_i = np.stack([_of_theta(theta_i), _of_phi(phi_i)], axis=1)
             whole: Weighted = [(np.zeros(len(wi), np.intp), np.ones(len(wi)))]
@@ -97,8 +97,8 @@ class RglTable:
                 _bilinear(plane[None, None, :, :, None], whole, u)
                 for plane, u in ((self.ndf, u_m), (self.sigma, u_i))
             )
-            found *= ndf / (4.0 * sigma)
-        return np.asarray(np.maximum(found, 0.0) / cosine)
+            values *= ndf / (4.0 * sigma)
+        return np.asarray(np.maximum(values, 0.0) / cosine)
 
     def _in_the_measured_part(self, wi: Array, wo: Array) -> tuple[Array, Array]:
         """Directions turned or mirrored to where incidence was measured, if that is a half or a quarter of all."""
@@ -115,11 +115,11 @@ class RglTable:
 
     def _slices(self, phi_i: Array, theta_i: Array) -> Weighted:
         """Numbers of slices [P, T], flat, with their shares."""
-        found: Weighted = []
+        slices: Weighted = []
         for row, share_of_row in _neighbours(self.phi_i, phi_i):
             for column, share in _neighbours(self.theta_i, theta_i):
-                found.append((row * len(self.theta_i) + column, share_of_row * share))
-        return found
+                slices.append((row * len(self.theta_i) + column, share_of_row * share))
+        return slices
 
     @cached_property
     def _cumulative(self) -> tuple[Array, Array, Array]:
@@ -144,14 +144,16 @@ class RglTable:
         def mixed(table: Array, *place: Indices) -> Array:
             return np.asarray(sum(share * table[number, *place] for number, share in slices))
 
-        left, right = (
+        density_left, density_right = (
             (1.0 - y) * mixed(density, row, column + k) + y * mixed(density, row + 1, column + k) for k in (0, 1)
         )
         before = (1.0 - y) * mixed(along, row, column) + y * mixed(along, row + 1, column)
         last = np.full(len(u), width - 1)
         lower, upper = mixed(along, row, last), mixed(along, row + 1, last)
         total = (1.0 - y) * lower + y * upper
-        in_row = (before + x * (left + 0.5 * x * (right - left))) / np.maximum(total, np.finfo(float).tiny)
+        in_row = (before + x * (density_left + 0.5 * x * (density_right - density_left))) / np.maximum(
+            total, np.finfo(float).tiny
+        )
         below = mixed(rows, row) + y * (lower + 0.5 * y * (upper - lower))
         return np.stack([in_row, below], axis=1)
 
@@ -164,17 +166,17 @@ def read_bsdf(path: Path) -> RglTable:
     def field(name: str, *shape: int | None) -> Array:
         if name not in fields:
             raise InputError(f"{path}: {_WHAT}; found no field `{name}` in it, but {', '.join(sorted(fields))}")
-        found = fields[name]
-        fits = found.ndim == len(shape) and all(w in (None, n) for n, w in zip(found.shape, shape, strict=True))
-        if found.dtype != np.float32 or not fits or not found.size:
-            wanted = " x ".join("n" if length is None else str(length) for length in shape)
+        array = fields[name]
+        fits = array.ndim == len(shape) and all(w in (None, n) for n, w in zip(array.shape, shape, strict=True))
+        if array.dtype != np.float32 or not fits or not array.size:
+            shape_words = " x ".join("n" if length is None else str(length) for length in shape)
             raise InputError(
-                f"{path}: field `{name}`: expected float32, {wanted}; found {found.dtype}, "
-                f"{' x '.join(map(str, found.shape))}; fetch or export it anew"
+                f"{path}: field `{name}`: expected float32, {shape_words}; found {array.dtype}, "
+                f"{' x '.join(map(str, array.shape))}; fetch or export it anew"
             )
-        if not np.isfinite(found).all():
+        if not np.isfinite(array).all():
             raise InputError(f"{path}: field `{name}`: holds values that are no numbers; fetch or export it anew")
-        return found.astype(np.float64)
+        return array.astype(np.float64)
 
     phi_i, theta_i = field("phi_i", None), field("theta_i", None)
     spectral = "spectra" in fields
@@ -191,11 +193,11 @@ def read_bsdf(path: Path) -> RglTable:
             raise InputError(f"{path}: field `{name}`: expected planes of 2 x 2 or more, of no value below 0")
     if (density["vndf"].mean(axis=(2, 3)) <= 0.0).any() or density["sigma"].min() <= 0.0:
         raise InputError(f"{path}: `vndf` or `sigma` is 0 where it must not be; fetch or export it anew")
-    flag, told = fields.get("jacobian"), fields.get("description", np.zeros(0, np.uint8))
+    flag, description = fields.get("jacobian"), fields.get("description", np.zeros(0, np.uint8))
     if flag is None or flag.size != 1:
         raise InputError(f"{path}: field `jacobian`: expected one number, 0 or 1; fetch or export it anew")
     planes = np.ascontiguousarray(np.moveaxis(values.astype(np.float32), 2, -1))
-    text = told.tobytes().decode("utf-8", "replace")
+    text = description.tobytes().decode("utf-8", "replace")
     return RglTable(
         phi_i, theta_i, density["ndf"], density["sigma"], density["vndf"], planes, wavelengths_nm, bool(flag[0]),
         text,
@@ -219,7 +221,7 @@ def _fields(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
     """Fields of a tensor file by name. Raises InputError."""
     if not data.startswith(_MAGIC):
         raise InputError(f"{path}: {_WHAT}, version 1.0, which begins with `tensor_file`; found {data[:12]!r}")
-    found: dict[str, NDArray[np.generic]] = {}
+    fields: dict[str, NDArray[np.generic]] = {}
     try:
         (count,), at = struct.unpack_from("<I", data, len(_MAGIC)), len(_MAGIC) + 4
         for _ in range(count):
@@ -229,10 +231,10 @@ def _fields(path: Path, data: bytes) -> dict[str, NDArray[np.generic]]:
             at += 2 + length + 11
             shape = struct.unpack_from(f"<{ndim}Q", data, at)
             at += 8 * ndim
-            found[name] = np.frombuffer(data, _DTYPES[kind], math.prod(shape), start).reshape(shape)
+            fields[name] = np.frombuffer(data, _DTYPES[kind], math.prod(shape), start).reshape(shape)
     except (struct.error, ValueError, KeyError, OverflowError) as error:
         raise InputError(f"{path}: {_WHAT}; its head is damaged, or it was cut short; fetch it anew") from error
-    return found
+    return fields
 
 
 # -- places in tables -----------------------------------------------------------------------------------------
@@ -274,10 +276,10 @@ def _bilinear(planes: Array | Floats32, slices: Weighted, u: Array) -> Array:
     flat = planes.reshape(-1, height, width, channels)
     column, x = _cell(u[:, 0], width)
     row, y = _cell(u[:, 1], height)
-    found = np.zeros((len(u), channels))
+    totals = np.zeros((len(u), channels))
     for number, share in slices:
         for down, share_down in ((0, 1.0 - y), (1, y)):
             for right, share_right in ((0, 1.0 - x), (1, x)):
                 weight = (share * share_down * share_right)[:, None]
-                found += weight * flat[number, row + down, column + right]
-    return found
+                totals += weight * flat[number, row + down, column + right]
+    return totals

@@ -38,14 +38,14 @@ def cosine_weighted(
     reflectance: Brdf, theta_i: NDArray[np.float32], half: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """[1, theta_i, channels, rows, columns] f cos(theta_o) of half vectors [rows, columns, 3]; 0 from below."""
-    found = []
+    slices = []
     ways = half.reshape(-1, 3)
     for theta in theta_i.astype(np.float64):
         light = way_in(theta)
         ways_out = 2.0 * (ways @ light)[:, None] * ways - light
         values = reflectance(np.broadcast_to(light, ways.shape), ways_out) * ways_out[:, 2:]
-        found.append(np.maximum(values, 0.0).T.reshape(-1, *half.shape[:2]).astype(np.float32))
-    return np.stack(found)[None]
+        slices.append(np.maximum(values, 0.0).T.reshape(-1, *half.shape[:2]).astype(np.float32))
+    return np.stack(slices)[None]
 
 
 def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -54,10 +54,10 @@ def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.fl
     Between values h apart it misses f by f'' h^2 t (1 - t) / 2, in the mean by f'' h^2 / 12, on each axis: that
     much is taken from the nodes, of h before and after them, but not where f ends at the horizon.
     """
-    found = values.copy()
+    node_values = values.copy()
     even = np.linspace(0.0, 1.0, values.shape[3])
     for axis, places in ((1, theta_i.astype(np.float64)), (3, even), (4, np.linspace(0.0, 1.0, values.shape[4]))):
-        along, nodes = np.moveaxis(values, axis, 0), np.moveaxis(found, axis, 0)
+        along, nodes = np.moveaxis(values, axis, 0), np.moveaxis(node_values, axis, 0)
         before, after = (step.reshape(-1, 1, 1, 1, 1) for step in (np.diff(places)[:-1], np.diff(places)[1:]))
         whole = along > 0.0
         inner = whole[2:] & whole[1:-1] & whole[:-2]
@@ -67,7 +67,7 @@ def nodes_for_linear_reading(values: NDArray[np.float32], theta_i: NDArray[np.fl
             bend = np.where(whole[1] & whole[0] & whole[-2], along[1] - 2.0 * along[0] + along[-2], 0.0) / 12.0
             nodes[0] -= bend
             nodes[-1] -= bend
-    return np.maximum(found, 0.0)
+    return np.maximum(node_values, 0.0)
 
 
 def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -77,8 +77,8 @@ def drawn_by(values: NDArray[np.float32], theta_i: NDArray[np.float32]) -> NDArr
     u = np.linspace(0.0, 1.0, values.shape[-1])
     lights = np.stack([way_in(float(theta)) for theta in theta_i])
     solid_angle = np.maximum(half @ lights.T, 0.0) * (u * np.sin(0.5 * np.pi * u**2))[None, :, None]
-    found = values.mean(axis=2) * np.moveaxis(solid_angle, -1, 0)[None]
-    return np.asarray(found + _LEAST_DRAWN * found.mean(axis=(2, 3), keepdims=True) + 1e-12, np.float32)
+    densities = values.mean(axis=2) * np.moveaxis(solid_angle, -1, 0)[None]
+    return np.asarray(densities + _LEAST_DRAWN * densities.mean(axis=(2, 3), keepdims=True) + 1e-12, np.float32)
 
 
 def fields_of(

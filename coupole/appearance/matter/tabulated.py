@@ -112,8 +112,8 @@ def _sample(source: Brdf, incidence: Array, theta: Array, phi: Array) -> tuple[A
     z = np.maximum(wo[..., 2], _LOWEST_Z)
     flat = np.hypot(wo[..., 0], wo[..., 1])
     shrink = np.sqrt(1.0 - z**2) / np.maximum(flat, 1e-12)
-    lifted = np.stack([wo[..., 0] * shrink, wo[..., 1] * shrink, z], axis=-1)
-    return source(wi, np.where((wo[..., 2] < _LOWEST_Z)[..., None], lifted, wo)), wo[..., 2]
+    lifted_way = np.stack([wo[..., 0] * shrink, wo[..., 1] * shrink, z], axis=-1)
+    return source(wi, np.where((wo[..., 2] < _LOWEST_Z)[..., None], lifted_way, wo)), wo[..., 2]
 
 
 def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
@@ -124,14 +124,14 @@ def _adapt(theta: Array, profiles: Array, cosines: Array, nodes: int) -> Array:
     proportional to the inverse square root of f (log f)''. A tenth of the nodes is spread evenly.
     """
     peak = np.maximum(profiles.max(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
-    scaled = np.maximum(profiles / peak, _FLOOR)
-    bend = np.abs(np.gradient(np.gradient(np.log(scaled), theta, axis=1), theta, axis=1))
-    seen = (cosines > _HORIZON_Z)[..., None]
-    curvature = (seen * scaled * bend).max(axis=(0, 2, 3))
+    relative = np.maximum(profiles / peak, _FLOOR)
+    bend = np.abs(np.gradient(np.gradient(np.log(relative), theta, axis=1), theta, axis=1))
+    is_visible = (cosines > _HORIZON_Z)[..., None]
+    curvature = (is_visible * relative * bend).max(axis=(0, 2, 3))
     density = np.sqrt(curvature)
     density += 0.1 * np.trapezoid(density, theta) / (theta[-1] - theta[0]) + 1e-12
-    grown = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(theta))])
-    return np.interp(np.linspace(0.0, grown[-1], nodes), grown, theta)
+    cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(theta))])
+    return np.interp(np.linspace(0.0, cumulative[-1], nodes), cumulative, theta)
 
 
 def look_up(incidence: Array, theta: Array, phi: Array, table: SpecularTable) -> Array:

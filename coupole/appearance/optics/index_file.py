@@ -36,14 +36,14 @@ def read_index(path: Path) -> Complex:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: {reason(error)}") from error
-    found = _of_yaml(text, path) if path.suffix.lower() in _YAML else _of_columns(text, path, 1)
-    if not np.all((found.real > 0.0) & (found.real < _HIGHEST) & (found.imag >= 0.0) & (found.imag < _HIGHEST)):
+    index = _of_yaml(text, path) if path.suffix.lower() in _YAML else _of_columns(text, path, 1)
+    if not np.all((index.real > 0.0) & (index.real < _HIGHEST) & (index.imag >= 0.0) & (index.imag < _HIGHEST)):
         raise InputError(
             f"{path}: expected n and k below {_HIGHEST:g}; found n "
-            f"{found.real.min():g} to {found.real.max():g}, "
-            f"k {found.imag.min():g} to {found.imag.max():g}; see the order of the columns"
+            f"{index.real.min():g} to {index.real.max():g}, "
+            f"k {index.imag.min():g} to {index.imag.max():g}; see the order of the columns"
         )
-    return found
+    return index
 
 
 def _of_yaml(text: str, path: Path) -> Complex:
@@ -56,8 +56,8 @@ def _of_yaml(text: str, path: Path) -> Complex:
     for part in parts:
         kind = str(part.get("type"))
         if kind == "tabulated nk":
-            both = _of_columns(str(part.get("data", "")), path, _line_of(text, "data:"))
-            n, k = both.real, both.imag
+            index = _of_columns(str(part.get("data", "")), path, _line_of(text, "data:"))
+            n, k = index.real, index.imag
         elif kind == "tabulated n":
             n = _of_columns(str(part.get("data", "")), path, _line_of(text, "data:")).real
         elif kind == "tabulated k":
@@ -76,21 +76,21 @@ def _of_yaml(text: str, path: Path) -> Complex:
 
 def _of_formula(kind: str, part: dict[str, Any], path: Path) -> Array:
     try:
-        given = [float(word) for word in str(part["coefficients"]).split()]
+        numbers = [float(word) for word in str(part["coefficients"]).split()]
         limits_nm = [1e3 * float(word) for word in str(part["wavelength_range"]).split()]
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: {kind}: expected `coefficients` and `wavelength_range`: {error}") from error
-    if not given or len(given) % 2 == 0 or len(limits_nm) != 2:
+    if not numbers or len(numbers) % 2 == 0 or len(limits_nm) != 2:
         raise InputError(f"{path}: {kind}: expected an odd number of coefficients and two limits of wavelength")
     # Formulas are smooth: those of glasses and polymers begin at the mercury line at 404.7 or 435.8 nm.
     if limits_nm[0] > FIRST_NM + _WIDEST_GAP_NM or limits_nm[1] < LAST_NM - _WIDEST_GAP_NM:
         raise _not_covered(path, limits_nm[0], limits_nm[1])
-    first, pairs = given[0], list(zip(given[1::2], given[2::2], strict=True))
+    first, pairs = numbers[0], list(zip(numbers[1::2], numbers[2::2], strict=True))
     if kind == _CAUCHY:
         um = WAVELENGTHS_NM * 1e-3
         return np.asarray(first + sum(c * um**power for c, power in pairs))
-    squared = [(b, c**2 if kind == _SELLMEIER else c) for b, c in pairs]
-    return indices.sellmeier(squared, first).real
+    terms = [(b, c**2 if kind == _SELLMEIER else c) for b, c in pairs]
+    return indices.sellmeier(terms, first).real
 
 
 def _of_columns(text: str, path: Path, first_line: int) -> Complex:
@@ -104,8 +104,8 @@ def _of_columns(text: str, path: Path, first_line: int) -> Complex:
         except ValueError as error:
             raise _wrong(path, number, f"expected wavelength, n and k with decimal points: {error}") from error
         if len(rows[-1]) not in (2, 3) or len(rows[-1]) != len(rows[0]):
-            expected = len(rows[0]) if len(rows[0]) in (2, 3) else 3
-            raise _wrong(path, number, f"expected {expected} numbers, found {len(rows[-1])}")
+            count = len(rows[0]) if len(rows[0]) in (2, 3) else 3
+            raise _wrong(path, number, f"expected {count} numbers, found {len(rows[-1])}")
         if min(rows[-1]) < 0.0 or rows[-1][0] == 0.0:
             raise _wrong(path, number, f"expected wavelength, n and k not negative, found {min(rows[-1]):g}")
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:

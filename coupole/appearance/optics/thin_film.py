@@ -40,14 +40,14 @@ def stack_power(
     `cos_outside` [...] is the cosine in the incident medium, which is transparent; wavelengths, in vacuum, and
     indices are [bands] or scalars. Both results are [..., bands]; the remainder to 1 is absorbed.
     """
-    reflected, transmitted = zip(
+    reflectances, transmittances = zip(
         *(
             _polarised(cos_outside, wavelengths_nm, films, outside, substrate, polarisation)
             for polarisation in (0, 1)
         ),
         strict=True,
     )
-    return 0.5 * (reflected[0] + reflected[1]), 0.5 * (transmitted[0] + transmitted[1])
+    return 0.5 * (reflectances[0] + reflectances[1]), 0.5 * (transmittances[0] + transmittances[1])
 
 
 def _polarised(

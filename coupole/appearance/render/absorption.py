@@ -99,8 +99,8 @@ def per_mm(absorption: Absorption, index: float, folder: Path) -> Array:
         case AbsorptionPerMm():
             return coefficient(absorption.per_mm, folder)
         case Transmittance():
-            found = read_spectrum(folder / absorption.path, column=absorption.column)
-            return lacquer.absorption_from(held(on_grid(found)), absorption.thickness_mm, index)
+            spectrum = read_spectrum(folder / absorption.path, column=absorption.column)
+            return lacquer.absorption_from(held(on_grid(spectrum)), absorption.thickness_mm, index)
         case _:
             assert_never(absorption)
 
@@ -114,5 +114,5 @@ def coefficient(value: PerMm, folder: Path) -> Array:
 
 def _numbers(path: Path, column: int | None) -> Array:
     """[81], not below 0."""
-    read = read_spectrum(path, unit="power", column=column)
-    return np.asarray(np.maximum(held(on_grid(read)), 0.0))
+    spectrum = read_spectrum(path, unit="power", column=column)
+    return np.asarray(np.maximum(held(on_grid(spectrum)), 0.0))

@@ -31,21 +31,21 @@ def arcature(radius_mm: float, height_mm: float, depth_mm: float) -> Niche:
     angle = np.linspace(np.pi, 0.0, _SEGMENTS + 1)
     arch = np.stack([radius_mm * np.cos(angle), height_mm + radius_mm * np.sin(angle)], axis=1)
     outline = np.concatenate([[[-radius_mm, 0.0]], arch, [[radius_mm, 0.0]]])
-    gilded = _between(_at(outline, depth_mm), _at(outline, 0.0))
-    left, right, top = (
+    gilded_mm = _between(_at(outline, depth_mm), _at(outline, 0.0))
+    left_mm, right_mm, top_mm = (
         -radius_mm * (1 + _MARGIN),
         radius_mm * (1 + _MARGIN),
         height_mm + radius_mm * (1 + _MARGIN),
     )
-    above = np.stack([arch[:, 0], np.full(len(arch), top)], axis=1)
+    above = np.stack([arch[:, 0], np.full(len(arch), top_mm)], axis=1)
     corners = [[-radius_mm, 0.0], [radius_mm, 0.0]]
     stone = [
         _fan(_at(outline, depth_mm), np.array([0.0, depth_mm, 0.5 * height_mm])),
         _between(_at(np.array(corners), 0.0), _at(np.array(corners), depth_mm)),
         _between(_at(arch, 0.0), _at(above, 0.0)),
-        *(_upright(start, end, top) for start, end in ((left, -radius_mm), (radius_mm, right))),
+        *(_upright(start, end, top_mm) for start, end in ((left_mm, -radius_mm), (radius_mm, right_mm))),
     ]
-    return Niche(gilded, np.concatenate(stone))
+    return Niche(gilded_mm, np.concatenate(stone))
 
 
 def _at(outline: Array, y_mm: float) -> Array:

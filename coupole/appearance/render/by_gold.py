@@ -37,26 +37,26 @@ def render(scene: PlainScene, wanted: Gathered, camera: Camera, folder: Path, pr
     Raises InputError for materials that photons do not know.
     """
     suns = tuple(light for light in scene.lights if isinstance(light, Distant))
-    others = tuple(light for light in scene.lights if not isinstance(light, Distant))
+    other_lights = tuple(light for light in scene.lights if not isinstance(light, Distant))
     room = _room(scene, folder)
-    chosen = bands.chosen(scene.bands.step_nm)
+    band_numbers = bands.chosen(scene.bands.step_nm)
     by_photons, is_gold = seen_by_gold(
         room,
         [_sun(light, scene, folder) for light in suns],
         eye_rays(camera),
-        chosen,
+        band_numbers,
         wanted.photons,
         wanted.radius_mm,
         scene.seed,
         progress,
     )
     shape = (camera.height_px, camera.width_px, _RAYS**2, -1)
-    gathered = by_photons.reshape(shape).mean(axis=2)
+    photon_radiance = by_photons.reshape(shape).mean(axis=2)
     gold = is_gold.reshape(shape).mean(axis=(2, 3))[..., None]
     whole = _paths(scene, suns, camera, folder)
     matt = _paths(_without_gold(scene, folder), suns, camera, folder)
-    around = _paths(scene, others, camera, folder).stokes[0] if others else 0.0
-    radiance = around + np.where(gold >= 0.5, whole.stokes[0], matt.stokes[0] + gathered)
+    around = _paths(scene, other_lights, camera, folder).stokes[0] if other_lights else 0.0
+    radiance = around + np.where(gold >= 0.5, whole.stokes[0], matt.stokes[0] + photon_radiance)
     return Spectral(whole.wavelengths_nm, radiance[None].astype(np.float32), whole.samples, whole.noise)
 
 

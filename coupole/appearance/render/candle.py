@@ -66,8 +66,8 @@ def stem(candle: Candle) -> Array:
 
 def seen_area_mm2(corners_mm: Array) -> float:
     """Return the area of a convex body as seen from the side, the mean over azimuths (Cauchy)."""
-    doubled = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    return float(np.hypot(doubled[:, 0], doubled[:, 1]).sum() / (2.0 * np.pi))
+    double_areas = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    return float(np.hypot(double_areas[:, 0], double_areas[:, 1]).sum() / (2.0 * np.pi))
 
 
 def _turned(radius_mm: Array, z_mm: Array) -> Array:

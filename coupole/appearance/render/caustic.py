@@ -66,26 +66,28 @@ def photons(
     niche: Niche, sun: Sun, opening_mm: tuple[float, float, float], count: int, seed: int | tuple[int, ...]
 ) -> Photons:
     """Trace `count` photons that pass the rectangle x from `opening_mm[0]` to [1], z from 0 to [2] in y = 0."""
-    met = _Met(niche)
-    left, right, top = opening_mm
-    area_m2 = (right - left) * top * 1e-6
+    ray_tracer = _Met(niche)
+    left_mm, right_mm, top_mm = opening_mm
+    area_m2 = (right_mm - left_mm) * top_mm * 1e-6
     facing = sun.irradiance * area_m2 / count
     random = np.random.default_rng(seed)
-    parts, started, escaped = [], np.zeros(BANDS), np.zeros(BANDS)
+    parts, started_power, escaped_power = [], np.zeros(BANDS), np.zeros(BANDS)
     for first in range(0, count, _CHUNK):
         n = min(_CHUNK, count - first)
-        starts = np.stack([random.uniform(left, right, n), np.zeros(n), random.uniform(0.0, top, n)], axis=1)
+        starts = np.stack(
+            [random.uniform(left_mm, right_mm, n), np.zeros(n), random.uniform(0.0, top_mm, n)], axis=1
+        )
         ways = blurred(sun, random, n)
         # Sampled uniformly over the sun's disk; the weight is the opening's projected area for each direction.
         shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
         power = (shares[:, None] * facing).astype(np.float32)
-        started += power.sum(axis=0, dtype=float)
+        started_power += power.sum(axis=0, dtype=float)
         # Start slightly outside, so that the wall around the opening can stop them.
-        part, lost = _traced(met, starts - ways, ways, power, random)
+        part, lost_power = _traced(ray_tracer, starts - ways, ways, power, random)
         parts.append(part)
-        escaped += lost
-    places, kept, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Photons(places, kept, bounces, started, escaped)
+        escaped_power += lost_power
+    places, powers, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Photons(places, powers, bounces, started_power, escaped_power)
 
 
 def irradiance(
@@ -144,25 +146,25 @@ def smooth_normals(corners_mm: Array) -> Array:
 def _traced(
     met: _Met, starts: Array, ways: Array, power: NDArray[np.float32], random: np.random.Generator
 ) -> tuple[tuple[Array, NDArray[np.float32], NDArray[np.int64]], Array]:
-    places, kept, bounces = [], [], []
-    escaped = np.zeros(BANDS)
+    places, powers, bounces = [], [], []
+    escaped_power = np.zeros(BANDS)
     gold_count = len(met.niche.gilded_mm)
     for bounce in range(_MOST_BOUNCES):
         triangle, distance, normals = met.first(starts, ways)
         here = starts + distance[:, None] * ways
-        escaped += power[triangle < 0].sum(axis=0, dtype=float)
+        escaped_power += power[triangle < 0].sum(axis=0, dtype=float)
         stone, gold = triangle >= gold_count, (triangle >= 0) & (triangle < gold_count)
         places.append(here[stone])
-        kept.append(power[stone])
+        powers.append(power[stone])
         bounces.append(np.full(np.count_nonzero(stone), bounce))
         if not gold.any():
             break
         facing = np.where(np.sum(normals[gold] * ways[gold], axis=1) > 0.0, -1.0, 1.0)[:, None] * normals[gold]
-        turned, share = reflected(ways[gold], facing, met.niche.reflectance, met.niche.roughness, random)
-        alive = np.sum(turned * facing, axis=1) > 0.0
+        new_ways, share = reflected(ways[gold], facing, met.niche.reflectance, met.niche.roughness, random)
+        alive = np.sum(new_ways * facing, axis=1) > 0.0
         power = (power[gold] * share)[alive].astype(np.float32)
-        starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], turned[alive]
-    return (np.concatenate(places), np.concatenate(kept), np.concatenate(bounces)), escaped
+        starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], new_ways[alive]
+    return (np.concatenate(places), np.concatenate(powers), np.concatenate(bounces)), escaped_power
 
 
 def reflected(
@@ -173,11 +175,11 @@ def reflected(
     if roughness > 0.0:
         facets = _facets(-ways, normals, roughness, random)
     cosines = np.clip(-np.sum(ways * facets, axis=1), 0.0, 1.0)
-    turned = ways + 2.0 * cosines[:, None] * facets
+    new_ways = ways + 2.0 * cosines[:, None] * facets
     share = reflectance(cosines)
     if roughness > 0.0:
-        share = share * _unmasked(np.sum(turned * normals, axis=1), roughness)[:, None]
-    return turned, share
+        share = share * _unmasked(np.sum(new_ways * normals, axis=1), roughness)[:, None]
+    return new_ways, share
 
 
 def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Generator) -> Array:

@@ -62,16 +62,16 @@ def church(size: Size) -> Church:
     outline = _pointed(size.width_mm, size.spring_mm)
     stone, openings = [_vault(outline, size)], []
     bounds = [-0.5 * size.length_mm + n * bay for n in range(size.bays + 1)]
-    for turned, x in ((90.0, -half), (-90.0, half)):
+    for turned_deg, x in ((90.0, -half), (-90.0, half)):
         for y in bounds[:-1]:
             wall, reveal = _wall(bay, size.spring_mm, size)
-            place = _upright(turned, [x, y + 0.5 * bay, 0.0])
+            place = _upright(turned_deg, [x, y + 0.5 * bay, 0.0])
             stone.append(_placed(np.concatenate([wall, reveal]), place))
             openings.append(_opening(place, size))
     stone += [_rib(outline, y, size) for y in bounds]
-    for turned, y in ((180.0, -0.5 * size.length_mm), (0.0, 0.5 * size.length_mm)):
+    for turned_deg, y in ((180.0, -0.5 * size.length_mm), (0.0, 0.5 * size.length_mm)):
         wall, reveal = _wall(size.width_mm, size.spring_mm, size)
-        place = _upright(turned, [0.0, y, 0.0])
+        place = _upright(turned_deg, [0.0, y, 0.0])
         stone.append(_placed(np.concatenate([wall, reveal, _gable(outline)]), place))
         openings.append(_opening(place, size))
     tiles = rectangle(size.width_mm, size.length_mm, _TILES, round(_TILES * size.length_mm / size.width_mm))
@@ -83,9 +83,9 @@ def church(size: Size) -> Church:
 def _pointed(width_mm: float, spring_mm: float) -> Array:
     """Points [n, 2] of x and z of a pointed arch from left to right: each half is about the other's springing."""
     angle = np.linspace(0.0, np.pi / 3.0, _ARC + 1)
-    right = width_mm * np.stack([np.cos(angle) - 0.5, np.sin(angle)], axis=1)
-    left = right * [-1.0, 1.0]
-    whole = np.concatenate([left, right[-2::-1]])
+    right_arc = width_mm * np.stack([np.cos(angle) - 0.5, np.sin(angle)], axis=1)
+    left_arc = right_arc * [-1.0, 1.0]
+    whole = np.concatenate([left_arc, right_arc[-2::-1]])
     return np.asarray(whole + np.array([0.0, spring_mm]))
 
 
@@ -131,7 +131,7 @@ def _rib(outline: Array, y_mm: float, size: Size) -> Array:
     inward[[0, -1], 1] = 0.0
     inner = whole + deep * inward / np.linalg.norm(inward, axis=1, keepdims=True)
     lines = [_at(whole, y_mm - half), _at(inner, y_mm - half), _at(inner, y_mm + half), _at(whole, y_mm + half)]
-    return np.concatenate([_between(one, other) for one, other in pairwise(lines)])
+    return np.concatenate([_between(line, next_line) for line, next_line in pairwise(lines)])
 
 
 def _opening(place: Array, size: Size) -> Opening:
@@ -145,9 +145,9 @@ def _opening(place: Array, size: Size) -> Opening:
 def _upright(turned_deg: float, at_mm: list[float]) -> Array:
     """A wall's frame, turned about z; at 0 it is seen from -y."""
     c, s = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
-    placed = np.eye(4)
-    placed[:2, :2], placed[:3, 3] = [[c, -s], [s, c]], at_mm
-    return placed
+    pose = np.eye(4)
+    pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], at_mm
+    return pose
 
 
 def _placed(corners_mm: Array, place: Array) -> Array:

@@ -51,8 +51,8 @@ def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: Ste
     functions = light.observer(observer)
     white = functions @ white_power
     scale = (luminosity @ white_power) / white[1]
-    wanted = LM_PER_W * np.concatenate([scale * functions, luminosity[None]])
-    return Eye(bands.weights(wanted, power, step_nm), white / white[1])
+    curves = LM_PER_W * np.concatenate([scale * functions, luminosity[None]])
+    return Eye(bands.weights(curves, power, step_nm), white / white[1])
 
 
 def adapted(xyz: Array, white: Array, transform: str) -> Array:
@@ -72,6 +72,6 @@ def displayed(xyz: Array) -> tuple[NDArray[np.uint8], float]:
     linear = light.linear_srgb(xyz)
     brightest = linear.max(axis=-1, keepdims=True)
     outside = (brightest[..., 0] > 1.0 + 1e-6) | (linear.min(axis=-1) < -0.01)
-    shown = np.clip(linear / np.maximum(1.0, brightest), 0.0, 1.0)
-    coded = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1.0 / 2.4) - 0.055)
-    return np.round(255.0 * coded).astype(np.uint8), float(outside.mean())
+    in_gamut = np.clip(linear / np.maximum(1.0, brightest), 0.0, 1.0)
+    srgb = np.where(in_gamut <= 0.0031308, 12.92 * in_gamut, 1.055 * in_gamut ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * srgb).astype(np.uint8), float(outside.mean())

@@ -14,5 +14,5 @@ def denoised(xyz: Array) -> Array:
     """XYZ [h, w, 3] with less noise. Raises InputError without the library (extra `denoiser`)."""
     pyoidn = needed("pyoidn", extra="denoiser")
     level = max(float(xyz.mean()), 1e-30)
-    found = pyoidn.denoise(np.ascontiguousarray(xyz / level, np.float32), hdr=True)
-    return np.asarray(found, dtype=float) * level
+    picture = pyoidn.denoise(np.ascontiguousarray(xyz / level, np.float32), hdr=True)
+    return np.asarray(picture, dtype=float) * level

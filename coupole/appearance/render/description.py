@@ -35,7 +35,7 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
     """Objects, `more` pieces and lights; triangles are written into the folder `meshes`, for Mitsuba to read."""
     parts: Description = {}
     reach_mm = 0.0
-    made: dict[Material | Pane, Description] = {}
+    surfaces: dict[Material | Pane, Description] = {}
     of_objects = [objects.pieces(thing, folder) for thing in scene.objects]
     for number, pieces in enumerate([*of_objects, more]):
         for row, piece in enumerate(pieces):
@@ -48,18 +48,18 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
                 shape = _mesh(piece, meshes / f"{name}.ply")
-            if material not in made:
-                made[material] = _surface(material, folder)
-            parts[name] = {**shape, "bsdf": made[material], **_inside(material, folder)}
+            if material not in surfaces:
+                surfaces[material] = _surface(material, folder)
+            parts[name] = {**shape, "bsdf": surfaces[material], **_inside(material, folder)}
     step_nm = scene.bands.step_nm
     in_units = lights.radiance_unit(scene.lights, folder, step_nm)
     setting = lights.Setting(folder, step_nm, in_units, reach_mm)
     for number, light in enumerate(scene.lights):
-        found = lights.emitters(light, setting, mi)
+        emitters = lights.emitters(light, setting, mi)
         if isinstance(light, candle.Candle):
-            parts |= _candle(light, found[0], f"light{number}", folder, meshes)
+            parts |= _candle(light, emitters[0], f"light{number}", folder, meshes)
         else:
-            parts |= {f"light{number}_{row}": emitter for row, emitter in enumerate(found)}
+            parts |= {f"light{number}_{row}": emitter for row, emitter in enumerate(emitters)}
     return parts
 
 
@@ -125,8 +125,8 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
     """The medium of a body, if it absorbs."""
     if not isinstance(material, Glass) or material.absorption is None:
         return {}
-    taken = absorption.per_mm(material.absorption, material.index, folder)
-    return {"interior": {"type": "homogeneous", "sigma_t": taken, "albedo": 0.0}}
+    absorption_per_mm = absorption.per_mm(material.absorption, material.index, folder)
+    return {"interior": {"type": "homogeneous", "sigma_t": absorption_per_mm, "albedo": 0.0}}
 
 
 def _integrator(parts: Description, *, polarised: bool) -> str:

@@ -60,10 +60,10 @@ class EnvironmentMap(Model):
         if self.white_cd_m2 is not None:
             return self.white_cd_m2
         assert self.illuminance_lux is not None
-        found = level_irradiance(pixels @ _LUMINANCE)
-        if found <= 0.0:
+        irradiance = level_irradiance(pixels @ _LUMINANCE)
+        if irradiance <= 0.0:
             raise InputError(f"{self.path}: expected light from above, found none; give `white_cd_m2`")
-        return self.illuminance_lux / found
+        return self.illuminance_lux / irradiance
 
 
 def read_map(path: Path, mi: Any) -> Array:
@@ -98,9 +98,9 @@ def _reduced(pixels: Array) -> Array:
     height, width = pixels.shape[:2]
     if width <= MOST_COLUMNS:
         return pixels
-    for axis, (found, wanted) in enumerate(((height, MOST_COLUMNS // 2), (width, MOST_COLUMNS))):
-        starts = np.linspace(0, found, wanted, endpoint=False).astype(int)
-        counts = np.diff([*starts, found]).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+    for axis, (pixel_count, most_pixels) in enumerate(((height, MOST_COLUMNS // 2), (width, MOST_COLUMNS))):
+        starts = np.linspace(0, pixel_count, most_pixels, endpoint=False).astype(int)
+        counts = np.diff([*starts, pixel_count]).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
         pixels = np.add.reduceat(pixels, starts, axis=axis) / counts
     return pixels
 
@@ -158,8 +158,8 @@ def _between(pixels: Array, places: Array, axis: int) -> Array:
     first = np.floor(places).astype(int)
     part = np.reshape(places - first, (-1, 1, 1) if axis == 0 else (1, -1, 1))
     count = pixels.shape[axis]
-    one, other = np.take(pixels, first % count, axis), np.take(pixels, (first + 1) % count, axis)
-    return np.asarray(one + part * (other - one))
+    lower, upper = np.take(pixels, first % count, axis), np.take(pixels, (first + 1) % count, axis)
+    return np.asarray(lower + part * (upper - lower))
 
 
 def _scene_from_map(centre_azimuth_deg: float, mi: Any) -> Any:

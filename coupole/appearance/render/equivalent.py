@@ -25,20 +25,20 @@ def equivalent_index(reflectance: Callable[[Array], Array]) -> Complex:
 
     Raises InputError where they differ by more than `MOST_OFF` at some wavelength and angle up to 78 degrees.
     """
-    wanted = reflectance(_COSINES)
-    normal = np.clip(wanted[0], 1e-6, 1.0 - 1e-6)
+    target = reflectance(_COSINES)
+    normal = np.clip(target[0], 1e-6, 1.0 - 1e-6)
     # R = ((n-1)^2 + k^2)/((n+1)^2 + k^2) along the normal: k follows from n, between the two n that need no k.
     root = np.sqrt(normal)
     least, most = (1.0 - root) / (1.0 + root), (1.0 + root) / (1.0 - root)
     n = least * (most / least) ** np.linspace(0.0, 1.0, _TRIED)[:, None]
     k = np.sqrt(np.maximum(0.0, (normal * (n + 1.0) ** 2 - (n - 1.0) ** 2) / (1.0 - normal)))
-    tried = np.stack([fresnel.reflectance(c, n + 1j * k) for c in _COSINES])
-    best = np.argmin(np.sum((tried - wanted[:, None, :]) ** 2, axis=0), axis=0)
-    off = float(np.abs(tried[:, best, np.arange(BANDS)] - wanted).max())
+    reflectances = np.stack([fresnel.reflectance(c, n + 1j * k) for c in _COSINES])
+    best = np.argmin(np.sum((reflectances - target[:, None, :]) ** 2, axis=0), axis=0)
+    off = float(np.abs(reflectances[:, best, np.arange(BANDS)] - target).max())
     if off > MOST_OFF:
         raise InputError(
             f"films: expected a stack that reflects like some bulk within {MOST_OFF} at all angles; the nearest "
             f"is off by {off:.2f}. Take thinner films, or fewer"
         )
-    chosen: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
-    return chosen
+    index: Complex = n[best, np.arange(BANDS)] + 1j * k[best, np.arange(BANDS)]
+    return index

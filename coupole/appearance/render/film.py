@@ -22,7 +22,7 @@ def write_film(pictures: Sequence[Path], path: Path, frames_per_s: int, about: s
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": "18"}
         for picture in pictures:
-            with Image.open(picture) as opened:
-                pixels = np.asarray(opened.convert("RGB"))[:height, :width]
+            with Image.open(picture) as image:
+                pixels = np.asarray(image.convert("RGB"))[:height, :width]
             film.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         film.mux(stream.encode())

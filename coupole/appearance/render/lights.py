@@ -108,8 +108,8 @@ class Daylight(Model):
         """The sun's disk, and the sky. Raises InputError if the sun is down, or if the series does not reach."""
         place = sun.place(self.when, self.latitude_deg, self.longitude_deg, self.altitude_m)
         air = sun.Air(self.aerosol_depth_500nm, self.water_cm, self.ozone_atm_cm, self.ground_albedo)
-        found = sun.clear_sky(place, air)
-        direct = found.sun if self.series is None else read_series(folder / self.series).at(self.when)
+        clear_sky = sun.clear_sky(place, air)
+        direct = clear_sky.sun if self.series is None else read_series(folder / self.series).at(self.when)
         x, y, z = (float(part) for part in place.direction(self.y_azimuth_deg))
         disk = Distant(
             kind="distant",
@@ -122,10 +122,12 @@ class Daylight(Model):
         )
         if not self.sky:
             return (disk,)
-        blue = Values(kind="values", name=f"sky of {self.when:%Y-%m-%d %H:%M}", values=tuple(found.sky.tolist()))
+        blue = Values(
+            kind="values", name=f"sky of {self.when:%Y-%m-%d %H:%M}", values=tuple(clear_sky.sky.tolist())
+        )
         return (
             disk,
-            Environment(kind="environment", luminance_cd_m2=float(luminous(found.sky) / np.pi), spectrum=blue),
+            Environment(kind="environment", luminance_cd_m2=float(luminous(clear_sky.sky) / np.pi), spectrum=blue),
         )
 
 
@@ -134,16 +136,16 @@ Light = Annotated[PlainLight | Daylight, Field(discriminator="kind")]
 
 def plain(lights: Iterable[Light], folder: Path) -> tuple[PlainLight, ...]:
     """The lights, with daylight as sun and sky. Raises InputError, also for two surroundings."""
-    found = tuple(
+    plain_lights = tuple(
         part for light in lights for part in (light.lights(folder) if isinstance(light, Daylight) else (light,))
     )
-    around = [light.kind for light in found if isinstance(light, Environment | EnvironmentMap)]
+    around = [light.kind for light in plain_lights if isinstance(light, Environment | EnvironmentMap)]
     if len(around) > 1:
         raise InputError(
             f"lights: expected one light from all directions, found {len(around)} ({', '.join(around)}); "
             "leave one, or write `sky: false` in `daylight`"
         )
-    return found
+    return plain_lights
 
 
 def radiance_unit(lights: Iterable[PlainLight], folder: Path, step_nm: StepNm) -> Array:
@@ -170,8 +172,8 @@ def emitters(light: PlainLight, setting: Setting, mi: Any) -> list[Description]:
     folder = setting.folder
     if isinstance(light, EnvironmentMap):
         return [emitter(light, folder, mi)]
-    found = power(light.spectrum, folder)
-    shape = around_nodes(found, setting.step_nm) / luminous(found) / setting.radiance_unit
+    spectral_power = power(light.spectrum, folder)
+    shape = around_nodes(spectral_power, setting.step_nm) / luminous(spectral_power) / setting.radiance_unit
     if isinstance(light, Candle):
         return [{"type": "area", "radiance": shape * light.luminance_cd_m2()}]
     if isinstance(light, Environment):

@@ -245,8 +245,8 @@ def _church(thing: Church) -> list[Piece]:
     ]
     for opening in parts.openings if thing.glazing else ():
         assert thing.glazing is not None
-        glazed = _glazed(thing.glazing, thing.lead, opening.width_mm, opening.height_mm)
-        pieces += [_moved(piece, opening.church_from_window) for piece in glazed]
+        window_pieces = _glazed(thing.glazing, thing.lead, opening.width_mm, opening.height_mm)
+        pieces += [_moved(piece, opening.church_from_window) for piece in window_pieces]
     return pieces
 
 
@@ -286,7 +286,7 @@ def _paint_fields(thing: PaintWedge) -> list[Material]:
 
 def _nashiji(thing: NashijiSlab) -> list[Piece]:
     """Black body, flakes, and the clear lacquer as a closed refracting body around the flakes."""
-    found = nashiji.flakes(
+    flakes = nashiji.flakes(
         nashiji.Slab(
             size_mm=thing.size_mm,
             depth_mm=thing.depth_mm,
@@ -300,9 +300,9 @@ def _nashiji(thing: NashijiSlab) -> list[Piece]:
     black = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.006))
     middle = np.array([0.5 * width, 0.5 * length, 0.0])
     parts = [Piece(slab(width, length, _NASHIJI_BODY_MM) + middle, black)]
-    points, faces = nashiji.triangulate(found, around=12, along=4)
+    points, faces = nashiji.triangulate(flakes, around=12, along=4)
     top_mm = _NASHIJI_BODY_MM + thing.depth_mm
-    corners = (points + np.array([0.0, 0.0, top_mm]))[faces].reshape(len(found.centres_mm), -1, 3, 3)
+    corners = (points + np.array([0.0, 0.0, top_mm]))[faces].reshape(len(flakes.centres_mm), -1, 3, 3)
     gold = Metal(kind="metal", roughness=thing.roughness, depth_mm=0.0, face=False)
     parts.append(Piece(corners.reshape(-1, 3, 3), gold))
     return [*parts, _clear(width, length, thing.depth_mm, 2.0 * thing.flake_radius_mm)]

@@ -95,8 +95,8 @@ def passage(pane: Pane, folder: Path) -> Array:
         return np.asarray(10.0 ** (-colour.density * bands))
     path = folder / colour.path
     if isinstance(colour, Absorbed):
-        read = measured.read_spectrum(path, unit="power", column=colour.column)
-        per_mm = resampling.held(resampling.on_grid(read))
+        spectrum = measured.read_spectrum(path, unit="power", column=colour.column)
+        per_mm = resampling.held(resampling.on_grid(spectrum))
         if per_mm.min() < 0.0:
             raise InputError(f"{path}: expected 0 or more per mm, found {per_mm.min():.3g}; correct it")
         return np.asarray(np.exp(-per_mm * colour.thickness_mm))
@@ -130,12 +130,12 @@ def _face(pane: Pane) -> float:
 def bsdf(pane: Pane, folder: Path) -> Description:
     """The sheet for Mitsuba, whose own is clear: its parts are multiplied by what colour makes of them."""
     face = _face(pane)
-    reflected, through = sheet(passage(pane, folder), face)
-    clear_reflected, clear_through = sheet(np.ones(1), face)
+    reflectance, through = sheet(passage(pane, folder), face)
+    clear_reflectance, clear_through = sheet(np.ones(1), face)
     return {
         "type": PLUGIN,
         "int_ior": pane.index,
         "ext_ior": 1.0,
-        "specular_reflectance": reflected / clear_reflected,
+        "specular_reflectance": reflectance / clear_reflectance,
         "specular_transmittance": through / clear_through,
     }

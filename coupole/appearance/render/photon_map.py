@@ -79,29 +79,35 @@ class Room:
         self._surface = np.repeat(np.arange(len(surfaces)), counts)
         self._normals = np.concatenate(
             [
-                smooth_normals(one.corners_mm)
-                if isinstance(one, Mirror)
-                else np.repeat(flat_normals(one.corners_mm)[:, None], 3, axis=1)
-                for one in surfaces
+                smooth_normals(room_surface.corners_mm)
+                if isinstance(room_surface, Mirror)
+                else np.repeat(flat_normals(room_surface.corners_mm)[:, None], 3, axis=1)
+                for room_surface in surfaces
             ]
         )
         self._tree: Any = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._tree, corners.astype(np.float32))
-        mirrors = np.concatenate([one.corners_mm.reshape(-1, 3) for one in surfaces if isinstance(one, Mirror)])
+        mirrors = np.concatenate(
+            [
+                room_surface.corners_mm.reshape(-1, 3)
+                for room_surface in surfaces
+                if isinstance(room_surface, Mirror)
+            ]
+        )
         self.box_mm = np.stack([mirrors.min(axis=0), mirrors.max(axis=0)])
         """[2, 3], about the mirrors."""
 
     def hits(self, starts: Array, ways: Array) -> Hits:
         hit = self._tree.run(starts.astype(np.float32), ways.astype(np.float32), output=True)
         triangle = np.asarray(hit["primID"]).astype(np.int64)
-        met = triangle != -1
+        is_hit = triangle != -1
         u, v = (np.asarray(hit[name], dtype=float)[:, None] for name in "uv")
         corners = self._normals[triangle]
         normals = (1.0 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         normals *= np.where(np.sum(normals * ways, axis=1) > 0.0, -1.0, 1.0)[:, None]
-        far = np.where(met, np.asarray(hit["tfar"], dtype=float), 0.0)
-        return Hits(np.where(met, self._surface[triangle], -1), starts + far[:, None] * ways, normals)
+        far = np.where(is_hit, np.asarray(hit["tfar"], dtype=float), 0.0)
+        return Hits(np.where(is_hit, self._surface[triangle], -1), starts + far[:, None] * ways, normals)
 
 
 def photons(room: Room, sun: Sun, bands: Sequence[int], count: int, seed: tuple[int, ...]) -> Iterator[Kept]:
@@ -113,14 +119,14 @@ def photons(room: Room, sun: Sun, bands: Sequence[int], count: int, seed: tuple[
     right = np.cross(sun.direction, helper)
     right /= np.linalg.norm(right)
     above = np.cross(right, sun.direction)
-    each = sun.irradiance[list(bands)] * (np.pi * (radius_mm * 1e-3) ** 2 / count)
+    photon_power = sun.irradiance[list(bands)] * (np.pi * (radius_mm * 1e-3) ** 2 / count)
     for first in range(0, count, _CHUNK):
         n = min(_CHUNK, count - first)
         out, turn = radius_mm * np.sqrt(random.random(n)), 2.0 * np.pi * random.random(n)
         across = (out * np.cos(turn))[:, None] * right + (out * np.sin(turn))[:, None] * above
         ways = blurred(sun, random, n)
         starts = middle + across - 10.0 * radius_mm * ways
-        yield _traced(room, starts, ways, np.tile(each.astype(np.float32), (n, 1)), list(bands), random)
+        yield _traced(room, starts, ways, np.tile(photon_power.astype(np.float32), (n, 1)), list(bands), random)
 
 
 def _traced(
@@ -131,33 +137,33 @@ def _traced(
     bands: list[int],
     random: np.random.Generator,
 ) -> Kept:
-    kept: list[tuple[Array, Array, NDArray[np.float32]]] = []
+    deposits: list[tuple[Array, Array, NDArray[np.float32]]] = []
     by_gold = np.zeros(len(starts), dtype=bool)
     for _ in range(_MOST_BOUNCES):
-        met = room.hits(starts, ways)
+        hits = room.hits(starts, ways)
         onward: list[tuple[Array, Array, NDArray[np.float32], NDArray[np.bool_]]] = []
         for number, surface in enumerate(room.surfaces):
-            here = met.surface == number
+            here = hits.surface == number
             if not here.any():
                 continue
-            places, normals = met.places_mm[here], met.normals[here]
+            places, normals = hits.places_mm[here], hits.normals[here]
             if isinstance(surface, Matt):
                 stays = here & by_gold
-                kept.append((met.places_mm[stays], met.normals[stays], power[stays]))
-                turned, share = _scattered(normals, surface.reflectance[bands], random)
+                deposits.append((hits.places_mm[stays], hits.normals[stays], power[stays]))
+                new_ways, share = _scattered(normals, surface.reflectance[bands], random)
             else:
-                turned, share = reflected(ways[here], normals, surface.reflectance, surface.roughness, random)
+                new_ways, share = reflected(ways[here], normals, surface.reflectance, surface.roughness, random)
                 share = share[:, bands]
-            alive = (np.sum(turned * normals, axis=1) > 0.0) & share.any(axis=1)
-            carried = (power[here] * share)[alive].astype(np.float32)
+            alive = (np.sum(new_ways * normals, axis=1) > 0.0) & share.any(axis=1)
+            onward_power = (power[here] * share)[alive].astype(np.float32)
             gold = by_gold[here][alive] | isinstance(surface, Mirror)
-            onward.append((places[alive] + _OFFSET_MM * normals[alive], turned[alive], carried, gold))
+            onward.append((places[alive] + _OFFSET_MM * normals[alive], new_ways[alive], onward_power, gold))
         if not onward or not sum(len(part[0]) for part in onward):
             break
         starts, ways, power, by_gold = (np.concatenate(column) for column in zip(*onward, strict=True))
     places, normals, powers = (
-        (np.concatenate(column) for column in zip(*kept, strict=True))
-        if kept
+        (np.concatenate(column) for column in zip(*deposits, strict=True))
+        if deposits
         else (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(bands)), np.float32))
     )
     return Kept(places, normals, powers)
@@ -220,19 +226,19 @@ def seen_by_gold(
     """Return for rays of an eye (starts [n, 3], ways [n, 3]): radiance [n, bands] of matt surfaces by light that
     came over gold, in W/(m^2 sr nm), and which rays meet gold first [n]."""
     hits = room.hits(*rays)
-    albedo = np.stack([one.reflectance if isinstance(one, Matt) else np.zeros(81) for one in room.surfaces])[
-        :, list(bands)
-    ]
-    mirrors = np.array([isinstance(one, Mirror) for one in room.surfaces])
+    albedo = np.stack(
+        [surface.reflectance if isinstance(surface, Matt) else np.zeros(81) for surface in room.surfaces]
+    )[:, list(bands)]
+    mirrors = np.array([isinstance(surface, Mirror) for surface in room.surfaces])
     is_gold = (hits.surface >= 0) & mirrors[hits.surface]
     is_matt = (hits.surface >= 0) & ~is_gold
     gathering = Gathering(hits, is_matt, len(list(bands)), radius_mm)
-    total, done = len(suns) * count, 0
+    total, photons_done = len(suns) * count, 0
     for number, sun in enumerate(suns):
         for part in photons(room, sun, bands, count, (seed, number)):
-            progress(done, total)
+            progress(photons_done, total)
             gathering.add(part)
-            done += _CHUNK
+            photons_done += _CHUNK
     progress(total, total)
     radiance = np.zeros((len(hits.surface), len(list(bands))))
     radiance[is_matt] = gathering.irradiance() * albedo[hits.surface[is_matt]] / np.pi

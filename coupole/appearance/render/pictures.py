@@ -26,8 +26,8 @@ SYNTHETIC = "simulated: computed by spectral path tracing, no photograph"
 def eye_of(scene: PlainScene, folder: Path) -> colour.Eye:
     """The scene's observer, used to the first light; spectra of several lights count alike."""
     powers = [power(light.spectrum, folder) for light in scene.lights]
-    mixed = np.sum([scaled(one, 1.0) for one in powers], axis=0)
-    return colour.eye(scene.observer, mixed, powers[0], scene.bands.step_nm)
+    mixture = np.sum([scaled(light_power, 1.0) for light_power in powers], axis=0)
+    return colour.eye(scene.observer, mixture, powers[0], scene.bands.step_nm)
 
 
 def write(
@@ -43,11 +43,13 @@ def write(
     if shown_white <= 0.0:
         raise InputError(f"{scene.name}: expected some light in the picture, found none; see to lights and camera")
     about = f"{scene.name}: {SYNTHETIC}; {written_by}"
-    shown = denoised(xyz) if scene.display.denoised else xyz
-    told = f"{about}; {DENOISED}" if scene.display.denoised else about
-    picture, outside = colour.displayed(colour.adapted(shown / shown_white, eye.white, scene.display.adaptation))
+    display_xyz = denoised(xyz) if scene.display.denoised else xyz
+    comment = f"{about}; {DENOISED}" if scene.display.denoised else about
+    picture, outside = colour.displayed(
+        colour.adapted(display_xyz / shown_white, eye.white, scene.display.adaptation)
+    )
     files = {"png": f"{stem.name}.png"} | ({"exr": f"{stem.name}.exr"} if with_spectra else {})
-    write_png(stem.with_name(files["png"]), picture, told)
+    write_png(stem.with_name(files["png"]), picture, comment)
     if with_spectra:
         write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
     summary: dict[str, Any] = {
@@ -106,15 +108,15 @@ def write_exr(
         )
     numbers = pixels.astype(np.float16) if scene.outputs.spectra == "half" else pixels
     bitmap = mi.Bitmap(numbers, mi.Bitmap.PixelFormat.MultiChannel, names)
-    told = bitmap.metadata()
-    told["spectralLayoutVersion"] = "1.0"
-    told["emissiveUnits"] = "W.m^-2.sr^-1.nm^-1"
-    told["polarisationHandedness"] = "right"
-    told["comments"] = about
-    told["synthetic"] = "true"
-    told["observer"] = f"CIE {scene.observer}; Y of the first light is its luminance in cd/m2"
+    metadata = bitmap.metadata()
+    metadata["spectralLayoutVersion"] = "1.0"
+    metadata["emissiveUnits"] = "W.m^-2.sr^-1.nm^-1"
+    metadata["polarisationHandedness"] = "right"
+    metadata["comments"] = about
+    metadata["synthetic"] = "true"
+    metadata["observer"] = f"CIE {scene.observer}; Y of the first light is its luminance in cd/m2"
     for name, value in (more or {}).items():
-        told[name] = value
+        metadata[name] = value
     try:
         bitmap.write(str(path))
     except RuntimeError as error:  # what Mitsuba makes of a full disk

@@ -65,9 +65,9 @@ def complex_index(refraction: Refraction, folder: Path) -> Complex:
 
 def real_index(refraction: Refraction, folder: Path) -> Array:
     """n [81] of something transparent. Raises InputError if it absorbs."""
-    found = complex_index(refraction, folder)
-    if np.any(found.imag > 1e-3):
+    index = complex_index(refraction, folder)
+    if np.any(index.imag > 1e-3):
         raise InputError(
-            f"index: expected something transparent, found k up to {found.imag.max():g}; give a binder's"
+            f"index: expected something transparent, found k up to {index.imag.max():g}; give a binder's"
         )
-    return within("index of a binder", found.real, 1.0 + 1e-9, 3.0)
+    return within("index of a binder", index.real, 1.0 + 1e-9, 3.0)

@@ -70,19 +70,19 @@ class Renderer:
         if self.scene.noise is not None:
             samples, noise = self._enough(camera, self.scene.noise)
         counts = _counts(samples, _most(camera))
-        done, total = 0, len(bands.groups(self.scene.bands.step_nm)) * len(filters) * len(counts)
+        pass_number, total = 0, len(bands.groups(self.scene.bands.step_nm)) * len(filters) * len(counts)
         behind = []
         for through in filters:
             whole = description.seen(self.scene, camera, self._parts, self._mi, through)
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
-                found = bands.for_group(whole, group, self.scene.bands.step_nm, self._files)
-                loaded = variant.loaded(self._mi, found)
+                group_scene = bands.for_group(whole, group, self.scene.bands.step_nm, self._files)
+                mitsuba_scene = variant.loaded(self._mi, group_scene)
                 for part, count in enumerate(counts):
-                    progress(done, total)
-                    sums += count * self._picture(loaded, count, part, camera)
-                    done += 1
+                    progress(pass_number, total)
+                    sums += count * self._picture(mitsuba_scene, count, part, camera)
+                    pass_number += 1
                 groups.append((sums / samples * self._radiance_unit[group]).astype(np.float32))
             count = len(bands.chosen(self.scene.bands.step_nm))
             behind.append(np.concatenate(groups, axis=2)[..., :count])
@@ -99,12 +99,14 @@ class Renderer:
         groups = bands.groups(self.scene.bands.step_nm)
         whole = description.seen(self.scene, camera, self._parts, self._mi)
         middle = groups[len(groups) // 2]
-        loaded = variant.loaded(self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files))
+        mitsuba_scene = variant.loaded(
+            self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files)
+        )
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
         sums = squares = np.zeros((camera.height_px, camera.width_px))
         for passes in range(1, max(2, self.scene.samples // count) + 1):
-            seen = self._picture(loaded, count, passes - 1, camera).mean(axis=2, dtype=float)
-            sums, squares = sums + seen, squares + seen**2
+            picture = self._picture(mitsuba_scene, count, passes - 1, camera).mean(axis=2, dtype=float)
+            sums, squares = sums + picture, squares + picture**2
             if passes < _LEAST_LOOKS:
                 continue
             variance = np.maximum(squares / passes - (sums / passes) ** 2, 0.0) / (passes - 1)
@@ -151,9 +153,9 @@ def opened(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[R
 
 def _stokes(behind: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     """[4, ...] from pictures behind `FILTERS`: a polariser at angle a passes (S0 + S1 cos 2a + S2 sin 2a)/2."""
-    across, upright, slanted, circular = behind
+    across, upright, diagonal, circular = behind
     s0 = across + upright
-    return np.stack([s0, across - upright, 2.0 * slanted - s0, 2.0 * circular - s0])
+    return np.stack([s0, across - upright, 2.0 * diagonal - s0, 2.0 * circular - s0])
 
 
 def degree_of_linear_polarisation(stokes: NDArray[np.float32]) -> NDArray[np.float32]:

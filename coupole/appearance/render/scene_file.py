@@ -193,11 +193,11 @@ class Scene(Model):
 
     def at(self, when: datetime) -> Scene:
         """The scene with its daylight at another time."""
-        moved = tuple(
+        moved_lights = tuple(
             light.model_copy(update={"when": when}) if isinstance(light, Daylight) else light
             for light in self.lights
         )
-        return self.model_copy(update={"lights": moved})
+        return self.model_copy(update={"lights": moved_lights})
 
     def turned(self, angle_deg: float) -> Scene:
         """The scene with all objects but planes turned about its z axis, anticlockwise from above."""
@@ -239,8 +239,8 @@ def files(part: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str
 
 def remarks(scene: Scene) -> list[str]:
     """Return remarks that the scene's maker must know, one sentence each."""
-    found = [shape.remark() for shape in _shapes(scene)]
-    return list(dict.fromkeys(remark for remark in found if remark))
+    shape_remarks = [shape.remark() for shape in _shapes(scene)]
+    return list(dict.fromkeys(remark for remark in shape_remarks if remark))
 
 
 def _shapes(part: Any) -> Iterator[Shape]:

@@ -149,24 +149,24 @@ def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalR
         return typical.reflectance(spectrum.name)
     if isinstance(spectrum, Bole):
         return typical.bole()
-    seen = _measured(spectrum, folder)
+    measured_reflectance = _measured(spectrum, folder)
     if spectrum.sample == "bare":
-        return BARE.inside(seen)
+        return BARE.inside(measured_reflectance)
     try:
-        return face(index, spectrum.sample).inside(seen)
+        return face(index, spectrum.sample).inside(measured_reflectance)
     except InputError as error:
         raise InputError(f"{folder / spectrum.path}: {error}") from error
 
 
 def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigment:
     """K and S [81], ends held. Raises InputError, also if they are not per mm where they must be."""
-    found = read_paint(folder / paint.path)
-    if needs_mm and found.unit != "per mm":
+    paint_file = read_paint(folder / paint.path)
+    if needs_mm and paint_file.unit != "per mm":
         raise InputError(
-            f"{folder / paint.path}: is {found.unit}; a layer of a thickness needs K and S per mm: measure it "
-            "with its thickness, or leave out thickness_mm for an opaque one"
+            f"{folder / paint.path}: is {paint_file.unit}; a layer of a thickness needs K and S per mm: measure "
+            "it with its thickness, or leave out thickness_mm for an opaque one"
         )
-    return found.on_grid()
+    return paint_file.on_grid()
 
 
 def matt(spectrum: Reflectance, folder: Path) -> MeasuredReflectance:
@@ -199,8 +199,8 @@ def power(spectrum: Power, folder: Path) -> Array:
         return _low_sun(spectrum)
     if isinstance(spectrum, Values):
         return np.array(spectrum.values)
-    read = measured.read_spectrum(folder / spectrum.path, unit="power", column=spectrum.column)
-    return np.maximum(resampling.held(resampling.on_grid(read)), 0.0)
+    measured_power = measured.read_spectrum(folder / spectrum.path, unit="power", column=spectrum.column)
+    return np.maximum(resampling.held(resampling.on_grid(measured_power)), 0.0)
 
 
 def luminous(spectral: Array) -> Array:

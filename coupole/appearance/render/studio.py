@@ -31,14 +31,14 @@ def reduced(
 ) -> Scene:
     """The scene with fewer samples, narrower pictures or coarser bands, for a quick look."""
     cameras = [camera.narrowed(width_px) if width_px else camera for camera in scene.cameras]
-    changed = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
+    fields = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
     if samples:
-        changed["samples"] = samples
+        fields["samples"] = samples
     if noise:
-        changed["noise"] = noise
+        fields["noise"] = noise
     if step_nm:
-        changed["bands"] = {"step_nm": step_nm}
-    return Scene.model_validate(changed)
+        fields["bands"] = {"step_nm": step_nm}
+    return Scene.model_validate(fields)
 
 
 def variant_of(scene: Scene) -> str:
@@ -70,12 +70,12 @@ def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
     with opened(scene, folder) as renderer:
         eye = pictures.eye_of(renderer.scene, folder)
         written_by = _written_by(renderer)
-        seen = {}
+        summaries = {}
         for camera in scene.cameras:
-            found = _seen(renderer, camera, folder, partial(progress, camera.name))
+            spectral = _seen(renderer, camera, folder, partial(progress, camera.name))
             stem = out / f"{scene.name}-{camera.name}"
-            seen[camera.name] = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by)
-        summary: dict[str, Any] = {"renderer": written_by, "cameras": seen}
+            summaries[camera.name] = pictures.write(renderer.scene, spectral, stem, eye=eye, written_by=written_by)
+        summary: dict[str, Any] = {"renderer": written_by, "cameras": summaries}
         if scene.caustic is not None:
             stem = out / f"{scene.name}-caustic"
             white_power = power(renderer.scene.lights[0].spectrum, folder)
@@ -110,30 +110,34 @@ def _film(scene: Scene, moves: _Moves, folder: Path, out: Path, progress: Progre
 
     All have the scene's `white_cd_m2`, or the level that the first of each camera has by itself.
     """
-    count, seen, written_by = len(moves.steps), {}, ""
+    count, summaries, written_by = len(moves.steps), {}, ""
     for camera in scene.cameras:
         frames = out / f"{scene.name}-{camera.name}-frames"
         frames.mkdir(parents=True, exist_ok=True)
-        fixed = scene.model_copy(update={"cameras": (camera,), "film": None, "turntable": None, "caustic": None})
-        made: list[dict[str, Any]] = []
+        still_scene = scene.model_copy(
+            update={"cameras": (camera,), "film": None, "turntable": None, "caustic": None}
+        )
+        frame_summaries: list[dict[str, Any]] = []
         for number, step in enumerate(moves.steps):
             progress(camera.name, number, count)
-            made.append(_frame(step(fixed), folder, frames / f"{number:04d}"))
-            written_by = made[-1]["renderer"]
+            frame_summaries.append(_frame(step(still_scene), folder, frames / f"{number:04d}"))
+            written_by = frame_summaries[-1]["renderer"]
             if number == 0:
-                display = fixed.display.model_copy(update={"white_cd_m2": made[0]["white_cd_m2"]})
-                fixed = fixed.model_copy(update={"display": display})
+                display = still_scene.display.model_copy(update={"white_cd_m2": frame_summaries[0]["white_cd_m2"]})
+                still_scene = still_scene.model_copy(update={"display": display})
         progress(camera.name, count, count)
         path = out / f"{scene.name}-{camera.name}.mp4"
-        told = f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {moves.told}"
-        write_film([frames / one["files"]["png"] for one in made], path, moves.frames_per_s, told)
-        seen[camera.name] = {
+        comment = f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {moves.told}"
+        write_film(
+            [frames / summary["files"]["png"] for summary in frame_summaries], path, moves.frames_per_s, comment
+        )
+        summaries[camera.name] = {
             "files": {"film": path.name, "frames": frames.name},
-            "frames": len(made),
-            "white_cd_m2": made[0]["white_cd_m2"],
-            "mean_cd_m2": [one["mean_cd_m2"] for one in made],
+            "frames": len(frame_summaries),
+            "white_cd_m2": frame_summaries[0]["white_cd_m2"],
+            "mean_cd_m2": [summary["mean_cd_m2"] for summary in frame_summaries],
         }
-    return {"renderer": written_by, "cameras": seen}
+    return {"renderer": written_by, "cameras": summaries}
 
 
 def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
@@ -141,24 +145,26 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
     summary_path = stem.with_suffix(".json")
     digest = sha256(f"{scene.model_dump_json()} {variant_of(scene)}".encode()).hexdigest()
     if summary_path.exists():
-        known: dict[str, Any] = read_json(summary_path, allow_nan=True)
-        if known["of"] == digest:
-            return known
+        old_summary: dict[str, Any] = read_json(summary_path, allow_nan=True)
+        if old_summary["of"] == digest:
+            return old_summary
     with opened(scene, folder) as renderer:
-        found = _seen(renderer, scene.cameras[0], folder, lambda done, total: None)
+        spectral = _seen(renderer, scene.cameras[0], folder, lambda done, total: None)
         eye = pictures.eye_of(renderer.scene, folder)
         written_by = _written_by(renderer)
-        seen = pictures.write(renderer.scene, found, stem, eye=eye, written_by=written_by, with_spectra=False)
-    made = {"of": digest, "renderer": written_by, **seen}
-    summary_path.write_text(json.dumps(made) + "\n")
-    return made
+        picture_summary = pictures.write(
+            renderer.scene, spectral, stem, eye=eye, written_by=written_by, with_spectra=False
+        )
+    summary = {"of": digest, "renderer": written_by, **picture_summary}
+    summary_path.write_text(json.dumps(summary) + "\n")
+    return summary
 
 
 def _seen(renderer: Renderer, camera: Camera, folder: Path, progress: Callable[[int, int], None]) -> Spectral:
-    gathered = renderer.scene.gathered
-    if gathered is None:
+    gathering = renderer.scene.gathered
+    if gathering is None:
         return renderer.render(camera, progress)
-    return by_gold.render(renderer.scene, gathered, camera, folder, progress)
+    return by_gold.render(renderer.scene, gathering, camera, folder, progress)
 
 
 def _written_by(renderer: Renderer) -> str:

@@ -145,10 +145,14 @@ def makie_grains(thing: Makie, folder: Path) -> sprinkled.Grains:
 
 def makie_pieces(thing: Makie, folder: Path) -> list[Piece]:
     """Powder and bare lacquer, in the object's frame. Raises InputError."""
-    found = makie_grains(thing, folder)
-    powder = np.random.default_rng(thing.seed).random(len(found.share)) < thing.density * found.share
+    grains = makie_grains(thing, folder)
+    powder = np.random.default_rng(thing.seed).random(len(grains.share)) < thing.density * grains.share
     parts = ((powder, thing.metal, False), (~powder, thing.lacquer, True))
-    return [Piece(found.corners_mm[one], matter, smooth) for one, matter, smooth in parts if one.any()]
+    return [
+        Piece(grains.corners_mm[is_chosen], matter, smooth)
+        for is_chosen, matter, smooth in parts
+        if is_chosen.any()
+    ]
 
 
 def nashiji_pieces(thing: Nashiji, folder: Path) -> list[Piece]:
@@ -157,8 +161,10 @@ def nashiji_pieces(thing: Nashiji, folder: Path) -> list[Piece]:
     Raises InputError.
     """
     skin = skin_of(body_corners(thing.body, folder))
-    if (expected := thing.flakes_per_mm2 * float(skin.areas_mm2().sum())) > _MOST_FLAKES:
-        raise InputError(f"nashiji: expected at most {_MOST_FLAKES} flakes, found {expected:.0f}; sprinkle fewer")
+    if (expected_flakes := thing.flakes_per_mm2 * float(skin.areas_mm2().sum())) > _MOST_FLAKES:
+        raise InputError(
+            f"nashiji: expected at most {_MOST_FLAKES} flakes, found {expected_flakes:.0f}; sprinkle fewer"
+        )
     depth_mm = thing.depth_mm - 2.0 * _CLEAR_MM
     if depth_mm <= 0.0:
         raise InputError(f"nashiji: expected lacquer of more than {2 * _CLEAR_MM:g} mm, found {thing.depth_mm:g}")

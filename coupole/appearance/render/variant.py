@@ -55,5 +55,5 @@ def llvm_version(library: str) -> int:
 
     The library is not loaded, because an old one would abort the process.
     """
-    named = re.search(r"LLVM(?:-|\.so\.|\.)(\d+)", Path(library).resolve().name)
-    return int(named.group(1)) if named else 0
+    version_match = re.search(r"LLVM(?:-|\.so\.|\.)(\d+)", Path(library).resolve().name)
+    return int(version_match.group(1)) if version_match else 0

@@ -70,10 +70,10 @@ def _lit(
     for part, count in enumerate(counts):
         progress(part, len(counts))
         weight = count / wanted.photons
-        found = caustic.photons(niche, sun, (*sides, top_mm), count, (seed, part))
-        lit = lit + weight * caustic.irradiance(found, sides, top_mm, wanted.cell_mm, thing.depth_mm)
-        on_stone = luminous(found.power[found.bounces > 0].sum(axis=0, dtype=float))
-        by_gold += weight * float(on_stone / luminous(found.started))
+        photons = caustic.photons(niche, sun, (*sides, top_mm), count, (seed, part))
+        lit = lit + weight * caustic.irradiance(photons, sides, top_mm, wanted.cell_mm, thing.depth_mm)
+        on_stone = luminous(photons.power[photons.bounces > 0].sum(axis=0, dtype=float))
+        by_gold += weight * float(on_stone / luminous(photons.started))
     progress(len(counts), len(counts))
     return np.asarray(lit), by_gold
 
@@ -103,5 +103,5 @@ def _niche(thing: Arcature, folder: Path) -> caustic.Niche:
 
 def _leaf(gilt: Gilt, folder: Path) -> Array:
     """Specular part of the covered share, as in `layered.Sheet`."""
-    gilded, _ = gilt_of(gilt, folder)
-    return np.asarray((1.0 - gilt.uncovered) * gilded.leaf.reflectance)
+    gilding, _ = gilt_of(gilt, folder)
+    return np.asarray((1.0 - gilt.uncovered) * gilding.leaf.reflectance)

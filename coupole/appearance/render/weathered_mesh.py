@@ -31,20 +31,20 @@ _MOST_OFF = 0.01
 
 def write(corners_mm: Array, material: Weathered, path: Path, *, smooth: bool) -> None:
     """Triangles [n, 3, 3] as a PLY file for Mitsuba. Raises InputError for a share that it cannot have."""
-    made = weathered(corners_mm, material, smooth=smooth)
-    numbers = {WORN: np.repeat(made.off.astype(float), 3)}
+    mesh = weathered(corners_mm, material, smooth=smooth)
+    numbers = {WORN: np.repeat(mesh.off.astype(float), 3)}
     if isinstance(material, Dusty):
-        numbers[DUSTY] = material.covered(made.normals[..., 2].ravel())
-    _write_ply(made, numbers, path)
+        numbers[DUSTY] = material.covered(mesh.normals[..., 2].ravel())
+    _write_ply(mesh, numbers, path)
 
 
 def weathered(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divided:
     """Triangles, divided as the pattern needs, with its mask. Raises InputError."""
     normals = _corner_normals(corners_mm, smooth=smooth)
-    worn = material.over if isinstance(material, Dusty) else material
-    if not isinstance(worn, Worn) or isinstance(worn.pattern, Uniform):
+    wear = material.over if isinstance(material, Dusty) else material
+    if not isinstance(wear, Worn) or isinstance(wear.pattern, Uniform):
         return Divided(corners_mm, normals, np.zeros(len(corners_mm), bool))
-    pattern, share = worn.pattern, worn.share
+    pattern, share = wear.pattern, wear.share
     points, ways = solid_masks.spread(corners_mm, normals, pattern.seed)
     if isinstance(pattern, Cracks):
         field = solid_masks.cracks(points, pattern.cell_mm, pattern.seed)
@@ -57,13 +57,13 @@ def weathered(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divide
     else:
         level_mm = solid_masks.level_of(field, share, points, ways)
     finest_mm = pattern.reach_mm / _FINE_EDGE if isinstance(pattern, Edges) else 2.0 * level_mm / _FINE
-    made = solid_masks.divided(corners_mm, normals, field, level_mm, max(finest_mm, 1e-4), share)
-    if share is not None and abs(made.share - share) > _MOST_OFF:
+    mesh = solid_masks.divided(corners_mm, normals, field, level_mm, max(finest_mm, 1e-4), share)
+    if share is not None and abs(mesh.share - share) > _MOST_OFF:
         raise InputError(
-            f"worn: expected a share of {share:g} by {pattern.kind}, found {made.share:.3f} on this surface; take "
+            f"worn: expected a share of {share:g} by {pattern.kind}, found {mesh.share:.3f} on this surface; take "
             "another share or pattern (a flat sheet has no edges)"
         )
-    return made
+    return mesh
 
 
 def _corner_normals(corners_mm: Array, *, smooth: bool) -> Array:
@@ -84,7 +84,7 @@ def _write_ply(made: Divided, numbers: dict[str, Array], path: Path) -> None:
     """Binary, three vertices for each triangle; Mitsuba names a number `worn_0` of vertices `vertex_worn`."""
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"{name}_0" for name in numbers)]
     columns = [made.corners_mm.reshape(-1, 3), made.normals.reshape(-1, 3)]
-    vertices = np.concatenate([*columns, *(one[:, None] for one in numbers.values())], axis=1).astype("<f4")
+    vertices = np.concatenate([*columns, *(column[:, None] for column in numbers.values())], axis=1).astype("<f4")
     faces = np.empty(len(made.off), [("count", "u1"), ("rows", "<i4", 3)])
     faces["count"], faces["rows"] = 3, np.arange(3 * len(made.off)).reshape(-1, 3)
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]

@@ -51,25 +51,25 @@ def skin_of(corners_mm: Array) -> Skin:
 
 def grown(skin: Skin, by_mm: float) -> Skin:
     """The skin moved outwards along its normals. Raises InputError where it would fold."""
-    moved = Skin(skin.points_mm + by_mm * skin.normals, skin.faces, skin.normals)
-    facing = np.sum(flat_normals(moved.corners_mm) * flat_normals(skin.corners_mm), axis=1)
-    if folded := int(np.count_nonzero((facing < 0.0) & (skin.areas_mm2() > 1e-9))):
+    grown_skin = Skin(skin.points_mm + by_mm * skin.normals, skin.faces, skin.normals)
+    facing = np.sum(flat_normals(grown_skin.corners_mm) * flat_normals(skin.corners_mm), axis=1)
+    if folds := int(np.count_nonzero((facing < 0.0) & (skin.areas_mm2() > 1e-9))):
         raise InputError(
-            f"coat: expected a surface whose hollows are wider than the coat of {by_mm:g} mm; {folded} triangles "
+            f"coat: expected a surface whose hollows are wider than the coat of {by_mm:g} mm; {folds} triangles "
             "would fold; make the coat thinner, or the hollows rounder"
         )
-    return moved
+    return grown_skin
 
 
 def scattered(skin: Skin, count: int, random: np.random.Generator) -> tuple[Array, Array]:
     """`count` points [count, 3], evenly by area, and the frames [count, 3, 3] there: normals are the third
     columns, the first ones lie anywhere in the surface."""
     areas = skin.areas_mm2()
-    chosen = random.choice(len(areas), count, p=areas / areas.sum())
+    triangles = random.choice(len(areas), count, p=areas / areas.sum())
     root, second = np.sqrt(random.random(count)), random.random(count)
     share = np.stack([1.0 - root, root * (1.0 - second), root * second], axis=1)
-    places = np.einsum("nk,nkj->nj", share, skin.points_mm[skin.faces[chosen]])
-    normals = np.einsum("nk,nkj->nj", share, skin.normals[skin.faces[chosen]])
+    places = np.einsum("nk,nkj->nj", share, skin.points_mm[skin.faces[triangles]])
+    normals = np.einsum("nk,nkj->nj", share, skin.normals[skin.faces[triangles]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     along = np.cross(least, normals)

@@ -47,16 +47,16 @@ def cracks(points_mm: Array, cell_mm: float, seed: int) -> Field:
     from scipy.spatial import KDTree
 
     near = np.array([[x, y, z] for x in range(-2, 3) for y in range(-2, 3) for z in range(-2, 3)])
-    own = np.unique(np.floor(points_mm / cell_mm).astype(np.int64), axis=0)
-    cells = np.unique((own[:, None] + near).reshape(-1, 3), axis=0)
+    own_cells = np.unique(np.floor(points_mm / cell_mm).astype(np.int64), axis=0)
+    cells = np.unique((own_cells[:, None] + near).reshape(-1, 3), axis=0)
     seeds = (cells + np.random.default_rng(seed).random(cells.shape)) * cell_mm
     tree = KDTree(seeds)
 
     def distance(points: Array, normals: Array) -> Array:
         _, nearest = tree.query(points, 6)
-        first, others = seeds[nearest[:, 0]], seeds[nearest[:, 1:]]
-        between = others - first[:, None]
-        to_middle = 0.5 * (others + first[:, None]) - points[:, None]
+        first, other_seeds = seeds[nearest[:, 0]], seeds[nearest[:, 1:]]
+        between = other_seeds - first[:, None]
+        to_middle = 0.5 * (other_seeds + first[:, None]) - points[:, None]
         return np.asarray((np.sum(to_middle * between, -1) / np.linalg.norm(between, axis=-1)).min(axis=1))
 
     return distance
@@ -84,10 +84,10 @@ def spread(corners_mm: Array, normals: Array, seed: int, count: int = SAMPLES) -
     """Points [n, 3] spread evenly over the area of triangles, and their normals."""
     random = np.random.default_rng(seed)
     areas = _areas(corners_mm)
-    which = np.searchsorted(np.cumsum(areas) / areas.sum(), random.random(count)).clip(0, len(areas) - 1)
+    triangles = np.searchsorted(np.cumsum(areas) / areas.sum(), random.random(count)).clip(0, len(areas) - 1)
     root, v = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack([1.0 - root, root * (1.0 - v), root * v], axis=1)[..., None]
-    return (corners_mm[which] * weights).sum(axis=1), _unit((normals[which] * weights).sum(axis=1))
+    return (corners_mm[triangles] * weights).sum(axis=1), _unit((normals[triangles] * weights).sum(axis=1))
 
 
 def level_of(field: Field, share: float, points_mm: Array, normals: Array) -> float:
@@ -103,16 +103,16 @@ def divided(
     With a `share` the level is moved a little, to have that share of the area. Raises InputError for more than
     `MOST_TRIANGLES`.
     """
-    done: list[tuple[Array, Array]] = []
+    finished_parts: list[tuple[Array, Array]] = []
     corners, ways = np.asarray(corners_mm, dtype=float), np.asarray(normals, dtype=float)
     count = 0
     while len(corners):
         middle = corners.mean(axis=1)
         radius = np.linalg.norm(corners - middle[:, None], axis=-1).max(axis=1)
         sides = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=-1)
-        crossed = np.abs(field(middle, _unit(ways.mean(axis=1))) - level_mm) < radius
-        again = crossed & (sides.max(axis=1) > finest_mm)
-        done.append((corners[~again], ways[~again]))
+        is_crossed = np.abs(field(middle, _unit(ways.mean(axis=1))) - level_mm) < radius
+        again = is_crossed & (sides.max(axis=1) > finest_mm)
+        finished_parts.append((corners[~again], ways[~again]))
         count += int((~again).sum())
         if count + 2 * again.sum() > MOST_TRIANGLES:
             raise InputError(
@@ -121,8 +121,8 @@ def divided(
             )
         edge = sides[again].argmax(axis=1)
         corners, ways = _halved(corners[again], edge), _halved(ways[again], edge)
-    corners = np.concatenate([part for part, _ in done])
-    ways = _unit(np.concatenate([part for _, part in done]))
+    corners = np.concatenate([part for part, _ in finished_parts])
+    ways = _unit(np.concatenate([part for _, part in finished_parts]))
     values = field(corners.mean(axis=1), _unit(ways.mean(axis=1)))
     if share is not None:
         order = np.argsort(values)

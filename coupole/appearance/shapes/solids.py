@@ -20,11 +20,11 @@ def unit_sphere(n: int) -> Array:
     i, j = i[inside][:, None], j[inside][:, None]
     net = (a * (n - i - j) + b * i + c * j) / n
     net = net / np.linalg.norm(net, axis=-1, keepdims=True)
-    upright = [(index[p, q], index[p + 1, q], index[p, q + 1]) for p in range(n) for q in range(n - p)]
-    inverted = [
+    upright_faces = [(index[p, q], index[p + 1, q], index[p, q + 1]) for p in range(n) for q in range(n - p)]
+    inverted_faces = [
         (index[p + 1, q], index[p + 1, q + 1], index[p, q + 1]) for p in range(n) for q in range(n - p - 1)
     ]
-    return np.asarray(net[:, np.array(upright + inverted)]).reshape(-1, 3, 3)
+    return np.asarray(net[:, np.array(upright_faces + inverted_faces)]).reshape(-1, 3, 3)
 
 
 def relief(size_mm: float, triangles: int, depth_mm: float, seed: int) -> Array:

@@ -50,27 +50,35 @@ def grains(
     normals = skin.normals[skin.faces]
     flat = np.zeros((len(corners_mm), 3, 2)) if uv is None else uv - 0.5
     whole = np.concatenate([corners_mm, normals, flat], axis=2)
-    cut = np.concatenate([_cut(whole[parts == count], int(count)) for count in np.unique(parts)])
-    places, along = cut[..., :3], cut[..., 3:6]
+    small_triangles = np.concatenate([_cut(whole[parts == count], int(count)) for count in np.unique(parts)])
+    places, along = small_triangles[..., :3], small_triangles[..., 3:6]
     along = along / np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-300)
 
     def share(place: Array, normal: Array, texture: Array) -> Array:
         return drawing(texture if wrapped == "uv" else _projected(place - middle, normal, wrapped))
 
-    centres = [cut[..., first:last].mean(axis=1) for first, last in ((0, 3), (3, 6), (6, 8))]
-    found = share(*centres)
+    centres = [small_triangles[..., first:last].mean(axis=1) for first, last in ((0, 3), (3, 6), (6, 8))]
+    metal_shares = share(*centres)
     if raised_mm > 0.0:
-        at_corners = share(places.reshape(-1, 3), along.reshape(-1, 3), cut[..., 6:].reshape(-1, 2))
+        at_corners = share(places.reshape(-1, 3), along.reshape(-1, 3), small_triangles[..., 6:].reshape(-1, 2))
         places = places + raised_mm * at_corners.reshape(-1, 3, 1) * along
-    return Grains(places, found)
+    return Grains(places, metal_shares)
 
 
 def _cut(corners: Array, count: int) -> Array:
     """[m count^2, 3, k] of triangles with values [m, 3, k] at their corners."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
-    upright, inverted = i + j < count, i + j < count - 1
-    a, b, c = (i[upright], j[upright]), (i[upright] + 1, j[upright]), (i[upright], j[upright] + 1)
-    d, e, f = (i[inverted] + 1, j[inverted]), (i[inverted] + 1, j[inverted] + 1), (i[inverted], j[inverted] + 1)
+    is_upright, is_inverted = i + j < count, i + j < count - 1
+    a, b, c = (
+        (i[is_upright], j[is_upright]),
+        (i[is_upright] + 1, j[is_upright]),
+        (i[is_upright], j[is_upright] + 1),
+    )
+    d, e, f = (
+        (i[is_inverted] + 1, j[is_inverted]),
+        (i[is_inverted] + 1, j[is_inverted] + 1),
+        (i[is_inverted], j[is_inverted] + 1),
+    )
     steps = np.concatenate(
         [np.stack([np.stack(p, 1) for p in (a, b, c)], 1), np.stack([np.stack(p, 1) for p in (d, e, f)], 1)]
     )

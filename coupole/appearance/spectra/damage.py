@@ -46,8 +46,10 @@ def damage_w_per_lm(spectrum: Measured) -> float:
             f"spectrum {spectrum.name}: expected {COVERED_NM[0]:g} to {COVERED_NM[1]:g} nm at least, found "
             f"{nm[0]:g} to {nm[-1]:g}"
         )
-    seen = float(np.trapezoid(fine * np.interp(fine_nm, WAVELENGTHS_NM, _V, left=0.0, right=0.0), fine_nm))
-    if seen <= 0.0:
+    visible_power = float(
+        np.trapezoid(fine * np.interp(fine_nm, WAVELENGTHS_NM, _V, left=0.0, right=0.0), fine_nm)
+    )
+    if visible_power <= 0.0:
         raise InputError(f"spectrum {spectrum.name}: expected visible light, found none")
     damaging = float(np.trapezoid(fine * np.exp(-B_PER_NM * (fine_nm - 300.0)), fine_nm))
-    return damaging / (LM_PER_W * seen)
+    return damaging / (LM_PER_W * visible_power)

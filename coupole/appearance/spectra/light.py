@@ -55,8 +55,8 @@ def led(name: str) -> Array:
     """Relative spectral power [81] of a light source that colour-science knows, such as 'LED-B3' of the CIE or
     'Phosphor LED YAG'; its peak is 1."""
     colour = _colour()
-    known = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
-    power = _on_grid(_named(known, "light source", name))
+    sources = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
+    power = _on_grid(_named(sources, "light source", name))
     power /= power.max()
     power.setflags(write=False)
     return power

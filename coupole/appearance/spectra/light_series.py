@@ -38,8 +38,8 @@ class LightSeries:
                 f"{when.isoformat()}; choose one of these, or measure longer"
             )
         seconds = np.array([(time - first).total_seconds() for time in self.times])
-        wanted = (when - first).total_seconds()
-        return np.array([np.interp(wanted, seconds, band) for band in self.irradiances.T])
+        when_s = (when - first).total_seconds()
+        return np.array([np.interp(when_s, seconds, band) for band in self.irradiances.T])
 
 
 def read_series(path: Path) -> LightSeries:
@@ -64,9 +64,9 @@ def read_series(path: Path) -> LightSeries:
 
 def _time(text: str, path: Path) -> datetime:
     try:
-        found = datetime.fromisoformat(text)
+        time = datetime.fromisoformat(text)
     except ValueError:
         raise InputError(f"{path}:1: expected columns named by {_FORM}, found {text!r}") from None
-    if found.tzinfo is None:
+    if time.tzinfo is None:
         raise InputError(f"{path}:1: expected {_FORM}, found {text}; write {text}+02:00 if that was it")
-    return found
+    return time

@@ -56,13 +56,13 @@ def resampled(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Arra
     inside = (bands >= nm[0] - 1e-6) & (bands <= nm[-1] + 1e-6)
     above = np.clip(np.searchsorted(nm, bands), 1, len(nm) - 1)
     on_sample = np.isclose(nm[above], bands) | np.isclose(nm[above - 1], bands)
-    covered = inside & ((nm[above] - nm[above - 1] <= _WIDEST_GAP_NM) | on_sample)
-    if not covered.any():
+    is_covered = inside & ((nm[above] - nm[above - 1] <= _WIDEST_GAP_NM) | on_sample)
+    if not is_covered.any():
         return result, 0.0
     if np.median(np.diff(nm)) < step_nm - 1e-6:
-        result[covered], error = _averaged(nm, values, bands[covered], step_nm)
+        result[is_covered], error = _averaged(nm, values, bands[is_covered], step_nm)
     else:
-        result[covered], error = _interpolated(nm, values, bands[covered])
+        result[is_covered], error = _interpolated(nm, values, bands[is_covered])
     return result, error
 
 
@@ -71,23 +71,23 @@ def held(spectrum: OnGrid) -> Array:
 
     That is a guess; rendering needs one, identification does not.
     """
-    known = np.isfinite(spectrum.values)
-    return np.interp(WAVELENGTHS_NM, WAVELENGTHS_NM[known], spectrum.values[known])
+    is_known = np.isfinite(spectrum.values)
+    return np.interp(WAVELENGTHS_NM, WAVELENGTHS_NM[is_known], spectrum.values[is_known])
 
 
 def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
     from scipy.interpolate import PchipInterpolator
 
     # Ends within rounding of the range belong to it.
-    found = np.asarray(PchipInterpolator(nm, values)(np.clip(at, nm[0], nm[-1])))
+    band_values = np.asarray(PchipInterpolator(nm, values)(np.clip(at, nm[0], nm[-1])))
     if np.isclose(at[:, None], nm).any(axis=1).all():
-        return found, 0.0
-    kept = np.arange(0, len(nm), 2)
-    left_out = np.arange(1, kept[-1], 2)
-    if len(kept) < 2 or not len(left_out):
-        return found, float(np.ptp(values))
-    again = PchipInterpolator(nm[kept], values[kept])(nm[left_out])
-    return found, 0.25 * float(np.abs(again - values[left_out]).max())
+        return band_values, 0.0
+    even_rows = np.arange(0, len(nm), 2)
+    left_out = np.arange(1, even_rows[-1], 2)
+    if len(even_rows) < 2 or not len(left_out):
+        return band_values, float(np.ptp(values))
+    again = PchipInterpolator(nm[even_rows], values[even_rows])(nm[left_out])
+    return band_values, 0.25 * float(np.abs(again - values[left_out]).max())
 
 
 def _averaged(nm: Array, values: Array, at: Array, step_nm: float) -> tuple[Array, float]:
@@ -95,5 +95,5 @@ def _averaged(nm: Array, values: Array, at: Array, step_nm: float) -> tuple[Arra
     half = np.minimum(step_nm, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
     u = np.linspace(-1.0, 1.0, _TRIANGLE)
     weight = (1.0 - np.abs(u)) / np.sum(1.0 - np.abs(u))
-    found = np.interp(at[:, None] + half[:, None] * u, nm, values) @ weight
-    return found, float(np.abs(found - np.interp(at, nm, values)).max())
+    band_values = np.interp(at[:, None] + half[:, None] * u, nm, values) @ weight
+    return band_values, float(np.abs(band_values - np.interp(at, nm, values)).max())

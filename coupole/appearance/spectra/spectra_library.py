@@ -58,19 +58,19 @@ def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, .
             raise InputError(f"{path}: expected spectra, {', '.join(sorted(_ENDINGS))}; found none")
     else:
         files = [path]
-    found = [spectrum for file in files for spectrum in _read_file(file, unit)]
-    seen: dict[str, LibrarySpectrum] = {}
-    for spectrum in found:
-        if spectrum.name in seen:
-            before = seen[spectrum.name]
+    spectra = [spectrum for file in files for spectrum in _read_file(file, unit)]
+    by_name: dict[str, LibrarySpectrum] = {}
+    for spectrum in spectra:
+        if spectrum.name in by_name:
+            before = by_name[spectrum.name]
             raise _wrong(
                 spectrum.file,
                 spectrum.line,
                 f"the name {spectrum.name!r} is that of {before.file}:{before.line} too; "
                 "give each spectrum a name of its own",
             )
-        seen[spectrum.name] = spectrum
-    return tuple(found)
+        by_name[spectrum.name] = spectrum
+    return tuple(spectra)
 
 
 def _read_file(path: Path, unit: Unit) -> list[LibrarySpectrum]:
@@ -81,8 +81,8 @@ def _read_file(path: Path, unit: Unit) -> list[LibrarySpectrum]:
     lines = [(number, line.strip("\r ")) for number, line in enumerate(text.split("\n"), start=1)]
     rows = [(number, *_named(line)) for number, line in lines if line.strip() and not line.startswith("#")]
     if not any(_are_numbers(fields) for _, name, fields in rows if name and not _NUMBER.fullmatch(name)):
-        one = parse_spectrum(text, str(path), name=path.stem, unit=unit)
-        return [LibrarySpectrum(one.name, str(path), 0, one.wavelengths_nm, one.values)]
+        spectrum = parse_spectrum(text, str(path), name=path.stem, unit=unit)
+        return [LibrarySpectrum(spectrum.name, str(path), 0, spectrum.wavelengths_nm, spectrum.values)]
     nm, rows = _wavelengths(path, rows)
     numbers = [_numbers(path, nm, *row) for row in rows]
     scale = _scale(path, nm, numbers, rows, unit)
@@ -97,21 +97,21 @@ def _spectrum(path: Path, nm: Array, values: Array, line: int, name: str) -> Lib
     if len(values) == len(nm):
         return LibrarySpectrum(name, str(path), line, nm[order], values[order])
     k, s = values[: len(nm)][order], values[len(nm) :][order]
-    known = (k >= 0.0) & (s > 0.0)
-    if not known.any():
+    is_known = (k >= 0.0) & (s > 0.0)
+    if not is_known.any():
         raise _wrong(str(path), line, f"{name}: expected K and S that are positive, found none; see the export")
     reflectance = np.full(len(nm), np.nan)
-    reflectance[known] = kubelka_munk.opaque(k[known] / s[known])
+    reflectance[is_known] = kubelka_munk.opaque(k[is_known] / s[is_known])
     return LibrarySpectrum(name, str(path), line, nm[order], reflectance, k, s)
 
 
 def _named(line: str) -> tuple[str, list[str]]:
     """Name and fields of a row. Tabs may be several, to align columns; of other separators each begins a field."""
-    quoted = re.match(r'"([^"]*)"', line)
-    rest = line[quoted.end() :] if quoted else line
+    quote = re.match(r'"([^"]*)"', line)
+    rest = line[quote.end() :] if quote else line
     separator = next((mark for mark in "\t;," if mark in rest), None)
     fields = [field.strip() for field in rest.split(separator)]
-    name = quoted.group(1) if quoted else fields[0]
+    name = quote.group(1) if quote else fields[0]
     fields = fields[1:]
     while fields and not fields[-1]:
         fields.pop()
@@ -166,11 +166,11 @@ def _numbers(path: Path, nm: Array, line: int, name: str, fields: list[str]) -> 
         raise _wrong(str(path), line, "expected a name, then numbers; found no name")
     for index, field in enumerate(fields):
         if not _NUMBER.fullmatch(field):
-            what = f"{field!r}" if field else "an empty field"
+            content = f"{field!r}" if field else "an empty field"
             raise _wrong(
                 str(path),
                 line,
-                f"{name}: expected a number at {nm[index % len(nm)]:g} nm, found {what}; measure it again, or "
+                f"{name}: expected a number at {nm[index % len(nm)]:g} nm, found {content}; measure it again, or "
                 "leave the spectrum out",
             )
     if len(fields) not in (len(nm), 2 * len(nm)):
@@ -194,13 +194,13 @@ def _scale(path: Path, nm: Array, numbers: list[Array], rows: list[Row], unit: U
         raise _wrong(str(path), line, f"{name}: {peak:g} may be percent or a fraction; say which with `unit`")
     scale = 0.01 if unit == "percent" or (unit == "auto" and peak >= _PERCENT_AT_LEAST) else 1.0
     low, high = _REFLECTANCE
-    for values, (at, named, _) in spectra:
+    for values, (at, label, _) in spectra:
         outside = np.flatnonzero((values * scale < low) | (values * scale > high))
         if len(outside):
             raise _wrong(
                 str(path),
                 at,
-                f"{named}: expected a reflectance of {low:g} to {high:g}, found {values[outside[0]] * scale:g} at "
+                f"{label}: expected a reflectance of {low:g} to {high:g}, found {values[outside[0]] * scale:g} at "
                 f"{nm[outside[0]]:g} nm; see whether it is percent or a fraction",
             )
     return scale

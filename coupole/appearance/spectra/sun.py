@@ -67,17 +67,17 @@ def place(when: datetime, latitude_deg: float, longitude_deg: float, altitude_m:
             f"{when.isoformat()}: expected a time with its offset from UTC, such as {when.isoformat()}+02:00"
         )
     pvlib, pandas = _pvlib()
-    found = pvlib.solarposition.get_solarposition(
+    position = pvlib.solarposition.get_solarposition(
         pandas.DatetimeIndex([when]), latitude_deg, longitude_deg, altitude=altitude_m
     ).iloc[0]
-    if found["apparent_elevation"] <= 0.0:
+    if position["apparent_elevation"] <= 0.0:
         raise InputError(
             f"{when} at {latitude_deg:g}, {longitude_deg:g}: expected the sun above the horizon, found it "
-            f"at {found['apparent_elevation']:.1f} degrees; choose another time"
+            f"at {position['apparent_elevation']:.1f} degrees; choose another time"
         )
     return SunPlace(
-        float(found["apparent_elevation"]),
-        float(found["azimuth"]),
+        float(position["apparent_elevation"]),
+        float(position["azimuth"]),
         int(when.timetuple().tm_yday),
         float(pvlib.atmosphere.alt2pres(altitude_m)),
     )
@@ -90,7 +90,7 @@ def clear_sky(sun: SunPlace, air: Air) -> ClearSky:
     """
     pvlib, _ = _pvlib()
     zenith_deg = 90.0 - sun.refracted_elevation_deg
-    found = pvlib.spectrum.spectrl2(
+    spectra = pvlib.spectrum.spectrl2(
         apparent_zenith=zenith_deg,
         aoi=zenith_deg,
         surface_tilt=0.0,
@@ -104,9 +104,9 @@ def clear_sky(sun: SunPlace, air: Air) -> ClearSky:
     )
 
     def on_grid(values: Any) -> Array:
-        return np.interp(WAVELENGTHS_NM, found["wavelength"], np.ravel(values))
+        return np.interp(WAVELENGTHS_NM, spectra["wavelength"], np.ravel(values))
 
-    return ClearSky(on_grid(found["dni"]), on_grid(found["dhi"]))
+    return ClearSky(on_grid(spectra["dni"]), on_grid(spectra["dhi"]))
 
 
 def _pvlib() -> tuple[Any, Any]:

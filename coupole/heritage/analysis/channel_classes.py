@@ -49,18 +49,20 @@ def classes_of_channels(
     """
     if not np.all(np.isfinite(channels) & (channels > 0.0)):
         raise InputError(f"the spot: expected positive reflectances, found {channels}; choose another spot")
-    covered = np.isfinite(references.reflectance).mean(axis=0) >= _COVERED
-    rows = np.isfinite(references.reflectance[:, covered]).all(axis=1)
-    power, *seen = (np.nan_to_num(resampled(one, BANDS_NM, STEP_NM)[0]) for one in (light, *sensitivities))
-    weights = channel_weights(np.maximum(power, 0.0), np.maximum(np.stack(seen), 0.0))
-    share = weights[:, covered].sum(axis=1)
+    covered_bands = np.isfinite(references.reflectance).mean(axis=0) >= _COVERED
+    rows = np.isfinite(references.reflectance[:, covered_bands]).all(axis=1)
+    power, *channel_sensitivities = (
+        np.nan_to_num(resampled(spectrum, BANDS_NM, STEP_NM)[0]) for spectrum in (light, *sensitivities)
+    )
+    weights = channel_weights(np.maximum(power, 0.0), np.maximum(np.stack(channel_sensitivities), 0.0))
+    share = weights[:, covered_bands].sum(axis=1)
     if share.min() < _COVERED:
         raise InputError(
             f"library: expected spectra wherever the channels see light; found {share.min():.0%} of one channel's "
             "covered; use a library with a wider range"
         )
-    weights = weights[:, covered] / share[:, None]
-    ratio = kubelka_munk.k_over_s(np.clip(references.reflectance[np.ix_(rows, covered)], 0.004, 0.999))
+    weights = weights[:, covered_bands] / share[:, None]
+    ratio = kubelka_munk.k_over_s(np.clip(references.reflectance[np.ix_(rows, covered_bands)], 0.004, 0.999))
     tints = channel_values(kubelka_munk.opaque(ratio[:, None] * _FACTORS[:, None]), weights)
     u = np.sqrt(u_channels**2 + _SPREAD**2)
     chi2 = (np.square((np.log(tints) - np.log(channels)) / u)).sum(axis=-1).min(axis=1)

@@ -47,10 +47,14 @@ class ClassModel:
         self.class_names = class_names
         self._classes, self._count = classes, len(looks)
         self._rows = features(looks.reshape(-1, looks.shape[-1]))
-        squared = _squared_distances(self._rows, self._rows)
-        self._length2 = float(np.median(squared[squared > 0.0])) if np.any(squared > 0.0) else 1.0
+        squared_distances = _squared_distances(self._rows, self._rows)
+        self._length2 = (
+            float(np.median(squared_distances[squared_distances > 0.0]))
+            if np.any(squared_distances > 0.0)
+            else 1.0
+        )
         self._members = np.eye(len(class_names))[np.tile(classes, self._count)]
-        self._precision = np.linalg.inv(self._kernel(squared) + _NOISE * np.eye(len(squared)))
+        self._precision = np.linalg.inv(self._kernel(squared_distances) + _NOISE * np.eye(len(squared_distances)))
         self._weights = self._precision @ self._members
 
     def probabilities(self, reflectance: Array) -> Array:
@@ -61,14 +65,14 @@ class ClassModel:
 
     def nearest(self, reflectance: Array) -> Array:
         """[q, n] distance of spectra [q, bands] to each reference in its most similar appearance."""
-        squared = _squared_distances(features(reflectance), self._rows)
-        nearest: Array = np.sqrt(squared.reshape(len(squared), self._count, -1).min(axis=1))
+        squared_distances = _squared_distances(features(reflectance), self._rows)
+        nearest: Array = np.sqrt(squared_distances.reshape(len(squared_distances), self._count, -1).min(axis=1))
         return nearest
 
     def is_known(self, probabilities: Array) -> NDArray[np.bool_]:
         """Tell whether the library has the class, for rows [q, classes + 1]."""
-        known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
-        return known
+        is_known: NDArray[np.bool_] = 1.0 - probabilities[:, -1] >= self.threshold
+        return is_known
 
     def is_sure(self, probabilities: Array) -> NDArray[np.bool_]:
         """Tell whether the first class is probable enough if the library has the class."""
@@ -78,20 +82,22 @@ class ClassModel:
     @cached_property
     def held_out(self) -> HeldOut:
         """Held-out probabilities of the references as they were measured."""
-        one, all_of_class = (_probabilities(found[: len(self._classes)], self._scale) for found in self._left_out)
-        return HeldOut(one, all_of_class)
+        without_row, all_of_class = (
+            _probabilities(predictions[: len(self._classes)], self._scale) for predictions in self._left_out
+        )
+        return HeldOut(without_row, all_of_class)
 
     @cached_property
     def threshold(self) -> float:
         """Probability that the class is in the library, from which it counts as known: only a share of 0.05 of the
         references whose class is left out, and that no family (`pigment_classes`) speaks against, reach it."""
-        found = self.held_out.without_class
-        known = 1.0 - found[:, -1]
+        probabilities = self.held_out.without_class
+        known_probability = 1.0 - probabilities[:, -1]
         for row, number in enumerate(self._classes):
-            left = set(self.class_names) - {self.class_names[number]}
-            if lacking(self.class_names[found[row, :-1].argmax()], left):
-                known[row] = 0.0
-        return max(_LEAST_KNOWN, float(np.quantile(known, 1.0 - _MOST_KNOWN)))
+            other_classes = set(self.class_names) - {self.class_names[number]}
+            if lacking(self.class_names[probabilities[row, :-1].argmax()], other_classes):
+                known_probability[row] = 0.0
+        return max(_LEAST_KNOWN, float(np.quantile(known_probability, 1.0 - _MOST_KNOWN)))
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
@@ -100,20 +106,20 @@ class ClassModel:
         return self._without(np.tile(numbers, self._count)), self._without(np.tile(self._classes, self._count))
 
     def _without(self, group: NDArray[np.intp]) -> Array:
-        found = np.empty((len(group), len(self.class_names) + 1))
+        predictions = np.empty((len(group), len(self.class_names) + 1))
         for number in np.unique(group):
             rows = np.flatnonzero(group == number)
             covariance = np.linalg.inv(self._precision[np.ix_(rows, rows)])
-            found[rows, :-1] = self._members[rows] - covariance @ self._weights[rows]
-            found[rows, -1] = np.diag(covariance) - _NOISE
-        return found
+            predictions[rows, :-1] = self._members[rows] - covariance @ self._weights[rows]
+            predictions[rows, -1] = np.diag(covariance) - _NOISE
+        return predictions
 
     @cached_property
     def _scale(self) -> Array:
         """log b, t0 and t1; a reference alone in its class can only be left out with it."""
         from scipy.optimize import minimize
 
-        one, all_of_class = self._left_out
+        without_row, all_of_class = self._left_out
         classes = np.tile(self._classes, self._count)
         sizes = np.bincount(self._classes)[classes]
         weight = sizes**-0.5
@@ -123,14 +129,14 @@ class ClassModel:
             none = np.log(_probabilities(all_of_class, scale)[:, -1] + 1e-12)
             total = -float(weight @ none / weight.sum()) + 1e-3 * float(scale @ scale)
             if several.any():
-                right = _probabilities(one[several], scale)[np.arange(several.sum()), classes[several]]
+                right = _probabilities(without_row[several], scale)[np.arange(several.sum()), classes[several]]
                 total -= float(weight[several] @ np.log(right + 1e-12) / weight[several].sum())
             return total
 
-        found = minimize(
+        minimum = minimize(
             missed, _START, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-4}
         )
-        return np.asarray(found.x)
+        return np.asarray(minimum.x)
 
     def _kernel(self, squared: Array) -> Array:
         distance = np.sqrt(3.0 * squared / self._length2)
@@ -148,8 +154,8 @@ def _probabilities(found: Array, scale: Array) -> Array:
 
 
 def _squared_distances(a: Array, b: Array) -> Array:
-    squared: Array = np.maximum(
+    squared_distances: Array = np.maximum(
         (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)[None] - 2.0 * a @ b.T,
         0.0,
     )
-    return squared
+    return squared_distances

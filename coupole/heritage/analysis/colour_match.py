@@ -35,16 +35,16 @@ def matches(
     """
     functions = light.observer(observer)
     a, b = (_held(values) for values in (target, recipe))
-    found: list[Match] = []
+    light_matches: list[Match] = []
     ratio = np.ones(3)
     for number, name in enumerate(lights):
         power = _power(name)
         xyz_a, xyz_b, white = (light.tristimulus(r, power, functions) for r in (a, b, np.ones(len(a))))
         if number == 0:
             ratio = xyz_a / xyz_b
-        left = difference(xyz_a, xyz_b * ratio, white) if number else 0.0
-        found.append(Match(name, difference(xyz_a, xyz_b, white), left, xyz_a, xyz_b, white))
-    return tuple(found)
+        residual = difference(xyz_a, xyz_b * ratio, white) if number else 0.0
+        light_matches.append(Match(name, difference(xyz_a, xyz_b, white), residual, xyz_a, xyz_b, white))
+    return tuple(light_matches)
 
 
 def difference(xyz_a: Array, xyz_b: Array, white: Array) -> float:
@@ -55,8 +55,8 @@ def difference(xyz_a: Array, xyz_b: Array, white: Array) -> float:
 
 
 def _held(values: Array) -> Array:
-    known = np.isfinite(values)
-    return np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+    is_known = np.isfinite(values)
+    return np.interp(np.arange(len(values)), np.flatnonzero(is_known), values[is_known])
 
 
 def _power(name: str) -> Array:

@@ -60,27 +60,27 @@ def fit(black: Film, white: Film, directional: Directional, face: Face, noise: f
 
     def drawn(values: Array, u: Array | float) -> Array:
         """[(1 + DRAWS) n]: as measured, then as it might have been."""
-        spread = np.broadcast_to(np.asarray(u, dtype=float), n)
-        noisy = values + spread * rng.standard_normal((DRAWS, n))
+        std = np.broadcast_to(np.asarray(u, dtype=float), n)
+        noisy = values + std * rng.standard_normal((DRAWS, n))
         return np.concatenate([values[None], noisy]).ravel()
 
     films = [
         Film(drawn(film.seen, noise), drawn(_ground(film), film.u_ground), film.ground_name, 0.0, 1.0)
         for film in (black, white)
     ]
-    found = layer_fit.fit(films, _repeated(face, DRAWS + 1), noise)
+    coefficients = layer_fit.fit(films, _repeated(face, DRAWS + 1), noise)
     light = Directional(
         drawn(directional.over_black, noise),
         drawn(directional.over_white, noise),
         np.clip(drawn(directional.transmittance, noise), 1e-4, 1.0),
     )
-    solved = _solved(found, films, light, _repeated(face, DRAWS + 1)).reshape(3, DRAWS + 1, n)
+    solutions = _solved(coefficients, films, light, _repeated(face, DRAWS + 1)).reshape(3, DRAWS + 1, n)
     # Coefficients of the whole layer: those per mm follow from the thickness, the same in all bands of a draw.
     h = black.thickness_mm * np.ones(DRAWS + 1)
     h[1:] += black.u_thickness_mm * rng.standard_normal(DRAWS)
-    solved = solved / h[None, :, None]
-    u = 0.5 * np.subtract(*np.percentile(solved[:, 1:], [84.13, 15.87], axis=1))
-    return FourFlux(*solved[:, 0], *u)
+    solutions = solutions / h[None, :, None]
+    u = 0.5 * np.subtract(*np.percentile(solutions[:, 1:], [84.13, 15.87], axis=1))
+    return FourFlux(*solutions[:, 0], *u)
 
 
 def _ground(film: Film) -> Array:
@@ -97,14 +97,14 @@ def _solved(found: Coefficients, films: list[Film], light: Directional, face: Fa
     """k, s_i, s_j [3, n] of the whole layer."""
     k, s = np.maximum(found.absorption, 0.0), found.scattering
     rho, tau = kubelka_munk.layer(k, s, 1.0)
-    seen = []
+    inside = []
     for film, value in zip(films, (light.over_black, light.over_white), strict=True):
         # Light enters once as it came; what the face sends back is diffuse, as if it had come so.
         diffuse = kubelka_munk.over(rho, tau, _ground(film))
-        seen.append((value - face.gloss) * (1.0 - face.inner * diffuse) / face.passing)
+        inside.append((value - face.gloss) * (1.0 - face.inner * diffuse) / face.passing)
     gains = [tau * _ground(film) / (1.0 - rho * _ground(film)) for film in films]
-    through = (seen[1] - seen[0]) / (gains[1] - gains[0])
-    up, down = seen[0] - gains[0] * through, through - light.transmittance
+    through = (inside[1] - inside[0]) / (gains[1] - gains[0])
+    up, down = inside[0] - gains[0] * through, through - light.transmittance
     mu = -np.log(light.transmittance)
     forwards, backwards = (
         four_flux.response(four_flux.Layer(k, s, 0.0, mu * a, mu * (1.0 - a), 1.0)) for a in (1.0, 0.0)

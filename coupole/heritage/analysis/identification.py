@@ -91,10 +91,10 @@ def identify(spectrum: Measured, references: References) -> Finding:
     """
     values, left_out = references.without_stray_light(on_bands(spectrum))
     of_bands = references.of_bands(spectrum.name, values)
-    seen = values[of_bands.bands]
+    reflectance = values[of_bands.bands]
     model = of_bands.model
-    probabilities = model.probabilities(seen[None])
-    distance = model.nearest(seen[None])[0]
+    probabilities = model.probabilities(reflectance[None])
+    distance = model.nearest(reflectance[None])[0]
     nearest = {
         number: int(rows[np.argmin(distance[rows])])
         for number in range(len(model.class_names))
@@ -109,9 +109,9 @@ def identify(spectrum: Measured, references: References) -> Finding:
         )
         for number in order
     )
-    mixed = unmix(seen, of_bands.reflectance, of_bands.classes)
-    verdict, reason = _judged(of_bands, probabilities, candidates, mixed, seen)
-    parts = _parts(references, of_bands, mixed) if verdict == "mixture" and mixed is not None else ()
+    mixture = unmix(reflectance, of_bands.reflectance, of_bands.classes)
+    verdict, reason = _judged(of_bands, probabilities, candidates, mixture, reflectance)
+    parts = _parts(references, of_bands, mixture) if verdict == "mixture" and mixture is not None else ()
     return Finding(
         spectrum.name,
         verdict,
@@ -120,7 +120,7 @@ def identify(spectrum: Measured, references: References) -> Finding:
         candidates,
         float(probabilities[0, -1]),
         parts,
-        _evidence(of_bands, seen, nearest[order[0]], nearest[order[1]]),
+        _evidence(of_bands, reflectance, nearest[order[0]], nearest[order[1]]),
         bool(BANDS_NM[of_bands.bands[-1]] > NEAR_INFRARED_NM),
         (left_out,) if left_out else (),
         of_bands.rates,
@@ -155,8 +155,8 @@ def _judged(
     if model.is_sure(probabilities)[0]:
         return "match", f"{best.class_name} with {best.probability:.0%}{flat}"
     several = [candidate for candidate in candidates if candidate.probability >= 0.25 * best.probability]
-    named = " or ".join(f"{candidate.class_name} ({candidate.probability:.0%})" for candidate in several)
-    return "ambiguous", f"{named}{flat}"
+    choices = " or ".join(f"{candidate.class_name} ({candidate.probability:.0%})" for candidate in several)
+    return "ambiguous", f"{choices}{flat}"
 
 
 def _parts(references: References, of_bands: OfBands, mixed: Unmixed) -> tuple[Part, ...]:
@@ -173,9 +173,9 @@ def _evidence(of_bands: OfBands, seen: Array, best: int, runner_up: int) -> Evid
 
     def scaled(row: int) -> tuple[Array, Array]:
         of_row = log_k_over_s(of_bands.reflectance[row])
-        fitted = of_row + (log_ratio - of_row).mean()
-        return kubelka_munk.opaque(np.exp(fitted)), (fitted - log_ratio) / of_bands.spread
+        log_fit = of_row + (log_ratio - of_row).mean()
+        return kubelka_munk.opaque(np.exp(log_fit)), (log_fit - log_ratio) / of_bands.spread
 
-    (one, missed_by_one), (two, missed_by_two) = scaled(best), scaled(runner_up)
+    (best_shape, missed_by_one), (second_shape, missed_by_two) = scaled(best), scaled(runner_up)
     log_odds = 0.5 * (missed_by_two**2 - missed_by_one**2)
-    return Evidence(BANDS_NM[of_bands.bands], seen, one, two, log_odds)
+    return Evidence(BANDS_NM[of_bands.bands], seen, best_shape, second_shape, log_odds)

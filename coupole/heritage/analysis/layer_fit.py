@@ -81,8 +81,8 @@ class Coefficients:
     @property
     def determined(self) -> NDArray[np.bool_]:
         """[n] of bool: whether the films show their grounds enough to tell S."""
-        known = self.u_scattering < LEAST_DETERMINED * self.scattering
-        return np.asarray(known & (self.unlike > _LEAST_UNLIKE))
+        is_determined = self.u_scattering < LEAST_DETERMINED * self.scattering
+        return np.asarray(is_determined & (self.unlike > _LEAST_UNLIKE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +128,12 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
             weight = 1.0 / _variances(k, s, films, face, noise)
             cost = np.sum(weight * (y - _seen(k, s, films, face)) ** 2, axis=1)
         jacobian = _jacobian(k, s, films, face)
-        missed = y - _seen(k, s, films, face)
+        residuals = y - _seen(k, s, films, face)
         normal = np.einsum("nfi,nf,nfj->nij", jacobian, weight, jacobian)
-        slope = np.einsum("nfi,nf,nf->ni", jacobian, weight, missed)
+        slope = np.einsum("nfi,nf,nf->ni", jacobian, weight, residuals)
         scale = np.einsum("nii->ni", normal) + 1e-6 * np.einsum("nii->n", normal)[:, None] + 1e-12
-        damped = _inverse(normal + np.eye(2) * (damping[:, None] * scale)[:, None, :])
-        step_k, step_s = np.einsum("nij,nj->in", damped, slope)
+        inverse_normal = _inverse(normal + np.eye(2) * (damping[:, None] * scale)[:, None, :])
+        step_k, step_s = np.einsum("nij,nj->in", inverse_normal, slope)
         new_k, new_s = k + step_k, np.maximum(s + step_s, _LEAST_S)
         new_k = np.maximum(new_k, -0.3 * new_s)
         trial = np.sum(weight * (y - _seen(new_k, new_s, films, face)) ** 2, axis=1)
@@ -147,10 +147,10 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
 def predict(found: Coefficients, face: Face, thickness_mm: float, ground: Array | float | None) -> Predicted:
     """Predict what a film of a thickness over a ground (inside the binder, known exactly) would show."""
     k, s = found.absorption, found.scattering
-    one = [Film(k, None if ground is None else np.broadcast_to(ground, k.shape), thickness_mm=thickness_mm)]
-    slope = _jacobian(k, s, one, face)[:, 0]
+    films = [Film(k, None if ground is None else np.broadcast_to(ground, k.shape), thickness_mm=thickness_mm)]
+    slope = _jacobian(k, s, films, face)[:, 0]
     return Predicted(
-        _seen(k, s, one, face)[:, 0], np.sqrt(np.einsum("ni,nij,nj->n", slope, found.covariance, slope))
+        _seen(k, s, films, face)[:, 0], np.sqrt(np.einsum("ni,nij,nj->n", slope, found.covariance, slope))
     )
 
 
@@ -230,13 +230,13 @@ def _variances(k: Array, s: Array, films: Sequence[Film], face: Face, noise: flo
 
 
 def _unlike(y: Array, films: Sequence[Film], face: Face) -> Array:
-    spread = np.sum((y - y.mean(axis=1)[:, None]) ** 2, axis=1)
-    changed = np.zeros(len(y))
+    variation = np.sum((y - y.mean(axis=1)[:, None]) ** 2, axis=1)
+    change = np.zeros(len(y))
     for film in films:
         if film.ground is not None:
             bare = face.passing * film.ground / (1.0 - face.inner * film.ground) + face.gloss
-            changed += 0.5 * (film.seen - bare) ** 2
-    return np.asarray(np.minimum(spread, changed))
+            change += 0.5 * (film.seen - bare) ** 2
+    return np.asarray(np.minimum(variation, change))
 
 
 def _inverse(matrices: Array) -> Array:
@@ -260,14 +260,14 @@ def _with_uncertainty(
     grounds, thicknesses = _effects(k, s, films, face)
     covariance = noise**2 * np.einsum("nif,njf->nij", gain, gain)
     for effect in (*grounds.values(), *thicknesses.values()):
-        moved = np.einsum("nif,nf->ni", gain, effect)
-        covariance += moved[:, :, None] * moved[:, None, :]
-    missed = y - _seen(k, s, films, face)
+        shift = np.einsum("nif,nf->ni", gain, effect)
+        covariance += shift[:, :, None] * shift[:, None, :]
+    residuals = y - _seen(k, s, films, face)
     return Coefficients(
         k,
         s,
         covariance,
-        np.sum(weight * missed**2, axis=1),
+        np.sum(weight * residuals**2, axis=1),
         _unlike(y, films, face) / noise**2,
         len(films),
     )

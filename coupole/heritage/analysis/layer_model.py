@@ -54,7 +54,7 @@ def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -
         )
     k, s = np.maximum(found.absorption, 0.0), found.scattering
     total = 4.0 / 3.0 * s
-    difference, unscattered, through = 0.0, 0.0, 0.0
+    difference, direct_share, through = 0.0, 0.0, 0.0
     for film in films:
         if film.ground is None:
             continue
@@ -65,31 +65,31 @@ def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -
         diffuse = kubelka_munk.over(rho, tau, ground)
         leaving = face.passing / (1.0 - face.inner * diffuse)
         difference = max(difference, float((leaving * np.abs(directional - diffuse))[sure].max()))
-        unscattered = max(unscattered, float(direct[sure].max()))
+        direct_share = max(direct_share, float(direct[sure].max()))
         through = max(through, float((leaving * direct * ground * tau / (1.0 - rho * ground))[sure].max()))
     because = (
-        f"of directional light {100.0 * unscattered:.2g} % reaches the ground unscattered, and adds up to "
+        f"of directional light {100.0 * direct_share:.2g} % reaches the ground unscattered, and adds up to "
         f"{through:.3f} to what is seen; twice the noise is {2.0 * noise:.3f}"
     )
     model: Model = "two fluxes" if through <= 2.0 * noise else "four fluxes"
-    return Deserved(model, because, difference, unscattered)
+    return Deserved(model, because, difference, direct_share)
 
 
 def deserved_by_measurement(
     diffuse: tuple[Array, Array], directional: tuple[Array, Array], transmittance: Array, noise: float
 ) -> Deserved:
     """Choose the model from spectra of one film under both kinds of light, over black and over white [n]."""
-    missed = np.stack([b - a for a, b in zip(diffuse, directional, strict=True)])
-    chi2, count = float(np.sum(missed**2) / (2.0 * noise**2)), missed.size
-    largest, unscattered = float(np.abs(missed).max()), float(transmittance.max())
+    differences = np.stack([b - a for a, b in zip(diffuse, directional, strict=True)])
+    chi2, count = float(np.sum(differences**2) / (2.0 * noise**2)), differences.size
+    largest, direct_share = float(np.abs(differences).max()), float(transmittance.max())
     if chi2 <= count + 3.0 * np.sqrt(2.0 * count):
         because = f"spectra under directional light are those under diffuse light within the noise of {noise:g}"
-        return Deserved("two fluxes", because, largest, unscattered)
+        return Deserved("two fluxes", because, largest, direct_share)
     because = (
         f"spectra under directional light differ by up to {largest:.3f} from those under diffuse light, "
         f"{np.sqrt(chi2 / count):.1f} times the noise of their difference"
     )
-    return Deserved("four fluxes", because, largest, unscattered)
+    return Deserved("four fluxes", because, largest, direct_share)
 
 
 def grain_ratio(first: tuple[Array, Array], second: tuple[Array, Array]) -> GrainRatio:
@@ -101,13 +101,13 @@ def grain_ratio(first: tuple[Array, Array], second: tuple[Array, Array]) -> Grai
     """
     (s1, u1), (s2, u2) = first, second
     relative = np.hypot(u1 / s1, u2 / s2)
-    known = np.isfinite(relative) & (relative < 0.25) & (relative > 0.0)
-    if not known.any():
+    is_known = np.isfinite(relative) & (relative < 0.25) & (relative > 0.0)
+    if not is_known.any():
         raise InputError(
             "grain size: expected bands in which S of both grindings is known within 25 %; found none"
         )
-    ratios, weights = (s2 / s1)[known], relative[known] ** -2.0
+    ratios, weights = (s2 / s1)[is_known], relative[is_known] ** -2.0
     ratio = float(np.exp(np.sum(weights * np.log(ratios)) / weights.sum()))
     # Bands differ by more than noise where the law does not hold: their spread counts, not that over its root.
-    spread = float(np.sqrt(np.sum(weights * np.log(ratios / ratio) ** 2) / weights.sum()))
-    return GrainRatio(ratio, ratio * max(spread, float(relative[known].min())), int(known.sum()))
+    scatter = float(np.sqrt(np.sum(weights * np.log(ratios / ratio) ** 2) / weights.sum()))
+    return GrainRatio(ratio, ratio * max(scatter, float(relative[is_known].min())), int(is_known.sum()))

@@ -79,12 +79,12 @@ def read_samples(given: LayerGiven, folder: Path) -> Samples:
     """The spectra, their paths relative to `folder`. Raises InputError with the file for what contradicts
     itself."""
     films = given.films
-    known = [film.thickness_um is not None for film in films if film.over is not None]
-    if any(known) != all(known):
+    has_thickness = [film.thickness_um is not None for film in films if film.over is not None]
+    if any(has_thickness) != all(has_thickness):
         raise InputError(
             "thickness: expected one for each film over a ground, or for none; some have one, some not"
         )
-    one = face(given.binder_index, given.geometry)
+    binder_face = face(given.binder_index, given.geometry)
     paths = {film.spectrum for film in films} | {film.over for film in films if film.over is not None}
     more = given.directional
     if more is not None:
@@ -98,10 +98,16 @@ def read_samples(given: LayerGiven, folder: Path) -> Samples:
     spectra = {path: values[bands] for path, values in spectra.items()}
     nm = WAVELENGTHS_NM[bands]
     for film in films:
-        _check_level(spectra[film.spectrum], film.spectrum, nm, one, given.noise)
-    found = [_film(film, spectra, one, given) for film in films]
-    _check_order(found, films, nm, given.noise)
-    return Samples(nm, found, _directional(given, spectra, nm, one), one, bool(known) and all(known))
+        _check_level(spectra[film.spectrum], film.spectrum, nm, binder_face, given.noise)
+    film_samples = [_film(film, spectra, binder_face, given) for film in films]
+    _check_order(film_samples, films, nm, given.noise)
+    return Samples(
+        nm,
+        film_samples,
+        _directional(given, spectra, nm, binder_face),
+        binder_face,
+        bool(has_thickness) and all(has_thickness),
+    )
 
 
 def paint_file(given: LayerGiven, samples: Samples, found: Coefficients, four: FourFlux | None) -> PaintFile:
@@ -116,19 +122,21 @@ def paint_file(given: LayerGiven, samples: Samples, found: Coefficients, four: F
         u_k, u_s = np.where(sure, found.u_absorption, ratio * s), np.where(sure, found.u_scattering, s)
     else:
         unit, s, u_k, u_s = "relative", np.ones(len(nm)), np.zeros(len(nm)), np.zeros(len(nm))
-    told: dict[str, Any] = {"noise": given.noise, "geometry": given.geometry, "grounds": given.grounds}
-    told["spectra"] = [film.spectrum.name for film in given.films]
+    provenance: dict[str, Any] = {"noise": given.noise, "geometry": given.geometry, "grounds": given.grounds}
+    provenance["spectra"] = [film.spectrum.name for film in given.films]
     if len(thicknesses := sorted({film.thickness_um for film in given.films if film.thickness_um})):
-        told["thickness_um"] = thicknesses
+        provenance["thickness_um"] = thicknesses
     if sure.any() and not sure.all():
-        told["assumed_scattering_at_nm"] = [float(value) for value in nm[~sure]]
+        provenance["assumed_scattering_at_nm"] = [float(value) for value in nm[~sure]]
     if (below := found.absorption < 0.0).any():
-        told["absorption_set_to_0_at_nm"] = [float(value) for value in nm[below]]
-    other = {}
+        provenance["absorption_set_to_0_at_nm"] = [float(value) for value in nm[below]]
+    directional_columns = {}
     if four is not None:
-        other = {"k": four.direct_absorption, "s_i": four.forward, "s_j": four.backward}
-        other |= {"u_k": four.u_direct_absorption, "u_s_i": four.u_forward, "u_s_j": four.u_backward}
-    return PaintFile(given.name, unit, given.binder_index, nm, ratio * s, s, u_k, u_s, told, other)
+        directional_columns = {"k": four.direct_absorption, "s_i": four.forward, "s_j": four.backward}
+        directional_columns |= {"u_k": four.u_direct_absorption, "u_s_i": four.u_forward, "u_s_j": four.u_backward}
+    return PaintFile(
+        given.name, unit, given.binder_index, nm, ratio * s, s, u_k, u_s, provenance, directional_columns
+    )
 
 
 def spectrum_on_grid(path: Path) -> Array:
@@ -136,8 +144,8 @@ def spectrum_on_grid(path: Path) -> Array:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a spectrum")
     values = resampling.on_grid(measured.read_spectrum(path)).values
-    known = np.flatnonzero(np.isfinite(values))
-    missing = known[0] + np.flatnonzero(np.isnan(values[known[0] : known[-1]]))
+    known_rows = np.flatnonzero(np.isfinite(values))
+    missing = known_rows[0] + np.flatnonzero(np.isnan(values[known_rows[0] : known_rows[-1]]))
     if len(missing):
         nm = WAVELENGTHS_NM[missing]
         raise InputError(f"{path}: has a gap of more than 20 nm about {nm[0]:g} nm; measure it there, too")
@@ -145,9 +153,9 @@ def spectrum_on_grid(path: Path) -> Array:
 
 
 def _film(film: FilmGiven, spectra: dict[Path, Array], one: Face, given: LayerGiven) -> Film:
-    seen = spectra[film.spectrum]
+    reflectance = spectra[film.spectrum]
     if film.over is None:
-        return Film(seen, None)
+        return Film(reflectance, None)
     ground = spectra[film.over]
     u_ground: Array | float = given.noise
     if given.grounds == "coated":
@@ -162,7 +170,7 @@ def _film(film: FilmGiven, spectra: dict[Path, Array], one: Face, given: LayerGi
     h, u_h = 1.0, 0.0
     if film.thickness_um is not None:
         h, u_h = 1e-3 * film.thickness_um, 1e-3 * film.u_thickness_um
-    return Film(seen, np.clip(ground, 0.0, 1.0), str(film.over), u_ground, h, u_h)
+    return Film(reflectance, np.clip(ground, 0.0, 1.0), str(film.over), u_ground, h, u_h)
 
 
 def _check_level(seen: Array, path: Path, nm: Array, one: Face, noise: float) -> None:
@@ -195,8 +203,8 @@ def _check_order(films: Sequence[Film], given: Sequence[FilmGiven], nm: Array, n
 
 
 def _directional(given: LayerGiven, spectra: dict[Path, Array], nm: Array, one: Face) -> Directional | None:
-    asked = given.directional
-    if asked is None:
+    directional = given.directional
+    if directional is None:
         return None
     grounds = [film.over for film in given.films]
     thicknesses = {film.thickness_um for film in given.films}
@@ -209,11 +217,11 @@ def _directional(given: LayerGiven, spectra: dict[Path, Array], nm: Array, one: 
         raise InputError(
             "directional: expected `films` to be over black first, then over white; found white first"
         )
-    for path in (asked.over_black, asked.over_white):
+    for path in (directional.over_black, directional.over_white):
         _check_level(spectra[path], path, nm, one, given.noise)
-    through = spectra[asked.transmittance]
+    through = spectra[directional.transmittance]
     if through.min() < -_BEYOND * given.noise or through.max() > 1.0 + _BEYOND * given.noise:
         raise InputError(
-            f"{asked.transmittance}: expected a transmittance of 0 to 1, found up to {through.max():.3g}"
+            f"{directional.transmittance}: expected a transmittance of 0 to 1, found up to {through.max():.3g}"
         )
-    return Directional(spectra[asked.over_black], spectra[asked.over_white], through)
+    return Directional(spectra[directional.over_black], spectra[directional.over_white], through)

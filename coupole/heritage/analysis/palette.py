@@ -72,26 +72,26 @@ def _files(source: Path) -> list[Path]:
         raise InputError(f"{source}: no such file or folder; expected a palette")
     if not source.is_dir():
         return [source]
-    found = [p for p in source.iterdir() if p.name.endswith(ENDING) or p.suffix.lower() in _LIBRARIES]
-    return sorted(found)
+    paths = [p for p in source.iterdir() if p.name.endswith(ENDING) or p.suffix.lower() in _LIBRARIES]
+    return sorted(paths)
 
 
 def _of_file(path: Path) -> Paint:
-    read = read_paint(path)
-    pigment = read.on_grid()
-    u_k, u_s = read.uncertainties_on_grid()
-    known = read.covered()
-    k, s = (np.where(known, values, np.nan) for values in (pigment.absorption, pigment.scattering))
-    return Paint(read.name, str(path), read.unit, k, s, u_k, u_s)
+    paint = read_paint(path)
+    pigment = paint.on_grid()
+    u_k, u_s = paint.uncertainties_on_grid()
+    is_covered = paint.covered()
+    k, s = (np.where(is_covered, values, np.nan) for values in (pigment.absorption, pigment.scattering))
+    return Paint(paint.name, str(path), paint.unit, k, s, u_k, u_s)
 
 
 def _of_library(path: Path) -> list[Paint]:
     spectra = read_library(path)
-    if all(one.absorption is None for one in spectra):
+    if all(spectrum.absorption is None for spectrum in spectra):
         raise InputError(
             f"{path}: expected K and S of each paint, found reflectances: they do not tell how paints mix"
         )
-    return [_of_row(one) for one in spectra]
+    return [_of_row(spectrum) for spectrum in spectra]
 
 
 def _of_row(row: LibrarySpectrum) -> Paint:
@@ -100,21 +100,21 @@ def _of_row(row: LibrarySpectrum) -> Paint:
     if row.absorption is None or row.scattering is None:
         raise InputError(f"{place}: {row.name}: expected K and S, found a reflectance; leave the row out")
     on_grid = []
-    known = (row.absorption >= 0.0) & (row.scattering > 0.0)
+    is_known = (row.absorption >= 0.0) & (row.scattering > 0.0)
     for values in (row.absorption, row.scattering):
-        one = resampling.on_grid(Measured(row.name, row.wavelengths_nm, values, ()))
-        near = np.interp(WAVELENGTHS_NM, row.wavelengths_nm, known.astype(float))
-        on_grid.append(np.where((near > 0.999) & (one.values >= 0.0), one.values, np.nan))
+        curve = resampling.on_grid(Measured(row.name, row.wavelengths_nm, values, ()))
+        near = np.interp(WAVELENGTHS_NM, row.wavelengths_nm, is_known.astype(float))
+        on_grid.append(np.where((near > 0.999) & (curve.values >= 0.0), curve.values, np.nan))
     k, s = on_grid
     nothing = np.zeros(len(WAVELENGTHS_NM))
     return Paint(row.name, place, _RELATIVE, k, np.where(s > 0.0, s, np.nan), nothing, nothing)
 
 
 def _is_same(a: Paint, b: Paint) -> bool:
-    both = np.isfinite(a.absorption + b.absorption + a.scattering + b.scattering)
-    if not both.any():
+    in_both = np.isfinite(a.absorption + b.absorption + a.scattering + b.scattering)
+    if not in_both.any():
         return False
     return all(
-        bool(np.allclose(x[both], y[both], rtol=_ALIKE, atol=_ALIKE * float(np.nanmax(y))))
+        bool(np.allclose(x[in_both], y[in_both], rtol=_ALIKE, atol=_ALIKE * float(np.nanmax(y))))
         for x, y in ((a.absorption, b.absorption), (a.scattering, b.scattering))
     )

@@ -46,18 +46,18 @@ def read_classes(path: Path) -> dict[str, PigmentClass]:
 def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClass]:
     """The tables that come with Coupole for the files of these spectra, found by the files' names."""
     folder = resources.files(__package__).joinpath("classes")
-    found: dict[str, PigmentClass] = {}
+    classes: dict[str, PigmentClass] = {}
     for stem in {Path(spectrum.file).stem for spectrum in spectra}:
         table = folder.joinpath(f"{stem}.csv")
         if table.is_file():
-            found |= _parsed(table.read_text(encoding="utf-8"), f"{stem}.csv")
-    return found
+            classes |= _parsed(table.read_text(encoding="utf-8"), f"{stem}.csv")
+    return classes
 
 
 def lacking(class_name: str, known: Collection[str]) -> list[str]:
     """Classes of the same family that `known` lacks."""
     return sorted(
-        other for family in FAMILIES if class_name in family for other in family if other not in set(known)
+        sibling for family in FAMILIES if class_name in family for sibling in family if sibling not in set(known)
     )
 
 
@@ -66,7 +66,7 @@ def _parsed(text: str, file: str) -> dict[str, PigmentClass]:
     if not lines:
         raise InputError(f"{file}: expected lines of name and class, found none")
     mark = max("\t;,", key=lines[0].count)
-    found: dict[str, PigmentClass] = {}
+    classes: dict[str, PigmentClass] = {}
     reader = csv.reader(text.splitlines(), delimiter=mark)
     columns = {name: index for index, name in enumerate(_COLUMNS)}
     for row in reader:
@@ -74,20 +74,20 @@ def _parsed(text: str, file: str) -> dict[str, PigmentClass]:
             continue
         fields = [" ".join(field.split()) for field in row]
         words = [field.lower().replace(" ", "_") for field in fields]
-        if not found and "name" in words and "class" in words:
+        if not classes and "name" in words and "class" in words:
             columns = {name: words.index(name) for name in _COLUMNS if name in words}
             continue
         if len(fields) <= max(columns["name"], columns["class"]) or not fields[columns["name"]]:
             raise _wrong(file, reader.line_num, f"expected a name and a class, found {mark.join(row)!r}")
         name, class_name = fields[columns["name"]], fields[columns["class"]]
         index = columns.get("colour_index", len(fields))
-        said = PigmentClass(class_name, fields[index] if index < len(fields) else "")
-        if found.get(name, said) != said:
+        pigment_class = PigmentClass(class_name, fields[index] if index < len(fields) else "")
+        if classes.get(name, pigment_class) != pigment_class:
             raise _wrong(
-                file, reader.line_num, f"{name!r} is in two classes: {found[name].class_name}, {class_name}"
+                file, reader.line_num, f"{name!r} is in two classes: {classes[name].class_name}, {class_name}"
             )
-        found[name] = said
-    return found
+        classes[name] = pigment_class
+    return classes
 
 
 def _wrong(file: str, line: int, message: str) -> InputError:

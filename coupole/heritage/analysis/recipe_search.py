@@ -75,7 +75,7 @@ class Found:
         """Return the bound within which a share of the best recipe is known: by its 95 % interval, and by what
         rivals have instead."""
         share = self.best.shares[name]
-        apart = [abs(other.get(name, 0.0) - share) for other in self.rivals]
+        apart = [abs(rival.get(name, 0.0) - share) for rival in self.rivals]
         return max(self.best.half_widths[name], *apart, 0.0)
 
     @property
@@ -117,18 +117,18 @@ def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_m
         )
     problem = _Problem(target[bands], palette, bands, face, noise)
     recipes: list[Recipe] = []
-    tried: list[tuple[float, tuple[int, ...], Array]] = []
+    all_fits: list[tuple[float, tuple[int, ...], Array]] = []
     before: list[tuple[int, ...]] = [()]
     for size in range(1, min(at_most, len(palette)) + 1):
         candidates = _subsets(len(palette), size, before)
-        ranked = sorted(candidates, key=problem.roughly)[:_REFINED]
-        refined = sorted((problem.refined(subset) for subset in ranked), key=lambda found: found[0])
-        before = [subset for _, subset, _ in refined[:3]]
-        tried += refined
-        recipes.append(problem.recipe(refined[0][1], refined[0][2]))
-    chosen = _chosen(recipes, int(bands.sum()))
-    rivals = _rivals(tried, chosen + 1, max(1.0, recipes[chosen].misfit) ** 2, palette)
-    return Found(tuple(recipes), chosen, target, bands, noise, rivals)
+        likely_subsets = sorted(candidates, key=problem.roughly)[:_REFINED]
+        fits = sorted((problem.refined(subset) for subset in likely_subsets), key=lambda found: found[0])
+        before = [subset for _, subset, _ in fits[:3]]
+        all_fits += fits
+        recipes.append(problem.recipe(fits[0][1], fits[0][2]))
+    choice = _chosen(recipes, int(bands.sum()))
+    rivals = _rivals(all_fits, choice + 1, max(1.0, recipes[choice].misfit) ** 2, palette)
+    return Found(tuple(recipes), choice, target, bands, noise, rivals)
 
 
 def _rivals(
@@ -136,32 +136,36 @@ def _rivals(
 ) -> tuple[dict[str, float], ...]:
     """Shares of the recipes tried that are not told from the best one of a size, the nearest first."""
     best = min(cost for cost, subset, _ in tried if len(subset) == size)
-    found = []
+    rivals = []
     for cost, subset, shares in sorted(tried, key=lambda one: one[0]):
         worse = (cost - best) / scale
         near = worse < _UNTOLD if len(subset) <= size else len(subset) == size + 1 and worse < -_UNTOLD
         if near and not (len(subset) == size and cost == best):
-            found.append({palette[i].name: float(share) for i, share in zip(subset, shares, strict=True)})
-    return tuple(found)
+            rivals.append({palette[i].name: float(share) for i, share in zip(subset, shares, strict=True)})
+    return tuple(rivals)
 
 
 def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterable[tuple[int, ...]]:
     if comb(count, size) <= _EXHAUSTIVE:
         return combinations(range(count), size)
-    grown = {tuple(sorted({*one, new})) for one in before for new in range(count) if new not in one}
-    if len(grown) * size * count > 10 * _EXHAUSTIVE:
-        return grown
-    others = range(count)
-    return grown | {
-        tuple(sorted({*one, new} - {old})) for one in grown for old in one for new in others if new not in one
+    supersets = {tuple(sorted({*subset, new})) for subset in before for new in range(count) if new not in subset}
+    if len(supersets) * size * count > 10 * _EXHAUSTIVE:
+        return supersets
+    all_indices = range(count)
+    return supersets | {
+        tuple(sorted({*subset, new} - {old}))
+        for subset in supersets
+        for old in subset
+        for new in all_indices
+        if new not in subset
     }
 
 
 def _chosen(recipes: Sequence[Recipe], bands: int) -> int:
     """The fewest to which one more paint adds nothing beyond noise, or what no palette explains."""
     scale = max(1.0, recipes[-1].misfit)
-    for number, (one, more) in enumerate(pairwise(recipes)):
-        if bands * (one.misfit**2 - more.misfit**2) / scale**2 < _WORTH:
+    for number, (recipe, more) in enumerate(pairwise(recipes)):
+        if bands * (recipe.misfit**2 - more.misfit**2) / scale**2 < _WORTH:
             return number
     return len(recipes) - 1
 
@@ -178,14 +182,14 @@ class _Problem:
         )
         self.k = np.stack([paint.absorption[bands] for paint in palette], axis=1)
         self.s = np.stack([paint.scattering[bands] for paint in palette], axis=1)
-        clipped = np.clip(target, self.face.gloss, self.face.brightest * (1.0 - 1e-6))
-        if np.abs(clipped - target).max() > 5.0 * noise:
-            at = int(np.argmax(np.abs(clipped - target)))
+        clipped_target = np.clip(target, self.face.gloss, self.face.brightest * (1.0 - 1e-6))
+        if np.abs(clipped_target - target).max() > 5.0 * noise:
+            at = int(np.argmax(np.abs(clipped_target - target)))
             raise InputError(
                 f"the target is {target[at]:.3g} at {WAVELENGTHS_NM[bands][at]:g} nm, which no paint under this "
                 "face shows: see whether gloss is included, and percent or fractions"
             )
-        inside = np.maximum(self.face.inside(MeasuredReflectance(clipped)).values, _DARKEST)
+        inside = np.maximum(self.face.inside(MeasuredReflectance(clipped_target)).values, _DARKEST)
         q = kubelka_munk.k_over_s(inside)
         # dR/dQ inside, then d(seen)/dR: residuals of the linear problem are about those of what is seen.
         slope = inside / np.sqrt(np.maximum(q * (q + 2.0), 1e-9))
@@ -205,35 +209,35 @@ class _Problem:
             return self._cost(subset, np.ones(1)), subset, np.ones(1)
         start = np.maximum(self._linear(subset), 1e-6)
         u = np.sqrt(self.noise**2 + self._of_palette(subset, start / start.sum()))
-        found = least_squares(
+        solution = least_squares(
             lambda c: np.append((self._seen(subset, c) - self.target) / u, c.sum() - 1.0),
             start / start.sum(),
             bounds=(0.0, 2.0),
             x_scale=np.maximum(start / start.sum(), 1e-3),
         )
-        shares = found.x / found.x.sum()
-        return 2.0 * float(found.cost), subset, shares
+        shares = solution.x / solution.x.sum()
+        return 2.0 * float(solution.cost), subset, shares
 
     def _cost(self, subset: tuple[int, ...], shares: Array) -> float:
         u2 = self.noise**2 + self._of_palette(subset, shares)
         return float(np.sum((self._seen(subset, shares) - self.target) ** 2 / u2))
 
     def recipe(self, subset: tuple[int, ...], shares: Array) -> Recipe:
-        seen = self._seen(subset, shares)
-        missed = seen - self.target
-        smooth = np.convolve(missed, np.ones(5) / 5.0, mode="same")
+        reflectance = self._seen(subset, shares)
+        residuals = reflectance - self.target
+        smooth = np.convolve(residuals, np.ones(5) / 5.0, mode="same")
         at = int(np.argmax(np.abs(smooth)))
         whole = np.full(len(self.bands), np.nan)
-        whole[self.bands] = seen
+        whole[self.bands] = reflectance
         names = [self.palette[i].name for i in subset]
         variance = self.noise**2 + self._of_palette(subset, shares)
-        misfit = float(np.sqrt(np.mean(missed**2 / variance)))
+        misfit = float(np.sqrt(np.mean(residuals**2 / variance)))
         widths = COVERAGE_FACTOR * self._uncertainty(subset, shares, max(1.0, misfit) ** 2 * variance)
         return Recipe(
             dict(zip(names, map(float, shares), strict=True)),
             dict(zip(names, map(float, widths), strict=True)),
             whole,
-            float(np.sqrt(np.mean(missed**2))),
+            float(np.sqrt(np.mean(residuals**2))),
             misfit,
             float(smooth[at]),
             float(WAVELENGTHS_NM[self.bands][at]),
@@ -248,8 +252,10 @@ class _Problem:
         size = self.s[:, columns].mean(axis=0)
         system = self.system[:, columns] / size
         heavy = 10.0 * np.abs(system).max() + 1e-9
-        found, _ = nnls(np.vstack([system, np.full(len(subset), heavy)]), np.append(np.zeros(len(system)), heavy))
-        return np.asarray(found / size / (found / size).sum())
+        amounts, _ = nnls(
+            np.vstack([system, np.full(len(subset), heavy)]), np.append(np.zeros(len(system)), heavy)
+        )
+        return np.asarray(amounts / size / (amounts / size).sum())
 
     def _seen(self, subset: tuple[int, ...], shares: Array) -> Array:
         columns = list(subset)
@@ -282,7 +288,7 @@ class _Problem:
             paint = self.palette[i]
             for u, at in ((paint.u_absorption, (1.0, 0.0)), (paint.u_scattering, (0.0, 1.0))):
                 step = 1e-6 * (k + s)
-                moved = kubelka_munk.opaque((k + at[0] * step) / (s + at[1] * step))
-                change = self.face.seen(InternalReflectance(moved)).values - self._seen(subset, shares)
+                reflectance = kubelka_munk.opaque((k + at[0] * step) / (s + at[1] * step))
+                change = self.face.seen(InternalReflectance(reflectance)).values - self._seen(subset, shares)
                 variance += (change / step * share * u[self.bands]) ** 2
         return variance

@@ -84,21 +84,21 @@ class OfBands:
         """Rates by leaving out each spectrum, and each class; mixtures are not looked for."""
         model, classes = self.model, self.classes
         several = np.bincount(classes)[classes] > 1
-        one, none = model.held_out.probabilities, model.held_out.without_class
-        right = one[:, :-1].argmax(axis=1) == classes
+        probabilities, none = model.held_out.probabilities, model.held_out.without_class
+        right = probabilities[:, :-1].argmax(axis=1) == classes
         names = model.class_names
-        match = model.is_known(one) & model.is_sure(one)
-        match &= [not lacking(names[best], names) for best in one[:, :-1].argmax(axis=1)]
-        known = model.is_known(none)
+        match = model.is_known(probabilities) & model.is_sure(probabilities)
+        match &= [not lacking(names[best], names) for best in probabilities[:, :-1].argmax(axis=1)]
+        is_known = model.is_known(none)
         for row, number in enumerate(classes):
-            left = [name for name in names if name != names[number]]
-            known[row] &= not lacking(names[none[row, :-1].argmax()], left)
+            other_names = [name for name in names if name != names[number]]
+            is_known[row] &= not lacking(names[none[row, :-1].argmax()], other_names)
         of = int(several.sum())
         return HeldOutRates(
             Rate(int((right & several).sum()), of),
             Rate(int((match & right & several).sum()), of),
             Rate(int((match & ~right & several).sum()), of),
-            Rate(int((~known).sum()), len(classes)),
+            Rate(int((~is_known).sum()), len(classes)),
         )
 
     @cached_property
@@ -108,14 +108,14 @@ class OfBands:
         shape = log_ratio - log_ratio.mean(axis=1, keepdims=True)
         differences = []
         for row, number in enumerate(self.classes):
-            others = np.flatnonzero((self.classes == number) & (np.arange(len(self.classes)) != row))
-            if len(others):
-                apart = shape[others] - shape[row]
+            other_rows = np.flatnonzero((self.classes == number) & (np.arange(len(self.classes)) != row))
+            if len(other_rows):
+                apart = shape[other_rows] - shape[row]
                 differences.append(apart[np.argmin((apart**2).sum(axis=1))])
         if not differences:
             return np.full(self.reflectance.shape[1], 0.1)
-        spread: Array = np.sqrt(np.mean(np.square(differences), axis=0)) + 0.01
-        return spread
+        band_spread: Array = np.sqrt(np.mean(np.square(differences), axis=0)) + 0.01
+        return band_spread
 
 
 @dataclass
@@ -136,18 +136,19 @@ class References:
 
         Raises InputError if the bands are fewer than 16.
         """
-        known = np.isfinite(self.reflectance)
-        shared = np.isfinite(reflectance) & (known.mean(axis=0) >= _COVERED)
-        if shared.sum() < LEAST_BANDS:
-            measured = BANDS_NM[np.isfinite(reflectance)]
-            covered = BANDS_NM[known.mean(axis=0) >= _COVERED]
+        is_known = np.isfinite(self.reflectance)
+        shared_bands = np.isfinite(reflectance) & (is_known.mean(axis=0) >= _COVERED)
+        if shared_bands.sum() < LEAST_BANDS:
+            spectrum_nm = BANDS_NM[np.isfinite(reflectance)]
+            library_nm = BANDS_NM[is_known.mean(axis=0) >= _COVERED]
             raise InputError(
                 f"spectrum {spectrum_name}: expected {LEAST_BANDS} or more bands of 10 nm in common with the "
-                f"library, found {shared.sum()}; it covers {_range(measured)}, the library {_range(covered)}"
+                f"library, found {shared_bands.sum()}; it covers {_range(spectrum_nm)}, the library "
+                f"{_range(library_nm)}"
             )
-        key = shared.tobytes()
+        key = shared_bands.tobytes()
         if key not in self._prepared:
-            bands, rows = np.flatnonzero(shared), np.flatnonzero(known[:, shared].all(axis=1))
+            bands, rows = np.flatnonzero(shared_bands), np.flatnonzero(is_known[:, shared_bands].all(axis=1))
             names = tuple(sorted({self.class_of[row] for row in rows}))
             if len(names) < _LEAST_CLASSES:
                 raise InputError(
@@ -175,17 +176,17 @@ class References:
         if not len(wrong):
             return reflectance, ""
         last = violet[wrong[-1]]
-        kept = reflectance.copy()
-        kept[: last + 1] = np.nan
-        return kept, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
+        reliable = reflectance.copy()
+        reliable[: last + 1] = np.nan
+        return reliable, f"below {BANDS_NM[last + 1]:g} nm it rises as no reference does (stray light?): left out"
 
     def without_class(self, class_name: str) -> References:
         """The library as if it had never had a class."""
-        kept = [row for row, name in enumerate(self.class_of) if name != class_name]
+        rows = [row for row, name in enumerate(self.class_of) if name != class_name]
         return References(
-            tuple(self.names[row] for row in kept),
-            tuple(self.class_of[row] for row in kept),
-            self.reflectance[kept],
+            tuple(self.names[row] for row in rows),
+            tuple(self.class_of[row] for row in rows),
+            self.reflectance[rows],
             self.remarks,
         )
 
@@ -195,8 +196,8 @@ def measured(spectrum: LibrarySpectrum) -> Measured:
 
     Raises InputError, with file and line, for gaps wider than 20 nm, which resampling leaves open.
     """
-    known = np.isfinite(spectrum.reflectance)
-    nm = spectrum.wavelengths_nm[known]
+    is_known = np.isfinite(spectrum.reflectance)
+    nm = spectrum.wavelengths_nm[is_known]
     wide = np.flatnonzero(np.diff(nm) > _WIDEST_GAP_NM)
     if len(wide):
         raise InputError(
@@ -211,7 +212,7 @@ def measured(spectrum: LibrarySpectrum) -> Measured:
                 )
             ]
         )
-    return Measured(spectrum.name, nm, spectrum.reflectance[known], ())
+    return Measured(spectrum.name, nm, spectrum.reflectance[is_known], ())
 
 
 def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, PigmentClass]) -> References:
@@ -222,48 +223,49 @@ def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, Pi
     """
     if not spectra:
         raise InputError("library: expected spectra, found none")
-    table = {name.casefold(): said for name, said in classes.items()}
-    classed = [
+    table = {name.casefold(): pigment_class for name, pigment_class in classes.items()}
+    members = [
         (spectrum, table[spectrum.name.casefold()].class_name)
         for spectrum in spectra
         if spectrum.name.casefold() in table and table[spectrum.name.casefold()].class_name
     ]
     file = spectra[0].file
-    if len({name for _, name in classed}) < _LEAST_CLASSES or len(classed) < _LEAST_SPECTRA:
+    if len({name for _, name in members}) < _LEAST_CLASSES or len(members) < _LEAST_SPECTRA:
         raise InputError(
             f"library {file}: expected {_LEAST_SPECTRA} or more spectra of {_LEAST_CLASSES} or more classes, "
-            f"found classes for {len(classed)} of {len(spectra)}; name a table of name and class with --classes"
+            f"found classes for {len(members)} of {len(spectra)}; name a table of name and class with --classes"
         )
     remarks = []
-    if len(classed) < len(spectra):
-        without = [s.name for s in spectra if s.name not in {c.name for c, _ in classed}]
+    if len(members) < len(spectra):
+        without = [s.name for s in spectra if s.name not in {c.name for c, _ in members}]
         remarks.append(f"{len(without)} spectra have no class and are left out: {_listed(without)}")
-    values = np.stack([on_bands(measured(spectrum)) for spectrum, _ in classed])
-    kept, doublets = _without_doublets(values, classed)
+    values = np.stack([on_bands(measured(spectrum)) for spectrum, _ in members])
+    rows, doublets = _without_doublets(values, members)
     return References(
-        tuple(classed[row][0].name for row in kept),
-        tuple(classed[row][1] for row in kept),
-        values[kept],
+        tuple(members[row][0].name for row in rows),
+        tuple(members[row][1] for row in rows),
+        values[rows],
         (*remarks, *doublets),
     )
 
 
 def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]]) -> tuple[list[int], list[str]]:
-    dropped: set[int] = set()
+    dropped_rows: set[int] = set()
     remarks = []
     for row in range(len(values)):
         apart = np.abs(values[:row] - values[row])
-        both = np.isfinite(apart)
-        same = np.where(both, apart, 0.0).max(axis=1, initial=0.0) < _SAME
-        for before in np.flatnonzero(same & both.any(axis=1)):
-            (one, of_one), (two, of_two) = classed[before], classed[row]
-            agree = of_one == of_two
-            dropped |= {row} if agree else {int(before), row}
-            what = "counts once" if agree else f"is left out: {of_one}, {of_two}"
+        in_both = np.isfinite(apart)
+        same = np.where(in_both, apart, 0.0).max(axis=1, initial=0.0) < _SAME
+        for before in np.flatnonzero(same & in_both.any(axis=1)):
+            (first, first_class), (second, second_class) = classed[before], classed[row]
+            agree = first_class == second_class
+            dropped_rows |= {row} if agree else {int(before), row}
+            effect = "counts once" if agree else f"is left out: {first_class}, {second_class}"
             remarks.append(
-                f"{one.file}:{one.line} {one.name}, :{two.line} {two.name}: the same spectrum, which {what}"
+                f"{first.file}:{first.line} {first.name}, :{second.line} {second.name}: the same spectrum, "
+                f"which {effect}"
             )
-    return [row for row in range(len(values)) if row not in dropped], remarks
+    return [row for row in range(len(values)) if row not in dropped_rows], remarks
 
 
 def _listed(names: list[str]) -> str:

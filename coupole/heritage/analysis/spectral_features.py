@@ -52,12 +52,12 @@ def appearances(reflectance: Array) -> Array:
     """
     ratio = kubelka_munk.k_over_s(np.clip(reflectance, _DARKEST, _LIGHTEST))
     looks = []
-    for factor, internal, added in _APPEARANCES:
-        seen = kubelka_munk.opaque(ratio * factor)
+    for factor, internal, gloss in _APPEARANCES:
+        look = kubelka_munk.opaque(ratio * factor)
         if internal:
             face = Face(np.array((1.0 - _SURFACE) * (1.0 - internal)), np.array(internal), np.zeros(()))
-            seen = face.seen(InternalReflectance(seen)).values
-        looks.append(added + (1.0 - added) * seen)
+            look = face.seen(InternalReflectance(look)).values
+        looks.append(gloss + (1.0 - gloss) * look)
     looks[0] = reflectance
     return np.stack(looks)
 

@@ -62,23 +62,23 @@ def unmix(reflectance: Array, references: Array, classes: NDArray[np.intp]) -> U
         b = (gram[first, first] * target[second] - gram[first, second] * target[first]) / determinant
     of_a, of_b = a * target[first], b * target[second]
     share = of_a / (of_a + of_b)
-    allowed = (
+    is_allowed = (
         (classes[first] != classes[second])
         & (determinant > 1e-9 * gram[first, first] * gram[second, second])
         & (a > 0.0)
         & (b > 0.0)
         & (np.minimum(share, 1.0 - share) >= _LEAST_SHARE)
     )
-    if not allowed.any():
+    if not is_allowed.any():
         return None
-    first, second, share = first[allowed], second[allowed], share[allowed]
-    pair = np.maximum(whole - of_a[allowed] - of_b[allowed], 0.0)
+    first, second, share = first[is_allowed], second[is_allowed], share[is_allowed]
+    pair = np.maximum(whole - of_a[is_allowed] - of_b[is_allowed], 0.0)
     best = int(np.argmin(pair))
     independent = bands / _INDEPENDENT_EVERY
     floor = bands * 1e-6
-    lowest, other = classes[first], classes[second]
-    lowest, other = np.minimum(lowest, other), np.maximum(lowest, other)
-    rivals = pair[(lowest != lowest[best]) | (other != other[best])]
+    lowest, highest = classes[first], classes[second]
+    lowest, highest = np.minimum(lowest, highest), np.maximum(lowest, highest)
+    rivals = pair[(lowest != lowest[best]) | (highest != highest[best])]
 
     def criterion(residual: float, parameters: int, choices: float) -> float:
         scatter = independent * np.log((residual + floor) / bands)

@@ -40,8 +40,8 @@ class LocalFits:
     @property
     def covariance(self) -> Floats:
         """[n, c, c] of the values."""
-        spread = np.sqrt(self.leverage)
-        return np.asarray(self.scatter * spread[:, :, None] * spread[:, None, :])
+        root = np.sqrt(self.leverage)
+        return np.asarray(self.scatter * root[:, :, None] * root[:, None, :])
 
 
 def fit_locally(
@@ -49,23 +49,23 @@ def fit_locally(
 ) -> LocalFits:
     """Fit the points of a tree, with values [m, c - 1] of their own, near places [n, 3] with normals [n, 3]."""
     count = 1 + (0 if values is None else values.shape[1])
-    found = LocalFits(
+    fits = LocalFits(
         np.full((len(places_mm), count), np.nan),
         np.full((len(places_mm), count, count), np.nan),
         np.full((len(places_mm), count), np.nan),
     )
     for first in range(0, len(places_mm), _BATCH):
         part = slice(first, first + _BATCH)
-        _fit_batch(tree, values, places_mm[part], normals[part], reach_mm, part, found)
+        _fit_batch(tree, values, places_mm[part], normals[part], reach_mm, part, fits)
     around = cKDTree(places_mm)
-    alone = found.scatter.copy()
+    alone = fits.scatter.copy()
     for first in range(0, len(places_mm), _BATCH):
         part = slice(first, first + _BATCH)
         near = around.query(places_mm[part], min(NEIGHBOURS, len(places_mm)))[1]
-        known = np.isfinite(alone[near, 0, 0])
-        total = np.sum(np.where(known[:, :, None, None], alone[near], 0.0), axis=1)
-        found.scatter[part] = total / np.maximum(known.sum(axis=1), 1)[:, None, None]
-    return found
+        is_known = np.isfinite(alone[near, 0, 0])
+        total = np.sum(np.where(is_known[:, :, None, None], alone[near], 0.0), axis=1)
+        fits.scatter[part] = total / np.maximum(is_known.sum(axis=1), 1)[:, None, None]
+    return fits
 
 
 def _fit_batch(
@@ -79,8 +79,8 @@ def _fit_batch(
 ) -> None:
     away, near = tree.query(places, NEIGHBOURS)
     offsets = np.asarray(tree.data)[near] - places[:, None]
-    one, two = _tangents(normals)
-    x, y = np.einsum("nka,na->nk", offsets, one), np.einsum("nka,na->nk", offsets, two)
+    tangent, bitangent = _tangents(normals)
+    x, y = np.einsum("nka,na->nk", offsets, tangent), np.einsum("nka,na->nk", offsets, bitangent)
     extent = np.sqrt(np.mean(x**2 + y**2, axis=1))
     there = (away[:, 0] < reach_mm) & (extent > 0)
     beside = np.hypot(x.mean(axis=1), y.mean(axis=1)) / np.where(extent > 0, extent, 1.0)
@@ -92,9 +92,9 @@ def _fit_batch(
     fits = [_least_squares(design, height)]
     if values is not None:
         fits.append(_least_squares(design[:, :, :_PLANE_TERMS], values[near]))
-    there_values, left = (np.concatenate([fit[k] for fit in fits], axis=-1) for k in (0, 1))
+    there_values, residuals = (np.concatenate([fit[k] for fit in fits], axis=-1) for k in (0, 1))
     found.values[part] = np.where(there[:, None], there_values, np.nan)
-    scatter = np.einsum("nkc,nkd->ncd", left, left) / _FREEDOM_ALONE
+    scatter = np.einsum("nkc,nkd->ncd", residuals, residuals) / _FREEDOM_ALONE
     found.scatter[part] = np.where(there[:, None, None], scatter, np.nan)
     found.leverage[part, 0] = np.where(there, fits[0][2], np.nan)
     found.leverage[part, 1:] = np.where(there, fits[-1][2], np.nan)[:, None]
@@ -111,6 +111,6 @@ def _least_squares(design: Floats, seen: Floats) -> tuple[Floats, Floats, Floats
 
 def _tangents(normals: Floats) -> tuple[Floats, Floats]:
     least = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    one = np.cross(normals, least)
-    one /= np.linalg.norm(one, axis=1, keepdims=True)
-    return one, np.cross(normals, one)
+    tangent = np.cross(normals, least)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return tangent, np.cross(normals, tangent)

@@ -31,22 +31,22 @@ def read_result_state(folder: Path) -> State:
     corners = surface.vertices_mm[surface.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(across, axis=1, keepdims=True)
-    kept = np.flatnonzero((lengths[:, 0] > 0) | surface.known)
-    middles = corners.mean(axis=1)[kept]
-    kd, known = surface.kd[kept], surface.known[kept]
-    if not known.any():
+    kept_triangles = np.flatnonzero((lengths[:, 0] > 0) | surface.known)
+    middles = corners.mean(axis=1)[kept_triangles]
+    kd, is_known = surface.kd[kept_triangles], surface.known[kept_triangles]
+    if not is_known.any():
         raise InputError(f"{folder}: no triangle has a fitted material")
-    lab = np.full((len(kept), 3), np.nan)
-    covariance = np.full((len(kept), 3, 3), np.nan)
-    rows = np.searchsorted(surface.result.triangles, kept[known])
-    lab[known], covariance[known] = lab_of_kd(
-        kd[known], *_uncertainties(surface.result.materials_path(surface.fit), rows)
+    lab = np.full((len(kept_triangles), 3), np.nan)
+    covariance = np.full((len(kept_triangles), 3, 3), np.nan)
+    rows = np.searchsorted(surface.result.triangles, kept_triangles[is_known])
+    lab[is_known], covariance[is_known] = lab_of_kd(
+        kd[is_known], *_uncertainties(surface.result.materials_path(surface.fit), rows)
     )
     return State(
         folder.name,
         middles,
         np.zeros((0, 3), np.int64),
-        across[kept] / np.where(lengths[kept] > 0, lengths[kept], 1.0),
+        across[kept_triangles] / np.where(lengths[kept_triangles] > 0, lengths[kept_triangles], 1.0),
         Colours(lab, covariance),
         spacing(middles.astype(np.float32)),
     )

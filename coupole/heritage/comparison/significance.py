@@ -33,24 +33,26 @@ def of_vectors(differences: Floats, covariances: Floats, freedom: float) -> tupl
     """p-values of differences [n, c] with covariances [n, c, c] (Hotelling's T2), and the factor that enlarges
     uncertainties."""
     dimensions = differences.shape[1]
-    squared = np.full(len(differences), np.nan)
-    known = np.isfinite(differences).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-    chosen = differences[known][:, :, None]
-    squared[known] = np.squeeze(np.swapaxes(chosen, 1, 2) @ np.linalg.solve(covariances[known], chosen), (1, 2))
-    left = freedom - dimensions + 1
-    squared *= left / (freedom * dimensions)
-    bulk = np.nanquantile(squared, _BULK) if known.any() else 0.0
-    factor = max(1.0, float(np.sqrt(bulk / f.ppf(_BULK, dimensions, left))))
-    return np.asarray(f.sf(squared / factor**2, dimensions, left)), factor
+    statistic = np.full(len(differences), np.nan)
+    is_known = np.isfinite(differences).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    columns = differences[is_known][:, :, None]
+    statistic[is_known] = np.squeeze(
+        np.swapaxes(columns, 1, 2) @ np.linalg.solve(covariances[is_known], columns), (1, 2)
+    )
+    freedom_left = freedom - dimensions + 1
+    statistic *= freedom_left / (freedom * dimensions)
+    bulk = np.nanquantile(statistic, _BULK) if is_known.any() else 0.0
+    factor = max(1.0, float(np.sqrt(bulk / f.ppf(_BULK, dimensions, freedom_left))))
+    return np.asarray(f.sf(statistic / factor**2, dimensions, freedom_left)), factor
 
 
 def discoveries(p: Floats, false_share: float = FALSE_SHARE) -> NDArray[np.bool_]:
     """Mark those of the p-values [n] that are significant, so that at most this share of them is expected to be
     false; NaN is not marked."""
-    known = np.flatnonzero(np.isfinite(p))
-    order = known[np.argsort(p[known])]
+    finite_rows = np.flatnonzero(np.isfinite(p))
+    order = finite_rows[np.argsort(p[finite_rows])]
     under = p[order] <= false_share * np.arange(1, len(order) + 1) / max(1, len(order))
-    marked = np.zeros(len(p), bool)
+    is_discovery = np.zeros(len(p), bool)
     if under.any():
-        marked[order[: int(np.flatnonzero(under)[-1]) + 1]] = True
-    return marked
+        is_discovery[order[: int(np.flatnonzero(under)[-1]) + 1]] = True
+    return is_discovery

@@ -104,32 +104,36 @@ def _compared(before: State, after: State, alignment: Alignment, noise_mm: float
     if before.colours is not None and after.colours is not None:
         colours = before.colours, after.colours
     say("fitting surfaces", 0, 2)
-    one = _fits(before.points_mm, colours and colours[0], before.points_mm, normals, reach_mm)
+    before_fits = _fits(before.points_mm, colours and colours[0], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 1, 2)
-    two = _fits(after_mm, colours and colours[1], before.points_mm, normals, reach_mm)
+    after_fits = _fits(after_mm, colours and colours[1], before.points_mm, normals, reach_mm)
     say("fitting surfaces", 2, 2)
-    differences = two.values - one.values
-    covariance = one.covariance + two.covariance
-    variance = covariance[:, 0, 0] if noise_mm is None else noise_mm**2 * (one.leverage + two.leverage)[:, 0]
+    differences = after_fits.values - before_fits.values
+    covariance = before_fits.covariance + after_fits.covariance
+    variance = (
+        covariance[:, 0, 0]
+        if noise_mm is None
+        else noise_mm**2 * (before_fits.leverage + after_fits.leverage)[:, 0]
+    )
     least_mm = 1e-6 * before.size_mm  # what float32 coordinates tell
     u_mm = np.sqrt(variance + alignment.uncertainty_mm(before.points_mm, normals) ** 2 + least_mm**2)
     p, factor = of_lengths(differences[:, 0], u_mm, 2 * FREEDOM if noise_mm is None else 1e9)
-    moved = discoveries(p)
-    de00, recoloured, colour_factor = None, None, 1.0
+    is_moved = discoveries(p)
+    de00, is_recoloured, colour_factor = None, None, 1.0
     if colours is not None:
-        known = covariance[:, 1:, 1:] + np.eye(3) * _SMALLEST_SPREAD
+        colour_covariance = covariance[:, 1:, 1:] + np.eye(3) * _SMALLEST_SPREAD
         for points_mm, of_state in zip((before.points_mm, after_mm), colours, strict=True):
-            known = known + _of_result(points_mm, of_state, before.points_mm)
-        p, colour_factor = of_vectors(differences[:, 1:], known, 2 * FREEDOM)
-        recoloured = discoveries(p)
-        de00 = de00_of(one.values[:, 1:], two.values[:, 1:])
-    found = Comparison(
-        before, after, alignment, normals, differences[:, 0], u_mm * factor, moved, factor, de00, recoloured,
+            colour_covariance = colour_covariance + _of_result(points_mm, of_state, before.points_mm)
+        p, colour_factor = of_vectors(differences[:, 1:], colour_covariance, 2 * FREEDOM)
+        is_recoloured = discoveries(p)
+        de00 = de00_of(before_fits.values[:, 1:], after_fits.values[:, 1:])
+    comparison = Comparison(
+        before, after, alignment, normals, differences[:, 0], u_mm * factor, is_moved, factor, de00, is_recoloured,
         colour_factor, (), (),
     )  # fmt: skip
-    shape = _regions(found, moved)
-    colour = () if recoloured is None else _regions(found, recoloured)
-    return Comparison(**{**found.__dict__, "shape_regions": shape, "colour_regions": colour})
+    shape = _regions(comparison, is_moved)
+    colour = () if is_recoloured is None else _regions(comparison, is_recoloured)
+    return Comparison(**{**comparison.__dict__, "shape_regions": shape, "colour_regions": colour})
 
 
 def _fits(
@@ -142,11 +146,11 @@ def _fits(
     if there.all():
         return fit_locally(cKDTree(points_mm), colours.lab, places_mm, normals, reach_mm)
     shape = fit_locally(cKDTree(points_mm), None, places_mm, normals, reach_mm)
-    found = fit_locally(cKDTree(points_mm[there]), colours.lab[there], places_mm, normals, reach_mm)
-    for own, of_shape in ((found.values, shape.values), (found.leverage, shape.leverage)):
-        own[:, 0] = of_shape[:, 0]
-    found.scatter[:, 0, 0] = shape.scatter[:, 0, 0]
-    return found
+    fits = fit_locally(cKDTree(points_mm[there]), colours.lab[there], places_mm, normals, reach_mm)
+    for fit_array, of_shape in ((fits.values, shape.values), (fits.leverage, shape.leverage)):
+        fit_array[:, 0] = of_shape[:, 0]
+    fits.scatter[:, 0, 0] = shape.scatter[:, 0, 0]
+    return fits
 
 
 def _of_result(points_mm: Floats, colours: Colours, places_mm: Floats) -> Floats:
@@ -184,17 +188,17 @@ def _regions(found: Comparison, marked: NDArray[np.bool_]) -> tuple[Region, ...]
     count, of_point = connected_components(graph, directed=False)
     regions = []
     for number in range(count):
-        mine = of_point == number
-        if mine.sum() < _LEAST_REGION:
+        in_region = of_point == number
+        if in_region.sum() < _LEAST_REGION:
             continue
-        own = numbers[mine]
+        region_rows = numbers[in_region]
         regions.append(
             Region(
-                len(own),
-                points[mine].mean(axis=0),
-                float(np.ptp(points[mine], axis=0).max()),
-                float(np.nanmean(found.distance_mm[own])),
-                float("nan") if found.de00 is None else float(np.nanmean(found.de00[own])),
+                len(region_rows),
+                points[in_region].mean(axis=0),
+                float(np.ptp(points[in_region], axis=0).max()),
+                float(np.nanmean(found.distance_mm[region_rows])),
+                float("nan") if found.de00 is None else float(np.nanmean(found.de00[region_rows])),
             )
         )
     return tuple(sorted(regions, key=lambda region: -region.points))
@@ -206,16 +210,16 @@ def about(found: Comparison) -> dict[str, Any]:
     def told(regions: tuple[Region, ...]) -> list[dict[str, Any]]:
         return [
             {
-                "points": one.points,
-                "middle_mm": one.middle_mm.tolist(),
-                "across_mm": one.across_mm,
-                "distance_mm": one.distance_mm,
-                "de00": None if np.isnan(one.de00) else one.de00,
+                "points": region.points,
+                "middle_mm": region.middle_mm.tolist(),
+                "across_mm": region.across_mm,
+                "distance_mm": region.distance_mm,
+                "de00": None if np.isnan(region.de00) else region.de00,
             }
-            for one in regions
+            for region in regions
         ]
 
-    known = np.isfinite(found.distance_mm)
+    is_known = np.isfinite(found.distance_mm)
     colours = None
     if found.de00 is not None and found.recoloured is not None:
         colours = {
@@ -230,12 +234,12 @@ def about(found: Comparison) -> dict[str, Any]:
         "after": found.after.name,
         "before_from_after": found.alignment.before_from_after.tolist(),
         "after_from_before": inverse_of(found.alignment.before_from_after).tolist(),
-        "points": len(known),
-        "not_comparable": int((~known).sum()),
+        "points": len(is_known),
+        "not_comparable": int((~is_known).sum()),
         "shape": {
             "changed": int(found.moved.sum()),
-            "median_mm": float(np.median(np.abs(found.distance_mm[known]))),
-            "largest_mm": float(np.abs(found.distance_mm[known]).max()),
+            "median_mm": float(np.median(np.abs(found.distance_mm[is_known]))),
+            "largest_mm": float(np.abs(found.distance_mm[is_known]).max()),
             "median_u_mm": float(np.nanmedian(found.u_mm)),
             "factor_by_scatter": found.noise_factor,
             "regions": told(found.shape_regions),

@@ -52,18 +52,18 @@ def align(before: State, after: State) -> Alignment:
     fine = [_thinned(state, spacing_mm, _FINE_POINTS) for state in (before, after)]
     coarse = [_thinned(state, 2 * fine[0].pitch_mm, _COARSE_POINTS) for state in (before, after)]
     pitch_mm = max(cloud.pitch_mm for cloud in coarse)
-    motion, given = np.eye(4), True
+    motion, is_given = np.eye(4), True
     if _share(coarse[0], coarse[1], motion, pitch_mm) < _ALIGNED_SHARE:
-        given = False
-        motion, agreed = match_by_features(*coarse)
-        if agreed >= _FEATURES_AGREED:
+        is_given = False
+        motion, agreement = match_by_features(*coarse)
+        if agreement >= _FEATURES_AGREED:
             motion = refined(coarse[0], coarse[1], motion, 2.5 * pitch_mm, 40)
-        if agreed < _FEATURES_AGREED or _share(coarse[0], coarse[1], motion, pitch_mm) < _LEAST_SHARE:
+        if agreement < _FEATURES_AGREED or _share(coarse[0], coarse[1], motion, pitch_mm) < _LEAST_SHARE:
             raise InputError(
                 f"{before.name} and {after.name}: no motion brings {100 * _LEAST_SHARE:.0f} % or more of one onto "
                 "the other. Another object, another unit, or a part of it only?"
             )
-    return _robust(fine[0], fine[1], motion, pitch_mm, given=given)
+    return _robust(fine[0], fine[1], motion, pitch_mm, given=is_given)
 
 
 def _thinned(state: State, pitch_mm: float, most: int) -> Cloud:
@@ -77,26 +77,26 @@ def _thinned(state: State, pitch_mm: float, most: int) -> Cloud:
 
 def _share(before: Cloud, after: Cloud, motion: Floats, pitch_mm: float) -> float:
     """Return the share of the after's points that lie on the other state, within half a cell along its normals."""
-    moved = applied(motion, after.points_mm)
-    away, nearest = before.tree.query(moved, distance_upper_bound=1.5 * pitch_mm)
+    moved_mm = applied(motion, after.points_mm)
+    away, nearest = before.tree.query(moved_mm, distance_upper_bound=1.5 * pitch_mm)
     hit = np.isfinite(away)
-    off = np.sum((moved[hit] - before.points_mm[nearest[hit]]) * before.normals[nearest[hit]], axis=1)
-    turned = after.normals[hit] @ motion[:3, :3].T
-    facing = np.abs(np.sum(turned * before.normals[nearest[hit]], axis=1))
-    return float(np.sum((np.abs(off) < 0.5 * pitch_mm) & (facing > 0.8)) / len(moved))
+    off = np.sum((moved_mm[hit] - before.points_mm[nearest[hit]]) * before.normals[nearest[hit]], axis=1)
+    turned_normals = after.normals[hit] @ motion[:3, :3].T
+    facing = np.abs(np.sum(turned_normals * before.normals[nearest[hit]], axis=1))
+    return float(np.sum((np.abs(off) < 0.5 * pitch_mm) & (facing > 0.8)) / len(moved_mm))
 
 
 def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, given: bool) -> Alignment:
     pivot = before.points_mm.mean(axis=0)
     for _ in range(_MOST_ROUNDS):
-        moved = applied(motion, after.points_mm)
-        away, nearest = before.tree.query(moved, distance_upper_bound=max(reach_mm, 1.5 * before.pitch_mm))
+        moved_mm = applied(motion, after.points_mm)
+        away, nearest = before.tree.query(moved_mm, distance_upper_bound=max(reach_mm, 1.5 * before.pitch_mm))
         hit = np.flatnonzero(np.isfinite(away))
         normals = before.normals[nearest[hit]]
-        off = np.sum((moved[hit] - before.points_mm[nearest[hit]]) * normals, axis=1)
+        off = np.sum((moved_mm[hit] - before.points_mm[nearest[hit]]) * normals, axis=1)
         noise_mm = max(1.4826 * float(np.median(np.abs(off))), 1e-6 * before.pitch_mm)
         weights = np.clip(1 - (off / (_TUKEY * noise_mm)) ** 2, 0, None) ** 2
-        rows = np.concatenate([normals, np.cross(moved[hit] - pivot, normals)], axis=1)
+        rows = np.concatenate([normals, np.cross(moved_mm[hit] - pivot, normals)], axis=1)
         normal = (rows * weights[:, None]).T @ rows
         normal += np.diag(np.full(6, 1e-12 * np.trace(normal)))
         step = -np.linalg.solve(normal, rows.T @ (weights * off))
@@ -105,7 +105,9 @@ def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, giv
         if reach_mm < before.pitch_mm and np.abs(step[:3]).max() < _SETTLED * before.pitch_mm:
             break
     size_mm = float(np.linalg.norm(np.ptp(before.points_mm, axis=0))) / _CELLS_ACROSS
-    cells = np.unique(np.floor(moved[hit] / size_mm).astype(np.int64), axis=0, return_inverse=True)[1].reshape(-1)
+    cells = np.unique(np.floor(moved_mm[hit] / size_mm).astype(np.int64), axis=0, return_inverse=True)[1].reshape(
+        -1
+    )
     pulls = np.stack([np.bincount(cells, column) for column in (rows * (weights * off)[:, None]).T], axis=1)
     bread = np.linalg.inv(normal)
     return Alignment(motion, bread @ (pulls.T @ pulls) @ bread, pivot, noise_mm, given)

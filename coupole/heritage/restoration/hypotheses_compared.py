@@ -47,18 +47,18 @@ def compared(
     pair = [light.lab(picture[on].astype(float) / white_cd_m2, eye.white) for picture in (xyz, other)]
     de00[on] = _ciede2000(*pair)
     rows = seen[on]
-    told: dict[str, dict[str, Any]] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for row, name in enumerate(names):
-        own = rows == row
-        if own.any():
-            means = [picture[on][own].mean(axis=0, dtype=float) / white_cd_m2 for picture in (xyz, other)]
+        of_part = rows == row
+        if of_part.any():
+            means = [picture[on][of_part].mean(axis=0, dtype=float) / white_cd_m2 for picture in (xyz, other)]
             labs = [light.lab(mean[None], eye.white) for mean in means]
-            told[name] = {
-                "pixels": int(own.sum()),
-                "mean_de00": round(float(de00[on][own].mean()), 2),
+            figures[name] = {
+                "pixels": int(of_part.sum()),
+                "mean_de00": round(float(de00[on][of_part].mean()), 2),
                 "de00_of_means": round(float(_ciede2000(*labs)[0]), 2),
             }
-    return Difference(de00, told)
+    return Difference(de00, figures)
 
 
 def drawn(de00: NDArray[np.float64]) -> NDArray[np.uint8]:

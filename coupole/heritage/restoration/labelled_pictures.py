@@ -27,10 +27,12 @@ _XMP_KEYWORD = "XML:com.adobe.xmp"
 
 def told(hypotheses: Sequence[Hypothesis]) -> dict[str, str]:
     """Texts for metadata by their keywords, of a picture of one or more hypotheses."""
-    names = "; ".join(f"{one.name}: {one.title}" for one in hypotheses)
+    names = "; ".join(f"{hypothesis.name}: {hypothesis.title}" for hypothesis in hypotheses)
     several = len(hypotheses) > 1
     sources = "\n".join(
-        f"{one.name}: {source}" if several else str(source) for one in hypotheses for source in one.sources
+        f"{hypothesis.name}: {source}" if several else str(source)
+        for hypothesis in hypotheses
+        for source in hypothesis.sources
     )
     return {"Hypothesis": names, "Sources": sources, "Disclaimer": DISCLAIMER}
 
@@ -61,8 +63,8 @@ def restamped(path: Path, attributes: Mapping[str, str]) -> None:
 
 def captioned(picture: Picture, hypothesis: Hypothesis, lines: int | None = None) -> Picture:
     """The picture [h, w, 3] with a strip below it: the word, title and references; of some number of lines."""
-    wanted = caption_lines(picture.shape[1], hypothesis)
-    return with_strip(picture, wanted, lines or len(wanted))
+    caption = caption_lines(picture.shape[1], hypothesis)
+    return with_strip(picture, caption, lines or len(caption))
 
 
 def caption_lines(width_px: int, hypothesis: Hypothesis) -> list[str]:

@@ -22,21 +22,21 @@ def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.
     Distances count the difference of unit normals as well, times the median edge: a thin wall keeps its two
     sides. A mesh with the same triangles in the same order is taken one by one.
     """
-    corners, own = vertices_mm[triangles], mesh.corners_mm
+    corners, mesh_corners_mm = vertices_mm[triangles], mesh.corners_mm
     size_mm = float(np.ptp(mesh.vertices_mm, axis=0).max())
-    if own.shape == corners.shape and np.abs(own - corners).max() <= _SAME_SHARE * size_mm:
-        return np.arange(len(own))
+    if mesh_corners_mm.shape == corners.shape and np.abs(mesh_corners_mm - corners).max() <= _SAME_SHARE * size_mm:
+        return np.arange(len(mesh_corners_mm))
     from scipy.spatial import cKDTree
 
     edge_mm = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    others = edge_mm * flat_normals(corners)
-    tree = cKDTree(np.concatenate([corners.mean(axis=1), others], axis=1))
-    middles, turned = own.mean(axis=1), edge_mm * flat_normals(own)
-    found = np.empty(len(own), np.int64)
-    for first in range(0, len(own), _CHUNK):
+    normals_mm = edge_mm * flat_normals(corners)
+    tree = cKDTree(np.concatenate([corners.mean(axis=1), normals_mm], axis=1))
+    middles, mesh_normals_mm = mesh_corners_mm.mean(axis=1), edge_mm * flat_normals(mesh_corners_mm)
+    nearest = np.empty(len(mesh_corners_mm), np.int64)
+    for first in range(0, len(mesh_corners_mm), _CHUNK):
         part = slice(first, first + _CHUNK)
-        found[part] = _nearest(tree, corners, others, middles[part], turned[part])
-    return found
+        nearest[part] = _nearest(tree, corners, normals_mm, middles[part], mesh_normals_mm[part])
+    return nearest
 
 
 def _nearest(tree: Any, corners: Floats, others: Floats, points: Floats, turned: Floats) -> NDArray[np.int64]:

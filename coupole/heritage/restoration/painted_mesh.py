@@ -45,9 +45,9 @@ class PaintedMesh:
 
     def digest(self) -> str:
         """Return the digest of its shape, whatever its colours."""
-        found = hashlib.sha256(np.ascontiguousarray(self.vertices_mm).tobytes())
-        found.update(np.ascontiguousarray(self.triangles).tobytes())
-        return found.hexdigest()
+        hasher = hashlib.sha256(np.ascontiguousarray(self.vertices_mm).tobytes())
+        hasher.update(np.ascontiguousarray(self.triangles).tobytes())
+        return hasher.hexdigest()
 
 
 def read_painted(path: Path, unit: str = "mm") -> PaintedMesh:
@@ -85,11 +85,11 @@ def _colours(visual: Any, count: int) -> tuple[NDArray[np.uint8] | None, Floats 
     elif visual.kind == "texture":
         if visual.uv is not None and len(visual.uv) == count:
             uv = np.asarray(visual.uv, np.float64)
-        named = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
-        texture = None if named is None else np.asarray(named.convert("RGB"))
-        painted = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
-        if painted is not None and len(painted) == count:
-            srgb = _eight_bit(np.asarray(painted))[:, :3]
+        image = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
+        texture = None if image is None else np.asarray(image.convert("RGB"))
+        vertex_colours = visual.vertex_attributes.get("color") if hasattr(visual, "vertex_attributes") else None
+        if vertex_colours is not None and len(vertex_colours) == count:
+            srgb = _eight_bit(np.asarray(vertex_colours))[:, :3]
     return srgb, uv, texture
 
 

@@ -41,8 +41,8 @@ class Parts:
 
     def counts(self) -> dict[str, int]:
         """Triangles of each part."""
-        found = np.bincount(self.labels, minlength=len(self.names))
-        return {name: int(count) for name, count in zip(self.names, found, strict=True)}
+        label_counts = np.bincount(self.labels, minlength=len(self.names))
+        return {name: int(count) for name, count in zip(self.names, label_counts, strict=True)}
 
 
 def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
@@ -55,19 +55,19 @@ def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
     problems: list[Problem] = []
     for number, rule in enumerate(given.rules):
         try:
-            own, found, unknown = _by_rule(mesh, rule, document)
+            rule_names, rule_labels, unknown = _by_rule(mesh, rule, document)
         except InputError as error:
             problems.append(document.problem(("rules", number), str(error)))
             continue
-        for name in own:
+        for name in rule_names:
             places.setdefault(name, number)
             if name not in names:
                 names.append(name)
-        rows = np.array([names.index(name) for name in own], np.int16)
-        said, new = found >= 0, np.where(found >= 0, rows[found], labels).astype(np.int16)
+        rows = np.array([names.index(name) for name in rule_names], np.int16)
+        is_labelled, new = rule_labels >= 0, np.where(rule_labels >= 0, rows[rule_labels], labels).astype(np.int16)
         remarks += _overlaps(names, labels, new, number)
         remarks += [f"rule {number + 1} ({rule.kind}): {unknown}"] if unknown else []
-        labels = np.where(said, new, labels)
+        labels = np.where(is_labelled, new, labels)
     labels = _with_rest(given, names, labels, document, problems)
     counts = np.bincount(labels[labels >= 0], minlength=len(names))
     for name, count in zip(names, counts, strict=True):
@@ -105,8 +105,8 @@ def _with_rest(
 
 def _overlaps(names: list[str], before: Labels, after: Labels, number: int) -> list[str]:
     """A sentence for each part that a rule takes triangles from."""
-    taken = (before >= 0) & (after != before)
-    pairs, counts = np.unique(np.stack([before[taken], after[taken]]), axis=1, return_counts=True)
+    is_taken = (before >= 0) & (after != before)
+    pairs, counts = np.unique(np.stack([before[is_taken], after[is_taken]]), axis=1, return_counts=True)
     return [
         f"rule {number + 1} comes later, and takes {count} triangles of {names[old]!r} for {names[new]!r}"
         for (old, new), count in zip(pairs.T, counts, strict=True)
@@ -119,11 +119,11 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
         case VertexColours():
             if mesh.srgb is None:
                 raise InputError(f"{mesh.path}: its vertices have no colours; choose another kind of rule")
-            known, unknown = _by_colour(mesh.srgb, rule.colours, rule.tolerance)
-            return list(rule.colours), _majority(known[mesh.triangles]), unknown
+            labels, unknown = _by_colour(mesh.srgb, rule.colours, rule.tolerance)
+            return list(rule.colours), _majority(labels[mesh.triangles]), unknown
         case Texture():
-            known, unknown = _by_colour(_seen(mesh, rule, document), rule.colours, rule.tolerance)
-            return list(rule.colours), known, unknown
+            labels, unknown = _by_colour(_seen(mesh, rule, document), rule.colours, rule.tolerance)
+            return list(rule.colours), labels, unknown
         case Box():
             middles = mesh.middles_mm
             inside = ((middles >= rule.low_mm) & (middles <= rule.high_mm)).all(axis=1)
@@ -132,32 +132,34 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
             beyond = (mesh.middles_mm - rule.point_mm) @ np.asarray(rule.normal) >= 0
             return [rule.part], np.where(beyond, 0, NONE), ""
         case PickedFile():
-            picked = read_picked(document.resolve(rule.path))
-            faces = nearest_faces(mesh, picked.vertices_mm.astype(np.float64), picked.triangles.astype(np.int64))
-            return list(picked.names), picked.parts[faces].astype(np.int64) - 1, ""
+            picked_parts = read_picked(document.resolve(rule.path))
+            faces = nearest_faces(
+                mesh, picked_parts.vertices_mm.astype(np.float64), picked_parts.triangles.astype(np.int64)
+            )
+            return list(picked_parts.names), picked_parts.parts[faces].astype(np.int64) - 1, ""
 
 
 def _by_colour(srgb: NDArray[np.uint8], table: dict[str, str], tolerance: float) -> tuple[NDArray[np.int64], str]:
     """Return for each colour [n, 3] the nearest row of the table, or `NONE`; and which colours have none."""
-    wanted = np.array([list(bytes.fromhex(code[1:])) for code in table.values()], float)
-    colours, which, counts = np.unique(srgb, axis=0, return_inverse=True, return_counts=True)
+    part_colours = np.array([list(bytes.fromhex(code[1:])) for code in table.values()], float)
+    colours, colour_rows, counts = np.unique(srgb, axis=0, return_inverse=True, return_counts=True)
     distance = np.full(len(colours), np.inf)
     rows = np.full(len(colours), NONE)
-    for row, one in enumerate(wanted):
-        here = np.linalg.norm(colours - one, axis=1)
+    for row, part_colour in enumerate(part_colours):
+        here = np.linalg.norm(colours - part_colour, axis=1)
         rows[here < distance] = row
         distance = np.minimum(distance, here)
     rows[distance > tolerance] = NONE
-    lost = np.flatnonzero(rows == NONE)
-    told = ""
-    if len(lost):
-        most = lost[np.argsort(-counts[lost], kind="stable")][:_SHOWN]
+    strays = np.flatnonzero(rows == NONE)
+    remark = ""
+    if len(strays):
+        most = strays[np.argsort(-counts[strays], kind="stable")][:_SHOWN]
         codes = ", ".join(f"#{bytes(colours[k].tolist()).hex()} ({counts[k]})" for k in most)
-        told = (
-            f"{int(counts[lost].sum())} of {len(srgb)} places have colours of no part within {tolerance:g}, "
+        remark = (
+            f"{int(counts[strays].sum())} of {len(srgb)} places have colours of no part within {tolerance:g}, "
             f"most often {codes}"
         )
-    return np.asarray(rows[which.reshape(-1)], np.int64), told
+    return np.asarray(rows[colour_rows.reshape(-1)], np.int64), remark
 
 
 def _majority(corners: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -186,8 +188,8 @@ def _picture(path: Path) -> NDArray[np.uint8]:
     from PIL import Image
 
     try:
-        with Image.open(path) as opened:
-            found: Any = np.asarray(opened.convert("RGB"))
+        with Image.open(path) as image:
+            pixels: Any = np.asarray(image.convert("RGB"))
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: expected a picture of labels (PNG); {error}") from error
-    return np.asarray(found, np.uint8)
+    return np.asarray(pixels, np.uint8)

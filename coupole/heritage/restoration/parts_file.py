@@ -138,10 +138,10 @@ def read_parts(path: Path) -> tuple[Document, PartsFile]:
 
 def read_picked(path: Path) -> Picked:
     """Raises InputError if it is no such file, or its numbers do not fit together."""
-    found = _read_json(path).validate(PickedParts)
-    vertices = _numbers(path, "vertices_mm", found.vertices_mm, "<f4").reshape(-1, 3)
-    triangles = _numbers(path, "triangles", found.triangles, "<u4").reshape(-1, 3)
-    parts = _numbers(path, "parts", found.parts, "u1", columns=1)
+    picked_parts = _read_json(path).validate(PickedParts)
+    vertices = _numbers(path, "vertices_mm", picked_parts.vertices_mm, "<f4").reshape(-1, 3)
+    triangles = _numbers(path, "triangles", picked_parts.triangles, "<u4").reshape(-1, 3)
+    parts = _numbers(path, "parts", picked_parts.parts, "u1", columns=1)
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: vertices_mm: expected finite coordinates; save the file from the page again")
     if len(triangles) == 0 or triangles.max() >= len(vertices) or len(parts) != len(triangles):
@@ -149,9 +149,9 @@ def read_picked(path: Path) -> Picked:
             f"{path}: {len(vertices)} vertices, {len(triangles)} triangles and {len(parts)} marks do not fit "
             "together; save the file from the page again"
         )
-    if parts.max() > len(found.names):
-        raise InputError(f"{path}: parts: found part {parts.max()}, but {len(found.names)} names")
-    return Picked(found.names, vertices, triangles, parts)
+    if parts.max() > len(picked_parts.names):
+        raise InputError(f"{path}: parts: found part {parts.max()}, but {len(picked_parts.names)} names")
+    return Picked(picked_parts.names, vertices, triangles, parts)
 
 
 # -- helpers --------------------------------------------------------------------------------------------------

@@ -138,15 +138,15 @@ class Stage(Scene):
 def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
     """Checked; the files that it names are there. Raises InputError with file:line:column."""
     document = yamlfile.read(path)
-    found = document.validate(RestorationFile)
+    restoration = document.validate(RestorationFile)
     missing = [
-        document.problem(at, f"no such file: {document.resolve(named)}")
-        for at, named in _files(found)
-        if not document.resolve(named).is_file()
+        document.problem(at, f"no such file: {document.resolve(file)}")
+        for at, file in _files(restoration)
+        if not document.resolve(file).is_file()
     ]
     if missing:
         raise InputError(missing)
-    return document, found
+    return document, restoration
 
 
 def reduced(
@@ -156,28 +156,28 @@ def reduced(
     for a step other than 5, 10, 20 or 40 nm."""
     if step_nm not in {None, 5, 10, 20, 40}:
         raise InputError(f"--step: expected 5, 10, 20 or 40, found {step_nm}; choose one of them")
-    changed: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     if samples:
-        changed["samples"] = samples
+        changes["samples"] = samples
     if step_nm:
-        changed["bands"] = Bands.model_validate({"step_nm": step_nm})
+        changes["bands"] = Bands.model_validate({"step_nm": step_nm})
     if width_px:
-        changed["views"] = _narrowed(_in_full(found.views), width_px)
-    return found.model_copy(update=changed)
+        changes["views"] = _narrowed(_in_full(found.views), width_px)
+    return found.model_copy(update=changes)
 
 
 def named_files(found: RestorationFile, document: Document) -> tuple[Path, ...]:
     """All that it names, each once."""
-    return tuple(dict.fromkeys(document.resolve(named) for _, named in _files(found)))
+    return tuple(dict.fromkeys(document.resolve(named_path) for _, named_path in _files(found)))
 
 
 def chosen(document: Document, found: RestorationFile, names: Sequence[str]) -> tuple[Hypothesis, ...]:
     """Return the hypotheses with these names, in the file's order; all without names. Raises InputError for an
     unknown name."""
-    known = [hypothesis.name for hypothesis in found.hypotheses]
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known)} of {document.path}")
-    return tuple(one for one in found.hypotheses if not names or one.name in names)
+    known_names = [hypothesis.name for hypothesis in found.hypotheses]
+    if unknown := [name for name in names if name not in known_names]:
+        raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known_names)} of {document.path}")
+    return tuple(candidate for candidate in found.hypotheses if not names or candidate.name in names)
 
 
 def expect_parts(document: Document, found: RestorationFile, names: Sequence[str], parts: Path) -> None:
@@ -223,7 +223,7 @@ def _in_full(views: Views) -> Turntable | Cameras | Auto:
 
 def _narrowed(views: Turntable | Cameras | Auto, width_px: int) -> Turntable | Cameras | Auto:
     if isinstance(views, Cameras):
-        return views.model_copy(update={"cameras": tuple(one.narrowed(width_px) for one in views.cameras)})
+        return views.model_copy(update={"cameras": tuple(camera.narrowed(width_px) for camera in views.cameras)})
     if width_px >= views.width_px:
         return views
     height_px = max(4, round(views.height_px * width_px / views.width_px))

@@ -67,21 +67,21 @@ class Restoration:
     @cached_property
     def stage(self) -> Stage:
         """The scene without the object."""
-        found = self.given
+        restoration_file = self.given
         return Stage(
             schema_version=1,
-            name=found.name,
+            name=restoration_file.name,
             cameras=self.cameras,
-            objects=found.surroundings,
-            lights=found.lights,
-            observer=found.observer,
-            bands=found.bands,
-            samples=found.samples,
-            noise=found.noise,
-            depth=found.depth,
-            seed=found.seed,
-            display=found.display,
-            outputs=found.outputs,
+            objects=restoration_file.surroundings,
+            lights=restoration_file.lights,
+            observer=restoration_file.observer,
+            bands=restoration_file.bands,
+            samples=restoration_file.samples,
+            noise=restoration_file.noise,
+            depth=restoration_file.depth,
+            seed=restoration_file.seed,
+            display=restoration_file.display,
+            outputs=restoration_file.outputs,
         )
 
     @cached_property
@@ -95,8 +95,8 @@ class Restoration:
 
     @cached_property
     def seen_parts(self) -> SeenParts:
-        others = [piece for thing in self.given.surroundings for piece in pieces(thing, self.folder)]
-        around: list[Piece | Ball] = list(others)
+        other_pieces = [piece for thing in self.given.surroundings for piece in pieces(thing, self.folder)]
+        around: list[Piece | Ball] = list(other_pieces)
         return SeenParts(self.corners_mm, self.parts.labels, around)
 
     @cached_property
@@ -105,33 +105,33 @@ class Restoration:
 
     def painted(self, hypothesis: Hypothesis) -> list[Piece]:
         """The object's parts in the scene's frame."""
-        corners, found = self.mesh.corners_mm, []
+        corners, painted_pieces = self.mesh.corners_mm, []
         for row, name in enumerate(self.parts.names):
-            own = self.parts.labels == row
-            normals = None if self._normals is None else self._normals[own]
-            piece = Piece(corners[own], hypothesis.materials[name], self.given.smooth, normals)
-            found.append(placed(piece, self.given.object))
-        return found
+            of_part = self.parts.labels == row
+            normals = None if self._normals is None else self._normals[of_part]
+            piece = Piece(corners[of_part], hypothesis.materials[name], self.given.smooth, normals)
+            painted_pieces.append(placed(piece, self.given.object))
+        return painted_pieces
 
     @cached_property
     def _digest(self) -> str:
         """Digest of what all pictures share: shape, parts, the scene but for display and cameras, files,
         renderer."""
-        told = hashlib.sha256(
+        hasher = hashlib.sha256(
             f"{self.mesh.digest()} {self.parts.names} {variant.spectral(polarised=False)}".encode()
         )
-        told.update(self.parts.labels.tobytes())
-        told.update(self.given.object.model_dump_json().encode() + str(self.given.smooth).encode())
-        told.update(self.stage.model_dump_json(exclude={"display", "cameras"}).encode())
+        hasher.update(self.parts.labels.tobytes())
+        hasher.update(self.given.object.model_dump_json().encode() + str(self.given.smooth).encode())
+        hasher.update(self.stage.model_dump_json(exclude={"display", "cameras"}).encode())
         for path in named_files(self.given, self.document):
-            told.update(path.read_bytes())
-        return told.hexdigest()
+            hasher.update(path.read_bytes())
+        return hasher.hexdigest()
 
     def digest(self, hypothesis: Hypothesis, camera: Camera) -> str:
         """Return the digest of what one picture follows from."""
-        materials = {name: one.model_dump(mode="json") for name, one in hypothesis.materials.items()}
-        told = f"{self._digest} {camera.model_dump_json()} {json.dumps(materials, sort_keys=True)}"
-        return hashlib.sha256(told.encode()).hexdigest()
+        materials = {name: material.model_dump(mode="json") for name, material in hypothesis.materials.items()}
+        description = f"{self._digest} {camera.model_dump_json()} {json.dumps(materials, sort_keys=True)}"
+        return hashlib.sha256(description.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -162,13 +162,13 @@ def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
 
     Raises InputError for what cannot be rendered, StorageError if nothing can be written.
     """
-    made: list[Made] = []
+    renderings: list[Made] = []
     try:
         for hypothesis in restoration.hypotheses:
-            made += _of_one(restoration, hypothesis, out / hypothesis.name, say)
+            renderings += _of_one(restoration, hypothesis, out / hypothesis.name, say)
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
-    return made
+    return renderings
 
 
 def smooth_normals(corners_mm: Floats) -> Floats:
@@ -178,8 +178,8 @@ def smooth_normals(corners_mm: Floats) -> Floats:
     sums = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(points)) for column in cross.T], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     units = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)[faces]
-    lost = np.linalg.norm(units, axis=2) == 0
-    units[lost] = np.repeat(flat_normals(corners_mm)[:, None], 3, axis=1)[lost]
+    has_no_normal = np.linalg.norm(units, axis=2) == 0
+    units[has_no_normal] = np.repeat(flat_normals(corners_mm)[:, None], 3, axis=1)[has_no_normal]
     return np.asarray(units)
 
 
@@ -189,26 +189,32 @@ def smooth_normals(corners_mm: Floats) -> Floats:
 def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say: Say) -> list[Made]:
     folder.mkdir(parents=True, exist_ok=True)
     texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
-    known = {camera.name: _known(restoration, hypothesis, camera, folder) for camera in restoration.cameras}
-    wanted = [camera for camera in restoration.cameras if known[camera.name] is None]
+    about_of_camera = {
+        camera.name: _known(restoration, hypothesis, camera, folder) for camera in restoration.cameras
+    }
+    new_cameras = [camera for camera in restoration.cameras if about_of_camera[camera.name] is None]
     step = f"rendering {hypothesis.name}"
-    if wanted:
-        say(step, 0, len(wanted))
+    if new_cameras:
+        say(step, 0, len(new_cameras))
         with opened(restoration.stage, restoration.folder, restoration.painted(hypothesis)) as renderer:
             written_by = f"Mitsuba {renderer.version}, {renderer.variant_name}"
-            for number, camera in enumerate(wanted):
+            for number, camera in enumerate(new_cameras):
 
                 def passes(done: int, total: int, number: int = number) -> None:
-                    say(step, number * total + done, len(wanted) * total)
+                    say(step, number * total + done, len(new_cameras) * total)
 
-                found = renderer.render(camera, passes)
-                known[camera.name] = _write(restoration, (hypothesis, camera), found, folder, written_by)
-    made = []
+                picture = renderer.render(camera, passes)
+                about_of_camera[camera.name] = _write(
+                    restoration, (hypothesis, camera), picture, folder, written_by
+                )
+    renderings = []
     for camera in restoration.cameras:
         path = folder / f"{camera.name}.exr"
         labelled_pictures.restamped(path, texts)
-        made.append(Made(hypothesis, camera, path, known[camera.name] or {}, camera in wanted))
-    return made
+        renderings.append(
+            Made(hypothesis, camera, path, about_of_camera[camera.name] or {}, camera in new_cameras)
+        )
+    return renderings
 
 
 def _known(
@@ -235,15 +241,15 @@ def _write(
     about = f"{restoration.given.name}, hypothesis {hypothesis.name}: {pictures.SYNTHETIC}; {written_by}"
     texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
     pictures.write_exr(folder / f"{camera.name}.exr", restoration.lit, found, xyz, about, texts)
-    told = {
+    record = {
         "of": restoration.digest(hypothesis, camera),
         "renderer": written_by,
         "samples": found.samples,
         "noise": None if found.noise is None else round(found.noise, 5),
         "mean_cd_m2": round(float(restoration.eye.luminance(found.radiance).mean()), 6),
     }
-    beside.write_text(json.dumps(told) + "\n", encoding="utf-8")
-    return told
+    beside.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    return record
 
 
 def common_white(restoration: Restoration, made: Sequence[Made]) -> float:
@@ -251,7 +257,7 @@ def common_white(restoration: Restoration, made: Sequence[Made]) -> float:
     display = restoration.given.display
     if display.white_cd_m2 is not None:
         return display.white_cd_m2
-    some = [one.xyz()[::2, ::2, 1].ravel() for one in made]
+    some = [rendering.xyz()[::2, ::2, 1].ravel() for rendering in made]
     white = float(np.quantile(np.concatenate(some), 1.0 - display.clipped))
     if white <= 0.0:
         raise InputError(

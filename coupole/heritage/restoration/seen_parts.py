@@ -26,8 +26,8 @@ class SeenParts:
         from embreex.mesh_construction import TriangleMesh
 
         around = [
-            one.centre_mm + one.radius_mm * unit_sphere(_BALL) if isinstance(one, Ball) else one.corners_mm
-            for one in others
+            body.centre_mm + body.radius_mm * unit_sphere(_BALL) if isinstance(body, Ball) else body.corners_mm
+            for body in others
         ]
         corners = np.concatenate([corners_mm, *around])
         self._labels = np.full(len(corners) + 1, NOTHING, np.int16)
@@ -39,9 +39,9 @@ class SeenParts:
         """[h, w] rows of parts, `NOTHING` where the object is not seen."""
         ways = rays(camera).reshape(-1, 3)
         starts = np.broadcast_to(np.asarray(camera.position_mm, float), ways.shape)
-        met = self._tree.run(starts.astype(np.float32), ways.astype(np.float32))
-        found: NDArray[np.int16] = self._labels[met].reshape(camera.height_px, camera.width_px)
-        return found
+        hit_rows = self._tree.run(starts.astype(np.float32), ways.astype(np.float32))
+        labels: NDArray[np.int16] = self._labels[hit_rows].reshape(camera.height_px, camera.width_px)
+        return labels
 
 
 def rays(camera: Camera) -> Floats:

@@ -43,14 +43,14 @@ def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say
     Raises InputError if all is black or the denoiser is missing, StorageError.
     """
     white_cd_m2 = common_white(restoration, made)
-    shown = []
+    views = []
     try:
         for number, camera in enumerate(restoration.cameras):
             say("showing", number, len(restoration.cameras))
-            own = [one for one in made if one.camera.name == camera.name]
-            shown.append(_of_view(restoration, own, white_cd_m2, out))
-        say("showing", len(shown), len(shown))
-        result = _result(restoration, made, shown, white_cd_m2, out)
+            renderings = [rendering for rendering in made if rendering.camera.name == camera.name]
+            views.append(_of_view(restoration, renderings, white_cd_m2, out))
+        say("showing", len(views), len(views))
+        result = _result(restoration, made, views, white_cd_m2, out)
         (out / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
@@ -62,29 +62,34 @@ def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say
 
 def _of_view(restoration: Restoration, made: Sequence[Made], white_cd_m2: float, out: Path) -> Shown:
     camera = made[0].camera
-    colours = [one.xyz() for one in made]
+    colours = [rendering.xyz() for rendering in made]
     if restoration.given.display.denoised:
-        seen = [_displayed(restoration, denoised(xyz.astype(float)), white_cd_m2) for xyz in colours]
+        displays = [_displayed(restoration, denoised(xyz.astype(float)), white_cd_m2) for xyz in colours]
     else:
-        seen = [_displayed(restoration, xyz, white_cd_m2) for xyz in colours]
-    room = max(len(caption_lines(camera.width_px, one.hypothesis)) for one in made)
-    strips = [labelled_pictures.captioned(one, of.hypothesis, room) for one, of in zip(seen, made, strict=True)]
+        displays = [_displayed(restoration, xyz, white_cd_m2) for xyz in colours]
+    room = max(len(caption_lines(camera.width_px, rendering.hypothesis)) for rendering in made)
+    strips = [
+        labelled_pictures.captioned(picture, of.hypothesis, room)
+        for picture, of in zip(displays, made, strict=True)
+    ]
     files = {}
-    for picture, one in zip(strips, made, strict=True):
-        files[one.hypothesis.name] = one.exr.with_suffix(".png")
-        about = _about(restoration, one, white_cd_m2)
-        pictures.write_png(one.exr.with_suffix(".png"), picture, about, for_png(told([one.hypothesis])))
+    for picture, rendering in zip(strips, made, strict=True):
+        files[rendering.hypothesis.name] = rendering.exr.with_suffix(".png")
+        about = _about(restoration, rendering, white_cd_m2)
+        pictures.write_png(
+            rendering.exr.with_suffix(".png"), picture, about, for_png(told([rendering.hypothesis]))
+        )
     beside = _side_by_side(strips, made, out) if len(made) > 1 else None
     parts = restoration.seen_parts.seen(camera)
     differences, of_parts = {}, {}
-    for (first, one), (second, other) in combinations(enumerate(made), 2):
-        pair = one.hypothesis.name, other.hypothesis.name
-        found = hypotheses_compared.compared(
+    for (first, rendering), (second, other_rendering) in combinations(enumerate(made), 2):
+        pair = rendering.hypothesis.name, other_rendering.hypothesis.name
+        difference = hypotheses_compared.compared(
             colours[first], colours[second], parts, restoration.parts.names, restoration.eye, white_cd_m2
         )
         differences[pair] = out / f"difference-{pair[0]}-{pair[1]}-{camera.name}.png"
-        of_parts[pair] = found.of_parts
-        _write_difference(found.de00, (one, other), differences[pair])
+        of_parts[pair] = difference.of_parts
+        _write_difference(difference.de00, (rendering, other_rendering), differences[pair])
     return Shown(camera.name, files, beside, differences, of_parts)
 
 
@@ -108,19 +113,19 @@ def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) ->
         first = number * (width + _GAP_PX)
         sheet[:, first : first + width] = strip
     path = out / f"side-by-side-{made[0].camera.name}.png"
-    hypotheses = [one.hypothesis for one in made]
-    names = "; ".join(f"hypothesis {one.name}" for one in hypotheses)
+    hypotheses = [rendering.hypothesis for rendering in made]
+    names = "; ".join(f"hypothesis {hypothesis.name}" for hypothesis in hypotheses)
     pictures.write_png(path, sheet, f"{names}: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
     return path
 
 
 def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: Path) -> None:
-    names = " and ".join(f"hypothesis {one.hypothesis.name}" for one in pair)
+    names = " and ".join(f"hypothesis {rendering.hypothesis.name}" for rendering in pair)
     words = f"Between {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
     width = de00.shape[1]
     lines = labelled_pictures.broken(words, width)
     picture = with_strip(hypotheses_compared.drawn(de00), lines, len(lines))
-    pictures.write_png(path, picture, words, for_png(told([one.hypothesis for one in pair])))
+    pictures.write_png(path, picture, words, for_png(told([rendering.hypothesis for rendering in pair])))
 
 
 def _result(
@@ -129,14 +134,14 @@ def _result(
     def name(path: Path | None) -> str | None:
         return None if path is None else path.relative_to(out).as_posix()
 
-    by_view = {(one.hypothesis.name, one.camera.name): one for one in made}
+    by_view = {(rendering.hypothesis.name, rendering.camera.name): rendering for rendering in made}
     views = []
     for view in shown:
-        own = {}
+        view_pictures = {}
         for hypothesis, path in view.pictures.items():
-            one = by_view[hypothesis, view.camera]
-            figures = {key: one.about[key] for key in ("renderer", "samples", "noise", "mean_cd_m2")}
-            own[hypothesis] = {"png": name(path), "exr": name(one.exr), **figures}
+            rendering = by_view[hypothesis, view.camera]
+            figures = {key: rendering.about[key] for key in ("renderer", "samples", "noise", "mean_cd_m2")}
+            view_pictures[hypothesis] = {"png": name(path), "exr": name(rendering.exr), **figures}
         differences = [
             {"hypotheses": list(pair), "png": name(path), "parts": view.of_parts[pair]}
             for pair, path in view.differences.items()
@@ -144,7 +149,7 @@ def _result(
         views.append(
             {
                 "view": view.camera,
-                "pictures": own,
+                "pictures": view_pictures,
                 "side_by_side": name(view.side_by_side),
                 "differences": differences,
             }
@@ -157,11 +162,11 @@ def _result(
         "mesh": {"name": restoration.mesh.path.name, "sha256_of_shape": restoration.mesh.digest()},
         "parts": restoration.parts.counts(),
         "remarks": list(restoration.parts.remarks),
-        "hypotheses": [one.model_dump(mode="json") for one in restoration.hypotheses],
+        "hypotheses": [hypothesis.model_dump(mode="json") for hypothesis in restoration.hypotheses],
         "observer": f"CIE {restoration.given.observer}",
         "bands": len(range(380, 781, restoration.given.bands.step_nm)),
         "white_cd_m2": round(white_cd_m2, 6),
-        "made_anew": sum(one.is_new for one in made),
-        "taken_as_they_were": sum(not one.is_new for one in made),
+        "made_anew": sum(rendering.is_new for rendering in made),
+        "taken_as_they_were": sum(not rendering.is_new for rendering in made),
         "views": views,
     }

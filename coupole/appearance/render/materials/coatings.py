@@ -176,20 +176,20 @@ def _film(leaf: Leaf, folder: Path) -> Film:
 
 
 def _glaze(layer: FourFlux | GlazeLayer, folder: Path) -> four_flux.Layer:
-    given = layer.coefficients
-    if isinstance(given, Coefficients):
+    fluxes = layer.coefficients
+    if isinstance(fluxes, Coefficients):
         names = ("absorption", "scattering", "direct_absorption", "forward", "backward")
-        k, s, direct, forward, backward = (coefficient(getattr(given, name), folder) for name in names)
+        k, s, direct, forward, backward = (coefficient(getattr(fluxes, name), folder) for name in names)
     else:
-        diffuse, found = coefficients(given, folder, needs_mm=True), read_paint(folder / given.path)
-        if missing := [name for name in ("k", "s_i", "s_j") if name not in found.other]:
+        diffuse, paint = coefficients(fluxes, folder, needs_mm=True), read_paint(folder / fluxes.path)
+        if missing := [name for name in ("k", "s_i", "s_j") if name not in paint.other]:
             raise InputError(
-                f"{folder / given.path}: expected k, s_i, s_j of four fluxes, found no {', '.join(missing)}; "
+                f"{folder / fluxes.path}: expected k, s_i, s_j of four fluxes, found no {', '.join(missing)}; "
                 "give `coupole layer` spectra under directional light, or take `kind: paint`"
             )
         k, s = diffuse.absorption, diffuse.scattering
         direct, forward, backward = (
-            np.maximum(np.interp(WAVELENGTHS_NM, found.wavelengths_nm, found.other[name]), 0.0)
+            np.maximum(np.interp(WAVELENGTHS_NM, paint.wavelengths_nm, paint.other[name]), 0.0)
             for name in ("k", "s_i", "s_j")
         )
     return four_flux.Layer(k, s, direct, forward, backward, layer.thickness_mm)

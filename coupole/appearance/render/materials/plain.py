@@ -258,20 +258,20 @@ def _metal(material: Metal, folder: Path) -> Description:
     if material.depth_mm is None:
         return metal(index, material.roughness, distribution=material.distribution)
     inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
-    left = lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())
-    return metal(index / indices.URUSHI, material.roughness, (inward * left) ** 2, material.distribution)
+    transmittance = lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())
+    return metal(index / indices.URUSHI, material.roughness, (inward * transmittance) ** 2, material.distribution)
 
 
 def _gilt(material: Gilt, folder: Path) -> Description:
-    gilded, index = gilt_of(material, folder)
-    bare = coated(gilded.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
+    gilding, index = gilt_of(material, folder)
+    bare = coated(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < THINNEST_NM or material.uncovered == 1.0:
         return bare
     films = [Film(index, material.thickness_nm)]
     leaf = metal(_equivalent(films, indices.constant(indices.EGG_WHITE)), material.roughness)
-    through = gilded.leaf.transmittance[-1] * layered.emerging(gilded.leaf, gilded.bole)
+    through = gilding.leaf.transmittance[-1] * layered.emerging(gilding.leaf, gilding.bole)
     if through.max() > 1e-5:
-        leaf = _sum(leaf, gilded.leaf.normal_reflectance, through)
+        leaf = _sum(leaf, gilding.leaf.normal_reflectance, through)
     if material.uncovered == 0.0:
         return leaf
     return {"type": "blendbsdf", "weight": material.uncovered, "leaf": leaf, "bare": bare}

@@ -19,7 +19,7 @@ from cells import CellFolder
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from coupole.calibration.record import Parameter, Record, pose_of, read_record, rows_of, sealed, write_record
+from coupole.calibration.record import Parameter, Record, pose_of, read_record, rows_of, seal_record, write_record
 
 Floats = NDArray[np.float64]
 RECORDS = cells.REPO / "configs/calibrations"
@@ -109,7 +109,7 @@ def draw(true_run: Path, folder: Path, seed: int) -> Drawn:
         "transforms": {"flange_from_camera": pose_of(given)},
         "fixed": {},
     }
-    write_record(folder / "hand-eye.yaml", sealed(**content))
+    write_record(folder / "hand-eye.yaml", seal_record(**content))
     wrong = waves()
     wrong.vertices = _scanned(np.asarray(wrong.vertices), np.asarray(wrong.vertex_normals), random)
     wrong.export(folder / "scan.ply")

@@ -75,11 +75,11 @@ def true_frame(result: RunResult, led: int) -> np.ndarray:
     """[h, w, 3] what the camera would see, in shares of its range, without shadows; NaN beside the object."""
     (view,) = result.views
     surface = surface_of_view(result, view)
-    triangle = np.maximum(surface.seen, 0)
+    triangle = np.maximum(surface.triangle_of_pixel, 0)
     apart = view.led_mm[led] - surface.places_mm.astype(np.float64)
     distance = np.linalg.norm(apart, axis=-1, keepdims=True)
     ways = apart / distance
     value = backscatter(surface.normals[triangle], ways, unit(surface.camera_mm - surface.places_mm))
     reach = -np.sum(ways * view.led_normals[led], axis=-1, keepdims=True) / (np.pi * (distance * 1e-3) ** 2)
     frame = value * reach * view.full_scales[led]
-    return np.where((surface.seen >= 0)[..., None], frame, np.nan)
+    return np.where((surface.triangle_of_pixel >= 0)[..., None], frame, np.nan)

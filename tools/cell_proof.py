@@ -95,7 +95,7 @@ def prove_cell(
         folder = Path(name)
         camera, hand_eye = _camera_and_hand_eye(cell, at, request, model)
         write_record(folder / "hand-eye.yaml", hand_eye)
-        prior = read_posed_camera(folder / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
+        prior = read_posed_camera(folder / "hand-eye.yaml", None, About(is_simulated=True), cell.size_px)
         arm = None if model is None else read_arm(folder / "hand-eye.yaml", model)
         proof = Proof([*_of_camera(cell, camera), *_of_hand_eye(cell, hand_eye)], {})
         _far(proof, "camera_mm", cell, *_camera_centres_mm(cell, at, prior, arm))
@@ -119,7 +119,9 @@ def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
         if cell.stranger in LIGHT_STRANGERS:
             with tempfile.TemporaryDirectory() as name:
                 write_record(Path(name) / "hand-eye.yaml", hand_eye)
-                prior = read_posed_camera(Path(name) / "hand-eye.yaml", None, About(simulated=True), cell.size_px)
+                prior = read_posed_camera(
+                    Path(name) / "hand-eye.yaml", None, About(is_simulated=True), cell.size_px
+                )
             _prove_leds(proof, cell, at, request, prior, None)
     except CoupoleError as error:
         return Proof([], {}, str(error))
@@ -128,7 +130,7 @@ def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
 
 def _missed(record: Record) -> Iterator[str]:
     for limit in record.limits:
-        if not limit.passed:
+        if not limit.is_met:
             yield f"{record.kind}: {limit.what} above its limit"
 
 
@@ -207,7 +209,7 @@ def _prove_leds(
     truth = as_built(read_leds(photographs.truth.scene.leds), photographs.truth.settings.dome)
     stated_tolerances = StatedOfLeds(tolerance_mm=0.05)
     geometry = leds_from(
-        photographs.leds(table, lit), table, prior, request, stated=stated_tolerances, arm=arm
+        photographs.leds(table, lit), table, prior, request, stated_noise=stated_tolerances, arm=arm
     ).geometry
     row_of = {int(led): row for row, led in enumerate(truth.ids)}
     at_truth = [row_of[int(led)] for led in table.ids]
@@ -248,7 +250,7 @@ def _prove_mesh(
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
     stated_tolerances = StatedOfMesh(scanner_mm=0.03, robot_mm=0.03, robot_deg=0.003)
     mesh_pose = mesh_from(
-        images, sources, scan, prior, request, stated=stated_tolerances, depth_mm=depth_mm, arm=arm
+        images, sources, scan, prior, request, stated_noise=stated_tolerances, depth_mm=depth_mm, arm=arm
     ).pose
     in_support = transform(place["translation_mm"], place["abc_deg"])
     true = cell.base_from_support @ in_support @ inverse(scanner_from_thing(cell.seed))

@@ -49,7 +49,7 @@ def main() -> None:
     for name in (name for name in names if name != BUST):
         samples, width_px, step_nm = QUICK[name]
         document, scene = read_scene(ROOT / "configs" / "scenes" / f"{name}.yaml")
-        quick = studio.reduced(scene, samples=samples, width_px=width_px, step_nm=step_nm)
+        quick = studio.reduced_scene(scene, samples=samples, width_px=width_px, step_nm=step_nm)
         with tempfile.TemporaryDirectory() as folder:
             render_scene(document, quick, Path(folder), lambda camera, done, total: None)
             for film in sorted(Path(folder).glob("*.mp4")):

@@ -99,7 +99,9 @@ def _compared(result: Path, folder: Path, count: int) -> dict[str, Row]:
     random = np.random.default_rng(1)
     lit = _lit(surface, count, random)
     true_values = ggx(_of_surface(surface, lit), lit)
-    sampled_triangles = tuple(map(int, random.choice(np.flatnonzero(surface.known), TRIANGLES, replace=False)))
+    sampled_triangles = tuple(
+        map(int, random.choice(np.flatnonzero(surface.has_material), TRIANGLES, replace=False))
+    )
     row_of_export: dict[str, Row] = {}
     readers: dict[str, Callable[[Path, Lit], np.ndarray]] = {
         "ply": _read_ply, "exr": _read_exr, "gltf": _read_gltf, "materialx": _read_materialx,
@@ -132,7 +134,7 @@ def _lit(surface: MeasuredSurface, count: int, random: np.random.Generator) -> L
         with h5py.File(view.path, "r") as file:
             triangle_of_pixel = file["seen"][()]
         number = np.where(triangle_of_pixel >= 0, view.triangles[triangle_of_pixel], 0)
-        row, column = np.nonzero((triangle_of_pixel >= 0) & surface.known[number])
+        row, column = np.nonzero((triangle_of_pixel >= 0) & surface.has_material[number])
         subset = random.choice(len(row), count // len(surface.result.views), replace=False)
         row, column = row[subset], column[subset]
         triangles = number[row, column]

@@ -18,7 +18,7 @@ from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.spectra_library import read_library
 from coupole.heritage.analysis.identification import identify
 from coupole.heritage.analysis.pigment_classes import shipped_classes
-from coupole.heritage.analysis.references import Rate, References, make_references, measured
+from coupole.heritage.analysis.references import Rate, References, make_references, trimmed_spectrum
 from coupole.heritage.analysis.spectral_features import BANDS_NM
 from coupole.heritage.analysis.unmixing import unmix
 from smallest import add_smallest
@@ -99,7 +99,7 @@ def test(references: References, folder: Path) -> None:
         for spectrum in spectra:
             class_name = table[spectrum.name].class_name
             if class_name:
-                (inside if class_name in classes else outside).append((measured(spectrum), class_name))
+                (inside if class_name in classes else outside).append((trimmed_spectrum(spectrum), class_name))
     with_class = [(true, identify(sample, references)) for sample, true in inside]
     without_class = [(true, identify(sample, references.without_class(true))) for sample, true in inside]
     never = [(true, identify(sample, references)) for sample, true in outside]

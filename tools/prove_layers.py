@@ -40,7 +40,7 @@ def coverage(kind: str, rounds: int) -> float:
         inside = []
         for _ in range(rounds):
             fit = layer_fit.fit(cases.films_of(kind, k, s, rng), cases.FACE, cases.NOISE)
-            sure = fit.determined
+            sure = fit.determined_bands
             inside += [
                 np.abs(fit.absorption - k)[sure] < COVERAGE_FACTOR * fit.u_absorption[sure],
                 np.abs(fit.scattering - s)[sure] < COVERAGE_FACTOR * fit.u_scattering[sure],

@@ -39,7 +39,7 @@ def seen(shares: np.ndarray, chosen: list[Paint], under: Face) -> np.ndarray:
         for coefficient in ("absorption", "scattering")
     )
     finite = np.isfinite(k + s)
-    spectrum = under.seen(
+    spectrum = under.reflectance_in_air(
         InternalReflectance(kubelka_munk.opaque(np.where(finite, k, 1.0) / np.where(finite, s, 1.0)))
     )
     return np.where(finite, spectrum.values, np.nan)

@@ -52,8 +52,8 @@ def main() -> int:
         paths = [folder / name for name in truth]
         start_s = time.monotonic()
         registration = register(paths, "mm", say=_say)
-        placed_scans = [registration.scans[k] for k in registration.placed]
-        poses = [registration.first_from_scan[k] for k in registration.placed]
+        placed_scans = [registration.scans[k] for k in registration.placed_numbers]
+        poses = [registration.first_from_scan[k] for k in registration.placed_numbers]
         out = Path(tempfile.mkdtemp(dir=folder))
         merged_mesh = merge(placed_scans, poses, "mm", arguments.mesh_mm, (5.0, 10.0, 50.0, 250.0), out, _say)
         minutes = (time.monotonic() - start_s) / 60
@@ -65,8 +65,9 @@ def main() -> int:
     off_mm, coverage = compared(registration, truth)
     loops = [loop.error_mm for loop in registration.loops] or [np.inf]
     print(
-        f"{len(registration.placed)} placed, {len(registration.unplaced)} not; {registration.pairs} pairs, "
-        f"{len(registration.rejected)} rejected, "
+        f"{len(registration.placed_numbers)} placed, {len(registration.unplaced_numbers)} not; "
+        f"{registration.pairs} pairs, "
+        f"{len(registration.rejected_motions)} rejected, "
         f"{len(loops)} loops: median {np.median(loops):.3f} mm, worst {max(loops):.3f} mm; factor "
         f"{registration.loop_factor:.2f}, inflation {registration.fit.inflation:.2f}, "
         f"noise {registration.fit.noise_mm:.3f} mm"
@@ -76,7 +77,7 @@ def main() -> int:
         f"off {np.median(off_mm):.3f} mm in the median, {off_mm.max():.3f} mm at worst; in 95 % regions "
         f"{100 * coverage:.1f} %; {minutes:.1f} minutes, {gb:.2f} GB in the largest process"
     )
-    wrong = bool(registration.unplaced) or off_mm.max() > MOST_OFF_MM or coverage < LEAST_COVERED
+    wrong = bool(registration.unplaced_numbers) or off_mm.max() > MOST_OFF_MM or coverage < LEAST_COVERED
     return int(wrong or minutes > MOST_MINUTES or gb > MOST_GB)
 
 
@@ -103,11 +104,11 @@ def make_scans(folder: Path, count: int, across: int) -> dict[str, np.ndarray]:
 def compared(found: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
     """Displacement of each placed scan's points from the truth, in the first one's frame; and the share of poses
     in their 95 % regions, on average over the frames of all scans, as the error of one frame is in all poses."""
-    world_from = [truth[found.names[number]] for number in found.placed]
+    world_from = [truth[found.names[number]] for number in found.placed_numbers]
     first_from_world = inverse_of(world_from[0])
     off_mm = [
         displacement_mm(found.first_from_scan[n], first_from_world @ true, found.scans[n].coarse.points_mm)
-        for n, true in zip(found.placed, world_from, strict=True)
+        for n, true in zip(found.placed_numbers, world_from, strict=True)
     ]
     return np.array(off_mm), float(np.mean([_covered(found, world_from, r) for r in range(len(world_from))]))
 

@@ -17,7 +17,7 @@ from coupole.calibration.leds.led_plan import led_plan
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.sources import LedImages
 from coupole.calibration.leds.spots import find_spots
-from coupole.calibration.poses import reported
+from coupole.calibration.poses import kuka_poses
 from coupole.calibration.sources import About, Source, Sources
 from coupole.geometry import apply, inverse, transform
 from coupole.motion.itinerary import plan_itinerary
@@ -261,7 +261,7 @@ class Photographs:
             Source(str(number), partial(read, number), tuple(joints))
             for number, joints in enumerate(self._joints_deg.tolist())
         )
-        return Sources(images, reported(self.reported), About(simulated=True), (("rendered", "0" * 64),))
+        return Sources(images, kuka_poses(self.reported), About(is_simulated=True), (("rendered", "0" * 64),))
 
     def leds(self, table: LedTable, lit: Sequence[tuple[int, int]]) -> LedImages:
         """Spots of LEDs: `lit` gives view and row of the table for each frame."""
@@ -281,7 +281,7 @@ class Photographs:
         )
         views = tuple(str(number) for number in range(len(self.reported)))
         size_px = (self.camera["width_px"], self.camera["height_px"])
-        about = About(simulated=True)
+        about = About(is_simulated=True)
         return LedImages(
             sightings, self.reported, views, size_px, (), about, (("rendered", "0" * 64),), self._joints_deg
         )

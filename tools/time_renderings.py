@@ -14,7 +14,7 @@ import os
 import time
 from pathlib import Path
 
-from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.rendering import Spectral, open_renderer
 from coupole.appearance.render.scene_file import Bands, FieldOfView, Scene
 from coupole.commands.render_scene import read_scene
 from smallest import add_smallest
@@ -36,7 +36,7 @@ def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) ->
 def timed(scene: Scene) -> tuple[Spectral, float, float]:
     """The picture, and the seconds that it took: on the clock, and of all cores together."""
     wall, cpu = time.perf_counter(), time.process_time()
-    with opened(scene, SCENES) as renderer:
+    with open_renderer(scene, SCENES) as renderer:
         rendering = renderer.render(scene.cameras[0])
     return rendering, time.perf_counter() - wall, time.process_time() - cpu
 

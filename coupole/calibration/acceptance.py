@@ -23,17 +23,17 @@ class Allowed:
 
     name: str
     """Name of the figure for `--limit`, with its unit."""
-    what: str
+    description: str
     usual: float
     unit: str = ""
 
 
 def words_of(limits: Sequence[Allowed]) -> str:
     """The limits for a command's help."""
-    return "; ".join(f"{limit.name}={limit.usual:g} ({limit.what})" for limit in limits)
+    return "; ".join(f"{limit.name}={limit.usual:g} ({limit.description})" for limit in limits)
 
 
-def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
+def parse_limits(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
     """`NAME=VALUE` as operators write it. Raises InputError: no such limit, given twice, not a positive number."""
     limit_by_name: dict[str, float] = {}
     names = {limit.name for limit in limits}
@@ -55,20 +55,20 @@ def asked(words: Sequence[str], limits: Sequence[Allowed]) -> dict[str, float]:
 
 
 def against_limits(
-    limits: Sequence[Allowed], wanted: Mapping[str, float], found: Mapping[str, float]
+    limits: Sequence[Allowed], operator_limits: Mapping[str, float], figures: Mapping[str, float]
 ) -> tuple[Limit, ...]:
-    """Figures compared with their limits, as the record keeps them. `wanted` are the limits that the operator set;
-    `found` has a figure for each limit."""
+    """Figures compared with their limits, as the record keeps them. `operator_limits` are the limits that the
+    operator set; `figures` has a figure for each limit."""
     from coupole.calibration.record import Limit
 
     return tuple(
         Limit(
-            what=limit.what,
-            found=found[limit.name],
-            limit=wanted.get(limit.name, limit.usual),
+            what=limit.description,
+            found=figures[limit.name],
+            limit=operator_limits.get(limit.name, limit.usual),
             unit=limit.unit,
             name=limit.name,
-            usual=limit.usual if limit.name in wanted else None,
+            usual=limit.usual if limit.name in operator_limits else None,
         )
         for limit in limits
     )

@@ -48,7 +48,7 @@ class Group:
     """Observations that share one noise."""
 
     name: str
-    estimated: bool
+    is_estimated: bool
     """Estimate the noise from residuals. Where False, or where observations are too few, the stated noise is
     used."""
     rejects: int = 0
@@ -74,7 +74,7 @@ class Component:
     name: str
     factor: float
     """Estimated over stated noise; 1 where it was not to be estimated."""
-    rejected: int
+    rejected_count: int
     redundancy: float
     chi2: float
     """Sum of squared residuals over the stated noise."""
@@ -93,7 +93,7 @@ class Adjusted(Generic[S]):
     """Effective degrees of freedom [p]."""
     residuals: tuple[Floats, ...]
     """Residuals of each block, over the stated noise."""
-    kept: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
+    accepted_masks: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
     """Masks of each block: True for residuals that were not rejected."""
     steps: int
 
@@ -113,13 +113,13 @@ def adjust(
     groups: Sequence[Group],
     parameters: int,
     *,
-    what: str,
+    calibration_name: str,
 ) -> Adjusted[S]:
     """Minimise the sum of squared residuals (Levenberg-Marquardt), estimate the noise, reject gross errors.
 
     Huber's weights first limit the influence of gross errors; then residuals beyond `REJECT_SIGMA` are left out
-    and the others are weighted by their noise alone. `what` names the calibration in errors. Raises InputError if
-    the observations do not determine all parameters.
+    and the others are weighted by their noise alone. `calibration_name` names the calibration in errors. Raises
+    InputError if the observations do not determine all parameters.
     """
     factors = np.ones(len(groups))
     blocks = evaluate(state)
@@ -131,12 +131,14 @@ def adjust(
         for _ in range(_MAX_ROUNDS):
             if robust:
                 weights = [_huber(b, groups[b.group].rejects, factors[b.group]) for b in blocks]
-            state, blocks, steps = _descend(state, blocks, evaluate, move, weights, factors, parameters, what)
+            state, blocks, steps = _descend(
+                state, blocks, evaluate, move, weights, factors, parameters, calibration_name
+            )
             step_count += steps
             if robust:
                 new_factors = _robust_factors(blocks, groups, factors)
             else:
-                new_factors = _seen_factors(blocks, groups, masks, weights, factors, parameters, what)
+                new_factors = _seen_factors(blocks, groups, masks, weights, factors, parameters, calibration_name)
             is_settled = bool(np.all(np.abs(new_factors / factors - 1) < _SETTLED))
             factors = new_factors
             if not robust and (new_masks := _reject(blocks, groups, masks, factors)):
@@ -147,7 +149,7 @@ def adjust(
         if robust:
             masks = _reject(blocks, groups, masks, factors) or masks
             weights = [k.astype(np.float64) for k in masks]
-    return _summary(state, blocks, groups, masks, weights, factors, parameters, what, step_count)
+    return _summary(state, blocks, groups, masks, weights, factors, parameters, calibration_name, step_count)
 
 
 def _normals(
@@ -177,7 +179,7 @@ def _descend(
     weights: Sequence[Floats],
     factors: Floats,
     parameters: int,
-    what: str,
+    calibration_name: str,
 ) -> tuple[S, list[Block], int]:
     """Levenberg-Marquardt with fixed weights, until a step no longer lowers the cost."""
     damping, cost = 1e-6, _cost(blocks, weights, factors)
@@ -187,7 +189,7 @@ def _descend(
         side = factors**-2.0 @ sides
         while True:
             damped_normal = normal + damping * np.diag(np.diag(normal))
-            change = cho_solve(_factored(damped_normal, what), side)
+            change = cho_solve(_cholesky_factor(damped_normal, calibration_name), side)
             tried_state = move(state, change)
             tried_blocks = evaluate(tried_state)
             tried_cost = _cost(tried_blocks, weights, factors)
@@ -201,12 +203,13 @@ def _descend(
         if predicted_gain < 1e-7 or gain < 1e-12 * cost:  # a step of 3e-4 of the uncertainty
             return state, blocks, step
     raise InputError(
-        f"{what}: no convergence in {_MAX_STEPS} steps. Look for views of another board or camera, and take views "
+        f"{calibration_name}: no convergence in {_MAX_STEPS} steps. Look for views of another board or camera, "
+        f"and take views "
         "that differ more in tilt, roll and distance."
     )
 
 
-def _factored(normal: Floats, what: str) -> tuple[Floats, bool]:
+def _cholesky_factor(normal: Floats, calibration_name: str) -> tuple[Floats, bool]:
     """Cholesky factor of the normal matrix, scaled to a unit diagonal for the test of its rank."""
     diagonal = np.diag(normal)
     if (diagonal > 0).all():
@@ -219,7 +222,8 @@ def _factored(normal: Floats, what: str) -> tuple[Floats, bool]:
             if np.diag(factor).min() > _SINGULAR:
                 return np.asarray(factor / scale[:, None]), lower
     raise InputError(
-        f"{what}: the observations do not determine all parameters. Take views that differ more in tilt, roll and "
+        f"{calibration_name}: the observations do not determine all parameters. Take views that differ more in "
+        f"tilt, roll and "
         "distance, or leave fewer parameters free."
     )
 
@@ -241,7 +245,7 @@ def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: F
     others."""
     new_factors = factors.copy()
     for number, group in enumerate(groups):
-        if group.rejects and group.estimated:
+        if group.rejects and group.is_estimated:
             residuals = np.concatenate([b.residuals for b in blocks if b.group == number])
             new_factors[number] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
     return new_factors
@@ -250,53 +254,55 @@ def _robust_factors(blocks: Sequence[Block], groups: Sequence[Group], factors: F
 def _seen_factors(
     blocks: Sequence[Block],
     groups: Sequence[Group],
-    kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    accepted_masks: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     weights: Sequence[Floats],
     factors: Floats,
     parameters: int,
-    what: str,
+    calibration_name: str,
 ) -> Floats:
     """Noise of each group from its squared residuals over its redundancy."""
     matrices, _ = _normals(blocks, weights, len(groups), parameters)
-    covariance = _covariance(matrices, factors, what)
+    covariance = _covariance(matrices, factors, calibration_name)
     new_factors = factors.copy()
     for number, group in enumerate(groups):
-        if not group.estimated:
+        if not group.is_estimated:
             continue
-        chi2, count = _chi2(blocks, kept, number)
+        chi2, count = _chi2(blocks, accepted_masks, number)
         redundancy = count - float(np.sum(covariance * matrices[number])) / factors[number] ** 2
         if redundancy >= _LEAST_REDUNDANCY:
             new_factors[number] = max(np.sqrt(chi2 / redundancy), _LEAST_FACTOR)
     return new_factors
 
 
-def _covariance(matrices: Floats, factors: Floats, what: str) -> Floats:
+def _covariance(matrices: Floats, factors: Floats, calibration_name: str) -> Floats:
     normal = np.einsum("g,gij->ij", factors**-2.0, matrices)
-    return np.asarray(cho_solve(_factored(normal, what), np.eye(len(normal))))
+    return np.asarray(cho_solve(_cholesky_factor(normal, calibration_name), np.eye(len(normal))))
 
 
 def _chi2(
-    blocks: Sequence[Block], kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]], group: int
+    blocks: Sequence[Block], accepted_masks: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]], group: int
 ) -> tuple[float, int]:
-    pairs = [(b.residuals[k], int(k.sum())) for b, k in zip(blocks, kept, strict=True) if b.group == group]
+    pairs = [
+        (b.residuals[k], int(k.sum())) for b, k in zip(blocks, accepted_masks, strict=True) if b.group == group
+    ]
     return sum(float(r @ r) for r, _ in pairs), sum(count for _, count in pairs)
 
 
 def _reject(
     blocks: Sequence[Block],
     groups: Sequence[Group],
-    kept: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    accepted_masks: Sequence[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     factors: Floats,
 ) -> list[np.ndarray[tuple[int], np.dtype[np.bool_]]] | None:
     """Return masks of the residuals of each block that are within `REJECT_SIGMA`; None if no further one was
     rejected."""
     result = []
-    for block, before in zip(blocks, kept, strict=True):
+    for block, before in zip(blocks, accepted_masks, strict=True):
         size = groups[block.group].rejects
         limit = REJECT_SIGMA * factors[block.group] / np.sqrt(size or 1)
         good = np.repeat(_observations(block.residuals, size) <= limit, size) if size else before
         result.append(before & good)
-    is_unchanged = all((a == b).all() for a, b in zip(result, kept, strict=True))
+    is_unchanged = all((a == b).all() for a, b in zip(result, accepted_masks, strict=True))
     return None if is_unchanged else result
 
 
@@ -304,23 +310,23 @@ def _summary(
     state: S,
     blocks: list[Block],
     groups: Sequence[Group],
-    kept: list[np.ndarray[tuple[int], np.dtype[np.bool_]]],
+    accepted_masks: list[np.ndarray[tuple[int], np.dtype[np.bool_]]],
     weights: Sequence[Floats],
     factors: Floats,
     parameters: int,
-    what: str,
+    calibration_name: str,
     steps: int,
 ) -> Adjusted[S]:
     matrices, _ = _normals(blocks, weights, len(groups), parameters)
-    covariance = _covariance(matrices, factors, what)
+    covariance = _covariance(matrices, factors, calibration_name)
     components, contributions, redundancies = [], [], []
     for number, group in enumerate(groups):
         information = matrices[number] / factors[number] ** 2
         contributions.append(np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True))
-        chi2, count = _chi2(blocks, kept, number)
+        chi2, count = _chi2(blocks, accepted_masks, number)
         whole = sum(len(block.residuals) for block in blocks if block.group == number)
         redundancy = count - float(np.sum(covariance * information))
-        has_redundancy = group.estimated and redundancy >= _LEAST_REDUNDANCY
+        has_redundancy = group.is_estimated and redundancy >= _LEAST_REDUNDANCY
         redundancies.append(redundancy if has_redundancy else np.inf)
         size = group.rejects or 1
         components.append(Component(group.name, float(factors[number]), (whole - count) // size, redundancy, chi2))
@@ -334,6 +340,6 @@ def _summary(
         shares,
         degrees,
         tuple(block.residuals for block in blocks),
-        tuple(kept),
+        tuple(accepted_masks),
         steps,
     )

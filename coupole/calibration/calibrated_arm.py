@@ -58,15 +58,15 @@ def calibrated_poses(
     uncertainty of the zeros."""
     sensitivity = axis_sensitivity(arm.model, joints_deg)
     arm_prior = replace(prior, covariance=arm.covariance, axis_sensitivity=sensitivity[:, :, 1:])
-    return _moved(base_from_flange, sensitivity, arm), arm_prior
+    return _poses_with_zeros(base_from_flange, sensitivity, arm), arm_prior
 
 
 def corrected_poses(base_from_flange: Floats, joints_deg: Floats, arm: CalibratedArm) -> Floats:
     """Reported poses [v, 4, 4] corrected by the axis zeros."""
-    return _moved(base_from_flange, axis_sensitivity(arm.model, joints_deg), arm)
+    return _poses_with_zeros(base_from_flange, axis_sensitivity(arm.model, joints_deg), arm)
 
 
-def _moved(base_from_flange: Floats, sensitivity: Floats, arm: CalibratedArm) -> Floats:
+def _poses_with_zeros(base_from_flange: Floats, sensitivity: Floats, arm: CalibratedArm) -> Floats:
     steps = sensitivity @ arm.zeros_deg
     moves = np.broadcast_to(np.eye(4), base_from_flange.shape).copy()
     moves[:, :3, :3], moves[:, :3, 3] = rotation(steps[:, 3:]), steps[:, :3]

@@ -33,7 +33,7 @@ def read_accepted(path: Path, kind: Kind) -> Record:
     record = read_record(path)
     if record.kind != kind:
         raise InputError(f"{path}: expected a record of the kind `{kind}`, found one of `{record.kind}`")
-    failures = [limit for limit in record.limits if not limit.passed]
+    failures = [limit for limit in record.limits if not limit.is_met]
     if failures:
         why = "; ".join(
             f"{failure.what} is {failure.found:.3g} {failure.unit}, at most {failure.limit:.3g}"
@@ -43,18 +43,18 @@ def read_accepted(path: Path, kind: Kind) -> Record:
     return record
 
 
-def refuse_read_otherwise(path: Path, record: Record, given: Collection[str]) -> None:
+def refuse_read_otherwise(path: Path, record: Record, given_kinds: Collection[str]) -> None:
     """Raise InputError if a record of LEDs' powers was made with a response or a flat field and none is among the
-    kinds `given`, or the other way round: frames must be read as those were that the powers come from."""
+    kinds `given_kinds`, or the other way round: frames must be read as those were that the powers come from."""
     for kind in SHAPE_SIGNAL:
         read_with = record.fixed.get(READ_WITH + kind)
         beside = _made_with(path, record, kind)
-        if (read_with or (read_with is None and beside)) and kind not in given:
+        if (read_with or (read_with is None and beside)) and kind not in given_kinds:
             raise InputError(
                 f"{path}: was made with a {kind} record; without one frames would be read otherwise, and all that "
                 f"is found would be off. Name {beside or 'it'} too"
             )
-        if read_with == 0.0 and kind in given:
+        if read_with == 0.0 and kind in given_kinds:
             raise InputError(
                 f"{path}: was made without a {kind} record; with one frames would be read otherwise, and all that "
                 "is found would be off. Leave it out, or calibrate the LEDs' powers anew with it"
@@ -88,9 +88,10 @@ def _refuse_other(path: Path, record: Record, about: About, size_px: tuple[int, 
     """Raise InputError unless a record holds for these images: their time, camera, lens, focus, frame size and
     temperature."""
     holds = record.validity
-    if about.begun is not None and record.simulated != about.simulated:
+    if about.begun is not None and record.simulated != about.is_simulated:
         record_cell, images_cell = (
-            "a simulated cell" if source.simulated else "a real cell" for source in (record, about)
+            "a simulated cell" if is_simulated else "a real cell"
+            for is_simulated in (record.simulated, about.is_simulated)
         )
         raise InputError(f"{path}: was made in {record_cell}; the images are of {images_cell}")
     if about.begun is not None and about.begun >= holds.expires:

@@ -49,7 +49,7 @@ class Picture:
             return self.values
         return plane(self.values, self.pattern, channel)
 
-    def measured(self, channel: Channel = "green") -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def values_and_mask(self, channel: Channel = "green") -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """The values [H, W] with the pixels of one colour not interpolated, and which pixels these are: a tile [h,
         w] that repeats over the image."""
         if self.pattern in (COLOUR, MONO):

@@ -25,7 +25,7 @@ class Situation:
 
     now: datetime
     """Time now, with a time zone."""
-    simulated: bool
+    is_simulated: bool
     size_px: tuple[int, int]
     """Width and height of the camera's frames."""
     focal_length_mm: float
@@ -64,12 +64,14 @@ def read_in_force(paths: Sequence[Path], files: InputFiles | None = None) -> tup
     return tuple(records)
 
 
-def refusals(named: Sequence[InForce], here: Situation, needed: Sequence[str] = NEEDED) -> list[str]:
+def refusals(plan_records: Sequence[InForce], here: Situation, needed_kinds: Sequence[str] = NEEDED) -> list[str]:
     """Return the reasons why a plan that names these records must not be acquired here; empty if it may."""
-    counts = Counter[str](item.record.kind for item in named)
-    reasons = [f"calibrations: no record of the kind `{kind}` is named" for kind in needed if not counts[kind]]
+    counts = Counter[str](item.record.kind for item in plan_records)
+    reasons = [
+        f"calibrations: no record of the kind `{kind}` is named" for kind in needed_kinds if not counts[kind]
+    ]
     reasons += [f"calibrations: {n} records of the kind `{kind}` are named" for kind, n in counts.items() if n > 1]
-    for item in named:
+    for item in plan_records:
         reasons += [f"{item.path}: {reason}" for reason in _record_refusals(item.record, here)]
     return reasons
 
@@ -82,14 +84,14 @@ def _record_refusals(record: Record, here: Situation) -> list[str]:
         reasons.append(
             f"made on {record.created:%Y-%m-%d %H:%M} UTC, which is in the future. Set this machine's clock"
         )
-    if record.simulated and not here.simulated:
+    if record.simulated and not here.is_simulated:
         reasons.append("made with a simulated camera; this cell is real")
-    if here.simulated and not record.simulated:
+    if here.is_simulated and not record.simulated:
         reasons.append("made in a real cell; this one is simulated")
     reasons += [
         f"not accepted: {limit.what} is {limit.found:.4g} {limit.unit}, at most {limit.limit:.4g} is allowed"
         for limit in record.limits
-        if not limit.passed
+        if not limit.is_met
     ]
     if holds.focus_distance_mm is not None:
         off_mm = abs(holds.focus_distance_mm - here.focus_distance_mm)

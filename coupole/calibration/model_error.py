@@ -136,13 +136,13 @@ class _Fit:
         self.root = np.sqrt(values[usable])[:, None] * vectors[:, usable].T
         self.seen = (vectors[:, usable].T @ side) / np.sqrt(values[usable])
 
-    def _spread(self, logs: Floats) -> Floats:
+    def _prior_variances(self, logs: Floats) -> Floats:
         """[modes] prior variances."""
         return np.asarray(np.exp(logs[1:])[self.of_mode])
 
     def _variance(self, logs: Floats) -> Floats:
         return np.asarray(
-            np.exp(logs[0]) * np.eye(len(self.seen)) + (self.root * self._spread(logs)) @ self.root.T
+            np.exp(logs[0]) * np.eye(len(self.seen)) + (self.root * self._prior_variances(logs)) @ self.root.T
         )
 
     def minus_twice_log_likelihood(self, logs: Floats, redundancy: float) -> float:
@@ -156,12 +156,12 @@ class _Fit:
         unexplained_chi2 = max(self.chi2 - float(self.seen @ self.seen), 0.0)
         return modes_part + rest * float(logs[0]) + unexplained_chi2 * float(np.exp(-logs[0]))
 
-    def most_likely(self, redundancy: float, allowed: Sequence[bool]) -> Floats:
+    def most_likely(self, redundancy: float, allowed_suspects: Sequence[bool]) -> Floats:
         """[1 + suspects] those logarithms; suspects that are not allowed have none."""
-        free = np.flatnonzero([True, *allowed])
+        free = np.flatnonzero([True, *allowed_suspects])
         start = np.full(1 + len(self.suspects), _LEAST_LOG)
         start[0] = 0.0
-        for number in np.flatnonzero(allowed):
+        for number in np.flatnonzero(allowed_suspects):
             information = np.mean(np.sum(self.root[:, self.of_mode == number] ** 2, axis=0))
             start[1 + number] = -np.log(max(float(information), 1e-12))
         bounds = [(-12.0, 3.0) if place == 0 else (start[place] - 14.0, start[place] + 14.0) for place in free]
@@ -177,7 +177,7 @@ class _Fit:
         return best
 
     def result(self, logs: Floats, redundancy: float, noise: float) -> ModelError:
-        variances = self._spread(logs)
+        variances = self._prior_variances(logs)
         factor = cho_factor(self._variance(logs))
         gain = variances[:, None] * self.root.T
         coefficients = gain @ cho_solve(factor, self.seen)

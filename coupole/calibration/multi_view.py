@@ -88,15 +88,20 @@ def seen_points(
             return []
         nearest, off_px = _nearest(points, views, camera_from_base, vector, depth_mm)
         agreeing = off_px <= tolerance_px
-        points = _refined(points, nearest, agreeing, rays, views)
+        points = _refined_points(points, nearest, agreeing, rays, views)
         enough = agreeing.sum(axis=1) >= least_views
         points = points[enough]
     nearest, off_px = _nearest(points, views, camera_from_base, vector, depth_mm)
-    return _chosen(points, nearest, off_px, tolerance_px, least_views)
+    return _best_points(points, nearest, off_px, tolerance_px, least_views)
 
 
 def _crossings(
-    a: CameraView, rays_a: Floats, b: CameraView, rays_b: Floats, depth_mm: tuple[float, float], spread: float
+    a: CameraView,
+    rays_a: Floats,
+    b: CameraView,
+    rays_b: Floats,
+    depth_mm: tuple[float, float],
+    tolerance_rad: float,
 ) -> Floats:
     """Midpoints [n, 3] of all pairs of rays that intersect within the tolerance in pixels, at allowed depths."""
     apart = b.base_from_camera[:3, 3] - a.base_from_camera[:3, 3]
@@ -108,7 +113,7 @@ def _crossings(
     on_b = b.base_from_camera[:3, 3] + t[..., None] * rays_b[None]
     gap_mm = np.linalg.norm(on_a - on_b, axis=2)
     near, far = depth_mm
-    good = (s > near) & (s < far) & (t > near) & (t < far) & (gap_mm < spread * (s + t)) & (sine2 > 1e-4)
+    good = (s > near) & (s < far) & (t > near) & (t < far) & (gap_mm < tolerance_rad * (s + t)) & (sine2 > 1e-4)
     return np.asarray((on_a[good] + on_b[good]) / 2)
 
 
@@ -137,7 +142,7 @@ def _nearest(
     return nearest, off_px
 
 
-def _refined(
+def _refined_points(
     points: Floats,
     nearest: np.ndarray[tuple[int, int], np.dtype[np.intp]],
     agreeing: np.ndarray[tuple[int, int], np.dtype[np.bool_]],
@@ -160,7 +165,7 @@ def _refined(
     return moved_points
 
 
-def _chosen(
+def _best_points(
     points: Floats,
     nearest: np.ndarray[tuple[int, int], np.dtype[np.intp]],
     off_px: Floats,

@@ -37,8 +37,8 @@ Pairs = tuple[Indices, Indices]
 class Matched:
     """Pairs of points, and the motion between them by least squares."""
 
-    found: Indices
-    known: Indices
+    found_rows: Indices
+    known_rows: Indices
     found_from_known: Floats
     """4x4, mm."""
     rms_mm: float
@@ -142,7 +142,7 @@ def _rms(motion: Floats, found_mm: Floats, known_mm: Floats, pairs: Pairs) -> fl
     return float(np.sqrt(np.mean(np.sum((brought - found_mm[pairs[0]]) ** 2, axis=1))))
 
 
-def _differ(motion: Floats, other: Floats, known_mm: Floats, tolerance_mm: float) -> bool:
+def _differ(motion: Floats, other_motion: Floats, known_mm: Floats, tolerance_mm: float) -> bool:
     """True if two motions bring the known points to different places."""
-    apart = known_mm @ (motion[:3, :3] - other[:3, :3]).T + motion[:3, 3] - other[:3, 3]
+    apart = known_mm @ (motion[:3, :3] - other_motion[:3, :3]).T + motion[:3, 3] - other_motion[:3, 3]
     return bool(np.linalg.norm(apart, axis=1).max() > 5 * tolerance_mm)

@@ -85,7 +85,7 @@ def read_poses(path: Path) -> tuple[PoseFile, ReportedPoses]:
     return file, ReportedPoses(np.array(list(file.poses.values())), convention)
 
 
-def reported(base_from_flange_mm: Floats) -> ReportedPoses:
+def kuka_poses(base_from_flange_mm: Floats) -> ReportedPoses:
     """Transforms [n, 4, 4] as a KUKA controller would write them."""
     numbers = [[*t[:3, 3], *abc_from_rotation(t[:3, :3])] for t in base_from_flange_mm]
     return ReportedPoses(np.array(numbers), Convention())

@@ -121,7 +121,7 @@ class Limit(Model):
     """Default of the limit if the operator set another; else None."""
 
     @property
-    def passed(self) -> bool:
+    def is_met(self) -> bool:
         return self.found <= self.limit
 
 
@@ -182,8 +182,8 @@ class Record(Model):
     sha256: Sha256
 
     @property
-    def passed(self) -> bool:
-        return all(limit.passed for limit in self.limits)
+    def is_accepted(self) -> bool:
+        return all(limit.is_met for limit in self.limits)
 
     @property
     def covariance_matrix(self) -> NDArray[np.float64]:
@@ -195,7 +195,7 @@ class Record(Model):
         return figures[name]
 
 
-def sealed(**content: Any) -> Record:
+def seal_record(**content: Any) -> Record:
     """A record of this content, with its hash. Raises pydantic's ValidationError for invalid content."""
     draft = Record.model_construct(**content, schema_version=1, sha256="")
     plain = json.loads(draft.model_dump_json(exclude={"sha256"}))

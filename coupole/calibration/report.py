@@ -73,7 +73,7 @@ def draw(outcome: Outcome) -> bytes:
     FigureCanvasAgg(figure)
     outcome.draw(figure)
     record = outcome.record
-    verdict = "accepted" if record.passed else "NOT ACCEPTED"
+    verdict = "accepted" if record.is_accepted else "NOT ACCEPTED"
     images = f": {len(record.images)} images" if record.images else ""
     title = f"{record.kind} calibration {record.name}{images}, {verdict}"
     figure.suptitle(title + (" (simulated)" if record.simulated else ""), fontsize=16, color=DARK)
@@ -108,10 +108,10 @@ def table(head: str, rows: Sequence[str]) -> str:
 
 
 def _limits(record: Record) -> str:
-    verdict = "<p class=ok><b>Accepted.</b>" if record.passed else "<p class=bad><b>Not accepted.</b>"
+    verdict = "<p class=ok><b>Accepted.</b>" if record.is_accepted else "<p class=bad><b>Not accepted.</b>"
     rows = [
         f"<td>{html.escape(limit.what)}<td class=n>{limit.found:.3g}<td class=n>{limit.limit:.3g}"
-        f"<td>{limit.unit}<td class={'ok>met' if limit.passed else 'bad>missed'}"
+        f"<td>{limit.unit}<td class={'ok>met' if limit.is_met else 'bad>missed'}"
         f"<td>{'' if limit.name is None else f'<code>{limit.name}</code>'}"
         f"{'' if limit.usual is None else f', usually {limit.usual:.3g}'}"
         for limit in record.limits

@@ -70,7 +70,7 @@ def nearest_rotation(matrices: ArrayLike) -> Floats:
     return np.asarray(u * signs[..., None, :] @ vt)
 
 
-def moved(a_from_b: Floats, steps: Floats) -> Floats:
+def moved_transforms(a_from_b: Floats, steps: Floats) -> Floats:
     """Transforms [..., 4, 4] after small steps [..., 6]: translation added (mm), rotation from the right (rad)."""
     result = a_from_b.copy()
     result[..., :3, 3] += steps[..., :3]
@@ -78,10 +78,10 @@ def moved(a_from_b: Floats, steps: Floats) -> Floats:
     return result
 
 
-def between(a_from_b: Floats, other: Floats) -> Floats:
+def between(a_from_b: Floats, other_transforms: Floats) -> Floats:
     """The step [..., 6] (mm, rad) that `moved` needs from the first transforms to the others."""
-    turn = np.swapaxes(a_from_b[..., :3, :3], -1, -2) @ other[..., :3, :3]
-    return np.concatenate([other[..., :3, 3] - a_from_b[..., :3, 3], rotation_vector(turn)], axis=-1)
+    turn = np.swapaxes(a_from_b[..., :3, :3], -1, -2) @ other_transforms[..., :3, :3]
+    return np.concatenate([other_transforms[..., :3, 3] - a_from_b[..., :3, 3], rotation_vector(turn)], axis=-1)
 
 
 def inverses(a_from_b: Floats) -> Floats:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.grey_image import COLOUR, Picture
-from coupole.calibration.poses import PoseFile, ReportedPoses, read_poses, reported
+from coupole.calibration.poses import PoseFile, ReportedPoses, kuka_poses, read_poses
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 from coupole.storage.durable import sha256
@@ -39,7 +39,7 @@ _CLIPPED = 0.02
 class About:
     """The camera that took the images. What is None is not known."""
 
-    simulated: bool
+    is_simulated: bool
     camera: str | None = None
     focal_length_mm: float | None = None
     focus_distance_mm: float | None = None
@@ -55,7 +55,7 @@ class Source:
     """One image, read when it is used."""
 
     name: str
-    read: Callable[[], Picture]
+    read_picture: Callable[[], Picture]
     joints_deg: tuple[float, ...] | None = None
 
 
@@ -82,7 +82,7 @@ def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
     """
     runs = [path for path in paths if (path / "run.json").is_file()]
     if runs and len(runs) == len(paths) and poses is None:
-        return _joined([_of_run(Run(path)) for path in runs])
+        return _joined_sources([_of_run(Run(path)) for path in runs])
     if runs:
         raise InputError(f"{runs[0]}: a run, which has its own poses: give runs only, or one folder of pictures")
     if len(paths) != 1:
@@ -112,7 +112,7 @@ def _of_folder(folder: Path, poses: Path | None) -> Sources:
     files = [*pictures, *([path] if file else [])]
     inputs = tuple((f"{folder.resolve().name}/{file_.name}", sha256(file_)) for file_ in files)
     images = tuple(Source(picture.name, partial(_picture, picture)) for picture in pictures)
-    return Sources(images, numbers, About(simulated=False), inputs)
+    return Sources(images, numbers, About(is_simulated=False), inputs)
 
 
 def _picture(path: Path) -> Picture:
@@ -135,7 +135,7 @@ def _of_run(run: Run) -> Sources:
     for shot, frame in run.proven().items():
         by_view.setdefault(shot.view, []).append(frame)
     images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
-    about = About(simulated=run.simulated)
+    about = About(is_simulated=run.simulated)
     lit_records: list[np.void] = []
     for view, frames in by_view.items():
         path = run.view_path(view)
@@ -155,7 +155,7 @@ def _of_run(run: Run) -> Sources:
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
     about = replace(about, temperature_c=temperature_range_c(lit_records), begun=run.created)
-    return Sources(tuple(images), reported(np.stack(flanges)), about, tuple(inputs))
+    return Sources(tuple(images), kuka_poses(np.stack(flanges)), about, tuple(inputs))
 
 
 def _at_one_pose(frames: Sequence[FrameProven], table: NDArray[np.void]) -> list[FrameProven]:
@@ -169,14 +169,14 @@ def _mean_frame(name: str, file: View, lit: Sequence[FrameProven], dark: Sequenc
     exposures = {frame.shot: int(file.records[frame.index]["exposure_us"]) for frame in (*lit, *dark)}
     for exposure_us in sorted({exposures[frame.shot] for frame in lit}, reverse=True):
         exposure_frames = [frame for frame in lit if exposures[frame.shot] == exposure_us]
-        frames = [file.proven_pixels(frame) for frame in _spread(exposure_frames)]
+        frames = [file.proven_pixels(frame) for frame in _evenly_chosen(exposure_frames)]
         clipped_share = np.mean([np.mean(frame >= file.white_dn) for frame in frames])
         if clipped_share < _CLIPPED:
             break
     mean = _mean(frames)
     darks = [frame for frame in dark if exposures[frame.shot] == exposure_us]
     if darks:
-        black = np.mean([file.proven_pixels(frame) for frame in _spread(darks)], axis=0, dtype=np.float64)
+        black = np.mean([file.proven_pixels(frame) for frame in _evenly_chosen(darks)], axis=0, dtype=np.float64)
     else:
         black = np.full(mean.shape, float(file.black_dn))
     white = file.white_dn - float(black.mean())
@@ -191,7 +191,7 @@ def _mean(frames: Sequence[NDArray[np.uint16]]) -> Floats:
     return total / len(frames)
 
 
-def _spread(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
+def _evenly_chosen(frames: Sequence[FrameProven]) -> Iterator[FrameProven]:
     """Return at most `_MOST_FRAMES` of the frames, evenly over the list."""
     step = max(1, -(-len(frames) // _MOST_FRAMES))
     return iter(frames[::step])
@@ -207,7 +207,7 @@ def about_of(run: Run, file: View) -> About:
     """Camera and lens by the attributes of a view's file. Raises StorageError."""
     camera = file.attributes.get("camera")
     return About(
-        simulated=run.simulated,
+        is_simulated=run.simulated,
         camera=str(camera) if camera is not None else None,
         focal_length_mm=file.number("focal_length_mm"),
         focus_distance_mm=file.number("focus_distance_mm"),
@@ -215,7 +215,7 @@ def about_of(run: Run, file: View) -> About:
     )
 
 
-def _joined(parts: Sequence[Sources]) -> Sources:
+def _joined_sources(parts: Sequence[Sources]) -> Sources:
     """Several runs as one. Raises InputError if they were taken with different lenses or cameras."""
     first = parts[0]
     for part in parts[1:]:
@@ -226,7 +226,7 @@ def _joined(parts: Sequence[Sources]) -> Sources:
     flanges: list[Floats] = [part.poses.base_from_flange for part in parts if part.poses is not None]
     return Sources(
         tuple(image for part in parts for image in part.images),
-        reported(np.concatenate(flanges)),
+        kuka_poses(np.concatenate(flanges)),
         replace(
             first.about,
             temperature_c=(min(warm), max(warm)) if warm else None,

@@ -53,7 +53,7 @@ def bracket(
             curve = camera_response.found_response(photos)
         response = camera_response.linear_response(curve.noise) if linear or photos.raw else curve
         with console.status("merging"):
-            picture = exposure_merging.merged(photos, response)
+            picture = exposure_merging.merge_exposures(photos, response)
             first, last = photos.exposure_s[[0, -1]]
             description = f"merged from {len(photos.paths)} photographs, {first:g} to {last:g} s"
             remark = "" if linear or photos.raw else camera_response.left_open(photos.exposure_s)
@@ -100,7 +100,7 @@ def sphere_brdf(
             table = fitting.table_of(samples)
             off = fitting.misses(samples, table)
         with console.status("writing"):
-            write_synced(out, encode_reflectance(fitting.evaluated(table)))
+            write_synced(out, encode_reflectance(fitting.table_function(table)))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -136,7 +136,7 @@ def _document(
             "ln_exposure": curve.log_exposure[steps].tolist(),
             "u_ln_exposure": np.where(np.isfinite(sigma), sigma, -1.0).tolist(),
         },
-        "saturated": float(merged.saturated.any(axis=2).mean()),
+        "saturated": float(merged.saturation_mask.any(axis=2).mean()),
         "dark": float(merged.dark.any(axis=2).mean()),
         "median_uncertainty": float(np.median(merged.uncertainty[is_finite])) if is_finite.any() else None,
     }

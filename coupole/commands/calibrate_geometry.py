@@ -104,7 +104,7 @@ def leds(
         with console.status("adjusting boards, poses, lens and hand-eye"):
             arm = arm_of(cell, hand_eye)
             calibration = leds_from(
-                images, table, prior, request, stated=tolerances, arm=arm, accept_faults=accept_faults
+                images, table, prior, request, stated_noise=tolerances, arm=arm, accept_faults=accept_faults
             )
         return Outcome(calibration.record, partial(draw_leds, calibration), calibration.files)
 
@@ -139,7 +139,7 @@ def mesh(
         scanned_mesh, sources = read_scan(scan), open_sources(runs, None)
         for made_with in (hand_eye, camera, rig):
             sources = sources.with_file(made_with)
-        size_px = sources.images[0].read().size_px
+        size_px = sources.images[0].read_picture().size_px
         prior = read_posed_camera(hand_eye, camera, sources.about, size_px)
         depth_mm = (stickers.nearest_mm, stickers.farthest_mm)
         with bar(console, "looking for stickers") as progress:
@@ -158,7 +158,7 @@ def mesh(
             scanned_mesh,
             prior,
             request,
-            stated=tolerances,
+            stated_noise=tolerances,
             depth_mm=depth_mm,
             base_from_support=support,
             arm=arm,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from coupole.calibration.acceptance import Allowed, asked, words_of
+from coupole.calibration.acceptance import Allowed, parse_limits, words_of
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.option_groups import flattened
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
@@ -163,7 +163,9 @@ def _calibrate(
     now = datetime.now(UTC)
     try:
         _refuse_name(name)
-        request = Request(name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=asked(limit or (), limits))
+        request = Request(
+            name or f"{kind}-{now:%Y%m%d}", now, valid_days, lens, limits=parse_limits(limit or (), limits)
+        )
         record_path = out / f"{request.name}.yaml"
         for path in (out / f"{request.name}{suffix}" for suffix in _SUFFIXES):
             if path.exists():
@@ -183,13 +185,13 @@ def _calibrate(
             "picture": str(picture.resolve()),
         }
         print(json.dumps(files | _figures(record)))
-    if not record.passed:
+    if not record.is_accepted:
         raise CalibrationRefused(
             [
                 f"{record_path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most "
                 f"{limit.limit:.3g} is allowed"
                 for limit in record.limits
-                if not limit.passed
+                if not limit.is_met
             ]
             + [fault.text for fault in record.faults if fault.is_wrong][:_MOST_FAULTS]
         )
@@ -233,7 +235,7 @@ def _show(console: Console, record: Record) -> None:
     for remark in record.remarks:
         console.print(f"[yellow]{remark}[/]")
     for limit in record.limits:
-        colour, how = ("green", "met") if limit.passed else ("red", "missed")
+        colour, how = ("green", "met") if limit.is_met else ("red", "missed")
         usual = "" if limit.usual is None else f", usually {limit.usual:.3g}"
         name = "" if limit.name is None else f", --limit {limit.name}"
         console.print(
@@ -246,7 +248,7 @@ def _figures(record: Record) -> dict[str, Any]:
     """The figures, for JSON."""
     return {
         "kind": record.kind,
-        "accepted": record.passed,
+        "accepted": record.is_accepted,
         "sha256": record.sha256,
         "images": len(record.images),
         "corners": sum(image.corners for image in record.images),
@@ -254,7 +256,7 @@ def _figures(record: Record) -> dict[str, Any]:
         "parameters": {p.name: {"value": p.value, "u": p.u} for p in record.parameters},
         "transforms": {name: pose.model_dump() for name, pose in record.transforms.items()},
         "noise": {n.name: {"found": n.found, "stated": n.stated, "unit": n.unit} for n in record.noise},
-        "limits": [{**limit.model_dump(), "passed": limit.passed} for limit in record.limits],
+        "limits": [{**limit.model_dump(), "passed": limit.is_met} for limit in record.limits],
         "faults": [asdict(fault) for fault in record.faults],
         "remarks": list(record.remarks),
     }

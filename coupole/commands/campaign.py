@@ -85,7 +85,7 @@ class Campaign:
 
         for kind in step.records:
             path = self._record(kind)
-            excesses = [limit for limit in read_record(path).limits if not limit.passed] if path.is_file() else []
+            excesses = [limit for limit in read_record(path).limits if not limit.is_met] if path.is_file() else []
             if excesses:
                 raise CalibrationRefused(
                     [

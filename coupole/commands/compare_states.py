@@ -54,7 +54,7 @@ def compare(
         if out is not None and out.exists():
             raise InputError(f"--out {out}: exists already; name a new folder")
         with step_bars(console) as say:
-            changes = compared(before, after, unit, noise_mm, aligned=aligned, say=say)
+            changes = compared(before, after, unit, noise_mm, is_aligned=aligned, say=say)
             facts = about(changes)
             if out is not None:
                 say("drawing", 0, 1)

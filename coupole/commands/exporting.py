@@ -170,7 +170,7 @@ def _export_colmap(asked: Asked, console: Console) -> Found:
                 asked.source,
                 asked.out,
                 records=asked.records,
-                refined=asked.path("refined"),
+                refined_folder=asked.path("refined"),
                 overwrite=asked.overwrite,
                 say=say,
             ),

@@ -131,7 +131,7 @@ def _found(
 ) -> list[tuple[LibrarySpectrum, Finding]]:
     from coupole.appearance.spectra.spectra_library import read_library
     from coupole.heritage.analysis import identification
-    from coupole.heritage.analysis.references import measured
+    from coupole.heritage.analysis.references import trimmed_spectrum
     from coupole.viewing.terminal import step_bars
 
     spectra = [spectrum for path in paths for spectrum in read_library(path, unit=unit)]
@@ -142,7 +142,7 @@ def _found(
     with step_bars(console) as say:
         for count, spectrum in enumerate(spectra):
             say("identify", count, len(spectra))
-            findings.append((spectrum, identification.identify(measured(spectrum), references)))
+            findings.append((spectrum, identification.identify(trimmed_spectrum(spectrum), references)))
         say("identify", len(spectra), len(spectra))
     return findings
 

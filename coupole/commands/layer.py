@@ -168,14 +168,13 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
     fit = layer_fit.fit(samples.films, samples.face, given.noise)
     four = None
     if samples.directional is None:
-        model = layer_model.deserved(fit, samples.films, samples.face, given.noise)
+        model = layer_model.deserved_model(fit, samples.films, samples.face, given.noise)
     else:
         black, white = samples.films
         four = four_flux_fit.fit(black, white, samples.directional, samples.face, given.noise)
-        light = samples.directional
-        model = layer_model.deserved_by_measurement(
-            (black.seen, white.seen), (light.over_black, light.over_white), light.transmittance, given.noise
-        )
+        light, reflectances = samples.directional, (black.reflectance, white.reflectance)
+        directional = light.over_black, light.over_white
+        model = layer_model.deserved_by_measurement(reflectances, directional, light.transmittance, given.noise)
     paint = paint_file(given, samples, fit, four)
     document: dict[str, Any] = {
         "name": given.name,
@@ -184,7 +183,7 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
             "deserved": model.model,
             "because": model.because,
             "difference": model.difference,
-            "unscattered": model.unscattered,
+            "unscattered": model.unscattered_share,
         },
         "coverage": 0.95,
         "wavelength_nm": samples.wavelengths_nm.tolist(),
@@ -192,7 +191,7 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
         "S": fit.scattering.tolist(),
         "half_width_K": (layer_fit.COVERAGE_FACTOR * fit.u_absorption).tolist(),
         "half_width_S": (layer_fit.COVERAGE_FACTOR * fit.u_scattering).tolist(),
-        "determined": fit.determined.tolist(),
+        "determined": fit.determined_bands.tolist(),
         "spectra": fit.spectra,
         "misfit": _misfit(fit),
     }

@@ -74,14 +74,14 @@ def makie(
         raise
     if as_json:
         lacquers = [rgb.tolist() for rgb in bare]
-        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers, "clamped": parts.clamped}
-        print(json.dumps(document))
+        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers}
+        print(json.dumps(document | {"clamped": parts.clamped_share}))
         return
     console.print(f"{out}: {float(parts.alpha.mean()):.1%} of the picture is metal", markup=False)
-    if parts.clamped > _TOLD_FROM:
+    if parts.clamped_share > _TOLD_FROM:
         console.print(
-            f"of {parts.clamped:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: noise, "
-            "shadow, or a colour that --metal or --lacquer do not name",
+            f"of {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
+            "noise, shadow, or a colour that --metal or --lacquer do not name",
             markup=False,
         )
 

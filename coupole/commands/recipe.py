@@ -115,14 +115,14 @@ def _found(
         search = find(spectrum_on_grid(target), paints, face, noise, at_most)
     except InputError as error:
         raise InputError(f"{target}: {error}" if str(target) not in str(error) else str(error)) from error
-    return search, [matches(search.target, mixture.seen, lights, observer) for mixture in search.recipes]
+    return search, [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
 
 
 def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:
     return {
         "verdict": found.verdict(),
         "explained": found.is_explained,
-        "chosen": found.chosen + 1,
+        "chosen": found.chosen_index + 1,
         "noise": found.noise,
         "bands": int(found.bands.sum()),
         "told_within": {name: found.told_within(name) for name in found.best.shares},
@@ -175,14 +175,14 @@ def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> 
         words = "yes" if within <= TOLD_WITHIN else f"no, {100 * within:.0f} %"
         table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %", words)
     console.print(table)
-    for match in matches[found.chosen]:
+    for match in matches[found.chosen_index]:
         metamerism = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
         console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{metamerism}", markup=False)
     console.print(f"{found.verdict()}.", markup=False)
     for rival in found.rivals[:_FEWER]:
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
         console.print(f"not told from it at a noise of {found.noise:g}: {shares}", markup=False)
-    for number in range(found.chosen - 1, max(-1, found.chosen - _FEWER), -1):
+    for number in range(found.chosen_index - 1, max(-1, found.chosen_index - _FEWER), -1):
         fewer = found.recipes[number]
         words = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())
         costs = ", ".join(f"{match.delta_e00:.2f} under {match.light}" for match in matches[number])

@@ -139,7 +139,7 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in this view")
     lights, intensities, mask = (folder / name for name in uncalibrated.FILES)
     picture_set = read_pictures(folder, lights, intensities=intensities, mask=mask)
-    picture_set = replace(picture_set, uncalibrated_run=run.resolve().name, simulated=view_pictures.simulated)
+    picture_set = replace(picture_set, uncalibrated_run=run.resolve().name, simulated=view_pictures.is_simulated)
     about = fit_pictures(picture_set, out, left_out=[view_pictures.leds.index(led) for led in left_out], say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 

@@ -127,7 +127,7 @@ class SamplesOfRuns:
         return RunRequest(
             tuple(runs), self.mesh, records_named(self.calibrations or []), tuple(left_out), self.scan_noise_um,
             support_reflectance=self.support_reflectance, keep_inter_reflection=self.keep_inter_reflection,
-            refined=self.refined, poses=self.poses,
+            refined_folder=self.refined, poses=self.poses,
         )  # fmt: skip
 
 

@@ -133,8 +133,8 @@ def _merged(
 ) -> Merged:
     from coupole.scan.registration.merging import default_cell_mm, merge
 
-    scans = [found.scans[k] for k in found.placed]
-    poses = [found.first_from_scan[k] for k in found.placed]
+    scans = [found.scans[k] for k in found.placed_numbers]
+    poses = [found.first_from_scan[k] for k in found.placed_numbers]
     return merge(scans, poses, unit, mesh_mm or default_cell_mm(scans), levels_mm, folder, say)
 
 

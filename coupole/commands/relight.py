@@ -266,11 +266,11 @@ def _write(
     import numpy as np
 
     from coupole.exchange.video_files import write_video
-    from coupole.reflectance.new_light.light_kinds import turned
+    from coupole.reflectance.new_light.light_kinds import turn_light
 
     def frame(number: int) -> NDArray[np.float32]:
         angle_deg = 360.0 * number / turn
-        return relit.picture([turned(light, angle_deg) for light in lights], lambda done, of: None)
+        return relit.picture([turn_light(light, angle_deg) for light in lights], lambda done, of: None)
 
     if white is None:
         numbers = sorted({number * turn // _LOOKED_AT for number in range(_LOOKED_AT)})

@@ -99,7 +99,7 @@ def write_relit_for_the_eye(
         )
     linear = linear_colours(relit.picture(lights, lambda done, of: bars("light", done, of)), colour)
     white = white or float(np.quantile(bright(linear), PEAK_QUANTILE)) or 1.0
-    about = {**relit.about, "colour": colour.told.partition("; white")[0], "white": white}
+    about = {**relit.about, "colour": colour.origin.partition("; white")[0], "white": white}
     write_for_the_eye(to, linear, white, about)
     return {"picture": str(to.resolve()), **about}
 

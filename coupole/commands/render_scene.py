@@ -50,7 +50,7 @@ def render(
         if step not in {None, 5, 10, 20, 40}:
             raise InputError(f"--step: expected 5, 10, 20 or 40, found {step}; choose one of them")
         document, settings = read_scene(scene)
-        settings = studio.reduced(settings, samples=samples, width_px=width, step_nm=step, noise=noise)
+        settings = studio.reduced_scene(settings, samples=samples, width_px=width, step_nm=step, noise=noise)
         console.print(f"{settings.name}: Mitsuba, {studio.variant_of(settings)}")
         with Progress(console=console, disable=not console.is_terminal) as bars:
             tasks: dict[str, TaskID] = {}

@@ -109,8 +109,8 @@ def read(
     from coupole.heritage.restoration.restoring import Restoration
 
     document, materials_file = restoration_file.read_restoration(materials)
-    materials_file = restoration_file.reduced(materials_file, *reduced)
-    hypotheses = restoration_file.chosen(document, materials_file, names)
+    materials_file = restoration_file.reduced_file(materials_file, *reduced)
+    hypotheses = restoration_file.chosen_hypotheses(document, materials_file, names)
     rules_document, rules = parts_file.read_parts(parts)
     say("reading the mesh", 0, 2)
     painted_mesh = read_painted(mesh, unit)

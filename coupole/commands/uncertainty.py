@@ -240,7 +240,7 @@ def _show(console: Console, found: Budget) -> None:
             share.said_by,
             f"{share.alone:.2%}",
             f"{share.linear:.1%}",
-            f"{share.removed:.1%}",
+            f"{share.width_decrease:.1%}",
         )
     console.print(table)
     for interval in found.numeric.intervals:
@@ -268,7 +268,7 @@ def _show_accuracies(console: Console, result: _Result) -> None:
     )
     table.add_row("robot's noise, found", "", *(case.robot for case in cases))
     for line in result.table:
-        table.add_row(line.what, line.paper, *(line.cell(number) for number in range(len(cases))))
+        table.add_row(line.quantity, line.paper, *(line.cell(number) for number in range(len(cases))))
     console.print()
     console.print(table)
     console.print("standard uncertainties, all directions together; samples over a dome: their 68 % intervals")

@@ -40,7 +40,7 @@ class CameraColour:
     xyz_from_balanced: Floats | None
     """[3, 3] XYZ under D65, Y = 1 for white, of red, green, blue of which white has 1, 1, 1; None: not known."""
     neutral: Neutral
-    told: str
+    origin: str
     """Origin of this knowledge, in words."""
 
 

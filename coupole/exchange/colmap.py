@@ -58,20 +58,20 @@ def export_colmap(
     out: Path,
     *,
     records: Sequence[Path] = (),
-    refined: Path | None = None,
+    refined_folder: Path | None = None,
     overwrite: bool,
     say: Callable[[str, int, int], None],
 ) -> list[Path]:
     """Write `images/VIEW.png` (8 bit, sRGB, the mean of some 48 frames of the view) and `sparse/0` with cameras,
     images and points: centres of at most 50 000 triangles that two views or more see, with these views. Poses and
-    lens are of the run's records, or of those that are named, or of `refined`, a folder of `coupole reflectance
-    refine`.
+    lens are of the run's records, or of those that are named, or of `refined_folder`, a folder of `coupole
+    reflectance refine`.
 
     Raises InputError: records or mesh are missing, files stand there already (unless `overwrite`); StorageError.
     """
     measured_run = read_measured_run(folder, records=records)
-    if refined is not None:
-        measured_run = read_refined(refined).of(measured_run)
+    if refined_folder is not None:
+        measured_run = read_refined(refined_folder).of(measured_run)
     model = out / MODEL
     pictures = [out / PICTURES / f"{view.name}.png" for view in measured_run.views]
     texts = [model / name for name in ("cameras.txt", "images.txt", "points3D.txt")]
@@ -81,11 +81,11 @@ def export_colmap(
     views = []
     with writing_into(model), writing_into(out / PICTURES):
         for number, (view, path) in enumerate(zip(measured_run.views, pictures, strict=True)):
-            views.append(_posed(measured_run, view, mesh))
+            views.append(_posed_picture(measured_run, view, mesh))
             write_synced(path, cv2.imencode(".png", views[-1].codes)[1].tobytes())
             say("views", number + 1, len(pictures))
         centres_mm = apply(inverse(measured_run.base_from_support), measured_run.corners_mm.mean(axis=1))
-        origin = "refined by overlapping views" if refined is not None else "by the run's calibrations"
+        origin = "refined by overlapping views" if refined_folder is not None else "by the run's calibrations"
         source = "simulated" if measured_run.run.simulated else "measured"
         head = (
             f"# Coupole {coupole.__version__}: {measured_run.run.folder.name}, {source}; {origin}; world in mm\n"
@@ -110,9 +110,11 @@ def camera_text(lens: Intrinsics, size_px: tuple[int, int]) -> str:
     return f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} {width} {height} {_row(figures)}\n"
 
 
-def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics) -> tuple[str, str]:
+def texts_of(posed_pictures: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics) -> tuple[str, str]:
     """images.txt and points3D.txt; `centres_mm` [m, 3] of all triangles, support frame."""
-    triangles, times = np.unique(np.concatenate([picture.triangles for picture in posed]), return_counts=True)
+    triangles, times = np.unique(
+        np.concatenate([picture.triangles for picture in posed_pictures]), return_counts=True
+    )
     if (times > 1).any():  # COLMAP's bundle adjustment ends at a point of one image
         triangles = triangles[times > 1]
     point_triangles = triangles[
@@ -121,7 +123,7 @@ def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics
     tracks: list[list[int]] = [[] for _ in point_triangles]
     colours = np.zeros((len(point_triangles), 3))
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    for number, picture in enumerate(posed, start=1):
+    for number, picture in enumerate(posed_pictures, start=1):
         camera_from_support = inverse(picture.support_from_camera)
         x, y, z, w = Rotation.from_matrix(camera_from_support[:3, :3]).as_quat(canonical=True)
         pose = _row([w, x, y, z, *camera_from_support[:3, 3]])
@@ -144,37 +146,37 @@ def texts_of(posed: Sequence[PosedPicture], centres_mm: Floats, lens: Intrinsics
     return "\n".join(images) + "\n", "\n".join(points_lines) + "\n"
 
 
-def _posed(measured: MeasuredRun, view: MeasuredView, mesh: PacketMesh) -> PosedPicture:
-    corners = measured.corners_mm
+def _posed_picture(measured_run: MeasuredRun, view: MeasuredView, mesh: PacketMesh) -> PosedPicture:
+    corners = measured_run.corners_mm
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    width, height = measured.frames.size_px
-    surface = seen_surface(mesh, normals, measured.lens, view.base_from_camera, (width, height))
+    width, height = measured_run.frames.size_px
+    surface = seen_surface(mesh, normals, measured_run.lens, view.base_from_camera, (width, height))
     centres_mm = apply(inverse(view.base_from_camera), corners[surface.triangles].mean(axis=1))
-    pixels = project(centres_mm, measured.lens.vector()).pixels
+    pixels = project(centres_mm, measured_run.lens.vector()).pixels
     column, row = np.rint(pixels).astype(int).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     is_visible = np.zeros(len(pixels), np.bool_)
     is_visible[inside] = surface.places[row[inside], column[inside]] == np.flatnonzero(inside)
     return PosedPicture(
         f"{view.name}.png",
-        inverse(measured.base_from_support) @ view.base_from_camera,
+        inverse(measured_run.base_from_support) @ view.base_from_camera,
         surface.triangles[is_visible],
         pixels[is_visible],
-        _picture(measured, view),
+        _picture(measured_run, view),
     )
 
 
-def _picture(measured: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]:
+def _picture(measured_run: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]:
     """[h, w, 3] sRGB, blue first, of the mean of frames of LEDs all round."""
     frames = [led_frames[0] for led_frames in view.by_led.values()]
     samples = frames[:: -(-len(frames) // _MOST_FRAMES)]
     total = np.zeros(samples[0].read().shape)
     for frame in samples:
-        total += np.maximum(frame.read().astype(np.float64) - measured.frames.black_dn, 0.0)
+        total += np.maximum(frame.read().astype(np.float64) - measured_run.frames.black_dn, 0.0)
     white = float(np.quantile(total, _WHITE_QUANTILE)) or 1.0
     mosaic = np.rint(65535.0 * np.clip(total / white, 0.0, 1.0)).astype(np.uint16)
-    pattern = measured.frames.pattern
+    pattern = measured_run.frames.pattern
     colour = cv2.merge([mosaic] * 3) if pattern == "MONO" else cv2.cvtColor(mosaic, DEMOSAIC[pattern])[..., ::-1]
     codes: NDArray[np.uint8] = np.rint(255.0 * srgb(colour / 65535.0)).astype(np.uint8)
     return codes

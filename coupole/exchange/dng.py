@@ -79,7 +79,7 @@ def _image_tags(height: int, width: int, *, bits: int, strip_bytes: int) -> list
 
 
 def _camera_tags(picture: Picture, colour: CameraColour) -> list[Tag]:
-    origin = "none: the sensor has no filters" if picture.pattern == "MONO" else colour.told
+    origin = "none: the sensor has no filters" if picture.pattern == "MONO" else colour.origin
     about = {**picture.about, "bayer_pattern": picture.pattern, "colour": origin}
     camera = str(about.get("camera", "unknown camera")) + (" (simulated)" if about["simulated"] else "")
     return [
@@ -108,7 +108,7 @@ def _exif_tags(picture: Picture) -> list[Tag]:
     f_number, focal_mm = (float(picture.about.get(key) or 0.0) for key in ("f_number", "focal_length_mm"))
     if f_number:
         tags.append(_rationals(33437, [_fraction(f_number)]))  # FNumber
-    if picture.taken:
+    if picture.taken_utc:
         tags.append(_ascii(36881, "+00:00"))  # OffsetTimeOriginal
     if focal_mm:
         tags.append(_rationals(37386, [_fraction(focal_mm)]))  # FocalLength, mm
@@ -117,9 +117,9 @@ def _exif_tags(picture: Picture) -> list[Tag]:
 
 
 def _times(picture: Picture, number: int) -> list[Tag]:
-    if not picture.taken:
+    if not picture.taken_utc:
         return []
-    return [_ascii(number, f"{datetime.fromisoformat(picture.taken).astimezone(UTC):%Y:%m:%d %H:%M:%S}")]
+    return [_ascii(number, f"{datetime.fromisoformat(picture.taken_utc).astimezone(UTC):%Y:%m:%d %H:%M:%S}")]
 
 
 def _colour_tags(picture: Picture, colour: CameraColour) -> list[Tag]:

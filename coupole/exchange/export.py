@@ -117,7 +117,7 @@ def _pictures(run: Run, frames: list[FrameProven]) -> Iterator[Picture]:
                 black_dn=file.black_dn,
                 white_dn=file.white_dn,
                 exposure_us=int(record["exposure_us"]),
-                taken=frame.t,
+                taken_utc=frame.t,
                 about=about,
             )
 

@@ -20,7 +20,7 @@ class Picture:
     black_dn: int
     white_dn: int
     exposure_us: int
-    taken: str
+    taken_utc: str
     """UTC, ISO 8601: when the frame was proven, soon after it was taken; empty if not known."""
     about: dict[str, Any]
     """Stored in the file as JSON: shot, LED, exposure, pose, lens, `simulated`, run."""

@@ -113,9 +113,9 @@ def format_named(name: str, source: Source, writer: Writer | None = None) -> For
     return FORMATS[name]
 
 
-def refuse_others_options(one: Format, given: list[str]) -> None:
+def refuse_others_options(export_format: Format, option_names: list[str]) -> None:
     """Raise InputError for the first of these options (names without dashes) that only other formats have."""
-    for option in given:
+    for option in option_names:
         takers = [entry.name for entry in FORMATS.values() if option in entry.options]
-        if takers and one.name not in takers:
-            raise InputError(f"--{option}: is for --to {', '.join(takers)}; found --to {one.name}")
+        if takers and export_format.name not in takers:
+            raise InputError(f"--{option}: is for --to {', '.join(takers)}; found --to {export_format.name}")

@@ -68,7 +68,7 @@ def write_crate(
     Raises InputError: no licence or author is known, or one is named twice, a run that is being acquired, an `out`
     that holds the source, or has files (unless `overwrite`); DiskFull or StorageError.
     """
-    origin = _described(source)
+    origin = _source_facts(source)
     licence = facts.licence or origin.get("licence")
     if not licence:
         raise InputError("--licence: RO-Crate demands one and the plan names none; give its URL, or words")
@@ -103,7 +103,7 @@ def write_crate(
     return [root / METADATA, *links]
 
 
-def _described(source: Path) -> dict[str, Any]:
+def _source_facts(source: Path) -> dict[str, Any]:
     """Kind, time, software and inputs of the source."""
     if (source / ABOUT).exists():
         about = read_about(source)
@@ -145,7 +145,7 @@ def _files(source: Path, without: Path | None) -> Iterator[Path]:
 
 def _entities(
     source: Path,
-    described: dict[str, Any],
+    source_facts: dict[str, Any],
     licence: str,
     facts: CrateFacts,
     people: Sequence[tuple[Entity, Entity | None]],
@@ -153,18 +153,18 @@ def _entities(
 ) -> Iterator[Entity]:
     authors = [person for person, _ in people]
     houses = {house["@id"]: house for _, house in people if house is not None}
-    softwares = [_software(name, version) for name, version in described["software"].items()]
+    softwares = [_software(name, version) for name, version in source_facts["software"].items()]
     inputs = [
         {"@id": f"#input-{digest[:16]}", "@type": "CreativeWork", "name": name, "identifier": f"sha256:{digest}"}
-        for name, digest in described["inputs"].items()
+        for name, digest in source_facts["inputs"].items()
     ]
     terms = _licence(licence)
-    kind = "simulated, no real object or light" if described["simulated"] else "measured"
+    kind = "simulated, no real object or light" if source_facts["simulated"] else "measured"
     root: Entity = {
         "@id": "./",
         "@type": "Dataset",
         "name": facts.name or source.resolve().name,
-        "description": f"{described['told']} ({kind}).",
+        "description": f"{source_facts['told']} ({kind}).",
         "datePublished": datetime.now(UTC).date().isoformat(),
         "license": _to(terms),
         "author": _to_all(authors),
@@ -186,8 +186,8 @@ def _entities(
     action: Entity = {
         "@id": "#made",
         "@type": "CreateAction",
-        "name": "acquisition" if described["kind"] == "run" else "measurement of reflectance",
-        "endTime" if described["kind"] == "result" else "startTime": described["ended"],
+        "name": "acquisition" if source_facts["kind"] == "run" else "measurement of reflectance",
+        "endTime" if source_facts["kind"] == "result" else "startTime": source_facts["ended"],
         "result": {"@id": "./"},
     }
     devices = [
@@ -197,7 +197,7 @@ def _entities(
             "name": f"{role}: {device.get('vendor', '')} {device['model']}".strip(),
             "identifier": str(device["serial"]),
         }
-        for role, device in described.get("devices", {}).items()
+        for role, device in source_facts.get("devices", {}).items()
     ]
     action["instrument"] = _to_all([*softwares, *devices])
     if inputs:

@@ -30,16 +30,18 @@ class ColourWanted:
     """Records in place of those that the run names."""
 
 
-def colour_of_run(run: Run, wanted: ColourWanted) -> CameraColour:
+def colour_of_run(run: Run, colour_request: ColourWanted) -> CameraColour:
     """Raises InputError: no table of the LEDs' spectrum, tables that are wrong, no colour-science."""
     files = read_plan(run.plan_path, run.rig_path)
-    leds, rig_spectrum = wanted.leds, files.cell.rig.dome.spectrum
+    leds, rig_spectrum = colour_request.leds, files.cell.rig.dome.spectrum
     if leds is None and rig_spectrum is None:
         raise InputError(f"{run.folder}: its rig names no spectrum of the LEDs; {_HOW}")
     if leds is None and rig_spectrum is not None:
         leds = files.cell.document.resolve(rig_spectrum)
     assert leds is not None
-    return camera_colour(wanted.sensor, leds, _measured_white(wanted.records or files.record_paths or ()))
+    return camera_colour(
+        colour_request.sensor, leds, _measured_white(colour_request.records or files.record_paths or ())
+    )
 
 
 def _measured_white(records: Sequence[Path]) -> Neutral | None:

@@ -44,7 +44,7 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     white_balance = np.minimum(channels / colour.neutral(picture.about.get("led")), 1.0)
     rgb = np.clip(linear_srgb(white_balance @ colour.xyz_from_balanced.T), 0.0, 1.0)
     codes = np.rint(65535.0 * (rgb if linear else srgb(rgb))).astype(np.uint16)
-    about = {**picture.about, "colour": colour.told, "linear": linear}
+    about = {**picture.about, "colour": colour.origin, "linear": linear}
     return tiff_of(codes, about, linear_profile() if linear else srgb_profile())
 
 

@@ -33,7 +33,7 @@ class InputFiles:
     def __contains__(self, path: Path) -> bool:
         return path.absolute() in self._read
 
-    def read(self, path: Path) -> bytes:
+    def read_bytes(self, path: Path) -> bytes:
         """All bytes of a file, as they were when it was first read. Raises OSError if that fails."""
         return self._once(path).data
 
@@ -48,7 +48,7 @@ class InputFiles:
     def _once(self, path: Path) -> _Read:
         key = path.absolute()
         if key not in self._read:
-            self._read[key] = _read(key)
+            self._read[key] = _read_file(key)
         return self._read[key]
 
     def changes(self) -> list[str]:
@@ -59,7 +59,7 @@ class InputFiles:
         return new
 
 
-def _read(path: Path) -> _Read:
+def _read_file(path: Path) -> _Read:
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         raise OSError(0, "it is a folder or a device, not a file", str(path))
@@ -73,17 +73,17 @@ def _stamp(about: os.stat_result) -> tuple[int, ...]:
     return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 
-def _change(path: Path, read: _Read) -> str:
+def _change(path: Path, earlier_read: _Read) -> str:
     """Return what is different now; empty if nothing is, or only the file's times are."""
     try:
         about = path.stat()
-        if _stamp(about) == read.stamp:
+        if _stamp(about) == earlier_read.stamp:
             return ""
         if not stat.S_ISREG(about.st_mode):
             return "is no file any more"
-        if about.st_size == read.stamp[2]:
+        if about.st_size == earlier_read.stamp[2]:
             with path.open("rb") as file:
-                same = hashlib.file_digest(file, "sha256").hexdigest() == read.sha256
+                same = hashlib.file_digest(file, "sha256").hexdigest() == earlier_read.sha256
         else:
             same = False
     except FileNotFoundError:

@@ -54,7 +54,7 @@ def json_of(raw: bytes | str, name: str, *, line: int = 1, allow_nan: bool = Fal
     Raises NotDataError if it is no JSON, InputError if a value in it is refused: NaN and infinity unless they are
     allowed, whole numbers of more than MAX_DIGITS digits, more than MAX_DEPTH levels.
     """
-    text = _decoded(raw, name, line)
+    text = _decoded_text(raw, name, line)
 
     def whole(token: str) -> int:
         if (digits := len(token.removeprefix("-"))) > MAX_DIGITS:
@@ -109,20 +109,20 @@ def yaml_of(text: str, name: str, *, line: int = 1) -> Any:
         raise NotDataError([Problem(name, line, 1, "", f"is no YAML of plain data: {reason}")]) from error
 
 
-def _values(node: Any, known: dict[int, int]) -> int:
+def _values(node: Any, known_counts: dict[int, int]) -> int:
     """Values in a node, each alias as many as it stands for; one that holds itself is too many."""
-    if id(node) in known:
-        return known[id(node)]
-    known[id(node)] = MAX_VALUES + 1
+    if id(node) in known_counts:
+        return known_counts[id(node)]
+    known_counts[id(node)] = MAX_VALUES + 1
     inside = node.value if isinstance(node.value, list) else ()
     count = 1 + sum(
-        _values(child, known) for part in inside for child in (part if isinstance(part, tuple) else (part,))
+        _values(child, known_counts) for part in inside for child in (part if isinstance(part, tuple) else (part,))
     )
-    known[id(node)] = count
+    known_counts[id(node)] = count
     return count
 
 
-def _decoded(raw: bytes | str, name: str, line: int) -> str:
+def _decoded_text(raw: bytes | str, name: str, line: int) -> str:
     if isinstance(raw, str):
         return raw.removeprefix("\ufeff")
     try:

@@ -92,7 +92,7 @@ def link_corners(folder: Path, link: int, files: InputFiles | None = None) -> Fl
 
     path = link_mesh_path(folder, link)
     try:
-        data = io.BytesIO((files or InputFiles()).read(path))
+        data = io.BytesIO((files or InputFiles()).read_bytes(path))
         mesh: Any = trimesh.load(data, file_type="stl", process=False, force="mesh")
     except Exception as error:  # any exception of trimesh means that the file is not a readable mesh
         raise InputError(f"{path}: expected the mesh of link {link}; {error}") from error

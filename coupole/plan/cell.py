@@ -127,11 +127,13 @@ def _damage_w_per_lm(
     if given is None:
         return None
     from coupole.appearance.spectra.damage import damage_w_per_lm
-    from coupole.appearance.spectra.measured import decoded, parse_spectrum
+    from coupole.appearance.spectra.measured import decode_text, parse_spectrum
 
     path = document.resolve(given)
     try:
-        return damage_w_per_lm(parse_spectrum(decoded(files.read(path)), str(path), name=path.stem, unit="power"))
+        return damage_w_per_lm(
+            parse_spectrum(decode_text(files.read_bytes(path)), str(path), name=path.stem, unit="power")
+        )
     except (OSError, UnicodeDecodeError) as error:
         problems.append(document.problem(("dome", key), f"cannot read the spectrum {path}: {reason(error)}"))
     except InputError as error:

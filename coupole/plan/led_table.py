@@ -57,7 +57,7 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
     try:
         if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
             raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
-        return _parsed(files.read(path).decode("utf-8"), str(path))
+        return _parsed(files.read_bytes(path).decode("utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
 

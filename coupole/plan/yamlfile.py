@@ -176,7 +176,7 @@ def text_of(path: Path, files: InputFiles | None = None) -> str:
     files = InputFiles() if files is None else files
     try:
         if path in files:
-            return _decoded(path, files.read(path))
+            return _decoded(path, files.read_bytes(path))
         if not path.exists():
             raise InputError([Problem(str(path), 0, 0, "", "no such file")])
         if not path.is_file():
@@ -184,7 +184,7 @@ def text_of(path: Path, files: InputFiles | None = None) -> str:
         if (size_bytes := path.stat().st_size) > MAX_FILE_BYTES:
             message = f"{size_bytes} bytes; a YAML file of this kind has {MAX_FILE_BYTES} at most"
             raise InputError([Problem(str(path), 0, 0, "", message)])
-        raw = files.read(path)
+        raw = files.read_bytes(path)
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
         raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
     return _decoded(path, raw)

@@ -73,7 +73,7 @@ class StepResult(Model):
     def passed(self) -> bool:
         return (
             not self.failure
-            and all(limit.passed for limit in self.limits)
+            and all(limit.is_met for limit in self.limits)
             and all(answer.yes for answer in self.answers)
         )
 

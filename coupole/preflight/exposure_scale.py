@@ -103,7 +103,7 @@ def _power(path: Path, record: Record, files: InputFiles, ids: NDArray[np.int64]
     """[ids] power in the channel that has most of it, DN s^-1 m^2 sr; 0 for LEDs that are dead or not in it."""
     table = path.parent / record.files[0].name
     try:
-        lines = [line for line in files.read(table).decode("utf-8").splitlines() if not line.startswith("#")]
+        lines = [line for line in files.read_bytes(table).decode("utf-8").splitlines() if not line.startswith("#")]
         rows = list(csv.DictReader(lines))
         channels = [name for name in rows[0] if name.startswith("power_")]
         of_led = {int(row["id"]): max(float(row[channel]) for channel in channels) for row in rows}

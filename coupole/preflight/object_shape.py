@@ -62,7 +62,7 @@ def read_object(files: PlanFiles) -> ObjectShape:
 def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -> NDArray[np.float64]:
     """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in it."""
     try:
-        data = files.read(mesh_path)
+        data = files.read_bytes(mesh_path)
     except OSError as error:
         raise InputError(f"{mesh_path}: {reason(error)}") from error
     except MemoryError as error:

@@ -97,7 +97,7 @@ def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]
         def copied(path: str, place: str) -> str:
             copy = Path(folder, place, Path(path).name)
             copy.parent.mkdir()
-            copy.write_bytes(files.read(Path(path)))
+            copy.write_bytes(files.read_bytes(Path(path)))
             return str(copy)
 
         objects = [

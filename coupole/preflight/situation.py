@@ -13,7 +13,7 @@ def situation_of(rig: Rig, *, camera: str | None = None, temperature_c: float | 
     """Return the present conditions that this rig's records must hold for."""
     return Situation(
         now=datetime.now(UTC),
-        simulated=in_world(rig, dry_run=False),
+        is_simulated=in_world(rig, dry_run=False),
         size_px=(rig.sensor.width_px, rig.sensor.height_px),
         focal_length_mm=rig.lens.focal_length_mm,
         focus_distance_mm=rig.lens.focus_distance_mm,

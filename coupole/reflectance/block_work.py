@@ -30,7 +30,7 @@ _BLOCKS_EACH, _FEWEST_ROWS, _MOST_ROWS = 8, 256, 1 << 12
 _MISSING = "--scheduler: dask.distributed is not installed here; `pip install 'coupole[cluster]'` adds it"
 
 
-def silent(step: str, done: int, of: int) -> None:
+def silent(step: str, done_count: int, of: int) -> None:
     """Tell nobody."""
 
 
@@ -52,7 +52,7 @@ class Workshop(Protocol):
         """Call a function in each process that does blocks."""
         ...
 
-    def heard(self, say: Said) -> Said:
+    def reporter(self, say: Said) -> Said:
         """Return the function by which a block can report its progress."""
         ...
 
@@ -76,7 +76,7 @@ class Here:
     def everywhere(self, function: Callable[[], Any]) -> None:
         function()
 
-    def heard(self, say: Said) -> Said:
+    def reporter(self, say: Said) -> Said:
         return say
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
@@ -129,7 +129,7 @@ class Cluster:
     def everywhere(self, function: Callable[[], Any]) -> None:
         self._client.run(function)
 
-    def heard(self, say: Said) -> Said:
+    def reporter(self, say: Said) -> Said:
         return silent
 
     def refuse_blind(self, folder: Path, witness: str) -> None:

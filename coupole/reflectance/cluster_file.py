@@ -44,14 +44,14 @@ class Clusters:
     """[clusters, functions, channels] of `pair_harmonics`, 1/sr."""
 
     def at(
-        self, own: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
+        self, own_materials: TriangleMaterials, mesh_normals: NDArray[np.float64], block: slice | NDArray[np.int64]
     ) -> TriangleMaterials:
         """Return the materials of triangles by their places in `RunResult.triangles`. Normals are those of their
-        `own` materials, or the mesh's where they borrow."""
+        `own_materials` materials, or the mesh's where they borrow."""
         number, is_borrowed = self.cluster[block], self.borrowed[block, None]
         kd, ks, alpha, residual = (getattr(self, name)[number] for name in self.OF_CLUSTERS)
         alpha[number < 0] = np.nan
-        normals = np.where(is_borrowed, mesh_normals, own.normals)
+        normals = np.where(is_borrowed, mesh_normals, own_materials.normals)
         return TriangleMaterials(normals, kd, ks, alpha, residual)
 
 

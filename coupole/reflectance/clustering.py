@@ -81,7 +81,7 @@ def clusters_of(features: Floats, count: int) -> NDArray[np.int64]:
 def pool_samples(
     pool: Pool,
     samples: TriangleSamples,
-    used: NDArray[np.bool_],
+    sample_mask: NDArray[np.bool_],
     normals: Floats,
     cluster: NDArray[np.int64],
     members: NDArray[np.int64],
@@ -90,7 +90,7 @@ def pool_samples(
     """Add samples of triangles with fitted `normals` [b, 3] to the pools of their clusters [b], -1 for none; each
     of a cluster's `members` [k] gives an equal share."""
     most_each = np.maximum(_LEAST_EACH, MOST_POOLED // np.maximum(members, 1))
-    order = random.permutation(np.flatnonzero(used))
+    order = random.permutation(np.flatnonzero(sample_mask))
     _pool(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, normals, cluster,
         most_each, order, pool.values, pool.lights, pool.views, pool.counts,
@@ -118,25 +118,25 @@ def fit_pool(pool: Pool, starts: TriangleMaterials) -> TriangleMaterials:
 
 
 def nearest_cluster(
-    samples: TriangleSamples, used: NDArray[np.bool_], materials: TriangleMaterials, fewest: int
+    samples: TriangleSamples, sample_mask: NDArray[np.bool_], materials: TriangleMaterials, fewest: int
 ) -> NDArray[np.int64]:
     """[b] the cluster whose material explains a triangle's samples best, the mesh's normal taken; -1 for fewer
     than `fewest` samples."""
     nearest = np.full(len(samples.values), -1, np.int64)
     _nearest(
         samples.values, samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm, samples.normals,
-        np.flatnonzero(used), materials.kd, materials.ks, materials.alpha, fewest, nearest,
+        np.flatnonzero(sample_mask), materials.kd, materials.ks, materials.alpha, fewest, nearest,
     )  # fmt: skip
     return nearest
 
 
 @numba.njit(cache=True, nogil=True)
-def _looks(kd, ks, alpha, off_cos, found):  # type: ignore[no-untyped-def]
+def _looks(kd, ks, alpha, off_cos, root_reflectances):  # type: ignore[no-untyped-def]
     for n in range(len(alpha)):
         for k in range(len(off_cos)):
             shine = lobe(_SLANT_COS, _SLANT_COS, off_cos[k], alpha[n])[0]
             for channel in range(kd.shape[1]):
-                found[n, channel, k] = math.sqrt(kd[n, channel] + ks[n, channel] * shine)
+                root_reflectances[n, channel, k] = math.sqrt(kd[n, channel] + ks[n, channel] * shine)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -161,7 +161,19 @@ def turned_to(axes, place, target, direction):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _pool(  # type: ignore[no-untyped-def]
-    values, led_mm, view_of, cameras_mm, centres_mm, normals, cluster, each, order, pooled, lights, views, counts
+    values,
+    led_mm,
+    view_of,
+    cameras_mm,
+    centres_mm,
+    normals,
+    cluster,
+    most_each,
+    order,
+    pool_values,
+    lights,
+    views,
+    counts,
 ):
     axes = np.empty((3, 3))
     for triangle in range(len(values)):
@@ -171,14 +183,14 @@ def _pool(  # type: ignore[no-untyped-def]
         axes_about(normals[triangle], axes)
         for sample in order:
             place = counts[number]
-            if count == each[number] or place == pooled.shape[1]:
+            if count == most_each[number] or place == pool_values.shape[1]:
                 break
             all_positive = True
             for channel in range(values.shape[2]):
                 all_positive &= values[triangle, sample, channel] > 0.0
             if not all_positive:
                 continue
-            pooled[number, place] = values[triangle, sample]
+            pool_values[number, place] = values[triangle, sample]
             turned_to(axes, centres_mm[triangle], led_mm[sample], lights[number, place])
             turned_to(axes, centres_mm[triangle], cameras_mm[view_of[sample]], views[number, place])
             count += 1
@@ -186,7 +198,7 @@ def _pool(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_one(values, lights, views, found):  # type: ignore[no-untyped-def]
+def _fit_one(values, lights, views, parameters):  # type: ignore[no-untyped-def]
     """A material (kd, ks, alpha, residual) in place, from the start that is there."""
     count, channels = values.shape
     half, roots, grey = np.empty((count, 3)), np.empty(count), np.zeros(2)
@@ -197,22 +209,22 @@ def _fit_one(values, lights, views, found):  # type: ignore[no-untyped-def]
         views[n, 2] = max(views[n, 2], 0.03)  # a view below a fitted normal forbids no step
         roots[n] = math.sqrt(np.sum(values[n]) / channels)
     for channel in range(channels):
-        grey[0] += found[channel] / channels
-        grey[1] += found[channels + channel] / channels
+        grey[0] += parameters[channel] / channels
+        grey[1] += parameters[channels + channel] / channels
     z_axis, indices = np.array([0.0, 0.0, 1.0]), np.arange(count)
-    unknowns = np.array([0.0, 0.0, 1.0, 0.0, 0.0, math.log(found[2 * channels])])
+    unknowns = np.array([0.0, 0.0, 1.0, 0.0, 0.0, math.log(parameters[2 * channels])])
     unknowns[3], unknowns[4] = math.log(max(grey[0], 1e-9)), math.log(max(grey[1], 1e-6))
     _, rms = fit_from(roots, indices, lights, half, views, indices, unknowns, z_axis, HELD, USUAL)
     colours_from(
-        values, indices, z_axis, np.exp(unknowns[3:6]), lights, half, views, indices, found[:channels],
-        found[channels : 2 * channels],
+        values, indices, z_axis, np.exp(unknowns[3:6]), lights, half, views, indices, parameters[:channels],
+        parameters[channels : 2 * channels],
     )  # fmt: skip
-    found[2 * channels], found[2 * channels + 1] = math.exp(unknowns[5]), rms
+    parameters[2 * channels], parameters[2 * channels + 1] = math.exp(unknowns[5]), rms
 
 
 @numba.njit(cache=True, nogil=True)
 def _nearest(  # type: ignore[no-untyped-def]
-    values, led_mm, view_of, cameras_mm, centres_mm, normals, used, kd, ks, alpha, fewest, found
+    values, led_mm, view_of, cameras_mm, centres_mm, normals, used_samples, kd, ks, alpha, fewest, nearest_clusters
 ):
     axes, light, view = np.empty((3, 3)), np.empty(3), np.empty(3)
     misses = np.empty(len(alpha))
@@ -220,7 +232,7 @@ def _nearest(  # type: ignore[no-untyped-def]
         axes_about(normals[triangle], axes)
         misses[:] = 0.0
         count = 0
-        for sample in used:
+        for sample in used_samples:
             value = values[triangle, sample]
             if np.isnan(value).all():
                 continue
@@ -237,4 +249,4 @@ def _nearest(  # type: ignore[no-untyped-def]
                         modelled_value = light[2] * (kd[number, channel] + ks[number, channel] * shine)
                         misses[number] += (math.sqrt(modelled_value) - math.sqrt(max(value[channel], 0.0))) ** 2
         if count >= fewest:
-            found[triangle] = np.argmin(misses)
+            nearest_clusters[triangle] = np.argmin(misses)

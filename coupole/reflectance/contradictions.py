@@ -57,7 +57,7 @@ class Neighbours:
         return cls(np.asarray(cKDTree(ways).query(ways, k=range(2, min(BESIDE, len(ways) - 1) + 2))[1], np.int64))
 
 
-def contradicted(
+def contradiction_mask(
     samples: TriangleSamples, materials: TriangleMaterials, u_noise: NDArray[np.float16], beside: Neighbours
 ) -> NDArray[np.bool_]:
     """[b, leds] of one view's samples, by materials [b] and relative noise [b, leds, channels]."""
@@ -103,19 +103,19 @@ def find(result: RunResult, view: ViewSamples, rows: slice) -> Found:
     materials = result.materials(GGX_NORMAL.name, np.searchsorted(result.triangles, view.triangles[rows]))
     samples, beside = result.view_samples(view, rows), Neighbours.of(view.led_mm, result.middle_mm)
     with h5py.File(view.path, "r") as file:
-        dark = contradicted(samples, materials, file["u_own"][rows], beside)
+        dark = contradiction_mask(samples, materials, file["u_own"][rows], beside)
         has_values = np.isfinite(file["f"][rows])
     return Found(rows, np.stack(np.nonzero(dark)), int(has_values[dark].sum()), int(has_values.sum()))
 
 
-def leave_out(view: ViewSamples, found: Iterable[Found]) -> None:
+def leave_out(view: ViewSamples, found_contradictions: Iterable[Found]) -> None:
     """Take what contradicts others out of a view's file, which is whole, before or after. Raises OSError."""
 
     def write(part: Path) -> None:
         count = total = 0
         shutil.copyfile(view.path, part)
         with h5py.File(part, "r+") as file:
-            for contradictions in found:
+            for contradictions in found_contradictions:
                 count, total = count + contradictions.values, total + contradictions.all_values
                 if contradictions.places.size:
                     f, codes = file["f"][contradictions.rows], file["codes"][contradictions.rows]

@@ -37,25 +37,25 @@ class MaterialFit(Fit):
     fits_normals: bool
 
     def fit(
-        self, samples: TriangleSamples, used: NDArray[np.bool_], noise_um: float, threads: int | None
+        self, samples: TriangleSamples, sample_mask: NDArray[np.bool_], noise_um: float, threads: int | None
     ) -> TriangleMaterials:
-        """Fit materials to the samples `used` [samples]; `noise_um` is that of the mesh's vertices."""
-        return fit_triangles(samples, used, noise_um if self.fits_normals else None, threads=threads)
+        """Fit materials to the samples `sample_mask` [samples]; `noise_um` is that of the mesh's vertices."""
+        return fit_triangles(samples, sample_mask, noise_um if self.fits_normals else None, threads=threads)
 
     def uncertainty(
         self,
         samples: TriangleSamples,
-        used: NDArray[np.bool_],
+        sample_mask: NDArray[np.bool_],
         materials: TriangleMaterials,
         noise_um: float,
         middle_mm: NDArray[np.float64],
         threads: int | None,
     ) -> MaterialUncertainty:
-        """Compute covariances of the materials fitted to the samples `used` [samples]; `middle_mm` is the middle
-        of the object. A fit of another form than GGX's needs covariances of its own here."""
+        """Compute covariances of the materials fitted to the samples `sample_mask` [samples]; `middle_mm` is the
+        middle of the object. A fit of another form than GGX's needs covariances of its own here."""
         return covariances(
             samples,
-            used,
+            sample_mask,
             materials,
             noise_um,
             fitted_normals=self.fits_normals,
@@ -91,15 +91,15 @@ class ViewFit(Fit):
 _F = TypeVar("_F", bound=Fit)
 
 
-def _named(*fits: _F) -> dict[str, _F]:
+def _fits_by_name(*fits: _F) -> dict[str, _F]:
     return {fit.name: fit for fit in fits}
 
 
 GGX = MaterialFit("ggx", "GGX, mesh's normals", "#999999", fits_normals=False)
 GGX_NORMAL = MaterialFit("ggx_normal", "GGX, normals fitted", "#cc79a7", fits_normals=True)
-MATERIALS = _named(GGX, GGX_NORMAL)
+MATERIALS = _fits_by_name(GGX, GGX_NORMAL)
 """Material fits by name, in the order in which they are made."""
-SLICES = _named(
+SLICES = _fits_by_name(
     ViewFit("sh", "spherical harmonics", "#0072b2", HARMONICS),
     ViewFit("rbf", "radial functions", "#d55e00", RADIAL),
     ViewFit(

@@ -84,7 +84,7 @@ def shine(nl, nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
+def lobe_density(nv, nh, alpha):  # type: ignore[no-untyped-def]
     """Return how often a ray that is drawn from a lobe takes a direction, per sr (Heitz 2018, eq. 17)."""
     alpha2 = alpha * alpha
     t = nh * nh * (alpha2 - 1.0) + 1.0
@@ -92,7 +92,7 @@ def drawn(nv, nh, alpha):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def reflected(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
+def sample_reflection(normal, v0, v1, v2, nv, alpha, first, second, way):  # type: ignore[no-untyped-def]
     """Fill `way` [3] with the view (unit, nv to the normal) mirrored at a normal that it sees, which two numbers
     from 0 to 1 choose; return the cosine of that normal (Heitz 2018, listing 1)."""
     x, y, z = normal[0], normal[1], normal[2]

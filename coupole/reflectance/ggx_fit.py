@@ -13,7 +13,7 @@ import numpy as np
 
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign, assign_rows
-from coupole.reflectance.lanes import LANES, if_less, lanes, larger, loaded, root, store, total
+from coupole.reflectance.lanes import LANES, if_less, lanes, larger, load_row, root, store, total
 from coupole.reflectance.normal_fit import (
     _MOST_STEPS,
     _USUAL_ALPHA,
@@ -55,9 +55,9 @@ def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-u
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from `unknowns` in place, until a step gains less than `settled` of the cost; cost and
-    weighted rms, as `fit_from` gives them."""
+def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt from `unknowns` in place, until a step gains less than `settled_share` of the cost; cost
+    and weighted rms, as `fit_from` gives them."""
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     rows = np.empty((len(packs) * (UNKNOWNS + 1), LANES))
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -78,7 +78,7 @@ def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled):  # type
             assign(right, new_right)
             damping = max(damping * 0.2, 1e-9)
             cost, rms = trial_cost, trial_rms
-            if gain < settled * (cost + gain):
+            if gain < settled_share * (cost + gain):
                 break
         else:
             damping *= 6.0
@@ -112,19 +112,19 @@ def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, ri
 
 
 @numba.njit(cache=True, nogil=True)
-def _product(rows, one, other, count):  # type: ignore[no-untyped-def]
+def _product(rows, first_row, second_row, count):  # type: ignore[no-untyped-def]
     products = lanes(0.0)
     for n in range(count):
-        products += loaded(rows, one + n) * loaded(rows, other + n)
+        products += load_row(rows, first_row + n) * load_row(rows, second_row + n)
     return total(products)
 
 
 @numba.njit(cache=True, nogil=True)
 def _dot(vector, values, first):  # type: ignore[no-untyped-def]
     return (
-        vector[0] * loaded(values, first)
-        + vector[1] * loaded(values, first + 1)
-        + vector[2] * loaded(values, first + 2)
+        vector[0] * load_row(values, first)
+        + vector[1] * load_row(values, first + 1)
+        + vector[2] * load_row(values, first + 2)
     )
 
 
@@ -149,7 +149,7 @@ def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped
         value = (0.5 / math.pi * alpha2) * by_t * by_t * by_s
         shine, value_by_s = ks * value, value * by_s
         modelled_root = root(nl * (kd + shine))
-        off = (if_less(0.0, cosine, modelled_root, 0.0) - loaded(samples, 0)) / scale
+        off = (if_less(0.0, cosine, modelled_root, 0.0) - load_row(samples, 0)) / scale
         weight = 1.0 / (1.0 + off * off)
         share = root(weight)
         factor = if_less(0.0, cosine, share * (0.5 / scale) / modelled_root, 0.0)
@@ -171,7 +171,7 @@ def _residuals(packs, unknowns, t1, t2, scale, rows):  # type: ignore[no-untyped
         store(factor * nl * ks * by_alpha, rows, 4 * count + n)
         store(off * share, rows, _OFF * count + n)
         squares += weight * off * off
-        weights += weight * loaded(samples, 10)
+        weights += weight * load_row(samples, 10)
         product = product * (1.0 + off * off)
         if n % _TOGETHER == _TOGETHER - 1 or n == count - 1:
             store(product, eight, 0)

@@ -123,28 +123,28 @@ def seen_from(scene: Scene, triangles: NDArray[np.int64], seed: int) -> csr_arra
 
     def part(first: int, seed: int) -> csr_array:
         part_triangles = triangles[first : first + step]
-        return _gathered(scene, part_triangles, strata, np.random.default_rng(seed))
+        return _gather_rays(scene, part_triangles, strata, np.random.default_rng(seed))
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = list(pool.map(part, starts, seeds))
     return vstack(parts, format="csr")
 
 
-def _gathered(
-    scene: Scene, mine: NDArray[np.int64], strata: NDArray[np.int64], random: np.random.Generator
+def _gather_rays(
+    scene: Scene, triangles: NDArray[np.int64], strata: NDArray[np.int64], random: np.random.Generator
 ) -> csr_array:
     """`seen_from` of some of the triangles, a ray in each cell of a square that is mapped to the half space."""
-    count, rays = len(mine), len(strata)
+    count, rays = len(triangles), len(strata)
     u = (strata + random.random((count, rays, 2))) / (strata.max(axis=0) + 1)
     radius, phi = np.sqrt(u[..., 0]), 2 * np.pi * u[..., 1]
-    normals = scene.normals[mine]
+    normals = scene.normals[triangles]
     first = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(normals, first)
     x, y, z = radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u[..., 0])
     ways = x[..., None] * first[:, None] + y[..., None] * second[:, None] + z[..., None] * normals[:, None]
     shares = random.dirichlet((1.0, 1.0, 1.0), (count, rays))
-    places = np.einsum("nrc,nck->nrk", shares, scene.corners_mm[mine]) + RAY_START_MM * normals[:, None]
+    places = np.einsum("nrc,nck->nrk", shares, scene.corners_mm[triangles]) + RAY_START_MM * normals[:, None]
     hits = scene.rays.run(
         np.ascontiguousarray(places.reshape(-1, 3), np.float32),
         np.ascontiguousarray(ways.reshape(-1, 3), np.float32),
@@ -192,17 +192,17 @@ def _cosines(centres_mm: Floats, normals: Floats, led_mm: Floats) -> Floats:
 
 
 def radiosity(
-    seen: csr_array, direct: NDArray[np.float32], shown: Floats, passes: int = _PASSES
+    form_factors: csr_array, direct: NDArray[np.float32], apparent_reflectance: Floats, passes: int = _PASSES
 ) -> NDArray[np.float32]:
-    """[channels, patches, leds] exitance of patches for a power of 1. `shown` [patches, channels] is the
-    reflectance that counts all light as direct; patches that no LED reaches keep it."""
+    """[channels, patches, leds] exitance of patches for a power of 1. `apparent_reflectance` [patches, channels]
+    is the reflectance that counts all light as direct; patches that no LED reaches keep it."""
     exitances = []
-    for channel_reflectance in shown.T:
+    for channel_reflectance in apparent_reflectance.T:
         reflectance = channel_reflectance.copy()
         for _ in range(passes):
             exitance = reflectance[:, None].astype(np.float32) * direct
             for _ in range(_MOST_BOUNCES):
-                indirect = seen @ exitance
+                indirect = form_factors @ exitance
                 exitance = reflectance[:, None].astype(np.float32) * (direct + indirect)
             direct_power = direct.sum(axis=1)
             beside = np.where(direct > 0, indirect, 0.0).sum(axis=1)  # of the LEDs that samples are of
@@ -241,12 +241,12 @@ def subtract(
 def _as_measured(
     result: RunResult, scene: Scene, count: int, support_reflectance: float
 ) -> tuple[Floats, dict[str, Floats]]:
-    """Reflectance of patches and triangles, by `_shown` and `_diffuse`, before anything was taken off: kept in a
-    file, by which a job that was stopped goes on."""
+    """Reflectance of patches and triangles, by `_apparent_reflectance` and `_diffuse`, before anything was taken
+    off: kept in a file, by which a job that was stopped goes on."""
     path = result.folder / AS_MEASURED
     if not path.exists():
         diffuse = {view.path.stem: _diffuse(result, view) for view in result.views}
-        patch_reflectance = _shown(result, diffuse, scene, count, support_reflectance)
+        patch_reflectance = _apparent_reflectance(result, diffuse, scene, count, support_reflectance)
 
         def write(part: Path) -> None:
             with h5py.File(part, "w") as file:
@@ -259,7 +259,7 @@ def _as_measured(
         return file["shown"][()], {name: values[()] for name, values in file["diffuse"].items()}
 
 
-def _shown(
+def _apparent_reflectance(
     result: RunResult, diffuse: dict[str, Floats], scene: Scene, count: int, support_reflectance: float
 ) -> Floats:
     """[patches, channels] reflectance by the samples, the mean of a patch's triangles; of those that no view shows
@@ -296,22 +296,27 @@ def _diffuse(result: RunResult, view: ViewSamples, most: int = 64) -> Floats:
     return medians
 
 
-def _fill_medians(found: Floats, samples: TriangleSamples) -> None:
-    """Fill those rows of `found` [n, channels] that have NaN with medians of the samples."""
+def _fill_medians(reflectances: Floats, samples: TriangleSamples) -> None:
+    """Fill those rows of `reflectances` [n, channels] that have NaN with medians of the samples."""
     cosine = _cosines(samples.centres_mm, samples.normals, samples.led_mm)
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.where(cosine[..., None] > _LEAST_COSINE, samples.values / cosine[..., None], np.nan)
-    missing = np.isnan(found).any(axis=1) & np.all(np.isfinite(values).any(axis=1), axis=1)
-    found[missing] = np.nanmedian(values[missing], axis=1)
+    missing = np.isnan(reflectances).any(axis=1) & np.all(np.isfinite(values).any(axis=1), axis=1)
+    reflectances[missing] = np.nanmedian(values[missing], axis=1)
 
 
 def _subtract_view(
-    view: ViewSamples, scene: Scene, seen: csr_array, shown: Floats, diffuse: Floats, paper: bool
+    view: ViewSamples,
+    scene: Scene,
+    form_factors: csr_array,
+    apparent_reflectance: Floats,
+    diffuse: Floats,
+    paper: bool,
 ) -> None:
     direct = direct_irradiance(scene, view.led_mm, view.led_normals, paper=paper)
-    exitance = radiosity(seen, direct, shown)
+    exitance = radiosity(form_factors, direct, apparent_reflectance)
     gathers = seen_from(scene, view.triangles, _POINTS)
-    diffuse = np.where(np.isfinite(diffuse), diffuse, shown[scene.patch[view.triangles]] / np.pi)
+    diffuse = np.where(np.isfinite(diffuse), diffuse, apparent_reflectance[scene.patch[view.triangles]] / np.pi)
 
     def write(part: Path) -> None:
         shutil.copyfile(view.path, part)

@@ -39,20 +39,20 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, _vector(kind.number))  # type: ignore[no-untyped-call]
 
 
-def _kind(*given: Any) -> Any:
+def _kind(*argument_types: Any) -> Any:
     """Return the type of what comes of these types: that of the lanes among them."""
-    kinds = {kind for kind in given if isinstance(kind, _Lanes)}
+    kinds = {kind for kind in argument_types if isinstance(kind, _Lanes)}
     if len(kinds) != 1:
-        raise errors.TypingError(f"expected lanes of one precision, got {', '.join(map(str, given))}")
+        raise errors.TypingError(f"expected lanes of one precision, got {', '.join(map(str, argument_types))}")
     return kinds.pop()
 
 
-def _compiled(kind_of: Any) -> Any:
+def _compiled_function(kind_of: Any) -> Any:
     """A function of compiled code alone; it takes the types of what it is given."""
     return intrinsic(kind_of)
 
 
-def _spread(context: Any, builder: Any, number: Any, kind: Any, value: Any) -> Any:
+def _broadcast(context: Any, builder: Any, number: Any, kind: Any, value: Any) -> Any:
     """A number in all lanes; lanes as they are."""
     if isinstance(kind, _Lanes):
         return value
@@ -66,7 +66,7 @@ def _made_of(build: Any) -> Any:
 
     def generate(context, builder, signature, values):  # type: ignore[no-untyped-def]
         number, typed_values = signature.return_type.number, zip(signature.args, values, strict=True)
-        return build(builder, *(_spread(context, builder, number, kind, value) for kind, value in typed_values))
+        return build(builder, *(_broadcast(context, builder, number, kind, value) for kind, value in typed_values))
 
     return generate
 
@@ -75,14 +75,14 @@ def _operate(name: str) -> Any:
     def kind_of(_context, left, right):  # type: ignore[no-untyped-def]
         return _kind(left, right)(left, right), _made_of(lambda builder, a, b: getattr(builder, name)(a, b))
 
-    return _compiled(kind_of)
+    return _compiled_function(kind_of)
 
 
-def _give_operator(function: Any, made: Any) -> None:
+def _give_operator(function: Any, lane_operator: Any) -> None:
     @overload(function)
     def choose(left, right):  # type: ignore[no-untyped-def]
         if isinstance(left, _Lanes) or isinstance(right, _Lanes):
-            return lambda left, right: made(left, right)  # noqa: PLW0108  numba wants a function of Python
+            return lambda left, right: lane_operator(left, right)  # noqa: PLW0108  numba wants a function of Python
         return None
 
 
@@ -97,14 +97,14 @@ for _function, _in_place, _name in (
     _give_operator(_in_place, _made)
 
 
-@_compiled
+@_compiled_function
 def lanes(_context, number):  # type: ignore[no-untyped-def]
     """A number in all lanes, of its precision."""
     kind = _KINDS[types.float32 if number == types.float32 else types.float64]
     return kind(number), _made_of(lambda builder, value: value)
 
 
-@_compiled
+@_compiled_function
 def larger(_context, left, right):  # type: ignore[no-untyped-def]
     """Lane by lane the larger one; `right` where one is NaN."""
 
@@ -114,7 +114,7 @@ def larger(_context, left, right):  # type: ignore[no-untyped-def]
     return _kind(left, right)(left, right), _made_of(build)
 
 
-@_compiled
+@_compiled_function
 def if_less(_context, left, right, then, otherwise):  # type: ignore[no-untyped-def]
     """`then` where `left` is less than `right`, else, also where one is NaN, `otherwise`."""
 
@@ -135,7 +135,7 @@ def _math(name: str) -> Any:
 
         return number(number), _made_of(build)
 
-    return _compiled(kind_of)
+    return _compiled_function(kind_of)
 
 
 root, absolute = _math("sqrt"), _math("fabs")
@@ -151,8 +151,8 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, *places: Any) ->
     return address
 
 
-@_compiled
-def loaded(_context, array, row):  # type: ignore[no-untyped-def]
+@_compiled_function
+def load_row(_context, array, row):  # type: ignore[no-untyped-def]
     """The first eight numbers of a row of an array [n, 8 or more] in C order; integers in single precision."""
     if array.layout != "C":
         raise errors.TypingError(f"expected an array in C order, got the order {array.layout}")
@@ -169,7 +169,7 @@ def loaded(_context, array, row):  # type: ignore[no-untyped-def]
     return vector_kind(array, types.intp), generate
 
 
-@_compiled
+@_compiled_function
 def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
     """Store lanes as the first eight numbers of a row of an array [n, 8 or more] in C order, of the lanes'
     precision."""
@@ -185,7 +185,7 @@ def store(_context, numbers, array, row):  # type: ignore[no-untyped-def]
     return types.void(numbers, array, types.intp), generate
 
 
-@_compiled
+@_compiled_function
 def total(_context, numbers):  # type: ignore[no-untyped-def]
     """Sum of the lanes, by halves."""
 
@@ -204,8 +204,8 @@ def total(_context, numbers):  # type: ignore[no-untyped-def]
     return numbers.number(numbers), generate
 
 
-@_compiled
-def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
+@_compiled_function
+def gather_lanes(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
     """The numbers at a place of eight `rows` [8] of `arrays` [m, n], of unsigned integers or floats, in single
     precision."""
 
@@ -228,9 +228,11 @@ def gathered(_context, arrays, rows, place):  # type: ignore[no-untyped-def]
     return _KINDS[types.float32](arrays, rows, types.intp), generate
 
 
-def _mixed(builder: Any, one: Any, other: Any, chosen: list[int]) -> Any:
+def _shuffle(builder: Any, first_vector: Any, second_vector: Any, places: list[int]) -> Any:
     """A vector of chosen numbers of two, those of the other numbered after those of the one."""
-    return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(_INT, len(chosen)), chosen))
+    return builder.shuffle_vector(
+        first_vector, second_vector, ir.Constant(ir.VectorType(_INT, len(places)), places)
+    )
 
 
 def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[Any]:
@@ -240,7 +242,7 @@ def _vectors_at(builder: Any, address: Any, kind: Any, count: int) -> Iterator[A
         yield builder.inttoptr(builder.add(address, ir.IntType(64)(number * size)), kind.as_pointer())
 
 
-@_compiled
+@_compiled_function
 def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def]
     """Four lanes: what is at the places `first` to `first` + 3 of eight `rows` [8] of `arrays` [m, n] in C order
     and single precision. Rows are read whole and transposed in two steps, faster than number by number."""
@@ -255,16 +257,16 @@ def four_gathered(_context, arrays, rows, first):  # type: ignore[no-untyped-def
             row = builder.load(builder.inttoptr(where, ir.IntType(64).as_pointer()))
             address = _address(context, builder, of_arrays, values[0], row, values[2])
             fours.append(builder.load(next(_vectors_at(builder, address, four, 1)), align=4))
-        rows = [_mixed(builder, fours[n], fours[n + 4], list(range(8))) for n in range(4)]
+        rows = [_shuffle(builder, fours[n], fours[n + 4], list(range(8))) for n in range(4)]
         low, high = [0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]
-        pairs = [_mixed(builder, rows[n], rows[n + 2], half) for half in (low, high) for n in (0, 1)]
-        vectors = [_mixed(builder, pairs[n], pairs[n + 1], half) for n in (0, 2) for half in (low, high)]
+        pairs = [_shuffle(builder, rows[n], rows[n + 2], half) for half in (low, high) for n in (0, 1)]
+        vectors = [_shuffle(builder, pairs[n], pairs[n + 1], half) for n in (0, 2) for half in (low, high)]
         return context.make_tuple(builder, signature.return_type, vectors)
 
     return _several(4)(arrays, rows, types.intp), generate
 
 
-@_compiled
+@_compiled_function
 def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
     """Three lanes whose numbers take turns in a row of 24 of an array [n, 24] in C order and single precision."""
     _refuse_but_singles(array)
@@ -276,16 +278,16 @@ def in_turns(_context, array, row):  # type: ignore[no-untyped-def]
         vectors = []
         for lane in range(3):
             sources = [3 * n + lane for n in range(LANES)]
-            early = _mixed(builder, first, second, [min(n, 15) for n in sources])
+            early = _shuffle(builder, first, second, [min(n, 15) for n in sources])
             late = [k if n < 16 else n - 8 for k, n in enumerate(sources)]
-            vectors.append(_mixed(builder, early, third, late))
+            vectors.append(_shuffle(builder, early, third, late))
         return context.make_tuple(builder, signature.return_type, vectors)
 
     return _several(3)(array, types.intp), generate
 
 
-@_compiled
-def add_in_turns(_context, one, two, three, array, row):  # type: ignore[no-untyped-def]
+@_compiled_function
+def add_in_turns(_context, first, two, three, array, row):  # type: ignore[no-untyped-def]
     """Add three lanes to a row of 24 in which their numbers take turns, of an array as `in_turns` has it."""
     _refuse_but_singles(array)
 
@@ -293,13 +295,13 @@ def add_in_turns(_context, one, two, three, array, row):  # type: ignore[no-unty
         address = _address(context, builder, signature.args[3], *values[3:])
         for number, place in enumerate(_vectors_at(builder, address, _vector(types.float32), 3)):
             sources = [divmod(8 * number + n, 3) for n in range(LANES)]
-            early = _mixed(builder, values[0], values[1], [lane + 8 * (of % 2) for lane, of in sources])
+            early = _shuffle(builder, values[0], values[1], [lane + 8 * (of % 2) for lane, of in sources])
             late = [8 + lane if of == 2 else n for n, (lane, of) in enumerate(sources)]
-            total_vector = builder.fadd(builder.load(place, align=4), _mixed(builder, early, values[2], late))
+            total_vector = builder.fadd(builder.load(place, align=4), _shuffle(builder, early, values[2], late))
             builder.store(total_vector, place, align=4)
         return context.get_dummy_value()
 
-    return types.void(one, two, three, array, types.intp), generate
+    return types.void(first, two, three, array, types.intp), generate
 
 
 def _several(count: int) -> Any:
@@ -311,7 +313,7 @@ def _refuse_but_singles(array: Any) -> None:
         raise errors.TypingError(f"expected an array of float32 in C order, got {array}")
 
 
-@_compiled
+@_compiled_function
 def store_halves(_context, numbers, bits):  # type: ignore[no-untyped-def]
     """Store eight numbers in `bits` [8] of uint16 as float16, each the nearest to its number."""
 

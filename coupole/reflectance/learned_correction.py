@@ -65,7 +65,7 @@ def strip_of(mask: NDArray[np.bool_], values: Floats, least_level: float) -> Str
 class Sight:
     """Input of the network for one light at the pixels of a strip, and the bounds of its answer."""
 
-    summed: Floats
+    kernel_sum: Floats
     """[pixels, 3] by the first kernel, as shares of the level."""
     features: Floats
     """[pixels * 3, features]"""
@@ -149,7 +149,7 @@ class Network:
         return gradients[::-1]
 
 
-def begun(features: int, generator: np.random.Generator) -> Network:
+def initial_network(features: int, generator: np.random.Generator) -> Network:
     """A network whose answer is about 0 (He et al. 2015 for the spread of its first weights)."""
     sizes = (features, *HIDDEN, 1)
     layers = []
@@ -185,7 +185,7 @@ class Lesson:
     """A strip without one light, and what that light showed."""
 
     features: Floats
-    wanted: Floats
+    targets: Floats
     """[n] what must be added to the sum, as shares of the level."""
     importance: Floats
     """[n] square of the level."""
@@ -209,27 +209,30 @@ def lessons(
             directions[light],
             kernels,
         )
-        targets = (strip.values[light] / strip.level[:, None] - sight.summed).ravel()
+        targets = (strip.values[light] / strip.level[:, None] - sight.kernel_sum).ravel()
         pixels = np.flatnonzero(generator.random(len(targets)) < share)
         yield Lesson(sight.features[pixels], targets[pixels], np.repeat(strip.level**2, 3)[pixels])
 
 
 def train(
-    given: Sequence[Lesson], *, seed: int = 0, say: Callable[[int, int], None] = lambda done, of: None
+    lessons_of_lights: Sequence[Lesson], *, seed: int = 0, say: Callable[[int, int], None] = lambda done, of: None
 ) -> Network:
     """A network from lessons of all lights. Every light counts alike, however hard it is."""
-    features = np.concatenate([lesson.features for lesson in given])
-    targets = np.concatenate([lesson.wanted for lesson in given])
-    errors = [float(np.mean(lesson.importance * lesson.wanted**2)) for lesson in given]
+    features = np.concatenate([lesson.features for lesson in lessons_of_lights])
+    targets = np.concatenate([lesson.targets for lesson in lessons_of_lights])
+    errors = [float(np.mean(lesson.importance * lesson.targets**2)) for lesson in lessons_of_lights]
     common = float(np.median(errors)) + 1e-20
     roots = np.concatenate(
-        [np.sqrt(lesson.importance / (error + common)) for lesson, error in zip(given, errors, strict=True)]
+        [
+            np.sqrt(lesson.importance / (error + common))
+            for lesson, error in zip(lessons_of_lights, errors, strict=True)
+        ]
     ).astype(np.float32)
     roots /= np.sqrt(np.mean(roots**2))
     np.minimum(roots, np.float32(np.sqrt(20.0)), out=roots)
     middle, deviation = features.mean(axis=0), features.std(axis=0) + np.float32(1e-6)
     generator = np.random.default_rng(seed)
-    network = begun(features.shape[1], generator)
+    network = initial_network(features.shape[1], generator)
     adam = _Adam(network)
     steps = min(_MOST_STEPS, 1 + _LOOKS * len(targets) // _BATCH)
     for number in range(steps):
@@ -246,9 +249,9 @@ def train(
     return Network([first_layer, *network.layers[1:]])
 
 
-def corrected(strip: Strip, sight: Sight, network: Network | None) -> Floats:
+def corrected_values(strip: Strip, sight: Sight, network: Network | None) -> Floats:
     """[pixels, 3] values of the light that was looked for, not below 0; the sum alone without a network."""
-    values: Floats = sight.summed
+    values: Floats = sight.kernel_sum
     if network is not None:
         values = np.clip(values + network(sight.features).reshape(values.shape), sight.low, sight.high)
     return np.maximum(values, 0.0) * strip.level[:, None]

@@ -46,11 +46,11 @@ def gains(
 
 
 def gain_between(
-    measured: NDArray[np.float64], found: NDArray[np.float64], direction: NDArray[np.float64]
+    light_directions: NDArray[np.float64], gains_of_lights: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> float:
     """The gain that a picture from another direction would have had: the median of the nearest ones', so that one
     faulty picture among good ones does not count."""
-    return float(np.median(found[nearest(measured, direction, _NEIGHBOURS)]))
+    return float(np.median(gains_of_lights[nearest(light_directions, direction, _NEIGHBOURS)]))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -34,14 +34,21 @@ def _phi(r: Floats, kernel: str) -> Floats:
     raise ValueError(kernel)
 
 
-def weights(measured: Floats, wanted: Floats, kernel: str) -> Floats:
-    """[wanted, measured] weights of values under lights from `measured` [n, 3] for lights from `wanted` [m, 3]."""
-    count = len(measured)
-    tail: Floats = np.hstack([np.ones((count, 1)), measured])
+def weights(light_directions: Floats, new_directions: Floats, kernel: str) -> Floats:
+    """[wanted, measured] weights of values under lights from `light_directions` [n, 3] for lights from
+    `new_directions` [m, 3]."""
+    count = len(light_directions)
+    tail: Floats = np.hstack([np.ones((count, 1)), light_directions])
     system = np.zeros((count + TAIL, count + TAIL))
-    system[:count, :count] = _phi(_distances(measured, measured), kernel)
+    system[:count, :count] = _phi(_distances(light_directions, light_directions), kernel)
     system[:count, count:], system[count:, :count] = tail, tail.T
-    right: Floats = np.hstack([_phi(_distances(wanted, measured), kernel), np.ones((len(wanted), 1)), wanted])
+    right: Floats = np.hstack(
+        [
+            _phi(_distances(new_directions, light_directions), kernel),
+            np.ones((len(new_directions), 1)),
+            new_directions,
+        ]
+    )
     # lights in one plane leave part of the tail open: the least solution is taken
     solution = np.linalg.lstsq(system.T, right.T, rcond=1e-12)[0]
     return np.asarray(solution.T[:, :count], dtype=np.float64)
@@ -52,13 +59,13 @@ def _distances(a: Floats, b: Floats) -> Floats:
     return distances
 
 
-def nearest(measured: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
+def nearest(light_directions: Floats, direction: Floats, count: int) -> NDArray[np.int64]:
     """Indices of the measured lights nearest to a direction, the nearest first; of equals, as rings of lamps have
     them, the first in the table, whatever the last bits say."""
-    return np.argsort(_distances(direction[None], measured)[0].round(_DIGITS), kind="stable")[:count]
+    return np.argsort(_distances(direction[None], light_directions)[0].round(_DIGITS), kind="stable")[:count]
 
 
-def left_without(measured: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
+def left_without(light_directions: Floats, number: int, neighbours: int) -> NDArray[np.int64]:
     """Indices of the lights that are left when one goes with so many of its nearest neighbours."""
-    near_lights = nearest(measured, measured[number], neighbours + 1)
-    return np.setdiff1d(np.arange(len(measured)), np.append(near_lights, number))
+    near_lights = nearest(light_directions, light_directions[number], neighbours + 1)
+    return np.setdiff1d(np.arange(len(light_directions)), np.append(near_lights, number))

@@ -79,7 +79,7 @@ def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
 
 def covariances(
     samples: TriangleSamples,
-    used: NDArray[np.bool_],
+    sample_mask: NDArray[np.bool_],
     materials: TriangleMaterials,
     noise_um: float,
     *,
@@ -87,12 +87,12 @@ def covariances(
     middle_mm: Floats,
     threads: int | None = None,
 ) -> MaterialUncertainty:
-    """Return the covariances of materials that were fitted to the samples `used` [samples]; `noise_um` is that of
-    the mesh's vertices, `middle_mm` the middle of the object."""
+    """Return the covariances of materials that were fitted to the samples `sample_mask` [samples]; `noise_um` is
+    that of the mesh's vertices, `middle_mm` the middle of the object."""
     prior = prior_stiffness(samples.areas_mm2, noise_um)
     stiffness = prior if fitted_normals else np.full(len(prior), HELD)
     group = groups_of(samples, middle_mm)
-    order = np.flatnonzero(used)
+    order = np.flatnonzero(sample_mask)
     order = order[np.argsort(group[order], kind="stable")]
     grey = np.stack([materials.kd.mean(axis=1), materials.ks.mean(axis=1), materials.alpha], axis=1)
     grey[:, 0] = np.maximum(grey[:, 0], LEAST_KD)
@@ -129,7 +129,8 @@ def relative_uncertainty(
 
 @numba.njit(cache=True, nogil=True)
 def _fill(  # type: ignore[no-untyped-def]
-    values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, kd, ks, held, prior, order, group, found, u_kd,
+    values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, kd, ks, normal_stiffness, prior, order,
+    group, covariance, u_kd,
     u_ks,
 ):  # fmt: skip
     samples = values.shape[1]
@@ -158,8 +159,8 @@ def _fill(  # type: ignore[no-untyped-def]
             meat,
         )
         for tilt in range(2):
-            bread[tilt, tilt] += held[triangle]
-            meat[tilt, tilt] += held[triangle] * held[triangle] / prior[triangle]
+            bread[tilt, tilt] += normal_stiffness[triangle]
+            meat[tilt, tilt] += normal_stiffness[triangle] * normal_stiffness[triangle] / prior[triangle]
         bread[2, 2] += _LEAST_KNOWN
         meat[2, 2] += _LEAST_KNOWN
         bread[3, 3] += USUAL / SPREAD_KS**2
@@ -167,10 +168,10 @@ def _fill(  # type: ignore[no-untyped-def]
         bread[4, 4] += USUAL
         meat[4, 4] += USUAL
         inverse = np.linalg.inv(bread)
-        assign_rows(found[triangle], inverse @ meat @ inverse.T)
+        assign_rows(covariance[triangle], inverse @ meat @ inverse.T)
         _colours(
             colours, good[:n], lights, half, views, view_of, group, normals[triangle], grey[triangle],
-            kd[triangle], ks[triangle], found[triangle], u_kd[triangle], u_ks[triangle],
+            kd[triangle], ks[triangle], covariance[triangle], u_kd[triangle], u_ks[triangle],
         )  # fmt: skip
 
 
@@ -211,7 +212,7 @@ def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread,
 
 @numba.njit(cache=True, nogil=True)
 def _colours(  # type: ignore[no-untyped-def]
-    own, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
+    sample_colours, good, lights, half, views, view_of, group, normal, grey, kd, ks, covariance, u_kd, u_ks
 ):
     """Relative uncertainties of each channel's kd and ks: what their own least squares (`normal_fit.colours_from`)
     say, with normal and roughness as they are, and what these add to the channels' mean."""
@@ -230,7 +231,7 @@ def _colours(  # type: ignore[no-untyped-def]
         nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
         nh = normal[0] * half[sample, 0] + normal[1] * half[sample, 1] + normal[2] * half[sample, 2]
         row[0], row[1] = nl, nl * lobe(nl, nv, nh, grey[2])[0]
-        weight = colour_weight(row[0] * grey[0] + row[1] * grey[1], own[sample], grey[0])
+        weight = colour_weight(row[0] * grey[0] + row[1] * grey[1], sample_colours[sample], grey[0])
         if group[sample] != before:
             groups, before = groups + 1, group[sample]
             for channel in range(channels + 1):
@@ -238,7 +239,7 @@ def _colours(  # type: ignore[no-untyped-def]
             score[:] = 0.0
         off[channels] = 0.0
         for channel in range(channels):
-            off[channel] = own[sample, channel] - row[0] * kd[channel] - row[1] * ks[channel]
+            off[channel] = sample_colours[sample, channel] - row[0] * kd[channel] - row[1] * ks[channel]
             off[channels] += off[channel] / channels
         for i in range(2):
             for j in range(2):
@@ -286,16 +287,16 @@ def _root(normal, t1, t2, light, half, view, grey, row):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def _relative(led_mm, view_of, cameras_mm, centres_mm, normals, grey, covariance, found):  # type: ignore[no-untyped-def]
+def _relative(led_mm, view_of, cameras_mm, centres_mm, normals, grey, covariance, u_relative):  # type: ignore[no-untyped-def]
     views, light, half, row = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3), np.empty(UNKNOWNS)
-    for triangle in range(len(found)):
+    for triangle in range(len(u_relative)):
         normal = normals[triangle]
         if not grey[triangle, 2] > 0.0:
             continue
         t1, t2 = tangents(normal[0], normal[1], normal[2])
         for view in range(len(cameras_mm)):
             towards(centres_mm[triangle], cameras_mm[view], views[view])
-        for sample in range(found.shape[1]):
+        for sample in range(u_relative.shape[1]):
             view = views[view_of[sample]]
             towards(centres_mm[triangle], led_mm[sample], light)
             between(light, view, half)
@@ -308,4 +309,4 @@ def _relative(led_mm, view_of, cameras_mm, centres_mm, normals, grey, covariance
             for i in range(UNKNOWNS):
                 for j in range(UNKNOWNS):
                     variance += row[i] * covariance[triangle, i, j] * row[j]
-            found[triangle, sample] = 2.0 * math.sqrt(max(variance, 0.0)) / root
+            u_relative[triangle, sample] = 2.0 * math.sqrt(max(variance, 0.0)) / root

@@ -118,15 +118,16 @@ def _fit_colours(values, normals, grey_kd, grey_ks, alphas, lights, half, view, 
 
 
 @numba.njit(cache=True, nogil=True)
-def colours_from(values, used, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
-    """kd and ks [channels] of the samples `used` of values [samples, channels], with a normal and `grey` (kd, ks,
-    alpha) that were fitted to their means; samples are weighted as the last step of that fit weighted them."""
+def colours_from(values, used_samples, normal, grey, lights, half, views, view_of, kd, ks):  # type: ignore[no-untyped-def]
+    """kd and ks [channels] of the samples `used_samples` of values [samples, channels], with a normal and `grey`
+    (kd, ks, alpha) that were fitted to their means; samples are weighted as the last step of that fit weighted
+    them."""
     n0, n1, n2 = normal
     channels = values.shape[1]
     sums = np.zeros((channels, 2))
     dd, ds, ss = 0.0, 0.0, 0.0
-    for number in range(len(used)):
-        light = used[number]
+    for number in range(len(used_samples)):
+        light = used_samples[number]
         nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
         if nl <= 0.0:
             continue
@@ -162,7 +163,7 @@ def colour_weight(model, values, grey_kd):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_all(values, lights, half, views, view_of, normals, albedo, least, found):  # type: ignore[no-untyped-def]
+def _fit_all(values, lights, half, views, view_of, normals, albedo, least, parameters):  # type: ignore[no-untyped-def]
     for pixel in range(len(values)):
         sample = values[pixel]
         indices = np.flatnonzero(sample > max(least[pixel], 0.0))
@@ -183,16 +184,16 @@ def _fit_all(values, lights, half, views, view_of, normals, albedo, least, found
             cost, rms = fit_from(roots, indices, lights, half, views, view_of, unknowns, views[0], 0.0, 0.0)
             if cost < best:
                 best = cost
-                assign(found[pixel, :3], unknowns[:3])
-                found[pixel, 3], found[pixel, 4] = math.exp(unknowns[3]), math.exp(unknowns[4])
-                found[pixel, 5], found[pixel, 6] = math.exp(unknowns[5]), rms
+                assign(parameters[pixel, :3], unknowns[:3])
+                parameters[pixel, 3], parameters[pixel, 4] = math.exp(unknowns[3]), math.exp(unknowns[4])
+                parameters[pixel, 5], parameters[pixel, 6] = math.exp(unknowns[5]), rms
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual):  # type: ignore[no-untyped-def]
+def fit_from(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt from `unknowns` (normal, log kd, log ks, log alpha), in place; cost and weighted rms.
 
-    `roots` are square roots of the samples `used`; `lights` and `half` [samples, 3], `views` [v, 3] that
+    `roots` are square roots of the samples `used_samples`; `lights` and `half` [samples, 3], `views` [v, 3] that
     `view_of` [samples] names. The normal is held to `prior` by `stiffness`, 1 over its variance in rad^2;
     roughness and ks to what is usual by `usual`, so that no highlight is invented where no sample could show it.
     """
@@ -200,7 +201,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     trial = np.empty(6)
     cost, rms = _equations(
-        roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
+        roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
     )
     damping = 1e-2
     for _ in range(_MOST_STEPS):
@@ -208,7 +209,7 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
         _move(unknowns, step, trial)
         if _least_cosine(trial, views) > 0.02:
             trial_cost, trial_rms = _cost(
-                roots, used, lights, half, views, view_of, trial, prior, stiffness, usual, scale
+                roots, used_samples, lights, half, views, view_of, trial, prior, stiffness, usual, scale
             )
         else:
             trial_cost, trial_rms = np.inf, 0.0
@@ -220,7 +221,19 @@ def fit_from(roots, used, lights, half, views, view_of, unknowns, prior, stiffne
                 cost, rms = trial_cost, trial_rms
                 break
             cost, rms = _equations(
-                roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
+                roots,
+                used_samples,
+                lights,
+                half,
+                views,
+                view_of,
+                unknowns,
+                prior,
+                stiffness,
+                usual,
+                scale,
+                matrix,
+                right,
             )
         else:
             damping *= 6.0
@@ -256,7 +269,7 @@ def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
+def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale):  # type: ignore[no-untyped-def]
     """Cauchy's cost, and the weighted rms of the residuals."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
@@ -264,8 +277,8 @@ def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness,
     cost = stiffness * ((n0 - prior[0]) ** 2 + (n1 - prior[1]) ** 2 + (n2 - prior[2]) ** 2)
     cost += usual * ((unknowns[5] - _USUAL_ALPHA) ** 2 + ((unknowns[4] - _USUAL_KS) / SPREAD_KS) ** 2)
     squares, weights = 0.0, 0.0
-    for number in range(len(used)):
-        light = used[number]
+    for number in range(len(used_samples)):
+        light = used_samples[number]
         nl = n0 * lights[light, 0] + n1 * lights[light, 1] + n2 * lights[light, 2]
         model = 0.0
         if nl > 0.0:
@@ -280,7 +293,9 @@ def _cost(roots, used, lights, half, views, view_of, unknowns, prior, stiffness,
 
 
 @numba.njit(cache=True, nogil=True)
-def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right):  # type: ignore[no-untyped-def]
+def _equations(  # type: ignore[no-untyped-def]
+    roots, used_samples, lights, half, views, view_of, unknowns, prior, stiffness, usual, scale, matrix, right
+):
     """Normal equations of a step, into `matrix` and `right`; cost and weighted rms."""
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
@@ -299,8 +314,8 @@ def _equations(roots, used, lights, half, views, view_of, unknowns, prior, stiff
     cost += usual * (more_alpha * more_alpha + more_ks * more_ks)
     right[3], right[4] = -usual * more_ks / SPREAD_KS, -usual * more_alpha
     matrix[3, 3], matrix[4, 4] = usual / SPREAD_KS**2, usual
-    for number in range(len(used)):
-        light = used[number]
+    for number in range(len(used_samples)):
+        light = used_samples[number]
         view = view_of[light]
         l0, l1, l2 = lights[light, 0], lights[light, 1], lights[light, 2]
         nl = n0 * l0 + n1 * l1 + n2 * l2

@@ -89,16 +89,16 @@ def _orders(degrees: int) -> list[tuple[int, int, int]]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _legendre(z, degrees, a, b, first, found):  # type: ignore[no-untyped-def]
-    """Fill `found` [degrees, degrees] with P(l, m) of z, without the power of the distance from the axis."""
+def _legendre(z, degrees, a, b, first, polynomials):  # type: ignore[no-untyped-def]
+    """Fill `polynomials` [degrees, degrees] with P(l, m) of z, without the power of the distance from the axis."""
     p_mm = math.sqrt(0.25 / math.pi)
     for m in range(degrees):
         p_mm *= first[m]
         before, now = 0.0, p_mm
-        found[m, m] = now
+        polynomials[m, m] = now
         for degree in range(m + 1, degrees):
             before, now = now, a[degree, m] * (z * now - b[degree, m] * before)
-            found[degree, m] = now
+            polynomials[degree, m] = now
 
 
 @numba.njit(cache=True, nogil=True)
@@ -122,15 +122,15 @@ def _pair(light, view, degrees, a, b, first, of_light, of_view, cosines, row):  
 
 
 @numba.njit(cache=True, nogil=True)
-def _functions(lights, views, degrees, a, b, first, found):  # type: ignore[no-untyped-def]
+def _functions(lights, views, degrees, a, b, first, harmonics):  # type: ignore[no-untyped-def]
     of_light, of_view, cosines = np.empty((degrees, degrees)), np.empty((degrees, degrees)), np.empty(degrees)
     for n in range(len(lights)):
-        _pair(lights[n], views[n], degrees, a, b, first, of_light, of_view, cosines, found[n])
+        _pair(lights[n], views[n], degrees, a, b, first, of_light, of_view, cosines, harmonics[n])
 
 
 @numba.njit(cache=True, nogil=True)
 def _values(  # type: ignore[no-untyped-def]
-    led_mm, view_of, cameras_mm, centres_mm, normals, cluster, coefficients, degrees, a, b, first, made
+    led_mm, view_of, cameras_mm, centres_mm, normals, cluster, coefficients, degrees, a, b, first, modelled_values
 ):
     of_light, of_view, cosines = np.empty((degrees, degrees)), np.empty((degrees, degrees)), np.empty(degrees)
     row, axes, light, view = np.empty(coefficients.shape[1]), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -144,8 +144,8 @@ def _values(  # type: ignore[no-untyped-def]
             if light[2] <= 0.0 or view[2] <= 0.0:
                 continue
             _pair(light, view, degrees, a, b, first, of_light, of_view, cosines, row)
-            for channel in range(made.shape[2]):
+            for channel in range(modelled_values.shape[2]):
                 total = 0.0
                 for n in range(len(row)):
                     total += row[n] * coefficients[cluster[triangle], n, channel]
-                made[triangle, sample, channel] = 0.0 if total < 0.0 else total * light[2]  # NaN stays
+                modelled_values[triangle, sample, channel] = 0.0 if total < 0.0 else total * light[2]  # NaN stays

@@ -32,7 +32,7 @@ from coupole.reflectance.picture_result import (
     SAMPLES,
     SCHEMA,
     PictureResult,
-    opened,
+    open_result_file,
 )
 from coupole.reflectance.picture_set import FEWEST_LIGHTS, PictureSet
 from coupole.reflectance.relighting import Interpolation, learn, read_interpolation, relit
@@ -176,7 +176,7 @@ def _fit(result: PictureResult, lights: NDArray[np.int64], path: Path, step: str
 
 def read_materials(path: Path) -> PointMaterials:
     """Read the materials of the grey values, [pixels] of the mask."""
-    with opened(path) as file:
+    with open_result_file(path) as file:
         names = ("normal", "grey_kd", "grey_ks", "alpha", "residual")
         return PointMaterials(*(np.asarray(file[name], dtype=np.float64) for name in names))
 
@@ -202,22 +202,24 @@ def check(result: PictureResult, interpolation: Interpolation, light: int, peak:
     return Checked(light, psnr_db, float(np.mean(np.abs(off))))
 
 
-def pooled_psnr_db(checked: Sequence[Checked]) -> float | None:
+def pooled_psnr_db(light_checks: Sequence[Checked]) -> float | None:
     """Return the PSNR of all left-out lights together; None without any."""
-    if not checked:
+    if not light_checks:
         return None
-    return float(-10.0 * np.log10(np.mean([10.0 ** (-light_check.psnr_db / 10.0) for light_check in checked])))
+    return float(
+        -10.0 * np.log10(np.mean([10.0 ** (-light_check.psnr_db / 10.0) for light_check in light_checks]))
+    )
 
 
 def _about(
     result: PictureResult,
-    told: dict[str, Any],
+    settings: dict[str, Any],
     interpolation: Interpolation,
     materials: PointMaterials,
-    checked: Sequence[Checked],
+    light_checks: Sequence[Checked],
     seconds: float,
 ) -> dict[str, Any]:
-    with opened(result.folder / SAMPLES) as file:
+    with open_result_file(result.folder / SAMPLES) as file:
         names = [name.decode() for name in file["names"][:]]
     gains_of_lights = zip(interpolation.lights.tolist(), interpolation.gains.tolist(), strict=True)
     suspects = {names[light]: round(gain, 3) for light, gain in gains_of_lights if abs(gain - 1.0) > SUSPECT}
@@ -225,7 +227,7 @@ def _about(
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "h5py")},
-        **told,
+        **settings,
         "axes": AXES,
         "lights": len(names),
         "pixels": int(np.count_nonzero(result.mask)),
@@ -236,9 +238,9 @@ def _about(
         "suspect_pictures": suspects,
         "held_out": [
             {"light": light_check.light, "psnr_db": round(light_check.psnr_db, 3), "mae": light_check.mae}
-            for light_check in checked
+            for light_check in light_checks
         ],
-        "held_out_psnr_db": pooled_psnr_db(checked),
+        "held_out_psnr_db": pooled_psnr_db(light_checks),
         "seconds": round(seconds, 3),
         "peak_memory_bytes": peak_bytes,
     }

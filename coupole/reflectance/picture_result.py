@@ -28,7 +28,7 @@ AXES = "x to the right of the picture, y up, z to the camera"
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
+def open_result_file(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file of a result. Raises InputError if it cannot be read."""
     try:
         file = h5py.File(path, "r")
@@ -62,25 +62,25 @@ class PictureResult:
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
         """[h, w] what was fitted."""
-        with opened(self.folder / SAMPLES) as file:
+        with open_result_file(self.folder / SAMPLES) as file:
             return np.asarray(file["mask"], dtype=bool)
 
     @cached_property
     def directions(self) -> NDArray[np.float64]:
         """[lights, 3] unit vectors to all lights, left out or not."""
-        with opened(self.folder / SAMPLES) as file:
+        with open_result_file(self.folder / SAMPLES) as file:
             return np.asarray(file["directions"], dtype=np.float64)
 
     @cached_property
     def _scales(self) -> Floats:
         """[lights, 1, 3] from raw values to full scale 1 divided by the intensities."""
-        with opened(self.folder / SAMPLES) as file:
+        with open_result_file(self.folder / SAMPLES) as file:
             factors: NDArray[np.float64] = 1.0 / (file.attrs["full_scale"] * np.asarray(file["intensities"]))
         return factors[:, None].astype(np.float32)
 
     def values(self, lights: NDArray[np.int64], pixels: slice = slice(None)) -> Floats:
         """[lights, pixels, 3] in full scales divided by the intensities; `lights` must rise."""
-        with opened(self.folder / SAMPLES) as file:
+        with open_result_file(self.folder / SAMPLES) as file:
             raw = file["values"]
             values = np.empty((len(lights), *raw[0, pixels].shape), np.float32)
             for place, light in enumerate(lights):

@@ -126,12 +126,12 @@ def linear_of_srgb(picture: NDArray[Any]) -> NDArray[np.uint16]:
     return values
 
 
-def _names_in(folder: Path, others: set[Path]) -> tuple[str, ...]:
+def _names_in(folder: Path, other_files: set[Path]) -> tuple[str, ...]:
     order = folder / ORDER_FILE
     if order.is_file():
         return tuple(" ".join(read_lines(order)).split())
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    return tuple(path.name for path in paths if path.resolve() not in others and path.stem != "mask")
+    return tuple(path.name for path in paths if path.resolve() not in other_files and path.stem != "mask")
 
 
 def read_picture(path: Path) -> NDArray[Any]:

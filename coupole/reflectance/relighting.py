@@ -18,7 +18,7 @@ from coupole.reflectance.light_gains import SUSPECT, gain_between
 from coupole.reflectance.light_interpolation import KERNELS, left_without
 from coupole.reflectance.new_light.environment import OF_PICTURES, read_environment
 from coupole.reflectance.new_light.light_kinds import AnyLight, DistantLight, EnvironmentLight
-from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, opened
+from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, open_result_file
 
 Floats = NDArray[np.float32]
 
@@ -60,7 +60,7 @@ class Interpolation:
 
 def read_interpolation(folder: Path) -> Interpolation:
     """Read the interpolation of a result folder. Raises InputError."""
-    with opened(folder / INTERPOLATION) as file:
+    with open_result_file(folder / INTERPOLATION) as file:
         layers = [
             (np.asarray(file[f"network/{number}/matrix"]), np.asarray(file[f"network/{number}/offset"]))
             for number in range(len(file["network"]) if "network" in file else 0)
@@ -103,15 +103,15 @@ def learn(
         lessons_of_strips.append(
             list(learned.lessons(strip, directions, sound.tolist(), kernels, share=share, generator=generator))
         )
-    by_light = [_joined(parts) for parts in zip(*lessons_of_strips, strict=True)]
+    by_light = [_join_lessons(parts) for parts in zip(*lessons_of_strips, strict=True)]
     network = learned.train(by_light, say=say) if by_light else None
     return Interpolation(lights, gains, kernel, rms, peak, network)
 
 
-def _joined(parts: Sequence[learned.Lesson]) -> learned.Lesson:
+def _join_lessons(parts: Sequence[learned.Lesson]) -> learned.Lesson:
     return learned.Lesson(
         np.concatenate([part.features for part in parts]),
-        np.concatenate([part.wanted for part in parts]),
+        np.concatenate([part.targets for part in parts]),
         np.concatenate([part.importance for part in parts]),
     )
 
@@ -143,7 +143,7 @@ def relit(result: PictureResult, interpolation: Interpolation, direction: NDArra
         strip = strip_between(result, interpolation, above, below)
         sight = learned.look(strip, directions, unit, kernels)
         strip_picture = np.zeros((below - above, result.mask.shape[1], 3), np.float32)
-        strip_picture[strip.mask] = gain * learned.corrected(strip, sight, interpolation.network)
+        strip_picture[strip.mask] = gain * learned.corrected_values(strip, sight, interpolation.network)
         picture[top:bottom] = strip_picture[top - above : bottom - above]
     return picture
 

@@ -54,14 +54,18 @@ def uncertainty_of_picture(
 
     straight = picture(materials, 0)
     step_pictures = np.empty_like(straight), np.empty_like(straight)
-    triangle_of_pixel = scene.surface.seen
+    triangle_of_pixel = scene.surface.triangle_of_pixel
     # -1, for nothing, takes the last
     square = (straight * np.append(common, 0.0)[triangle_of_pixel][..., None]) ** 2
     for part in range(UNKNOWNS):
         deviation = roots[:, :, part]
         shorter = _LONGEST_STEP / np.maximum(np.abs(deviation[:, _NOT_LINEAR]).max(axis=1), _LONGEST_STEP)
         up, down = (
-            picture(_moved(materials, wider, sign * shorter[:, None] * deviation), 1 + 2 * part + (sign > 0), into)
+            picture(
+                _stepped_materials(materials, wider, sign * shorter[:, None] * deviation),
+                1 + 2 * part + (sign > 0),
+                into,
+            )
             for sign, into in zip((-1.0, 1.0), step_pictures, strict=True)
         )
         square += ((up - down) / (2.0 * np.append(shorter, 1.0)[triangle_of_pixel][..., None])) ** 2
@@ -93,12 +97,12 @@ def _uncertain(scene: RelitScene) -> tuple[Floats, Floats, Floats]:
     return covariance, np.nan_to_num(of_channels / np.maximum(of_means, 1e-12)), common
 
 
-def _moved(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
+def _stepped_materials(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
     """Materials whose tilts and logarithms have moved by a small step [n, 5]. Channels move together, each as far
     as its own uncertainty is `wider` [n, 2, channels] (of kd, of ks) than that of their mean."""
     return dataclasses.replace(
         materials,
-        normals=_turned(materials.normals, step[:, :2]),
+        normals=_tilted_normals(materials.normals, step[:, :2]),
         kd=materials.kd * (1.0 + step[:, 2:3] * wider[:, 0]),
         ks=materials.ks * (1.0 + step[:, 3:4] * wider[:, 1]),
         alpha=materials.alpha * np.exp(step[:, 4]),
@@ -106,7 +110,7 @@ def _moved(materials: TriangleMaterials, wider: Floats, step: Floats) -> Triangl
 
 
 @numba.njit(cache=True, nogil=True)
-def _turned(normals, tilts):  # type: ignore[no-untyped-def]
+def _tilted_normals(normals, tilts):  # type: ignore[no-untyped-def]
     turned_normals = np.empty_like(normals)
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])

@@ -107,7 +107,7 @@ class _Case:
     samples: TriangleSamples
     leds: NDArray[np.int64]
     """[samples]"""
-    held: NDArray[np.bool_]
+    left_out_mask: NDArray[np.bool_]
     """[samples] those under LEDs that were left out."""
     incidence_deg: Floats
     """[b, samples]"""
@@ -136,7 +136,7 @@ def _case(result: RunResult, block: slice, settings: dict[str, Any]) -> _Case:
 
 def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]:
     """Return the errors of each fit, under the LEDs that were left out, where every fit has something."""
-    of_leds = np.unique(case.leds[~case.held])[:: variant.led_step]
+    of_leds = np.unique(case.leds[~case.left_out_mask])[:: variant.led_step]
     is_fitted = np.isin(case.leds, of_leds)
     values = np.where(case.incidence_deg[..., None] <= variant.most_incidence_deg, case.samples.values, np.nan)
     samples = replace(case.samples, values=values.astype(np.float32))
@@ -159,9 +159,11 @@ def _errors(case: _Case, variant: Variant, noise_um: float) -> dict[str, Floats]
             basis = fewer(fit.basis, variant.coefficients)
             coefficients = fit_slices(view_samples, is_fitted[in_view], (basis, model), threads=1)[0]
             values_of_fits[name][:, in_view] = slice_values(view_samples, coefficients, basis, model)
-    held_out_values = case.samples.values[:, case.held]
+    held_out_values = case.samples.values[:, case.left_out_mask]
     is_finite = np.isfinite(held_out_values)
     for fit_values in values_of_fits.values():
-        is_finite &= np.isfinite(fit_values[:, case.held])
-    share = case.share[:, case.held]
-    return {name: ((values_of_fits[name][:, case.held] - held_out_values) * share)[is_finite] for name in FITS}
+        is_finite &= np.isfinite(fit_values[:, case.left_out_mask])
+    share = case.share[:, case.left_out_mask]
+    return {
+        name: ((values_of_fits[name][:, case.left_out_mask] - held_out_values) * share)[is_finite] for name in FITS
+    }

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.fits import FITS, GGX, MATERIALS
 from coupole.reflectance.material_uncertainty import relative_uncertainty
 from coupole.reflectance.result_folder import read_settings
-from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_pictures import held_out, read_check_frames
 from coupole.reflectance.run_result import ABOUT, SCHEMA, RunResult, ViewSamples
 from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
@@ -117,7 +117,7 @@ def _check_view(
     check.noise += list(read_check_frames(result, view).noise)
     for part in held_out(result, view, settings, memory_bytes):
         some = part.samples
-        values_of_fits = _made(result, view, part.rows, some, part.share)
+        values_of_fits = _modelled_values(result, view, part.rows, some, part.share)
         _compare(values_of_fits, some.values * part.share, check.triangles)
         noise = result.view_noise(view, part.rows, np.isin(view.leds, settings["left_out"]))
         for name, inside in check.inside.items():
@@ -134,44 +134,48 @@ def _check_view(
         say(f"check of {view.view}", part.rows.stop, len(view.triangles))
 
 
-def _made(
+def _modelled_values(
     result: RunResult, view: ViewSamples, rows: slice, samples: TriangleSamples, share: NDArray[np.float64]
 ) -> dict[str, NDArray[np.float64]]:
     """Return what all fits make of some samples, in shares of the camera's range."""
 
     def of(name: str) -> NDArray[np.float64]:
-        return predicted(result, name, view, rows, samples) * share
+        return predict_samples(result, name, view, rows, samples) * share
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return dict(zip(FITS, pool.map(of, FITS), strict=True))
 
 
 def _inside(
-    made: NDArray[np.float64],
+    modelled_values: NDArray[np.float64],
     relative: NDArray[np.float32],
-    measured: NDArray[np.float32],
+    measured_values: NDArray[np.float32],
     noise: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
     """Tell whether the channels' means of samples [n, leds, channels] lie in the interval of what was made, by its
     uncertainty [n, leds] and theirs. Only samples that have all channels count."""
-    middle = made.mean(axis=2)
-    variance = (relative * middle) ** 2 + np.sum((noise * measured) ** 2, axis=2) / measured.shape[2] ** 2
-    off = np.abs(measured.mean(axis=2) - middle)
+    middle = modelled_values.mean(axis=2)
+    variance = (relative * middle) ** 2 + np.sum((noise * measured_values) ** 2, axis=2) / measured_values.shape[
+        2
+    ] ** 2
+    off = np.abs(measured_values.mean(axis=2) - middle)
     is_finite = np.isfinite(off) & np.isfinite(variance)
     in_interval: NDArray[np.bool_] = off[is_finite] < QUANTILE * np.sqrt(variance[is_finite])
     return in_interval
 
 
 def _compare(
-    made: Mapping[str, NDArray[np.floating]], measured: NDArray[np.floating], missed: dict[str, _Missed]
+    values_of_fits: Mapping[str, NDArray[np.floating]],
+    measured_values: NDArray[np.floating],
+    misses: dict[str, _Missed],
 ) -> NDArray[np.floating]:
     """Add what fits miss where all have something; the measured values there."""
-    is_finite = np.isfinite(measured)
-    for values in made.values():
+    is_finite = np.isfinite(measured_values)
+    for values in values_of_fits.values():
         is_finite &= np.isfinite(values)
-    for name, values in made.items():
-        missed[name].add(values[is_finite] - measured[is_finite])
-    compared_values: NDArray[np.floating] = measured[is_finite]
+    for name, values in values_of_fits.items():
+        misses[name].add(values[is_finite] - measured_values[is_finite])
+    compared_values: NDArray[np.floating] = measured_values[is_finite]
     return compared_values
 
 

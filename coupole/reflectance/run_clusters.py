@@ -76,7 +76,7 @@ def cluster_result(
     pool = empty_pool(len(members), materials.kd.shape[1])
     random = np.random.default_rng(0)
     for block in result.blocks(memory_bytes):
-        sample_mask = _used(result, block, settings["left_out"], without_view)
+        sample_mask = _sample_mask(result, block, settings["left_out"], without_view)
         samples, normals = result.samples(block), materials.normals[block]
         pool_samples(pool, samples, sample_mask, normals, cluster[block], members, random)
         say("pool samples", block.stop, len(is_fitted))
@@ -95,7 +95,7 @@ def cluster_result(
             "without": int(np.count_nonzero(cluster < 0)),
             "harmonics": harmonics.shape[1],
             "without_view": without_view,
-            **_missed(result, settings, without_view, memory_bytes, say),
+            **_left_out_errors(result, settings, without_view, memory_bytes, say),
         }
         write_synced(out / ABOUT_CLUSTERS, json.dumps(report, indent=1) + "\n")
     except OSError as error:
@@ -103,7 +103,9 @@ def cluster_result(
     return report
 
 
-def _used(result: RunResult, block: slice, left_out: list[int], without_view: str | None) -> NDArray[np.bool_]:
+def _sample_mask(
+    result: RunResult, block: slice, left_out: list[int], without_view: str | None
+) -> NDArray[np.bool_]:
     """[samples] of a block: those of neither the LEDs nor the view that are left out."""
     led_in_use = ~np.isin(result.along_samples(block, "leds"), left_out)
     return np.asarray(led_in_use & (result.along_samples(block, "names") != without_view))
@@ -123,7 +125,7 @@ def _medians(materials: TriangleMaterials, cluster: NDArray[np.int64], count: in
 
 def _borrow(
     result: RunResult,
-    pooled: TriangleMaterials,
+    pool_materials: TriangleMaterials,
     cluster: NDArray[np.int64],
     left_out: list[int],
     without_view: str | None,
@@ -135,16 +137,16 @@ def _borrow(
     for block in result.blocks(memory_bytes):
         lacking = np.flatnonzero(cluster[block] < 0)
         if len(lacking):
-            sample_mask = _used(result, block, left_out, without_view)
+            sample_mask = _sample_mask(result, block, left_out, without_view)
             some = result.samples(block).of_triangles(lacking)
-            nearest = nearest_cluster(some, sample_mask, pooled, FEWEST_TO_BORROW)
+            nearest = nearest_cluster(some, sample_mask, pool_materials, FEWEST_TO_BORROW)
             cluster[block.start + lacking] = nearest
             is_borrowed[block.start + lacking] = nearest >= 0
         say("borrow", block.stop, len(cluster))
     return is_borrowed
 
 
-def _missed(
+def _left_out_errors(
     result: RunResult, settings: dict[str, Any], without_view: str | None, memory_bytes: int, say: Said
 ) -> dict[str, Any]:
     """Mean absolute errors, shares of the camera's range, under the LEDs that were left out: of all views, and of

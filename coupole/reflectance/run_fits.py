@@ -34,9 +34,9 @@ from coupole.reflectance.slice_fit import fit_slices
 from coupole.reflectance.triangle_fit import (
     TriangleMaterials,
     TriangleSamples,
-    joined,
+    join_materials,
     model_values,
-    recoloured,
+    recolour_materials,
 )
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import make_folder
@@ -74,12 +74,12 @@ def fit_result(out: Path, memory_bytes: int, *, scheduler: str | None = None, sa
                     _fit_materials(result, job, fit, shop, say)
             _leave_out(result, job, shop, say)
             _fit_slices(RunResult(result.folder), job, shop, say)
-            shop.everywhere(_opened.cache_clear)
+            shop.everywhere(_open_result.cache_clear)
     except OSError as error:
         raise disk_error(out, error) from error
 
 
-def predicted(
+def predict_samples(
     result: RunResult, name: str, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32]:
     """[b, samples, channels] f cos_i, 1/sr, that a fit gives for `samples` of rows of a view's file, whatever
@@ -94,30 +94,30 @@ def predicted(
     return fit.values(samples, result.slices(name, view, rows), _under(result, fit, view, rows, samples))
 
 
-def _fit_materials(result: RunResult, job: _Job, made: MaterialFit, shop: Workshop, say: Said) -> None:
+def _fit_materials(result: RunResult, job: _Job, material_fit: MaterialFit, shop: Workshop, say: Said) -> None:
     parts: list[TriangleMaterials] = []
     uncertain: list[MaterialUncertainty] = []
     blocks = list(result.blocks(job.memory_bytes, shop.most_rows(len(result.triangles))))
-    fit = partial(_materials_block, job, made, shop.threads)
+    fit = partial(_materials_block, job, material_fit, shop.threads)
     for block, materials_part in zip(blocks, shop.map(fit, blocks), strict=True):
         parts.append(materials_part)
-        say(f"fit {made.name}", block.stop, len(result.triangles))
-    if made.fits_normals:
-        whole = joined(parts)
+        say(f"fit {material_fit.name}", block.stop, len(result.triangles))
+    if material_fit.fits_normals:
+        whole = join_materials(parts)
         normals = unbiased_normals(whole, *_mesh(result), job.noise_um)
         parts = [replace(part, normals=normals[block]) for part, block in zip(parts, blocks, strict=True)]
     tasks = list(zip(blocks, parts, strict=True))
-    finish = partial(_uncertain_block, job, made, shop.threads)
+    finish = partial(_uncertain_block, job, material_fit, shop.threads)
     for number, (block, (materials, uncertainty)) in enumerate(zip(blocks, shop.map(finish, tasks), strict=True)):
         parts[number] = materials
         uncertain.append(uncertainty)
-        say(f"uncertainty of {made.name}", block.stop, len(result.triangles))
+        say(f"uncertainty of {material_fit.name}", block.stop, len(result.triangles))
     u_triangle = np.concatenate([result.u_triangles(block) for block in blocks])
 
     def write(path: Path) -> None:
         write_materials(path, parts, uncertain, u_triangle, result.u_shared, result.triangles)
 
-    complete(result.materials_path(made.name), write)
+    complete(result.materials_path(material_fit.name), write)
 
 
 def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
@@ -128,27 +128,29 @@ def _mesh(result: RunResult) -> tuple[Floats, Floats, Floats]:
     return across / np.maximum(twice, 1e-300)[:, None], corners.mean(axis=1), 0.5 * twice
 
 
-def _materials_block(job: _Job, made: MaterialFit, threads: int | None, block: slice) -> TriangleMaterials:
-    result = _opened(job.folder, job.token)
+def _materials_block(job: _Job, material_fit: MaterialFit, threads: int | None, block: slice) -> TriangleMaterials:
+    result = _open_result(job.folder, job.token)
     sample_mask = ~np.isin(result.along_samples(block, "leds"), job.left_out)
-    return made.fit(result.samples(block), sample_mask, job.noise_um, threads)
+    return material_fit.fit(result.samples(block), sample_mask, job.noise_um, threads)
 
 
 def _uncertain_block(
-    job: _Job, made: MaterialFit, threads: int | None, task: tuple[slice, TriangleMaterials]
+    job: _Job, material_fit: MaterialFit, threads: int | None, task: tuple[slice, TriangleMaterials]
 ) -> tuple[TriangleMaterials, MaterialUncertainty]:
     """Materials of a block with the normals that they shall have: fitted ones without what they have in common."""
     block, materials = task
-    result = _opened(job.folder, job.token)
+    result = _open_result(job.folder, job.token)
     sample_mask = ~np.isin(result.along_samples(block, "leds"), job.left_out)
     samples = result.samples(block)
-    if made.fits_normals:
-        materials = recoloured(samples, sample_mask, materials, materials.normals, threads=threads)
-    return materials, made.uncertainty(samples, sample_mask, materials, job.noise_um, result.middle_mm, threads)
+    if material_fit.fits_normals:
+        materials = recolour_materials(samples, sample_mask, materials, materials.normals, threads=threads)
+    return materials, material_fit.uncertainty(
+        samples, sample_mask, materials, job.noise_um, result.middle_mm, threads
+    )
 
 
 def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
-    view_numbers = [number for number, view in enumerate(result.views) if view.contradicted is None]
+    view_numbers = [number for number, view in enumerate(result.views) if view.contradicted_count is None]
     tasks = _blocks_of_views(result, view_numbers, job.memory_bytes // 4, shop)
     task_outcomes = zip(tasks, shop.map(partial(_contradictions_block, job), tasks), strict=True)
     for count, (number, blocks) in enumerate(groupby(task_outcomes, key=lambda one: one[0][0]), start=1):
@@ -158,7 +160,7 @@ def _leave_out(result: RunResult, job: _Job, shop: Workshop, say: Said) -> None:
 
 def _contradictions_block(job: _Job, task: tuple[int, slice]) -> Found:
     number, rows = task
-    result = _opened(job.folder, job.token)
+    result = _open_result(job.folder, job.token)
     return find(result, result.views[number], rows)
 
 
@@ -215,7 +217,7 @@ def _slices_block(
     job: _Job, threads: int | None, task: tuple[Sequence[ViewFit], int, slice]
 ) -> list[NDArray[np.float32]]:
     together, number, rows = task
-    result = _opened(job.folder, job.token)
+    result = _open_result(job.folder, job.token)
     view = result.views[number]
     samples = result.view_samples(view, rows)
     fits = [(fit.basis, _under(result, fit, view, rows, samples)) for fit in together]
@@ -226,10 +228,10 @@ def _under(
     result: RunResult, fit: ViewFit, view: ViewSamples, rows: slice, samples: TriangleSamples
 ) -> NDArray[np.float32] | None:
     """Return what the material gives that a fit is added to; None for a fit without one."""
-    return None if fit.over is None else predicted(result, fit.over.name, view, rows, samples)
+    return None if fit.over is None else predict_samples(result, fit.over.name, view, rows, samples)
 
 
 @lru_cache(maxsize=1)
-def _opened(folder: Path, _token: str) -> RunResult:
+def _open_result(folder: Path, _token: str) -> RunResult:
     """A result as it is during one job, once in each process."""
     return RunResult(folder)

@@ -58,7 +58,7 @@ class RunRequest:
     """Reflectance of the disk, from which light comes to the object too."""
     keep_inter_reflection: bool = False
     """Do not take it off the samples."""
-    refined: Path | None = None
+    refined_folder: Path | None = None
     """Folder of `coupole reflectance refine`: its poses, lens and mesh hold instead of the records' and scan's."""
     poses: Path | None = None
     """Folder of COLMAP's, of one run: its poses hold instead of the records'."""
@@ -66,7 +66,9 @@ class RunRequest:
     @property
     def sources(self) -> _Sources:
         """Sources of the runs' geometry, by whole paths."""
-        mesh, refined_path, poses = (path and path.resolve() for path in (self.mesh, self.refined, self.poses))
+        mesh, refined_path, poses = (
+            path and path.resolve() for path in (self.mesh, self.refined_folder, self.poses)
+        )
         return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined_path, poses)
 
 
@@ -74,7 +76,7 @@ class RunRequest:
 class _Sources:
     mesh: Path | None
     records: tuple[Path, ...]
-    refined: Path | None
+    refined_folder: Path | None
     poses: Path | None
 
 
@@ -97,10 +99,10 @@ def reflectance_of(
 def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
-    if request.poses is not None and (request.refined is not None or len(request.runs) != 1):
+    if request.poses is not None and (request.refined_folder is not None or len(request.runs) != 1):
         raise InputError("--poses: expected one run, and no --refined; COLMAP's images are named after its views")
     sources = request.sources
-    measured_runs = [_measured(token, run, sources) for run in request.runs]
+    measured_runs = [_read_run(token, run, sources) for run in request.runs]
     refuse_different(measured_runs)
     try:
         with workshop(scheduler) as shop:
@@ -133,8 +135,8 @@ def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredR
         "runs": {m.run.folder.name: dict(m.frames.inputs) for m in measured_runs},
         "records": [{kind: sha256(path) for kind, path in m.records.items()} for m in measured_runs],
         "mesh": sha256(measured_runs[0].mesh_path),
-        "refined": None if request.refined is None else what_was_refined(request.refined),
-        **_posed(request, token),
+        "refined": None if request.refined_folder is None else what_was_refined(request.refined_folder),
+        **_pose_summary(request, token),
         "emission": measured_runs[0].emission,
         "simulated": any(m.run.simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),
@@ -142,11 +144,11 @@ def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredR
     }
 
 
-def _posed(request: RunRequest, token: str) -> dict[str, Any]:
+def _pose_summary(request: RunRequest, token: str) -> dict[str, Any]:
     """Return what a result says of poses by COLMAP."""
     if request.poses is None:
         return {}
-    return {"poses": read_poses(request.poses, _recorded(token, request.runs[0], request.sources)).told()}
+    return {"poses": read_poses(request.poses, _read_records(token, request.runs[0], request.sources)).summary()}
 
 
 @dataclass(frozen=True)
@@ -175,12 +177,12 @@ def _extract(
     sources = request.sources
     for run_view in remaining_views:
         shop.refuse_blind(run_view.run, RUN_JSON)
-    if sources.refined is not None:
-        shop.refuse_blind(sources.refined, ABOUT)
+    if sources.refined_folder is not None:
+        shop.refuse_blind(sources.refined_folder, ABOUT)
     if sources.poses is not None:
         path = read_model(sources.poses).path
         shop.refuse_blind(path.parent, path.name)
-    extract = partial(_extract_one, token, sources, shop.threads, shop.heard(say))
+    extract = partial(_extract_one, token, sources, shop.threads, shop.reporter(say))
     for number, (run_view, summary) in enumerate(
         zip(remaining_views, shop.map(extract, remaining_views), strict=True), start=1
     ):
@@ -194,44 +196,46 @@ def _extract_one(
     sources: _Sources,
     threads: int | None,
     say: Said,
-    one: _View,
+    task: _View,
 ) -> dict[str, Any]:
     """Write the files of a view's samples and frames for the check; what the report says of them."""
-    measured_run, geometry, radiometry = _prepared(token, one.run, sources)
-    view = next(view for view in measured_run.views if view.name == one.view)
-    summary = extract_view(measured_run, geometry, radiometry, view, one.path, say, threads=threads)
-    frames = one.path.parents[1] / FRAMES / one.path.name
-    complete(frames, partial(write_frames, radiometry, view, one.path, one.left_out, threads))
+    measured_run, geometry, radiometry = _prepare_run(token, task.run, sources)
+    view = next(view for view in measured_run.views if view.name == task.view)
+    summary = extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
+    frames = task.path.parents[1] / FRAMES / task.path.name
+    complete(frames, partial(write_frames, radiometry, view, task.path, task.left_out, threads))
     return summary
 
 
 @lru_cache(maxsize=1)
-def _prepared(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
+def _prepare_run(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
     """Return what all views of a run share, made once in each process and job (`token`)."""
-    measured_run = _measured(token, run, sources)
+    measured_run = _read_run(token, run, sources)
     return measured_run, geometry_of(measured_run), Radiometry(measured_run)
 
 
 @lru_cache(maxsize=16)
-def _measured(token: str, run: Path, sources: _Sources) -> MeasuredRun:
-    measured_run = _recorded(token, run, sources)
+def _read_run(token: str, run: Path, sources: _Sources) -> MeasuredRun:
+    measured_run = _read_records(token, run, sources)
     if sources.poses is not None:
         return read_poses(sources.poses, measured_run).of(measured_run)
-    return measured_run if sources.refined is None else read_refined(sources.refined).of(measured_run)
+    return (
+        measured_run if sources.refined_folder is None else read_refined(sources.refined_folder).of(measured_run)
+    )
 
 
 @lru_cache(maxsize=16)
-def _recorded(_token: str, run: Path, sources: _Sources) -> MeasuredRun:
+def _read_records(_token: str, run: Path, sources: _Sources) -> MeasuredRun:
     """Read a run by the records alone."""
     return read_measured_run(run, sources.mesh, sources.records)
 
 
 def _forget() -> None:
-    _prepared.cache_clear()
-    _measured.cache_clear()
-    _recorded.cache_clear()
+    _prepare_run.cache_clear()
+    _read_run.cache_clear()
+    _read_records.cache_clear()
 
 
-def _name(measured_runs: Sequence[MeasuredRun], measured: MeasuredRun, view: MeasuredView) -> str:
+def _name(measured_runs: Sequence[MeasuredRun], measured_run: MeasuredRun, view: MeasuredView) -> str:
     """Return the name of a view's files: its own, with its run's before where there are several."""
-    return view.name if len(measured_runs) == 1 else f"{measured.run.folder.name}-{view.name}"
+    return view.name if len(measured_runs) == 1 else f"{measured_run.run.folder.name}-{view.name}"

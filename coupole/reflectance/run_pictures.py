@@ -31,7 +31,7 @@ class CheckFrames:
     def pairs(self, rows: slice, channel: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return, for the blocks whose pixel sees one of some rows of the view's file, its place among these rows
         [blocks], and `share` [blocks, leds]."""
-        order, places = self._sorted[channel]
+        order, places = self._blocks_by_place[channel]
         first, end = np.searchsorted(places, [rows.start, rows.stop])
         leds, height, width, channels = self.share.shape
         flat = self.share.reshape(leds, height * width, channels)
@@ -43,7 +43,7 @@ class CheckFrames:
         return np.stack([of_none[places, channel] for channel, places in enumerate(self.triangle)], axis=-1)
 
     @cached_property
-    def _sorted(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _blocks_by_place(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Blocks of each channel in the order of what they see, and what they see."""
         channels = []
         for places in self.triangle.reshape(len(self.triangle), -1):

@@ -43,7 +43,7 @@ from coupole.reflectance.new_light.shading import (
     alike,
     coats_of,
 )
-from coupole.reflectance.new_light.shadow_edges import reached
+from coupole.reflectance.new_light.shadow_edges import trace_beam
 from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
@@ -113,7 +113,7 @@ class RelitScene:
         paper = read_about(self.result.folder).get("emission") == "paper"
         base_from_support, channels = self.result.base_from_support, self.result.channels
         lighting = lighting_of(lights, self.views, base_from_support, channels, samples, paper=paper)
-        picture = np.zeros((*self.surface.seen.shape, channels), np.float32) if into is None else into
+        picture = np.zeros((*self.surface.triangle_of_pixel.shape, channels), np.float32) if into is None else into
         if into is not None:
             in_strips(len(into), lambda rows: into[rows].fill(0.0))
         if isinstance(self.reflecting, Slices | Pairs):
@@ -124,12 +124,12 @@ class RelitScene:
 
     def _by_materials(self, picture: Picture, lighting: Lighting, coats: Coats, lobe_rays: int, say: Say) -> None:
         work = len(lighting.beams) + len(lighting.emitters)
-        codes = np.zeros((LANES, *self.surface.seen.shape), np.uint8)
+        codes = np.zeros((LANES, *self.surface.triangle_of_pixel.shape), np.uint8)
         count = 0
         for beams in alike(lighting.beams):
             alone = len(beams) == 1 and beams[0].density == 0.0
             for lane, beam in enumerate(beams):
-                reached(self.mesh, self.surface, beam, codes[lane])
+                trace_beam(self.mesh, self.surface, beam, codes[lane])
                 count += 1
                 say(count, work)
             if alone:
@@ -141,9 +141,9 @@ class RelitScene:
             say(len(lighting.beams) + number + 1, work)
 
     def _by_values(self, picture: Picture, lighting: Lighting, reflecting: Slices | Pairs, say: Say) -> None:
-        codes = np.zeros(self.surface.seen.shape, np.uint8)
+        codes = np.zeros(self.surface.triangle_of_pixel.shape, np.uint8)
         for number, beam in enumerate(lighting.beams):
-            reached(self.mesh, self.surface, beam, codes)
+            trace_beam(self.mesh, self.surface, beam, codes)
             add_values(picture, self.surface, self._triangle_values(reflecting, beam), codes, beam)
             say(number + 1, len(lighting.beams))
 

@@ -72,7 +72,7 @@ class ViewSamples:
     view: str
     inter_reflection: tuple[float, float] | None
     """Median and 95th percentile of its share that was taken off f; None if nothing was."""
-    contradicted: int | None
+    contradicted_count: int | None
     """Samples that were left out because they contradict others; None before they were looked for."""
     samples_left: int | None
     """Samples that can be used after both."""
@@ -142,7 +142,7 @@ class RunResult:
             {
                 **summary,
                 INTER_REFLECTION: view.inter_reflection,
-                CONTRADICTED: view.contradicted,
+                CONTRADICTED: view.contradicted_count,
                 SAMPLES: summary[SAMPLES] if view.samples_left is None else view.samples_left,
             }
             for summary, view in zip(summaries, self.views, strict=True)
@@ -279,12 +279,12 @@ class RunResult:
     def materials(self, name: str, block: Block = slice(None)) -> TriangleMaterials:
         """A fit by its name in `MATERIALS`."""
         with h5py.File(self.materials_path(name), "r") as file:
-            return TriangleMaterials(*(_read(file[field], block) for field in FIELDS))
+            return TriangleMaterials(*(_read_rows(file[field], block) for field in FIELDS))
 
     def material_covariances(self, name: str, block: Block = slice(None)) -> NDArray[np.float64]:
         """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
         with h5py.File(self.materials_path(name), "r") as file:
-            lower = _read(file["covariance"], block)
+            lower = _read_rows(file["covariance"], block)
         covariances = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
         covariances[:, *LOWER] = lower
         covariances[:, *LOWER[::-1]] = lower
@@ -305,7 +305,7 @@ class RunResult:
             return np.asarray(file["coefficients"][rows], np.float32)
 
 
-def _read(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
+def _read_rows(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:
     """Rows; h5py takes rising numbers one by one."""
     if isinstance(block, slice):
         return np.asarray(data[block], np.float64)
@@ -363,10 +363,10 @@ def _parts(count: int, samples: int, budget_bytes: int, most: int) -> Iterator[s
         yield slice(first, min(first + step, count))
 
 
-def _rows(view: ViewSamples, wanted: NDArray[np.int64]) -> range:
-    """Return the rows of a view's file that hold the `wanted` triangles, whose numbers rise; no other triangle may
-    lie between them."""
-    first, end = np.searchsorted(view.triangles, [wanted[0], wanted[-1] + 1])
+def _rows(view: ViewSamples, triangles: NDArray[np.int64]) -> range:
+    """Return the rows of a view's file that hold the `triangles` triangles, whose numbers rise; no other triangle
+    may lie between them."""
+    first, end = np.searchsorted(view.triangles, [triangles[0], triangles[-1] + 1])
     return range(int(first), int(end))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.run_result import RunResult, ViewSamples
 from coupole.reflectance.sample_sources import ChannelSamples, channel_samples
-from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn
+from coupole.reflectance.sample_uncertainty import SOURCES, Places, Sources, bounds, drawn_ratios
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -38,8 +38,8 @@ def uncertainty_of(
         known_samples(result, view, result.channels // 2, scan_noise_um, most=most, of_triangles=_TRIANGLES)
         for view in result.views
     ]
-    places = Places(*_joined([part.places for part in channel_parts]))
-    sources = Sources(*_joined([part.sources for part in channel_parts]))
+    places = Places(*_join_fields([part.places for part in channel_parts]))
+    sources = Sources(*_join_fields([part.sources for part in channel_parts]))
     if not len(sources.u_noise):
         return None
     random = np.random.default_rng(0)
@@ -47,7 +47,7 @@ def uncertainty_of(
     places_drawn, sources_drawn = places.at(some), sources.at(some)
 
     def table(of: Sources) -> dict[str, Any]:
-        ratios = drawn(places_drawn, of, _DRAWS, np.random.default_rng(1), paper=paper)
+        ratios = drawn_ratios(places_drawn, of, _DRAWS, np.random.default_rng(1), paper=paper)
         below, above = 0.5 - TABLE_COVERAGE / 2, 0.5 + TABLE_COVERAGE / 2
         return percentiles(*np.nanquantile(ratios, [below, above], axis=1))
 
@@ -85,12 +85,12 @@ def known_samples(
     rows = np.arange(0, len(view.triangles), max(1, len(view.triangles) // of_triangles))
     leds = np.arange(0, len(view.leds), -(-len(view.leds) // _LEDS))
     some = channel_samples(result, view, rows, leds, channel, scan_noise_um)
-    places = some.known
+    places = some.known_places
     if len(places) > most:
         places = np.sort(np.random.default_rng(2).choice(places, most, replace=False))
     return some.at(places)
 
 
-def _joined(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:
+def _join_fields(parts: Sequence[Places] | Sequence[Sources]) -> list[Floats]:
     """Their fields, one part after the other."""
     return [np.concatenate(values) for values in zip(*(vars(part).values() for part in parts), strict=True)]

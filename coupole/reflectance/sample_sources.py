@@ -38,12 +38,12 @@ class ChannelSamples:
     places: Places
     sources: Sources
 
-    def at(self, picked: Integers) -> ChannelSamples:
-        rows, leds, f = self.rows[picked], self.leds[picked], self.f[picked]
-        return ChannelSamples(rows, leds, f, self.places.at(picked), self.sources.at(picked))
+    def at(self, row_numbers: Integers) -> ChannelSamples:
+        rows, leds, f = self.rows[row_numbers], self.leds[row_numbers], self.f[row_numbers]
+        return ChannelSamples(rows, leds, f, self.places.at(row_numbers), self.sources.at(row_numbers))
 
     @property
-    def known(self) -> Integers:
+    def known_places(self) -> Integers:
         """Places of those that have a value."""
         return np.flatnonzero(np.isfinite(self.f) & np.isfinite(self.sources.u_noise))
 
@@ -118,13 +118,13 @@ class Beside:
     """[n, sides] of the distance across the line of sight."""
 
     def uncertainty(
-        self, signal: Floats, u_noise: Floats, own: Integers, beside: Integers, lateral_u_mm: float
+        self, signal: Floats, u_noise: Floats, own_places: Integers, beside: Integers, lateral_u_mm: float
     ) -> Floats:
         """[n, leds] relative standard uncertainty of `signal` [used, leds], in any unit, of triangles at places
-        `own` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them differ by,
-        as the square of the shift over that of the distance, at most as far as they are away. 1 where nothing
-        beside is known."""
-        own_signal, noise = signal[own], (signal[own] * u_noise[own]) ** 2
+        `own_places` [n] by those at `beside` [n, sides]: what they differ by, less what noise alone makes them
+        differ by, as the square of the shift over that of the distance, at most as far as they are away. 1 where
+        nothing beside is known."""
+        own_signal, noise = signal[own_places], (signal[own_places] * u_noise[own_places]) ** 2
         share = np.minimum(2.0 * lateral_u_mm**2 / np.maximum(self.square_mm2, 1e-12), 1.0)
         total, count = np.zeros(own_signal.shape), np.zeros(own_signal.shape)
         for side in range(beside.shape[1]):

@@ -64,8 +64,8 @@ class Sources:
         """The same with one of `SOURCES` at 0."""
         return replace(self, **{source: np.zeros_like(getattr(self, source))})
 
-    def at(self, picked: NDArray[np.int64]) -> Sources:
-        return Sources(*(getattr(self, field.name)[picked] for field in fields(self)))
+    def at(self, row_numbers: NDArray[np.int64]) -> Sources:
+        return Sources(*(getattr(self, field.name)[row_numbers] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class Places:
     led_normals: Floats
     """[n, 3] unit."""
 
-    def at(self, picked: NDArray[np.int64]) -> Places:
-        return Places(*(getattr(self, field.name)[picked] for field in fields(self)))
+    def at(self, row_numbers: NDArray[np.int64]) -> Places:
+        return Places(*(getattr(self, field.name)[row_numbers] for field in fields(self)))
 
 
 def bounds(places: Places, sources: Sources, quantile: float) -> tuple[Floats, Floats]:
@@ -119,7 +119,7 @@ def tilt_covariance(corners_mm: Floats, vertex_um: Floats) -> Floats:
     return covariance * ((vertex_um * 1e-3) ** 2)[:, None, None]
 
 
-def drawn(
+def drawn_ratios(
     places: Places, sources: Sources, draws: int, random: np.random.Generator, *, paper: bool = False
 ) -> Floats:
     """[n, draws] true over measured reflectance, by Monte Carlo: power, vertices and LEDs are drawn anew, and the

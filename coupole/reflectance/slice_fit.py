@@ -39,23 +39,23 @@ _LEFT_OUT = 64
 
 def fit_slices(
     samples: TriangleSamples,
-    used: NDArray[np.bool_],
+    sample_mask: NDArray[np.bool_],
     *fits: tuple[Basis, NDArray[np.float32] | None],
     threads: int | None = None,
 ) -> list[NDArray[np.float32]]:
     """Return, for each of some fits with the same functions, [b, channels, COUNT] coefficients; NaN for too few
     samples.
 
-    The fits are to the samples `used` [samples] of one view. With a model [b, samples, channels] they are added to
-    a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one to the
-    samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
+    The fits are to the samples `sample_mask` [samples] of one view. With a model [b, samples, channels] they are
+    added to a share of it, one more coefficient at the end: the mean of a fit to what the model leaves and of one
+    to the samples, by how well each foretells samples. The more a model leaves, the less are coefficients held.
     """
     count, _, channels = samples.values.shape
     coefficients = np.full((len(fits), count, channels, COUNT + 1), np.nan, np.float32)
     residuals = np.stack([samples.values if model is None else samples.values - model for _, model in fits])
     penalties = np.stack([basis.penalty for basis, _ in fits])
     over = np.array([model is not None for _, model in fits])
-    camera_mm, indices = samples.cameras_mm[0], np.flatnonzero(used)
+    camera_mm, indices = samples.cameras_mm[0], np.flatnonzero(sample_mask)
 
     def fit(first: int) -> None:
         part = slice(first, min(first + _PART, count))
@@ -113,12 +113,12 @@ def _frame(normal, centre_mm, camera_mm, frame):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _directions(frame, centre_mm, led_mm, which, x, y, z):  # type: ignore[no-untyped-def]
-    """Fill `x`, `y` and `z` with the directions of the LEDs `which` [n] in a slice's frame; LEDs below the surface
-    get z = 0. Return how many are above it."""
+def _directions(frame, centre_mm, led_mm, led_numbers, x, y, z):  # type: ignore[no-untyped-def]
+    """Fill `x`, `y` and `z` with the directions of the LEDs `led_numbers` [n] in a slice's frame; LEDs below the
+    surface get z = 0. Return how many are above it."""
     above = 0
-    for n in range(len(which)):
-        led = led_mm[which[n]]
+    for n in range(len(led_numbers)):
+        led = led_mm[led_numbers[n]]
         d0, d1, d2 = led[0] - centre_mm[0], led[1] - centre_mm[1], led[2] - centre_mm[2]
         inverse = 1.0 / math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
         x[n] = (frame[0, 0] * d0 + frame[0, 1] * d1 + frame[0, 2] * d2) * inverse
@@ -130,14 +130,25 @@ def _directions(frame, centre_mm, led_mm, which, x, y, z):  # type: ignore[no-un
 
 @numba.njit(cache=True, nogil=True)
 def _fit_part(  # type: ignore[no-untyped-def]
-    values, left, led_mm, camera_mm, centres_mm, normals, used, harmonic, penalties, over, found
+    values,
+    residuals,
+    led_mm,
+    camera_mm,
+    centres_mm,
+    normals,
+    used_samples,
+    harmonic,
+    penalties,
+    over,
+    coefficients,
 ):
     """Channels with the same samples share their matrix."""
     count, _, channels = values.shape
-    memory, indices = np.empty(COUNT * len(used)), np.empty(len(used), np.int64)
-    xyz, product, frame = np.empty((3, len(used))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
+    memory, indices = np.empty(COUNT * len(used_samples)), np.empty(len(used_samples), np.int64)
+    xyz, product, frame = np.empty((3, len(used_samples))), np.zeros((COUNT, COUNT)), np.empty((3, 3))
     memories = (
-        np.empty(COUNT), np.empty(COUNT * COUNT), np.empty(2 * COUNT * COUNT), np.empty(channels * len(used)),
+        np.empty(COUNT), np.empty(COUNT * COUNT), np.empty(2 * COUNT * COUNT),
+        np.empty(channels * len(used_samples)),
         np.empty((channels, COUNT)),
     )  # fmt: skip
     for triangle in range(count):
@@ -145,9 +156,9 @@ def _fit_part(  # type: ignore[no-untyped-def]
         end = np.int64(0)  # no literal, for which functions would be compiled once more
         while end < channels:
             first, end = end, end + 1
-            while end < channels and _same(values[triangle], used, end):
+            while end < channels and _same(values[triangle], used_samples, end):
                 end += 1
-            n = _known(values[triangle, :, first], used, indices)
+            n = _known_samples(values[triangle, :, first], used_samples, indices)
             x, y, z = xyz[0, :n], xyz[1, :n], xyz[2, :n]
             if n < FEWEST or _directions(frame, centres_mm[triangle], led_mm, indices[:n], x, y, z) < FEWEST:
                 continue
@@ -158,55 +169,55 @@ def _fit_part(  # type: ignore[no-untyped-def]
                     rows[k, number] *= z[number]
             if n >= COUNT:
                 gram(rows, product)
-            for fit in range(len(left)):
+            for fit in range(len(residuals)):
                 _fit_one(
-                    rows, product, values[triangle], left[fit, triangle], indices[:n], first, penalties[fit],
-                    over[fit], memories, found[fit, triangle, first:end],
+                    rows, product, values[triangle], residuals[fit, triangle], indices[:n], first, penalties[fit],
+                    over[fit], memories, coefficients[fit, triangle, first:end],
                 )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
 def _fit_one(  # type: ignore[no-untyped-def]
-    rows, product, values, left, which, first, penalty, over, memories, found
+    rows, product, values, residuals, sample_numbers, first, penalty, over, memories, coefficients
 ):
-    """Fill `found` [channels, COUNT + 1] with a fit to `left` of the samples `which` [n] in channels from
-    `first`."""
-    channels, n, size = len(found), len(which), min(len(which), COUNT)
+    """Fill `coefficients` [channels, COUNT + 1] with a fit to `residuals` of the samples `sample_numbers` [n] in
+    channels from `first`."""
+    channels, n, size = len(coefficients), len(sample_numbers), min(len(sample_numbers), COUNT)
     ridge, matrix, room, target_memory, solution = memories
     targets, right = target_memory[: channels * n].reshape(channels, n), solution[:channels]
     factor = matrix[: size * size].reshape(size, size)
-    _wanted(left, which, first, targets)
-    share = _held_by(targets, values, which, first) if over else 1.0
+    _take_samples(residuals, sample_numbers, first, targets)
+    share = _held_by(targets, values, sample_numbers, first) if over else 1.0
     for k in range(COUNT):
         ridge[k] = share * penalty[k]
     if not _solve(rows, product, ridge, targets, room, factor, right):
         return
-    assign_rows(found[:, :COUNT], right)
-    found[:, COUNT] = 1.0
+    assign_rows(coefficients[:, :COUNT], right)
+    coefficients[:, COUNT] = 1.0
     if over:
         step = max(1, n // _LEFT_OUT)
         off = np.empty((2, channels, (n + step - 1) // step))
         left_out(rows, targets, right, factor, step, off[0])
-        _wanted(values, which, first, targets)
+        _take_samples(values, sample_numbers, first, targets)
         for k in range(COUNT):
             ridge[k] = LEAST_RESIDUAL * penalty[k]
         if _solve(rows, product, ridge, targets, room, factor, right):
             left_out(rows, targets, right, factor, step, off[1])
-            _stack(off, right, found)
+            _stack(off, right, coefficients)
 
 
 @numba.njit(cache=True, nogil=True)
-def _wanted(values, which, first, wanted):  # type: ignore[no-untyped-def]
-    """Fill `wanted` [channels, n] with the samples `which` [n] in the channels from `first`."""
-    for channel in range(len(wanted)):
-        for number in range(len(which)):
-            wanted[channel, number] = values[which[number], first + channel]
+def _take_samples(values, sample_numbers, first, targets):  # type: ignore[no-untyped-def]
+    """Fill `targets` [channels, n] with the samples `sample_numbers` [n] in the channels from `first`."""
+    for channel in range(len(targets)):
+        for number in range(len(sample_numbers)):
+            targets[channel, number] = values[sample_numbers[number], first + channel]
 
 
 @numba.njit(cache=True, nogil=True)
-def _stack(off, plain, found):  # type: ignore[no-untyped-def]
-    """Make of `found` [channels, COUNT + 1], a model and what it leaves, and of `plain` [channels, COUNT] the mean
-    that misses least what both miss, `off` [2, channels, samples]."""
+def _stack(off, plain, coefficients):  # type: ignore[no-untyped-def]
+    """Make of `coefficients` [channels, COUNT + 1], a model and what it leaves, and of `plain` [channels, COUNT]
+    the mean that misses least what both miss, `off` [2, channels, samples]."""
     covariance, apart = 0.0, 0.0
     for channel in range(off.shape[1]):
         for number in range(off.shape[2]):
@@ -214,21 +225,21 @@ def _stack(off, plain, found):  # type: ignore[no-untyped-def]
             covariance += between * off[1, channel, number]
             apart += between * between
     share = min(1.0, max(0.0, covariance / max(apart, 1e-30)))
-    for channel in range(len(found)):
-        found[channel, COUNT] = share
+    for channel in range(len(coefficients)):
+        coefficients[channel, COUNT] = share
         for k in range(COUNT):
-            found[channel, k] = share * found[channel, k] + (1.0 - share) * plain[channel, k]
+            coefficients[channel, k] = share * coefficients[channel, k] + (1.0 - share) * plain[channel, k]
 
 
 @numba.njit(cache=True, nogil=True)
-def _held_by(left, values, which, first):  # type: ignore[no-untyped-def]
+def _held_by(residuals, values, sample_numbers, first):  # type: ignore[no-untyped-def]
     """Share of the usual ridge by which coefficients are held, by what is left [channels, n] of the samples
-    `which` [n] in the channels from `first`."""
+    `sample_numbers` [n] in the channels from `first`."""
     remains, whole = 0.0, 0.0
-    for channel in range(len(left)):
-        for number in range(len(which)):
-            remains += left[channel, number] ** 2
-            whole += values[which[number], first + channel] ** 2
+    for channel in range(len(residuals)):
+        for number in range(len(sample_numbers)):
+            remains += residuals[channel, number] ** 2
+            whole += values[sample_numbers[number], first + channel] ** 2
     return min(1.0, max(LEAST_RESIDUAL, USUAL_LEFT * whole / max(remains, 1e-30)))
 
 
@@ -246,28 +257,28 @@ def _solve(rows, product, penalty, values, room, factor, right):  # type: ignore
 
 
 @numba.njit(cache=True, nogil=True)
-def _known(values, used, which):  # type: ignore[no-untyped-def]
-    """Fill `which` with those of the samples `used` that a channel has; return how many."""
+def _known_samples(values, used_samples, sample_numbers):  # type: ignore[no-untyped-def]
+    """Fill `sample_numbers` with those of the samples `used_samples` that a channel has; return how many."""
     n = 0
-    for sample in used:
+    for sample in used_samples:
         if not math.isnan(values[sample]):
-            which[n] = sample
+            sample_numbers[n] = sample
             n += 1
     return n
 
 
 @numba.njit(cache=True, nogil=True)
-def _same(values, used, channel):  # type: ignore[no-untyped-def]
+def _same(values, used_samples, channel):  # type: ignore[no-untyped-def]
     """Tell whether a channel has the same samples as the one before."""
     same = True
-    for number in used:
+    for number in used_samples:
         same &= math.isnan(values[number, channel]) == math.isnan(values[number, channel - 1])
     return same
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, made):  # type: ignore[no-untyped-def]
-    count, samples, channels = made.shape
+def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, modelled_values):  # type: ignore[no-untyped-def]
+    count, samples, channels = modelled_values.shape
     frame, indices, total = np.empty((3, 3)), np.arange(samples), np.empty(samples)
     x, y, z, rows = np.empty(samples), np.empty(samples), np.empty(samples), np.empty((COUNT, samples))
     for triangle in range(count):
@@ -281,4 +292,4 @@ def _add_part(coefficients, led_mm, camera_mm, centres_mm, normals, harmonic, ma
                 for sample in range(samples):
                     total[sample] += coefficient * rows[k, sample]
             for sample in range(samples):
-                made[triangle, sample, channel] += z[sample] * total[sample]
+                modelled_values[triangle, sample, channel] += z[sample] * total[sample]

@@ -88,7 +88,7 @@ class TriangleMaterials:
         return TriangleMaterials(*(getattr(self, field.name)[triangles] for field in fields(self)))
 
 
-def joined(parts: Sequence[TriangleMaterials]) -> TriangleMaterials:
+def join_materials(parts: Sequence[TriangleMaterials]) -> TriangleMaterials:
     """Join the materials of blocks, one after the other."""
     names = [field.name for field in fields(TriangleMaterials)]
     return TriangleMaterials(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
@@ -102,9 +102,9 @@ def prior_stiffness(areas_mm2: Floats, noise_um: float) -> Floats:
 
 
 def fit_triangles(
-    samples: TriangleSamples, used: NDArray[np.bool_], noise_um: float | None, *, threads: int | None = None
+    samples: TriangleSamples, sample_mask: NDArray[np.bool_], noise_um: float | None, *, threads: int | None = None
 ) -> TriangleMaterials:
-    """Materials from the samples `used` [samples]; normals are fitted if `noise_um` is given."""
+    """Materials from the samples `sample_mask` [samples]; normals are fitted if `noise_um` is given."""
     count, _, channels = samples.values.shape
     stiffness = np.full(count, HELD) if noise_um is None else prior_stiffness(samples.areas_mm2, noise_um)
     parameters = np.full((count, 5 + 2 * channels), np.nan)
@@ -113,7 +113,8 @@ def fit_triangles(
         part = slice(first, min(first + _PART, count))
         _fit_part(
             samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
-            samples.normals[part], stiffness[part], noise_um is not None, np.flatnonzero(used), parameters[part],
+            samples.normals[part], stiffness[part], noise_um is not None, np.flatnonzero(sample_mask),
+            parameters[part],
         )  # fmt: skip
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
@@ -128,16 +129,16 @@ def fit_triangles(
     return TriangleMaterials(*map(np.ascontiguousarray, parts))  # functions are compiled for each layout
 
 
-def recoloured(
+def recolour_materials(
     samples: TriangleSamples,
-    used: NDArray[np.bool_],
+    sample_mask: NDArray[np.bool_],
     materials: TriangleMaterials,
     normals: Floats,
     *,
     threads: int | None = None,
 ) -> TriangleMaterials:
-    """Materials with other normals [b, 3]: kd and ks are fitted anew to the samples `used` [samples], roughness
-    and residual stay."""
+    """Materials with other normals [b, 3]: kd and ks are fitted anew to the samples `sample_mask` [samples],
+    roughness and residual stay."""
     kd, ks = materials.kd.copy(), materials.ks.copy()
     grey = np.stack([np.maximum(kd.mean(axis=1), LEAST_KD), ks.mean(axis=1), materials.alpha], axis=1)
 
@@ -145,7 +146,7 @@ def recoloured(
         part = slice(first, first + _PART)
         _recolour(
             samples.values[part], samples.led_mm, samples.view_of, samples.cameras_mm, samples.centres_mm[part],
-            normals[part], grey[part], np.flatnonzero(used), kd[part], ks[part],
+            normals[part], grey[part], np.flatnonzero(sample_mask), kd[part], ks[part],
         )  # fmt: skip
 
     with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
@@ -164,7 +165,7 @@ def model_values(samples: TriangleSamples, materials: TriangleMaterials) -> NDAr
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffness, free, used, found):  # type: ignore[no-untyped-def]
+def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffness, free, used_samples, parameters):  # type: ignore[no-untyped-def]
     count, samples, channels = values.shape
     lights, half = np.empty((samples, 3)), np.empty((samples, 3))
     views = np.empty((len(cameras_mm), 3))
@@ -174,7 +175,8 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
     for triangle in range(count):
         normal, normal_stiffness = normals[triangle], stiffness[triangle]
         n = gather(
-            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, colours, good,
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used_samples, colours,
+            good,
             roots, lights, half, views,
         )  # fmt: skip
         if n < FEWEST:
@@ -182,18 +184,18 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
         start = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, normal_stiffness, packs)
         count = pack(roots[:n], good[:n], lights, half, views, view_of, packs)
         _, rms = fit_packs(packs[:count], views, start, normal, normal_stiffness, USUAL, _SETTLED)
-        assign(found[triangle, :3], start[:3] if free else normal)
-        found[triangle, 3], found[triangle, 4] = math.exp(start[5]), rms
-        kd, ks = found[triangle, 5 : 5 + channels], found[triangle, 5 + channels :]
+        assign(parameters[triangle, :3], start[:3] if free else normal)
+        parameters[triangle, 3], parameters[triangle, 4] = math.exp(start[5]), rms
+        kd, ks = parameters[triangle, 5 : 5 + channels], parameters[triangle, 5 + channels :]
         for k in range(3):
             grey[k] = math.exp(start[3 + k])
-        colours_from(colours, good[:n], found[triangle, :3], grey, lights, half, views, view_of, kd, ks)
+        colours_from(colours, good[:n], parameters[triangle, :3], grey, lights, half, views, view_of, kd, ks)
         for channel in range(channels):
             ks[channel] = min(ks[channel], MOST_KS)
 
 
 @numba.njit(cache=True, nogil=True)
-def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, used, kd, ks):  # type: ignore[no-untyped-def]
+def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, used_samples, kd, ks):  # type: ignore[no-untyped-def]
     count, samples, channels = values.shape
     lights, half, views = np.empty((samples, 3)), np.empty((samples, 3)), np.empty((len(cameras_mm), 3))
     good, roots, colours = np.empty(samples, np.int64), np.empty(samples), np.empty((samples, channels))
@@ -202,7 +204,8 @@ def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, us
             continue
         normal = normals[triangle]
         n = gather(
-            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used, colours, good,
+            values[triangle], led_mm, view_of, cameras_mm, centres_mm[triangle], normal, used_samples, colours,
+            good,
             roots, lights, half, views,
         )  # fmt: skip
         colours_from(
@@ -214,7 +217,7 @@ def _recolour(values, led_mm, view_of, cameras_mm, centres_mm, normals, grey, us
 
 @numba.njit(cache=True, nogil=True)
 def gather(  # type: ignore[no-untyped-def]
-    values, led_mm, view_of, cameras_mm, centre_mm, normal, used, own, good, roots, lights, half, views
+    values, led_mm, view_of, cameras_mm, centre_mm, normal, used_samples, colours, good, roots, lights, half, views
 ):
     """Fill the arrays with one triangle's samples and directions; how many there are. A camera that does not see
     the triangle is put on its normal, so that it forbids no normal."""
@@ -222,12 +225,12 @@ def gather(  # type: ignore[no-untyped-def]
     for view in range(len(cameras_mm)):
         towards(centre_mm, cameras_mm[view], views[view])
     n = 0
-    for number in range(len(used)):
-        sample = used[number]
+    for number in range(len(used_samples)):
+        sample = used_samples[number]
         grey = 0.0
         for channel in range(values.shape[1]):
-            own[sample, channel] = values[sample, channel]
-            grey += own[sample, channel] / values.shape[1]
+            colours[sample, channel] = values[sample, channel]
+            grey += colours[sample, channel] / values.shape[1]
         if not grey > 0.0:
             continue
         towards(centre_mm, led_mm[sample], lights[sample])
@@ -284,8 +287,8 @@ def between(light, view, half):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, made):  # type: ignore[no-untyped-def]
-    count, samples, channels = made.shape
+def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, modelled_values):  # type: ignore[no-untyped-def]
+    count, samples, channels = modelled_values.shape
     views, light, half = np.empty((len(cameras_mm), 3)), np.empty(3), np.empty(3)
     for triangle in range(count):
         n = normals[triangle]
@@ -302,6 +305,6 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, made
             nh = n[0] * half[0] + n[1] * half[1] + n[2] * half[2]
             shine = lobe(nl, nv, nh, alpha[triangle])[0] if nl > 0.0 and nv > 0.0 else 0.0
             for channel in range(channels):
-                made[triangle, sample, channel] = max(nl, 0.0) * (
+                modelled_values[triangle, sample, channel] = max(nl, 0.0) * (
                     kd[triangle, channel] + ks[triangle, channel] * shine
                 )

@@ -46,7 +46,7 @@ class PicturedView:
     """[n, 3] LEDs from the point that the camera is focused on: x right, y up, z to the camera."""
     width_mm: float
     """Width of what a row of pixels shows at that distance."""
-    simulated: bool
+    is_simulated: bool
 
 
 def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> PicturedView:
@@ -101,9 +101,9 @@ def lights_of_view(folder: Path, view: str | None) -> PicturedView:
     return _nominal(read_plan(run.plan_path, run.rig_path), frame_of_led, run.simulated)
 
 
-def _nominal(files: PlanFiles, chosen: dict[int, LightFrame], simulated: bool) -> PicturedView:
-    leds = tuple(sorted(chosen))
-    pose = chosen[leds[0]].base_from_camera
+def _nominal(files: PlanFiles, frame_of_led: dict[int, LightFrame], is_simulated: bool) -> PicturedView:
+    leds = tuple(sorted(frame_of_led))
+    pose = frame_of_led[leds[0]].base_from_camera
     rows = files.cell.leds.rows(leds)
     towards = apply(inverse(pose), files.cell.leds.positions_mm[rows])
     towards -= apply(inverse(pose), _target_mm(files, pose))
@@ -111,7 +111,7 @@ def _nominal(files: PlanFiles, chosen: dict[int, LightFrame], simulated: bool) -
     rig = files.cell.rig
     wide_mm = rig.sensor.width_px * rig.sensor.pixel_pitch_um * 1e-3
     width_mm = wide_mm * (rig.lens.focus_distance_mm / rig.lens.focal_length_mm - 1.0)
-    return PicturedView(leds, (), towards, width_mm, simulated)
+    return PicturedView(leds, (), towards, width_mm, is_simulated)
 
 
 def _target_mm(files: PlanFiles, base_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,7 +138,7 @@ def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[
         if frame.view != name or frame.led is None:
             continue
         earlier_frame = frame_of_led.get(frame.led)
-        if earlier_frame is None or _clipped(earlier_frame, frames.white_dn) > _MOST_CLIPPED:
+        if earlier_frame is None or _clipped_share(earlier_frame, frames.white_dn) > _MOST_CLIPPED:
             frame_of_led[frame.led] = frame
     if len(frame_of_led) < FEWEST_LIGHTS:
         raise InputError(
@@ -147,7 +147,7 @@ def frames_of_leds(folder: Path, frames: LightFrames, view: str | None) -> dict[
     return frame_of_led
 
 
-def _clipped(frame: LightFrame, white_dn: int) -> float:
+def _clipped_share(frame: LightFrame, white_dn: int) -> float:
     return float(np.mean(frame.read() >= white_dn))
 
 

@@ -28,16 +28,19 @@ class Mesh:
     """[m, 3] rows of `vertices`."""
 
 
-def expect_records(path: Path, what: str, count: int, read: int, wanted: int | None = None) -> None:
-    if read < (count if wanted is None else wanted):
-        raise InputError(f"{path}: the file ends in {what} {read} of {count}: it was cut off")
+def expect_records(
+    path: Path, record_name: str, count: int, read_count: int, wanted_count: int | None = None
+) -> None:
+    if read_count < (count if wanted_count is None else wanted_count):
+        raise InputError(f"{path}: the file ends in {record_name} {read_count} of {count}: it was cut off")
 
 
-def expect_room(path: Path, what: str, count: int, least_bytes: int, size_bytes: int) -> None:
+def expect_room(path: Path, record_name: str, count: int, least_bytes: int, size_bytes: int) -> None:
     """Raise InputError if a file of this size cannot hold as many records as it says, before they get memory."""
     if count * least_bytes > size_bytes:
         raise InputError(
-            f"{path}: expected {count} of {what}, as its header says, of {least_bytes} bytes or more each; the "
+            f"{path}: expected {count} of {record_name}, as its header says, of {least_bytes} bytes or more "
+            f"each; the "
             f"file has {size_bytes} bytes: it was cut off, or its header is wrong"
         )
 
@@ -75,8 +78,8 @@ def _first_beyond(triangles, vertices):  # type: ignore[no-untyped-def]
     return -1
 
 
-def expect_text(path: Path, state: int, line: int, expected: str) -> None:
+def expect_text(path: Path, state: int, line: int, expected_text: str) -> None:
     if state == TOO_FEW:
-        raise InputError(f"{path}:{line}: expected {expected}; the file ends here: it was cut off")
+        raise InputError(f"{path}:{line}: expected {expected_text}; the file ends here: it was cut off")
     if state != OK:
-        raise InputError(f"{path}:{line}: expected {expected}")
+        raise InputError(f"{path}:{line}: expected {expected_text}")

@@ -23,10 +23,10 @@ class MeshFile:
     def size_bytes(self) -> int:
         return self.path.stat().st_size if self.data is None else len(self.data)
 
-    def opened(self) -> BinaryIO:
+    def open_file(self) -> BinaryIO:
         return self.path.open("rb") if self.data is None else io.BytesIO(self.data)
 
-    def mapped(self) -> NDArray[np.uint8]:
+    def mapped_bytes(self) -> NDArray[np.uint8]:
         """Its bytes; a file's are mapped into memory, not loaded."""
         if self.data is not None or self.size_bytes == 0:
             return np.frombuffer(self.data or b"", np.uint8)

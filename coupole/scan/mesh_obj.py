@@ -14,7 +14,7 @@ from coupole.scan.mesh_text import BAD_CORNER, NOT_A_NUMBER, OK
 
 def read_obj(source: MeshFile) -> Mesh:
     """Read an OBJ. Raises InputError with the line of the error."""
-    path, data = source.path, source.mapped()
+    path, data = source.path, source.mapped_bytes()
     count, triangles_count, bad_line = _count_obj(data)
     if bad_line:
         raise InputError(f"{path}:{bad_line}: expected a face with three corners or more")

@@ -46,7 +46,7 @@ def read_ply(source: MeshFile) -> Mesh:
         return _read_ascii_ply(source, elements, at, line)
     order = "<" if file_format == "binary_little_endian" else ">"
     vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
-    with source.opened() as file:
+    with source.open_file() as file:
         file.seek(at)
         for element in elements:
             if element.name == "vertex":
@@ -75,7 +75,7 @@ def _ply_header(source: MeshFile) -> tuple[str, list[_Element], int, int]:
     """Format, elements, and the byte and line at which the data begin."""
     elements: list[_Element] = []
     path, file_format = source.path, ""
-    with source.opened() as file:
+    with source.open_file() as file:
         for number in range(1, 10_000):
             words = file.readline(4096).decode("ascii", "replace").split()
             if number == 1 and words != ["ply"]:
@@ -99,8 +99,8 @@ def _ply_header(source: MeshFile) -> tuple[str, list[_Element], int, int]:
     raise InputError(f"{path}: expected `end_header`; the header has no end")
 
 
-def _with(element: _Element, described: tuple[str, ...]) -> _Element:
-    return _Element(element.name, element.count, (*element.properties, described))
+def _with(element: _Element, property_words: tuple[str, ...]) -> _Element:
+    return _Element(element.name, element.count, (*element.properties, property_words))
 
 
 def _plain_record(path: Path, element: _Element, order: str) -> np.dtype[np.void]:
@@ -168,7 +168,7 @@ def _binary_triangles(path: Path, file, element: _Element, order: str, vertices:
 
 
 def _read_ascii_ply(source: MeshFile, elements: list[_Element], at: int, line: int) -> Mesh:
-    path, data = source.path, source.mapped()
+    path, data = source.path, source.mapped_bytes()
     vertices, triangles = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32)
     for element in elements:
         names = [field[0] for field in element.properties]

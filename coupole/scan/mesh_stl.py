@@ -21,7 +21,7 @@ _STL_HEADER_BYTES = 80
 def read_stl(source: MeshFile) -> Mesh:
     """Read an STL: as binary if its size agrees with its count of triangles, whatever its header; else as text."""
     path, size = source.path, source.size_bytes
-    with source.opened() as file:
+    with source.open_file() as file:
         header = file.read(_STL_HEADER_BYTES)
         count = int.from_bytes(file.read(4), "little")
     file_bytes = _STL_HEADER_BYTES + 4 + count * _STL_RECORD.itemsize
@@ -35,7 +35,7 @@ def read_stl(source: MeshFile) -> Mesh:
             f"{path}: the file ends in triangle {at} of {count}, or is not an STL: {size} bytes, not {file_bytes}"
         )
     welder = _Welder(count)
-    with source.opened() as file:
+    with source.open_file() as file:
         file.seek(_STL_HEADER_BYTES + 4)
         for first in range(0, count, CHUNK):
             part = np.ascontiguousarray(read_records(file, _STL_RECORD, min(CHUNK, count - first))["corners"])
@@ -45,7 +45,7 @@ def read_stl(source: MeshFile) -> Mesh:
 
 
 def _read_ascii_stl(source: MeshFile) -> Mesh:
-    path, data = source.path, source.mapped()
+    path, data = source.path, source.mapped_bytes()
     count, line = _count_lines_with(data, np.frombuffer(b"vertex", np.uint8))
     if count % 3 or not re.search(rb"endsolid[^\n]*\s*\Z", bytes(data[-4096:])):
         raise InputError(f"{path}:{line}: expected `endsolid` after whole triangles: the file was cut off")
@@ -139,22 +139,22 @@ def _slot(slots, vertices, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill_slots(slots, vertices, known):  # type: ignore[no-untyped-def]
-    for n in range(known):
+def _fill_slots(slots, vertices, vertex_count):  # type: ignore[no-untyped-def]
+    for n in range(vertex_count):
         slots[_slot(slots, vertices, vertices[n, 0], vertices[n, 1], vertices[n, 2])] = n
 
 
 @numba.njit(cache=True, nogil=True)
-def _weld(points, done, slots, vertices, known, out):  # type: ignore[no-untyped-def]
-    while done < len(points):
-        x, y, z = points[done, 0], points[done, 1], points[done, 2]
+def _weld(points, done_count, slots, vertices, vertex_count, out):  # type: ignore[no-untyped-def]
+    while done_count < len(points):
+        x, y, z = points[done_count, 0], points[done_count, 1], points[done_count, 2]
         at = _slot(slots, vertices, x, y, z)
         if slots[at] < 0:
-            if known == len(vertices) or 2 * known > len(slots):
-                return done, known
-            vertices[known, 0], vertices[known, 1], vertices[known, 2] = x, y, z
-            slots[at] = known
-            known += 1
-        out[done] = slots[at]
-        done += 1
-    return done, known
+            if vertex_count == len(vertices) or 2 * vertex_count > len(slots):
+                return done_count, vertex_count
+            vertices[vertex_count, 0], vertices[vertex_count, 1], vertices[vertex_count, 2] = x, y, z
+            slots[at] = vertex_count
+            vertex_count += 1
+        out[done_count] = slots[at]
+        done_count += 1
+    return done_count, vertex_count

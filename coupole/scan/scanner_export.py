@@ -109,10 +109,10 @@ def _refuse(path: Path, mesh: Mesh, defects: Defects, *, accept_defects: bool) -
         )
 
 
-def _targets_unit(path: Path, table: Targets, stated: str | None, mesh_unit: str) -> str:
-    if stated and table.unit and stated != table.unit:
-        raise InputError(f"{path}: the unit in the table is {table.unit}, that of --targets-unit {stated}")
-    return stated or table.unit or mesh_unit
+def _targets_unit(path: Path, table: Targets, stated_unit: str | None, mesh_unit: str) -> str:
+    if stated_unit and table.unit and stated_unit != table.unit:
+        raise InputError(f"{path}: the unit in the table is {table.unit}, that of --targets-unit {stated_unit}")
+    return stated_unit or table.unit or mesh_unit
 
 
 def _expect_together(mesh_path: Path, mesh: Mesh, path: Path, centers_mm: NDArray[np.float64]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def simplified(
+def simplified_mesh(
     vertices_mm: NDArray[np.float64], faces: NDArray[np.int64], faces_at_most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices [n, 3] and faces [m, 3] of about the same shape with fewer faces: the vertices in each cell of a

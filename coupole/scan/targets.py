@@ -61,8 +61,8 @@ def read_targets(path: Path) -> Targets:
     return _targets(path, rows, next(iter(units), ""))
 
 
-def _unit(found: str) -> str:
-    name = re.split(r"\W+", found.strip("[]()").lower())[-1]
+def _unit(written_unit: str) -> str:
+    name = re.split(r"\W+", written_unit.strip("[]()").lower())[-1]
     return {"µm": "um", "inch": "in", "inches": "in"}.get(name, name)
 
 

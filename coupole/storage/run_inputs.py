@@ -97,7 +97,7 @@ def _described(path: Path, files: InputFiles) -> dict[str, str]:
 
 
 def _text(path: Path, files: InputFiles) -> str:
-    return files.read(path).decode("utf-8").replace("\r\n", "\n")
+    return files.read_bytes(path).decode("utf-8").replace("\r\n", "\n")
 
 
 def _read(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
@@ -161,7 +161,7 @@ class _Keeper:
         path = path.absolute()
         if path not in self.stored:
             if not self.files.there(path) or (
-                len(self.files.read(path)) > MOST_COPIED_BYTES and not self.copy_large
+                len(self.files.read_bytes(path)) > MOST_COPIED_BYTES and not self.copy_large
             ):
                 self.stored[path] = None
             else:
@@ -172,7 +172,7 @@ class _Keeper:
 
     def _write(self, path: Path, stored: str) -> None:
         make_folder((self.run / stored).parent)
-        write_synced(self.run / stored, self.files.read(path))
+        write_synced(self.run / stored, self.files.read_bytes(path))
 
     def _new_place(self, folder: str, name: str) -> str:
         taken_places = set(self.stored.values())
@@ -287,5 +287,5 @@ def _meaning(path: Path, files: InputFiles) -> str:
     """Hash of what counts in a file: of a table's lines without comments, and of all bytes of another file."""
     if path.suffix.lower() != ".csv":
         return files.sha256(path)
-    lines = [line.strip() for line in files.read(path).splitlines()]
+    lines = [line.strip() for line in files.read_bytes(path).splitlines()]
     return hashlib.sha256(b"\n".join(line for line in lines if line and not line.startswith(b"#"))).hexdigest()

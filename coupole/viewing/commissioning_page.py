@@ -40,7 +40,7 @@ def _step(result: StepResult) -> str:
     limits = [
         f"<td>{html.escape(entry.what)}<td class=n>{entry.found:.4g}<td "
         f"class=n>{entry.limit:.4g}<td>{html.escape(entry.unit)}"
-        f"<td class={'ok>met' if entry.passed else 'bad>missed'}"
+        f"<td class={'ok>met' if entry.is_met else 'bad>missed'}"
         for entry in result.limits
     ]
     answers = [

@@ -45,14 +45,14 @@ def remarks(found: Comparison) -> Iterator[str]:
     """Yield what the reader of the report must know, one sentence each."""
     is_finite = np.isfinite(found.distance_mm)
     yield (
-        f"shape: {int(found.moved.sum()):,} of {int(is_finite.sum()):,} points changed significantly, in "
+        f"shape: {int(found.moved_points.sum()):,} of {int(is_finite.sum()):,} points changed significantly, in "
         f"{len(found.shape_regions)} regions; standard uncertainty {np.nanmedian(found.u_mm):.2g} mm in the median"
     )
-    if found.de00 is None or found.recoloured is None:
+    if found.de00 is None or found.recoloured_points is None:
         yield "colour: not compared, as not both states have colours"
     else:
         yield (
-            f"colour: {int(found.recoloured.sum()):,} points changed significantly, in "
+            f"colour: {int(found.recoloured_points.sum()):,} points changed significantly, in "
             f"{len(found.colour_regions)} regions; dE00 {np.nanmedian(found.de00):.2f} in the median, with noise"
         )
     if (~is_finite).any():
@@ -81,18 +81,18 @@ def distance_colours(distance_mm: Points, scale_mm: float) -> Points:
 
 def _shape(found: Comparison, colours: Points, scale_mm: float) -> str:
     figures = _image(found, colours, f"Distances: blue {scale_mm:.3g} mm inwards, orange as much outwards")
-    figures += _image(found, _marks(found.moved), "Points whose shape changed significantly")
+    figures += _image(found, _marks(found.moved_points), "Points whose shape changed significantly")
     return figures + _regions("Regions that changed in shape", found.shape_regions)
 
 
 def _colour(found: Comparison) -> str:
-    if found.de00 is None or found.recoloured is None:
+    if found.de00 is None or found.recoloured_points is None:
         return ""
     most = max(3.0, float(np.nanquantile(found.de00, _SHOWN_QUANTILE)))
     share = np.clip(np.nan_to_num(found.de00 / most), 0, 1)[:, None]
     colours = np.where(np.isfinite(found.de00)[:, None], _ENDS[1] + share * (_STRONG - _ENDS[1]), _UNKNOWN)
     figures = _image(found, colours, f"Colour differences, dE00 under D65: 0 light, {most:.2g} dark")
-    figures += _image(found, _marks(found.recoloured), "Points whose colour changed significantly")
+    figures += _image(found, _marks(found.recoloured_points), "Points whose colour changed significantly")
     return figures + _regions("Regions that changed in colour", found.colour_regions)
 
 
@@ -141,9 +141,9 @@ def _write_maps(found: Comparison, colours: Points, path: Path) -> None:
         rows[name] = found.before.points_mm[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         rows[name] = np.round(255 * colours[:, channel])
-    rows["distance_mm"], rows["u_mm"], rows["shape_changed"] = found.distance_mm, found.u_mm, found.moved
-    if found.de00 is not None and found.recoloured is not None:
-        rows["de00"], rows["colour_changed"] = found.de00, found.recoloured
+    rows["distance_mm"], rows["u_mm"], rows["shape_changed"] = found.distance_mm, found.u_mm, found.moved_points
+    if found.de00 is not None and found.recoloured_points is not None:
+        rows["de00"], rows["colour_changed"] = found.de00, found.recoloured_points
     kinds = {"<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", "comment mm", f"element vertex {count}"]
     header += [f"property {kinds[kind]} {name}" for name, kind in fields]

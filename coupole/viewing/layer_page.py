@@ -17,7 +17,7 @@ def layer_page(
     given: LayerGiven, samples: Samples, found: Coefficients, model: Deserved, four: FourFlux | None
 ) -> str:
     """HTML."""
-    nm, sure = samples.wavelengths_nm, found.determined
+    nm, sure = samples.wavelengths_nm, found.determined_bands
     unit = "per mm" if samples.is_per_mm else "of the layer"
     head = {
         "Model": f"{text(model.model)}: {text(model.because)}",
@@ -38,7 +38,7 @@ def layer_page(
     for film, told_film in zip(samples.films, given.films, strict=True):
         prediction = layer_fit.predict(found, samples.face, film.thickness_mm, film.ground)
         fits += [
-            Curve(f"{told_film.spectrum.name}, measured", film.seen),
+            Curve(f"{told_film.spectrum.name}, measured", film.reflectance),
             Curve(f"{told_film.spectrum.name}, fitted", prediction.seen, dashed=True),
         ]
     body += section("fit", "Measured and fitted", chart("Reflectance in air", nm, fits))

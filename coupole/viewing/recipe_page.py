@@ -16,7 +16,7 @@ from coupole.viewing.spectra_drawing import Array, Curve, chart, patches
 
 def recipe_page(name: str, found: Found, matches: Sequence[Sequence[Match]]) -> str:
     """HTML; `matches` are those of each of `found.recipes` under each light."""
-    best, under = found.best, matches[found.chosen]
+    best, under = found.best, matches[found.chosen_index]
     body = f"<h1>{text(name)}: recipe</h1><p>{text(found.verdict())}.</p>"
     shares = [
         [text(paint), f"{100 * share:.1f} %", f"{100 * best.half_widths[paint]:.1f} %"]
@@ -33,7 +33,7 @@ def recipe_page(name: str, found: Found, matches: Sequence[Sequence[Match]]) -> 
     note = "Adapted to the screen's white (CAT16); colours outside its gamut are nearest ones."
     body += section("colours", "Side by side", f'{patches(patch_pairs)}<p class="note">{note}</p>')
     bands = found.bands
-    curves = [Curve("target", found.target[bands]), Curve("recipe", best.seen[bands], dashed=True)]
+    curves = [Curve("target", found.target[bands]), Curve("recipe", best.reflectance[bands], dashed=True)]
     body += section("spectra", "Spectra", chart("Reflectance in air", WAVELENGTHS_NM[bands], curves))
     lights = [m.light for m in under]
     rows = [_row(mixture, of_one) for mixture, of_one in zip(found.recipes, matches, strict=True)]
@@ -48,7 +48,7 @@ def _row(recipe: Recipe, under: Sequence[Match]) -> list[str]:
 
 
 def _srgb(xyz: Array, match: Match) -> tuple[int, int, int]:
-    screen_xyz = colour.adapted(xyz, match.white_xyz, "CAT16")
-    pixels, _ = colour.displayed(np.asarray(screen_xyz)[None, None])
+    screen_xyz = colour.adapted_xyz(xyz, match.white_xyz, "CAT16")
+    pixels, _ = colour.displayed_srgb(np.asarray(screen_xyz)[None, None])
     red, green, blue = (int(value) for value in pixels[0, 0])
     return red, green, blue

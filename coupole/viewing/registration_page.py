@@ -15,7 +15,7 @@ from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration.merging import Merged
 from coupole.scan.registration.registering import Registered
-from coupole.scan.registration.small_motions import applied
+from coupole.scan.registration.small_motions import moved_points
 from coupole.scan.registration.summary import point_uncertainty_mm, remarks, worst_loop_mm
 from coupole.viewing.page_parts import facts, link, page, picture, section, table, text
 from coupole.viewing.view_canvas import Canvas, Lookout
@@ -60,7 +60,9 @@ def _image(sheet: Any, alternative: str) -> str:
 
 def scans_drawn(found: Registered) -> Any:
     """The scans' coarse points, each scan in a colour of its own, as a PIL image."""
-    clouds = [applied(found.first_from_scan[k], found.scans[k].coarse.points_mm) for k in found.placed]
+    clouds = [
+        moved_points(found.first_from_scan[k], found.scans[k].coarse.points_mm) for k in found.placed_numbers
+    ]
     colours = [np.tile(_hue(k / len(clouds)), (len(cloud), 1)) for k, cloud in enumerate(clouds)]
     points, colour = np.concatenate(clouds), np.concatenate(colours)
     if len(points) > _DRAWN_POINTS:
@@ -116,7 +118,7 @@ def _files(merged: Merged | None) -> str:
 def _scans(found: Registered) -> str:
     rows = []
     for number, scan in enumerate(found.scans):
-        is_placed = number in found.placed
+        is_placed = number in found.placed_numbers
         rows.append(
             (
                 text(scan.name),
@@ -152,7 +154,7 @@ def _targets(found: Registered) -> str:
     rows = [
         (
             text(sighting.name),
-            text(found.names[found.placed[sighting.scan]]),
+            text(found.names[found.placed_numbers[sighting.scan]]),
             f"{sighting.u_mm:.3g}",
             f"{sighting.left_mm:.3g}",
         )

@@ -15,7 +15,7 @@ from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.fits import FITS, GGX, GGX_NORMAL, MATERIALS
-from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_result import REPORT, RunResult, read_about
 from coupole.reflectance.triangle_fit import FEWEST
@@ -205,7 +205,7 @@ def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iter
     yield f"<p>Direct light of LED {lamp} in the frame, made by each fit, and how far each is off, white 10 %<br>"
     yield figure("measured", display(_rgb(np.nan_to_num(photo)), white))
     for name in FITS:
-        model = frames.picture(predicted(result, name, view, rows, under)[:, 0] * share)
+        model = frames.picture(predict_samples(result, name, view, rows, under)[:, 0] * share)
         off = np.where(is_known, np.abs(model - photo), 0.0).mean(axis=2)
         yield figure(FITS[name].title, display(_rgb(np.nan_to_num(np.where(is_known, model, 0.0))), white))
         yield figure("off", grey(np.nan_to_num(off) / (0.1 * white)))

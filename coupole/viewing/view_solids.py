@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coupole.scan.simplify import simplified
+from coupole.scan.simplify import simplified_mesh
 
 Points = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def disk(name: str, radius_mm: float, thickness_mm: float, around: int = 96) -> 
 
 def with_fewer_faces(solid: Solid, faces_at_most: int) -> Solid:
     """Return about the same shape with fewer faces, for drawing."""
-    return Solid(solid.name, *simplified(solid.vertices_mm, solid.faces, faces_at_most))
+    return Solid(solid.name, *simplified_mesh(solid.vertices_mm, solid.faces, faces_at_most))
 
 
 @lru_cache(maxsize=8)

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial.transform import Rotation
 
-from coupole.appearance.shapes.triangles import Array, welded
+from coupole.appearance.shapes.triangles import Array, weld_corners
 from coupole.errors import InputError, StorageError
 from coupole.geometry import Transform
 from sim.scene.things import Sample, Thing
@@ -53,7 +53,7 @@ def export_scan(
     random = np.random.default_rng([seed, 2])
     frame = scanner_from_thing(seed)
     bare = sample.bare()
-    points, faces = welded(bare.corners_mm)
+    points, faces = weld_corners(bare.corners_mm)
     points = points @ frame[:3, :3].T + frame[:3, 3] + random.normal(0.0, accuracy_mm, points.shape)
     poses = frame @ sample.stickers.poses_when_scanned(bare)
     poses = poses[random.permutation(len(poses))]

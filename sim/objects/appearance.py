@@ -57,7 +57,7 @@ def paint(
         inside = kubelka_munk.over(rho, tau, ground)
     return Material(
         f"{name}",
-        rgb(face(indices.BINDER).seen(InternalReflectance(inside)).values),
+        rgb(face(indices.BINDER).reflectance_in_air(InternalReflectance(inside)).values),
         _normal(indices.BINDER),
         0.25,
     )
@@ -68,7 +68,7 @@ def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12
 
     `uncovered` is the fraction bared by holes and cracks; a roughness of 0.12 is well burnished (assumed).
     """
-    gilt_layers = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), uncovered=uncovered)
+    gilt_layers = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), bare_share=uncovered)
     specular, diffuse = gilding.reflectances(gilt_layers)
     return Material(f"gold leaf, {thickness_nm:g} nm", rgb(diffuse), rgb(specular), roughness)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coupole.appearance.matter.alta_samples import interpolated, read_alta
+from coupole.appearance.matter.alta_samples import interpolated_brdf, read_alta
 from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.matter.hemisphere import albedo
 from coupole.appearance.matter.merl_table import read_merl
@@ -48,7 +48,7 @@ def bsdf_material(path: Path) -> Material:
 def alta_material(paths: tuple[Path, ...]) -> Material:
     """One file of one channel, which is grey, or of three; or one file for each of red, green and blue. Raises
     InputError for other files, and for samples between which nothing can be interpolated."""
-    parts = [interpolated(read_alta(path)) for path in paths]
+    parts = [interpolated_brdf(read_alta(path)) for path in paths]
 
     def whole(wi: Array, wo: Array) -> Array:
         brdf = np.concatenate([part(wi, wo) for part in parts], axis=-1)

@@ -41,19 +41,19 @@ def tabulated_finish() -> Brdf:
         body = brdf.oren_nayar(wi, wo, reflectance=0.6 * grains, roughness=0.6)
         return np.asarray(body + 0.12 * brdf.cook_torrance(wi, wo, slope=0.28, fresnel=_gold))
 
-    return partial(tabulated.tabulated, table=tabulated.tabulate(measured, np.linspace(0.0, 88.0, 12)))
+    return partial(tabulated.tabulated_brdf, table=tabulated.tabulate(measured, np.linspace(0.0, 88.0, 12)))
 
 
 def layered_paint() -> Brdf:
     """A red body under varnish."""
     coat = layered.coat(layered.sheet((), indices.BINDER), 0.22)
-    return partial(layered.layered, coat=coat, body=typical.reflectance("red_shape"))
+    return partial(layered.layered_brdf, coat=coat, body=typical.reflectance("red_shape"))
 
 
 def makie_ground() -> Brdf:
     """Gold powder on red lacquer: a share of metal by its alpha, the rest diffuse (seed 002, section 4)."""
     powder = partial(brdf.cook_torrance, slope=0.32, fresnel=_gold)
-    residual = _RED_LACQUER.seen(typical.reflectance("orange_shape")).values
+    residual = _RED_LACQUER.reflectance_in_air(typical.reflectance("orange_shape")).values
     return partial(makie.makie_brdf, alpha=0.3, residual=0.7 * residual, metallic=powder)
 
 

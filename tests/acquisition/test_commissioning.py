@@ -59,7 +59,7 @@ def wrong(wrong_cell: tuple[Bench, Any]) -> Iterator[Bench]:
 
 
 def missed(bench: Bench) -> list[str]:
-    return [one.what for one in bench.findings.limits if not one.passed]
+    return [one.what for one in bench.findings.limits if not one.is_met]
 
 
 def test_a_right_cell_passes_every_step_and_its_record_says_who_and_with_what(right: tuple[Path, Ended]) -> None:

@@ -56,7 +56,7 @@ def with_rig(bench: Bench, **changes: Any) -> Bench:
 
 
 def missed(bench: Bench) -> list[str]:
-    return [one.what for one in bench.findings.limits if not one.passed]
+    return [one.what for one in bench.findings.limits if not one.is_met]
 
 
 HIGHER = {"base_from_support": {"translation_mm": [200, 0, 1400], "abc_deg": [0, 0, 180]}}

@@ -43,7 +43,7 @@ def bench_with(box: Box, person: Onlooker, *, must_exist: bool = False) -> Bench
 
 
 def missed(bench: Bench) -> list[str]:
-    return [one.what for one in bench.findings.limits if not one.passed]
+    return [one.what for one in bench.findings.limits if not one.is_met]
 
 
 def test_a_switch_that_follows_the_person_passes() -> None:

@@ -10,7 +10,7 @@ import pytest
 from places import SHARED_DATA
 from scipy.spatial.transform import Rotation
 
-from coupole.appearance.matter.alta_samples import interpolated, read_alta
+from coupole.appearance.matter.alta_samples import interpolated_brdf, read_alta
 from coupole.errors import InputError
 
 RETRO = SHARED_DATA / "brdf/retro-gray-tape.dat"
@@ -114,7 +114,7 @@ def test_between_samples_a_smooth_reflectance_is_found(tmp_path: Path) -> None:
     light, eye = directions(4000, 0.05, 3), directions(4000, 0.05, 4)
     rows = np.column_stack([angles(light, eye)["ISOTROPIC_TL_TV_PROJ_DPHI"], smooth(light, eye)])
     text = "\n".join(" ".join(f"{value:.12g}" for value in row) for row in rows)
-    made = interpolated(read_alta(written(tmp_path, HEAD + text)))
+    made = interpolated_brdf(read_alta(written(tmp_path, HEAD + text)))
     np.testing.assert_allclose(made(light, eye)[:, 0], smooth(light, eye), rtol=1e-6)
     light, eye = directions(500, 0.3, 5), directions(500, 0.3, 6)
     found = made(light, eye)[:, 0]
@@ -131,11 +131,11 @@ def test_between_samples_a_smooth_reflectance_is_found(tmp_path: Path) -> None:
 def test_what_cannot_be_interpolated_is_refused(tmp_path: Path) -> None:
     rows = "\n".join(f"0.5 {0.1 * n} 0 1" for n in range(12))
     with pytest.raises(InputError, match="their angles lie in one plane"):
-        interpolated(read_alta(written(tmp_path, HEAD + rows)))
+        interpolated_brdf(read_alta(written(tmp_path, HEAD + rows)))
     with pytest.raises(InputError, match="expected 8 samples above the surface; found 1"):
-        interpolated(read_alta(written(tmp_path, HEAD + "0.5 0 0 1\n0.5 2 0 1")))
+        interpolated_brdf(read_alta(written(tmp_path, HEAD + "0.5 0 0 1\n0.5 2 0 1")))
     with pytest.raises(InputError, match="PARAM_OUT: expected INV_STERADIAN; found ENERGY"):
-        interpolated(read_alta(written(tmp_path, HEAD.replace("INV_STERADIAN", "ENERGY") + rows)))
+        interpolated_brdf(read_alta(written(tmp_path, HEAD.replace("INV_STERADIAN", "ENERGY") + rows)))
     with pytest.raises(InputError, match="PARAM_IN COS_TLV: expected one of"):
         read_alta(written(tmp_path, "#DIM 1 1\n#PARAM_IN COS_TLV\n0.5 1")).directions()
 

@@ -30,7 +30,7 @@ def of_gold(cosines: Array) -> Array:
 
 def table_of_gold() -> Brdf:
     source = partial(brdf.ggx, roughness=0.2, fresnel=mirror_all)
-    return partial(tabulated.tabulated, table=tabulated.tabulate(source, np.arange(0.0, 90.0, 5.0)))
+    return partial(tabulated.tabulated_brdf, table=tabulated.tabulate(source, np.arange(0.0, 90.0, 5.0)))
 
 
 BRDFS: dict[str, Brdf] = {
@@ -42,7 +42,7 @@ BRDFS: dict[str, Brdf] = {
     "smooth cook-torrance": partial(brdf.cook_torrance, slope=0.1, fresnel=mirror_all),
     "rough cook-torrance": partial(brdf.cook_torrance, slope=0.6, fresnel=mirror_all),
     "lacquered white": partial(
-        layered.layered, coat=layered.coat(layered.sheet([], indices.URUSHI), 0.1), body=WHITE
+        layered.layered_brdf, coat=layered.coat(layered.sheet([], indices.URUSHI), 0.1), body=WHITE
     ),
     "tabulated": table_of_gold(),
     "makie": partial(
@@ -124,7 +124,7 @@ def test_cook_torrance_in_the_papers_norm_would_create_light() -> None:
 def test_a_white_body_under_clear_lacquer_returns_all_light(roughness: float) -> None:
     coat = layered.coat(layered.sheet([], 1.53), roughness)
 
-    reflected = hemisphere.albedo(partial(layered.layered, coat=coat, body=WHITE), COSINES)
+    reflected = hemisphere.albedo(partial(layered.layered_brdf, coat=coat, body=WHITE), COSINES)
 
     assert reflected == pytest.approx(1.0, abs=2.5e-3)
 
@@ -145,6 +145,8 @@ def test_paint_under_smooth_lacquer_is_what_saunderson_says() -> None:
     gloss = partial(brdf.ggx, roughness=0.002, fresnel=fresnel.of_index(1.5))
 
     def diffuse(wi: Array, wo: Array) -> Array:
-        return layered.layered(wi, wo, coat=coat, body=body) - gloss(wi, wo)
+        return layered.layered_brdf(wi, wo, coat=coat, body=body) - gloss(wi, wo)
 
-    assert hemisphere.albedo(diffuse, np.array([1.0]))[0] == pytest.approx(face(1.5).seen(body).values, abs=1e-3)
+    assert hemisphere.albedo(diffuse, np.array([1.0]))[0] == pytest.approx(
+        face(1.5).reflectance_in_air(body).values, abs=1e-3
+    )

@@ -18,7 +18,7 @@ from coupole.errors import InputError
 
 GOLD = indices.gold()
 BOLE = typical.bole()
-SEEN = face(indices.EGG_WHITE).seen(BOLE).values
+SEEN = face(indices.EGG_WHITE).reflectance_in_air(BOLE).values
 """As an instrument sees it, gloss excluded."""
 
 
@@ -107,7 +107,7 @@ def test_a_thick_leaf_is_bulk_gold() -> None:
 
 
 def test_a_leaf_that_is_all_holes_is_the_bole_as_measured() -> None:
-    _, diffuse = gilding.reflectances(gilding.gilt(GOLD, 200.0, BOLE, uncovered=1.0))
+    _, diffuse = gilding.reflectances(gilding.gilt(GOLD, 200.0, BOLE, bare_share=1.0))
 
     assert diffuse == pytest.approx(SEEN, abs=1e-12)
 
@@ -140,7 +140,7 @@ def test_no_gilt_reflects_more_than_it_gets(thickness_nm: float, holes: float, b
     white = InternalReflectance(np.ones(81))
 
     specular, diffuse = gilding.reflectances(
-        gilding.gilt(gilding.leaf_index(GOLD, holes), thickness_nm, white, uncovered=bare)
+        gilding.gilt(gilding.leaf_index(GOLD, holes), thickness_nm, white, bare_share=bare)
     )
 
     assert np.all(specular + diffuse <= 1.0 + 1e-9)
@@ -163,9 +163,9 @@ def test_a_sheets_internal_reflectance_equals_a_plain_quadrature() -> None:
 
 
 def test_cracks_and_holes_overlap_by_chance() -> None:
-    assert gilding.uncovered(0.1, 20.0, 5.0) == pytest.approx(1.0 - 0.9 * 0.9)
+    assert gilding.bare_share_of(0.1, 20.0, 5.0) == pytest.approx(1.0 - 0.9 * 0.9)
 
 
 def test_cracks_wider_than_the_leaf_are_refused() -> None:
     with pytest.raises(InputError, match="cracks"):
-        gilding.uncovered(0.0, 500.0, 5.0)
+        gilding.bare_share_of(0.0, 500.0, 5.0)

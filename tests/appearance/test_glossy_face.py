@@ -48,7 +48,7 @@ def by_counting_reflections(r: float, n: float, geometry: Geometry) -> float:
 @pytest.mark.parametrize("geometry", GEOMETRIES)
 @pytest.mark.parametrize("inside", [0.02, 0.5, 0.97])
 def test_what_is_seen_is_the_sum_of_what_leaves_after_each_reflection(geometry: Geometry, inside: float) -> None:
-    seen = face(1.5, geometry).seen(InternalReflectance(np.asarray(inside))).values
+    seen = face(1.5, geometry).reflectance_in_air(InternalReflectance(np.asarray(inside))).values
 
     assert seen == pytest.approx(by_counting_reflections(inside, 1.5, geometry), abs=2e-6)
 
@@ -58,7 +58,7 @@ def test_what_is_seen_is_the_sum_of_what_leaves_after_each_reflection(geometry: 
 def test_what_is_inside_comes_back(inside: float, index: float, geometry: Geometry) -> None:
     one = face(index, geometry)
 
-    seen = one.seen(InternalReflectance(np.asarray(inside)))
+    seen = one.reflectance_in_air(InternalReflectance(np.asarray(inside)))
 
     assert one.inside(seen).values == pytest.approx(inside, abs=1e-9)
 

@@ -136,7 +136,7 @@ def test_a_thin_layer_grows_brighter_towards_grazing_light_as_photons_say() -> N
 
     by_photons = [walked(float(c), 5.0, 1e-9, 0.1, 60_000) for c in cosines]
 
-    assert found.directed[[64, 0], 0] == pytest.approx(by_photons, rel=0.12)
+    assert found.directional[[64, 0], 0] == pytest.approx(by_photons, rel=0.12)
     assert by_photons[1] > 1.2 * by_photons[0]
 
 
@@ -152,7 +152,7 @@ def test_a_leaf_under_the_face_alone_is_the_leaf_of_thin_films() -> None:
     ]
 
     assert found.mirror[ROW, 32] == pytest.approx(np.mean(expected), rel=1e-6)
-    assert found.directed.max() == 0.0
+    assert found.directional.max() == 0.0
 
 
 def test_facets_under_a_face_look_as_much_steeper_as_refraction_makes_them() -> None:

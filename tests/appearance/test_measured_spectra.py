@@ -225,7 +225,7 @@ def test_a_gap_stays_a_gap() -> None:
 
 
 def test_missing_ends_are_held_only_when_asked_to() -> None:
-    held = resampling.held(resampling.on_grid(sampled(10.0, 400.0, 700.0)))
+    held = resampling.fill_missing(resampling.on_grid(sampled(10.0, 400.0, 700.0)))
 
     assert held[0] == pytest.approx(edge(np.array(400.0)))
     assert held[-1] == pytest.approx(edge(np.array(700.0)))

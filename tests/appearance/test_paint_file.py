@@ -34,7 +34,7 @@ def test_a_paint_is_read_as_it_is_written_by_hand_and_by_the_program(tmp_path: P
 
     for paint in (by_hand, again):
         assert (paint.name, paint.unit, paint.binder_index) == ("ochre, fine", "per mm", 1.5)
-        assert paint.told["thickness_um"] == 30
+        assert paint.head_lines["thickness_um"] == 30
         assert paint.absorption.tolist() == [9.5, 8.0, 5.0]
         assert paint.u_scattering.tolist() == [0.4, 0.4, 0.4]
 

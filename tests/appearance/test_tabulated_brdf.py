@@ -85,7 +85,7 @@ def test_a_whole_table_gives_back_its_source_at_any_angle() -> None:
     rng = np.random.default_rng(4)
     wi, wo = (hemisphere.directions(rng.uniform(0.35, 1.0, 3000), rng.uniform(0.0, 6.3, 3000)) for _ in range(2))
 
-    assert worst_over_peak(tabulated.tabulated(wi, wo, table=table), f(wi, wo)) < 3e-3
+    assert worst_over_peak(tabulated.tabulated_brdf(wi, wo, table=table), f(wi, wo)) < 3e-3
 
 
 @settings(deadline=None, max_examples=40)

@@ -76,7 +76,7 @@ def test_a_pixel_brighter_than_metal_is_clamped_and_counted() -> None:
     found = makie.decompose(picture, METAL, LACQUERS)
 
     assert found.alpha == pytest.approx([1.0, 0.5])
-    assert found.clamped == 0.5
+    assert found.clamped_share == 0.5
 
 
 def test_a_whole_picture_is_taken_apart_as_its_pixels_are() -> None:

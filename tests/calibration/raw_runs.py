@@ -20,7 +20,7 @@ from sticker_scenes import LENS, SIZE_PX, Scene
 from synthesis import Array, frame
 
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.record import Input, Noise, Parameter, Validity, sealed, step_names, write_record
+from coupole.calibration.record import Input, Noise, Parameter, Validity, seal_record, step_names, write_record
 from coupole.devices import ArmState, FrameFormat
 from coupole.geometry import abc_from_rotation
 from coupole.plan.led_table import COLUMNS, LedTable
@@ -106,7 +106,7 @@ def write_hand_eye(path: Path, prior: CameraPrior, **validity: Any) -> Path:
         "expires": now + timedelta(days=30), "size_px": SIZE_PX, "focal_length_mm": 35.0, "f_number": 8.0,
         "focus_distance_mm": 335.0, "temperature_c": (20.0, 30.0),
     }  # fmt: skip
-    record = sealed(
+    record = seal_record(
         kind="hand-eye",
         name="hand-eye",
         created=now - timedelta(days=1),
@@ -207,7 +207,7 @@ def sticker_frames(made: Scene) -> list[Frame]:
             source.name,
             "led0000",
             flange,
-            np.clip(np.rint(source.read().plane() + BLACK_DN), 0, WHITE_DN).astype(np.uint16),
+            np.clip(np.rint(source.read_picture().plane() + BLACK_DN), 0, WHITE_DN).astype(np.uint16),
         )
         for source, flange in zip(made.sources.images, made.sources.poses.base_from_flange, strict=True)
     ]

@@ -13,7 +13,7 @@ from synthesis import Array, TrueLens, frame
 from coupole.calibration.grey_image import Picture
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.poses import reported
+from coupole.calibration.poses import kuka_poses
 from coupole.calibration.sources import About, Source, Sources
 
 SIZE_PX = (512, 384)
@@ -56,7 +56,7 @@ def scene(seed: int, *, stickers: int = 14, views: int = 8, missing: int = 0) ->
         said[:3, :3] = flange[:3, :3] @ off[:3, :3]
         flanges.append(said)
     sources = Sources(
-        tuple(images), reported(np.array(flanges)), About(simulated=True), (("run/run.json", "0" * 64),)
+        tuple(images), kuka_poses(np.array(flanges)), About(is_simulated=True), (("run/run.json", "0" * 64),)
     )
     known = places + random.normal(0, 0.03, places.shape)
     names = tuple(f"T{row}" for row in range(stickers))

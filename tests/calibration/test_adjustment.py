@@ -21,7 +21,7 @@ def mean_of(values: Any, stated: float, *, estimated: bool = True) -> Adjusted[A
         return [Block((values - state[0]) / stated, ones, np.array([0]), 0)]
 
     groups = [Group("values", estimated)]
-    return adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, what="a mean")
+    return adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, calibration_name="a mean")
 
 
 def test_the_variance_of_a_mean_is_that_of_the_values_over_their_number() -> None:
@@ -54,8 +54,8 @@ def test_two_groups_are_weighted_by_their_noise_and_share_the_variance_by_it() -
             Block(np.array([20.0 - state[0]]) / 3, np.ones((1, 1)) / 3, at, 1),
         ]
 
-    groups = [Group("fine", estimated=False), Group("coarse", estimated=False)]
-    found = adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, what="a mean")
+    groups = [Group("fine", is_estimated=False), Group("coarse", is_estimated=False)]
+    found = adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, calibration_name="a mean")
     assert found.state[0] == pytest.approx(11.0, abs=1e-6)
     assert found.covariance[0, 0] == pytest.approx(0.9)
     assert found.contributions[:, 0] == pytest.approx([0.9, 0.1])
@@ -68,7 +68,14 @@ def test_a_line_through_points_has_the_covariance_of_textbooks() -> None:
     def evaluate(state: Any) -> list[Block]:
         return [Block(y - state[0] - state[1] * x, np.column_stack([np.ones(len(x)), x]), np.array([0, 1]), 0)]
 
-    found = adjust(np.zeros(2), evaluate, lambda s, step: s + step, [Group("y", estimated=True)], 2, what="a line")
+    found = adjust(
+        np.zeros(2),
+        evaluate,
+        lambda s, step: s + step,
+        [Group("y", is_estimated=True)],
+        2,
+        calibration_name="a line",
+    )
     expected, covariance = np.polyfit(x, y, 1, cov=True)
     assert found.state[::-1] == pytest.approx(expected, abs=1e-6)
     assert found.covariance[::-1, ::-1] == pytest.approx(covariance, rel=2e-3)
@@ -80,9 +87,9 @@ def test_gross_errors_are_left_out_and_counted() -> None:
     def evaluate(state: Any) -> list[Block]:
         return [Block(values - state[0], np.ones((len(values), 1)), np.array([0]), 0)]
 
-    groups = [Group("values", estimated=True, rejects=1)]
-    found = adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, what="a mean")
-    assert found.components[0].rejected == 2
+    groups = [Group("values", is_estimated=True, rejects=1)]
+    found = adjust(np.zeros(1), evaluate, lambda state, step: state + step, groups, 1, calibration_name="a mean")
+    assert found.components[0].rejected_count == 2
     assert found.state[0] == pytest.approx(VALUES.mean(), abs=1e-9)
     assert found.covariance[0, 0] == pytest.approx(np.tile(VALUES, 8).var(ddof=1) / 64, rel=2e-3)
 
@@ -92,7 +99,14 @@ def test_a_parameter_that_nothing_determines_is_refused() -> None:
         return [Block(VALUES - state[0] - state[1], np.ones((8, 2)), np.array([0, 1]), 0)]
 
     with pytest.raises(InputError, match="do not determine all parameters"):
-        adjust(np.zeros(2), evaluate, lambda s, step: s + step, [Group("y", estimated=True)], 2, what="two")
+        adjust(
+            np.zeros(2),
+            evaluate,
+            lambda s, step: s + step,
+            [Group("y", is_estimated=True)],
+            2,
+            calibration_name="two",
+        )
 
 
 @pytest.mark.parametrize("width", [1e-8, 1e-6])
@@ -105,7 +119,14 @@ def test_a_parameter_that_is_hardly_determined_is_refused_too(width: float) -> N
         return [Block(VALUES - columns @ state, columns, np.array([0, 1]), 0)]
 
     with pytest.raises(InputError, match="do not determine all parameters"):
-        adjust(np.zeros(2), evaluate, lambda s, step: s + step, [Group("y", estimated=True)], 2, what="two")
+        adjust(
+            np.zeros(2),
+            evaluate,
+            lambda s, step: s + step,
+            [Group("y", is_estimated=True)],
+            2,
+            calibration_name="two",
+        )
 
 
 def test_each_groups_share_of_a_variance_is_what_its_noise_brings_into_the_parameter() -> None:
@@ -118,8 +139,8 @@ def test_each_groups_share_of_a_variance_is_what_its_noise_brings_into_the_param
         off, both = y / sigma - columns @ state, np.array([0, 1])
         return [Block(off[:2], columns[:2], both, 0), Block(off[2:], columns[2:], both, 1)]
 
-    groups = [Group("fine", estimated=False), Group("coarse", estimated=False)]
-    found = adjust(np.zeros(2), evaluate, lambda s, step: s + step, groups, 2, what="a line")
+    groups = [Group("fine", is_estimated=False), Group("coarse", is_estimated=False)]
+    found = adjust(np.zeros(2), evaluate, lambda s, step: s + step, groups, 2, calibration_name="a line")
     enters = np.linalg.pinv(columns)
     fine, coarse = (enters[:, :2] ** 2).sum(axis=1), (enters[:, 2:] ** 2).sum(axis=1)
     assert found.contributions[0] == pytest.approx(fine / (fine + coarse))

@@ -22,7 +22,7 @@ from coupole.calibration.budget.accuracy import Case, accuracies
 from coupole.calibration.budget.budget import Known
 from coupole.calibration.budget.records import doubts, known_from, ray_mm, read_records
 from coupole.calibration.optics import project
-from coupole.calibration.record import Input, Limit, Parameter, Validity, sealed, step_names, write_record
+from coupole.calibration.record import Input, Limit, Parameter, Validity, seal_record, step_names, write_record
 from coupole.calibration.report import Outcome, write_outcome
 from coupole.errors import InputError
 from coupole.plan.plan import Pose
@@ -49,7 +49,7 @@ def write(path: Path, kind: str, **content: Any) -> Path:
         "remarks": (),
         "inputs": (Input(name="run/run.json", sha256="0" * 64),),
     }
-    write_record(path, sealed(**basic | content))
+    write_record(path, seal_record(**basic | content))
     return path
 
 
@@ -175,11 +175,11 @@ def test_a_rays_uncertainty_is_that_of_points_seen_through_random_records(tmp_pa
 
 def test_accuracies_come_from_records_and_say_where_there_is_none(folder: Path) -> None:
     lines = accuracies([Case("sound", read_records([folder])), Case("empty", ())])
-    cells_of = {line.what: (line.cell(0), line.cell(1)) for line in lines}
+    cells_of = {line.quantity: (line.cell(0), line.cell(1)) for line in lines}
     assert cells_of["mesh, worst sticker"] == ("0.04 mm", "no record")
     assert all(cell[1] == "no record" for cell in cells_of.values())
-    (median,) = next(line for line in lines if line.what == "LED centre, median").ours[0] or (0.0,)
-    (worst,) = next(line for line in lines if line.what == "LED centre, worst").ours[0] or (0.0,)
+    (median,) = next(line for line in lines if line.quantity == "LED centre, median").our_figures[0] or (0.0,)
+    (worst,) = next(line for line in lines if line.quantity == "LED centre, worst").our_figures[0] or (0.0,)
     record = next(item.record for item in read_records([folder]) if item.record.kind == "leds")
     assert median == pytest.approx(record.value("led_centre_median_u_mm"))
     assert worst >= median

@@ -14,7 +14,7 @@ from light_runs import FOCAL_PX, SIZE_PX, Taken, write_light_run
 from light_synthesis import Array, TrueSensor
 from typer.testing import CliRunner, Result
 
-from coupole.calibration.record import Record, read_record, sealed, write_record
+from coupole.calibration.record import Record, read_record, seal_record, write_record
 from coupole.commands import calibrate_light
 from coupole.commands.uncertainty import budget
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
@@ -154,7 +154,7 @@ def test_a_record_of_another_camera_is_refused(
         ("other", {"camera": "Other 7"}, "holds for the camera Other 7"),
         ("old", {"expires": datetime(2020, 1, 1, tzinfo=UTC)}, "expired on 2020-01-01"),
     ):
-        other = sealed(**content | {"validity": record.validity.model_copy(update=validity)})
+        other = seal_record(**content | {"validity": record.validity.model_copy(update=validity)})
         write_record(path.with_name(f"{name}.yaml"), other)
         folder, _ = panel_views(tmp_path / name)
         result = run(calibrate_light.flat_field, folder, option, path.with_name(f"{name}.yaml"), "--out", tmp_path)

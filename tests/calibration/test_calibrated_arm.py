@@ -19,7 +19,7 @@ from coupole.calibration.light.frames import LightFrame, LightFrames
 from coupole.calibration.multi_view import CameraView
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.rotations import moved
+from coupole.calibration.rotations import moved_transforms
 from coupole.calibration.sources import About
 from coupole.calibration.stickers.mesh_to_robot import Stated, mesh_to_robot
 from coupole.errors import InputError
@@ -62,7 +62,7 @@ def seen(seed: int, views: int = 12, stickers: int = 20) -> Seen:
             continue
         at = nearest(KR10_R1100_SIXX, ways, HOME_DEG)
         own = np.concatenate([random.normal(0, 0.03, 3), np.radians(random.normal(0, 0.003, 3))])
-        camera = moved(forward(KR10_R1100_SIXX, at + ZEROS_DEG), own) @ hand_eye
+        camera = moved_transforms(forward(KR10_R1100_SIXX, at + ZEROS_DEG), own) @ hand_eye
         in_base = places @ base_from_mesh[:3, :3].T + base_from_mesh[:3, 3]
         spots = LENS.see((in_base - camera[:3, 3]) @ camera[:3, :3])
         inside = np.all((spots > 4) & (spots < (SIZE_PX[0] - 4, SIZE_PX[1] - 4)), axis=1)
@@ -75,7 +75,7 @@ def seen(seed: int, views: int = 12, stickers: int = 20) -> Seen:
     return Seen(
         np.array(joints),
         pixels,
-        CameraPrior(lens, LENS_FREE, moved(hand_eye, off[4:10]), np.diag(U[:10] ** 2)),
+        CameraPrior(lens, LENS_FREE, moved_transforms(hand_eye, off[4:10]), np.diag(U[:10] ** 2)),
         arm,
         known,
         base_from_mesh,
@@ -115,7 +115,7 @@ def test_frames_of_light_are_posed_by_the_axes_with_their_zero_errors() -> None:
         for row in range(2 * len(flanges))
     )
     frames = tuple(replace(one, joints_deg=made.joints_deg[row // 2]) for row, one in enumerate(frames))
-    light = LightFrames(frames, "GBRG", 64, 4095, About(simulated=True), 1740.0, ())
+    light = LightFrames(frames, "GBRG", 64, 4095, About(is_simulated=True), 1740.0, ())
     posed = light.seen_through(made.prior.flange_from_camera, made.arm)
     for row, one in enumerate(posed.frames):
         true = forward(KR10_R1100_SIXX, made.joints_deg[row // 2] + made.arm.zeros_deg)
@@ -141,7 +141,7 @@ def test_intervals_hold_with_what_is_left_of_the_zero_errors(scale: Callable[[in
             for number, (pose, spots) in enumerate(zip(base_from_flange, made.pixels, strict=True))
         ]
         names = [f"T{row}" for row in range(len(made.table_mm))]
-        found = mesh_to_robot(views, made.prior.lens, made.table_mm, names, stated=STATED, prior=known)
+        found = mesh_to_robot(views, made.prior.lens, made.table_mm, names, stated_noise=STATED, prior=known)
         turn = Rotation.from_matrix(found.base_from_mesh[:3, :3].T @ made.base_from_mesh[:3, :3])
         shift = made.base_from_mesh[:3, 3] - found.base_from_mesh[:3, 3]
         step = np.concatenate([shift, turn.as_rotvec(degrees=True)])

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sticker_scenes import Scene, scene, write_scan
 from synthesis import frame
 
-from coupole.calibration.record import Record, read_record, sealed, write_record
+from coupole.calibration.record import Record, read_record, seal_record, write_record
 from coupole.geometry import transform
 from coupole.plan.led_table import read_led_table
 
@@ -35,7 +35,7 @@ def resealed(record: Record, **validity: object) -> Record:
     """A record that holds elsewhere."""
     content = {name: getattr(record, name) for name in Record.model_fields}
     del content["schema_version"], content["sha256"]
-    return sealed(**content | {"validity": record.validity.model_copy(update=validity)})
+    return seal_record(**content | {"validity": record.validity.model_copy(update=validity)})
 
 
 # -- camera and hand-eye --------------------------------------------------------------------------------------

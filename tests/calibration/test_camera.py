@@ -46,7 +46,7 @@ def test_gross_errors_are_left_out_and_change_nothing() -> None:
         pixels[corner] += shift_px
         spoilt[image] = replace(spoilt[image], pixels=pixels)
     clean, fit = (calibrate_camera(seen, cell.size_px) for seen in (cell.sightings, spoilt))
-    assert [(int(i), np.flatnonzero(~k).tolist()) for i, k in enumerate(fit.kept) if not k.all()] == [
+    assert [(int(i), np.flatnonzero(~k).tolist()) for i, k in enumerate(fit.accepted_masks) if not k.all()] == [
         (3, [5, 9]),
         (7, [11]),
     ]

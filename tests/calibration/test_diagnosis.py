@@ -12,7 +12,7 @@ from synthesis import Array, Cell, frame, make_cell
 from coupole.calibration.lens import hypotheses
 from coupole.calibration.lens.camera import calibrate_camera
 from coupole.calibration.lens.diagnosis import Diagnosis, diagnose, expected_scatter
-from coupole.calibration.poses import Convention, ReportedPoses, reported
+from coupole.calibration.poses import Convention, ReportedPoses, kuka_poses
 
 IMAGES = 14
 
@@ -46,7 +46,7 @@ def numbers(rotation: str = "abc") -> Array:
 
 
 def test_true_poses_raise_no_alarm() -> None:
-    found = judged(reported(seen()[0].base_from_flange))
+    found = judged(kuka_poses(seen()[0].base_from_flange))
     assert not found.contradicts
     assert found.sentences() == ()
 
@@ -63,7 +63,7 @@ def test_positions_in_another_unit_are_named(said: str) -> None:
 def test_a_board_described_in_metres_is_named() -> None:
     board = seen()[1].copy()
     board[:, :3, 3] *= 1e-3
-    found = judged(reported(seen()[0].base_from_flange), board)
+    found = judged(kuka_poses(seen()[0].base_from_flange), board)
     assert "squares are given in m, not mm" in found.sentences()[1]
 
 
@@ -93,12 +93,12 @@ def test_another_kind_of_angles_is_named(meant: str, said: str) -> None:
 
 
 def test_inverse_poses_are_named() -> None:
-    found = judged(reported(np.linalg.inv(seen()[0].base_from_flange)))
+    found = judged(kuka_poses(np.linalg.inv(seen()[0].base_from_flange)))
     assert found.cause == hypotheses.INVERSE
 
 
 def test_two_mistakes_at_once_are_both_named() -> None:
-    poses = reported(np.linalg.inv(seen()[0].base_from_flange)).numbers
+    poses = kuka_poses(np.linalg.inv(seen()[0].base_from_flange)).numbers
     poses[:, :3] *= 1e-3
     assert judged(ReportedPoses(poses, Convention())).cause == f"{hypotheses.UNITS} and {hypotheses.INVERSE}"
 
@@ -107,7 +107,7 @@ def test_two_mistakes_at_once_are_both_named() -> None:
 def test_a_board_that_was_moved_in_mid_run_is_named_with_the_moment(change: int) -> None:
     board = seen()[1].copy()
     board[change:] = board[change:] @ frame(np.array([3.0, -2.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    found = judged(reported(seen()[0].base_from_flange), board)
+    found = judged(kuka_poses(seen()[0].base_from_flange), board)
     assert found.cause == hypotheses.MOVED_BOARD
     assert f"between image {change - 1} and image {change}" in found.sentences()[1]
 
@@ -118,7 +118,7 @@ def test_a_board_that_moved_by_less_than_a_bad_robot_may_err_is_named_too() -> N
     board[6:] = board[6:] @ frame(np.array([1.0, 0.0, 0.0]), np.zeros(3))
     allowed = expected_scatter(board, pixel_px=0.1, focal_px=1600.0, robot_mm=0.3, robot_deg=0.02)
     names = [f"image {i}" for i in range(IMAGES)]
-    found = diagnose(reported(cell.base_from_flange), board, allowed, names)
+    found = diagnose(kuka_poses(cell.base_from_flange), board, allowed, names)
     assert found.cause == hypotheses.MOVED_BOARD
     assert "between image 5 and image 6" in found.sentences()[1]
 
@@ -136,7 +136,7 @@ def of_steady(base_from_flange: Array, order: Array | None = None) -> Diagnosis:
         board, pixel_px=0.1, focal_px=cell.lens.focal_px[0], robot_mm=0.03, robot_deg=0.003
     )
     order = np.arange(len(board)) if order is None else order
-    return diagnose(reported(base_from_flange[order]), board[order], expected, [f"image {i}" for i in order])
+    return diagnose(kuka_poses(base_from_flange[order]), board[order], expected, [f"image {i}" for i in order])
 
 
 def test_a_board_that_moved_by_a_few_times_the_noise_is_named_though_the_scatter_falls_little() -> None:
@@ -161,7 +161,7 @@ def test_an_arm_that_errs_smoothly_over_the_cell_is_not_called_a_moved_board() -
 def test_a_wrong_pair_is_named(wrong: int) -> None:
     flange = seen()[0].base_from_flange.copy()
     flange[wrong] = flange[wrong] @ frame(np.array([20.0, 0.0, 5.0]), np.array([3.0, 0.0, 0.0]))
-    found = judged(reported(flange))
+    found = judged(kuka_poses(flange))
     assert found.cause == hypotheses.WRONG_PAIR
     assert f"image {wrong} " in found.sentences()[1]
 
@@ -169,14 +169,14 @@ def test_a_wrong_pair_is_named(wrong: int) -> None:
 def test_two_poses_that_are_exchanged_are_named() -> None:
     flange = seen()[0].base_from_flange.copy()
     flange[[3, 9]] = flange[[9, 3]]
-    found = judged(reported(flange))
+    found = judged(kuka_poses(flange))
     assert found.cause == hypotheses.WRONG_PAIR
     assert "the poses of image 3 and image 9 are exchanged" in found.sentences()[1]
 
 
 def test_images_that_are_one_off_from_their_poses_are_named() -> None:
     cell, board = seen()
-    found = judged(reported(cell.base_from_flange[:-1]), board[1:])
+    found = judged(kuka_poses(cell.base_from_flange[:-1]), board[1:])
     assert found.cause == hypotheses.SHIFTED
 
 
@@ -184,7 +184,7 @@ def test_a_robot_that_is_merely_worse_than_stated_is_given_no_false_cause() -> N
     cell, board = seen()
     random = np.random.default_rng(5)
     shaken = np.stack([t @ frame(random.normal(0, 2, 3), random.normal(0, 0.2, 3)) for t in cell.base_from_flange])
-    found = judged(reported(shaken), board)
+    found = judged(kuka_poses(shaken), board)
     assert found.contradicts
     assert found.cause is None
     assert "worse than stated" in found.sentences()[1]
@@ -194,6 +194,6 @@ def test_methods_that_disagree_beyond_their_noise_are_named() -> None:
     cell, board = seen()
     stretched = cell.base_from_flange.copy()
     stretched[:, :3, 3] *= 1.05  # a robot whose millimetres are too long
-    found = judged(reported(stretched), board)
+    found = judged(kuka_poses(stretched), board)
     assert any(apart.beyond_noise for apart in found.disagreements)
     assert "methods disagree by" in found.sentences()[-1]

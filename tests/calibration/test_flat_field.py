@@ -106,14 +106,14 @@ def test_something_in_front_of_one_view_moves_nothing() -> None:
     views[2] = FlatView("v2", views[2].pixels, hidden, views[2].panel_mm)
     corner = np.array([[0.0, 0.0], [127.0, 95.0]])
     assert np.abs(np.log(fitted(views).at(corner) / clean.at(corner))).max() < 0.005
-    assert fitted(views).rejected > clean.rejected
+    assert fitted(views).rejected_share > clean.rejected_share
 
 
 def test_a_block_with_saturated_pixels_is_not_used() -> None:
     image = np.full((16, 16), 100.0)
     full = np.zeros(image.shape, bool)
     full[:4, :4] = True
-    means = block_means(image, np.ones(image.shape, bool), 8, saturated=full)[1]
+    means = block_means(image, np.ones(image.shape, bool), 8, saturation_mask=full)[1]
     assert np.isnan(means[0])
     assert (means[1:] == 100.0).all()
 

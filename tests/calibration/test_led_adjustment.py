@@ -10,7 +10,7 @@ from domes import Dome, Noise, dome
 from synthesis import Array
 
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
-from coupole.calibration.leds.boards import boards_of, placed
+from coupole.calibration.leds.boards import board_poses, boards_of
 from coupole.calibration.leds.equations import Stated
 from coupole.calibration.leds.matching import match_leds
 
@@ -44,7 +44,7 @@ def found(made: Dome, *, robot_mm: float = 0.03, robot_deg: float = 0.003) -> Fo
         matching.place_of[matching.sightings.led],
         made.base_from_flange,
         boards,
-        placed(boards, matching.by_place_mm),
+        board_poses(boards, matching.by_place_mm),
         made.prior,
         Stated(robot_mm=robot_mm, robot_deg=robot_deg),
     )
@@ -104,7 +104,7 @@ def test_a_spot_that_is_a_reflection_is_left_out() -> None:
     made = dome(4, noise=Noise(robot_mm=0.001, robot_deg=0.0001))
     made.seen.pixels[10] += [6.0, -5.0]
     result = found(made, robot_mm=0.001, robot_deg=0.0001)
-    assert (~result.geometry.kept).sum() == 1
+    assert (~result.geometry.accepted_mask).sum() == 1
 
 
 def test_a_board_that_was_not_seen_stays_at_its_table_with_an_uncertainty_that_says_so() -> None:

@@ -43,7 +43,7 @@ def off_by_axes(made: Dome, joints_deg: Array) -> Dome:
 
 def found(made: Dome, joints_deg: Array, arm: CalibratedArm | None) -> LedsFound:
     seen = replace(images(made), joints_deg=joints_deg)
-    return leds_from(seen, made.table, made.prior, REQUEST, stated=Stated(), arm=arm)
+    return leds_from(seen, made.table, made.prior, REQUEST, stated_noise=Stated(), arm=arm)
 
 
 def test_axis_zeros_of_the_hand_eye_record_are_taken_out_of_the_poses() -> None:

@@ -193,7 +193,7 @@ def test_a_tile_in_several_places_tells_its_tilt() -> None:
     found = calibrate_led_power(views_of(positions, power, random, tilts_deg=tilts), positions, TILE)
     u = np.sqrt(np.diag(found.common_covariance))
     at = [found.common_names.index(f"place{p}.tilt_{axis}_deg") for p in range(3) for axis in "xy"]
-    assert (np.abs(found.found[at] - np.ravel(tilts)) < 4 * u[at]).all()
+    assert (np.abs(found.departures[at] - np.ravel(tilts)) < 4 * u[at]).all()
     one = calibrate_led_power(views_of(positions, power, random), positions, TILE)
     assert (u[:2] < 0.8 * np.sqrt(np.diag(one.common_covariance))[:2]).all()
 
@@ -237,7 +237,7 @@ def test_an_led_that_the_arm_hides_in_one_view_is_not_dead() -> None:
 def test_a_saturated_tile_is_named_and_not_used() -> None:
     positions, power, random = small_dome()
     views = views_of(positions, power, random)
-    views[1].saturated[5] = True
+    views[1].saturation_mask[5] = True
     found = found_with(views, positions)
     assert any("view p0c1: the tile is saturated under LED 5" in remark for remark in found.remarks)
 

@@ -64,7 +64,9 @@ def test_a_constant_frame_gives_dn_per_second(exposure_us: float) -> None:
     pixels = np.full((FORMAT.height_px, FORMAT.width_px), FORMAT.black_dn + 1000, np.uint16)
     shot = ShotId.parse("v/led0005/e0")
     frame = LightFrame(shot, exposure_us, 0.0, math.nan, pose, pose, lambda: pixels)
-    frames = LightFrames((frame,), "GBRG", FORMAT.black_dn, FORMAT.white_dn, About(simulated=True), FOCAL_PX, ())
+    frames = LightFrames(
+        (frame,), "GBRG", FORMAT.black_dn, FORMAT.white_dn, About(is_simulated=True), FOCAL_PX, ()
+    )
     positions = Positions(np.array([5]), CENTRE_MM, DOWN)
     lens = Intrinsics(FOCAL_PX, FOCAL_PX, (FORMAT.width_px - 1) / 2, (FORMAT.height_px - 1) / 2)
     read = TileReader(frames, Setting(TILE, np.eye(4), positions, lens), pixels.shape)

@@ -11,7 +11,7 @@ import pytest
 
 from coupole.calibration.leds.workflow import led_csv
 from coupole.calibration.light.led_power_tile import calibrated_positions
-from coupole.calibration.record import Input, Parameter, Validity, sealed, write_record
+from coupole.calibration.record import Input, Parameter, Validity, seal_record, write_record
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
 
@@ -31,7 +31,7 @@ def record(folder: Path, kind: str) -> Path:
     now = datetime(2026, 5, 1, tzinfo=UTC)
     write_record(
         folder / "made.yaml",
-        sealed(
+        seal_record(
             kind=kind,
             name="made",
             created=now,

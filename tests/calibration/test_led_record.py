@@ -34,11 +34,13 @@ REQUEST = Request("leds-test", datetime(2026, 5, 1, tzinfo=UTC))
 def images(made: Dome) -> LedImages:
     names = tuple(f"v{number}" for number in range(len(made.base_from_flange)))
     inputs = (("run/run.json", "0" * 64),)
-    return LedImages(made.seen, made.base_from_flange, names, SIZE_PX, (), About(simulated=True), inputs)
+    return LedImages(made.seen, made.base_from_flange, names, SIZE_PX, (), About(is_simulated=True), inputs)
 
 
 def found(made: Dome, *, accept_faults: bool = False) -> LedsFound:
-    return leds_from(images(made), made.table, made.prior, REQUEST, stated=Stated(), accept_faults=accept_faults)
+    return leds_from(
+        images(made), made.table, made.prior, REQUEST, stated_noise=Stated(), accept_faults=accept_faults
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def test_the_record_is_accepted_and_its_files_are_beside_it(sound: Dome, tmp_pat
     path = tmp_path / "leds-test.yaml"
     write_outcome(path, Outcome(result.record, partial(draw_leds, result), result.files))
     record = read_record(path)
-    assert record.passed
+    assert record.is_accepted
     assert record.kind == "leds"
     assert {file.name for file in record.files} == {"leds-test.csv", "leds-test.h5"}
 
@@ -76,7 +78,7 @@ def test_each_leds_covariance_is_kept(sound: Dome) -> None:
 
 def test_swapped_leds_have_each_others_place_in_the_new_table(sound: Dome) -> None:
     result = found(replace(sound, seen=rewired(sound, {4: 29, 29: 4})), accept_faults=True)
-    assert result.record.passed
+    assert result.record.is_accepted
     assert "leds-test.csv" in result.files
     assert np.linalg.norm(result.new_table.positions_mm[4] - sound.true_mm[29]) < 0.5
     assert result.new_table.boards[4] == 4
@@ -95,7 +97,7 @@ def test_a_fault_of_leds_is_kept_in_a_record_that_is_not_accepted_and_has_no_tab
 ) -> None:
     wrong = replace(sound, seen=seen(sound))
     result = found(wrong)
-    assert [limit.what for limit in result.record.limits if not limit.passed] == (
+    assert [limit.what for limit in result.record.limits if not limit.is_met] == (
         ["faults of LEDs and wires"] if kind == "swapped" else ["LEDs not found", "faults of LEDs and wires"]
     )
     assert set(result.files) == {"leds-test.h5"}
@@ -110,14 +112,14 @@ def test_a_board_that_moved_against_its_table_is_named(sound: Dome) -> None:
     moved_mm[18:24] += [0.0, 0.0, 14.0]
     result = found(replace(sound, table=replace(sound.table, positions_mm=moved_mm)))
     assert any(remark.startswith("board 3 stands 1") for remark in result.record.remarks)
-    assert result.record.passed, "a board that was mounted anew is what a calibration is for"
+    assert result.record.is_accepted, "a board that was mounted anew is what a calibration is for"
 
 
 def test_too_many_dead_leds_are_not_accepted(sound: Dome) -> None:
     dark = sound.seen.only(np.flatnonzero(sound.seen.led > 2))
     record = found(replace(sound, seen=dark)).record
-    assert not record.passed
-    assert [limit.what for limit in record.limits if not limit.passed] == [
+    assert not record.is_accepted
+    assert [limit.what for limit in record.limits if not limit.is_met] == [
         "LEDs not found",
         "faults of LEDs and wires",
     ]
@@ -128,7 +130,7 @@ def test_a_lens_of_another_focus_is_named_though_its_record_says_nothing() -> No
     lens = replace(made.prior.lens, fx=made.prior.lens.fx * 1.003, fy=made.prior.lens.fy * 1.003)
     assert isinstance(lens, Intrinsics)
     record = found(replace(made, prior=replace(made.prior, lens=lens))).record
-    assert not record.passed
+    assert not record.is_accepted
     assert any("it was made at another focus" in remark for remark in record.remarks)
 
 

@@ -95,20 +95,20 @@ def test_a_reflection_is_a_spot_of_its_own() -> None:
 def test_a_spot_cut_by_the_edge_is_rejected() -> None:
     found = spots(frame([(190.0, 80.0)]))
     assert found.good == ()
-    assert "cut by the frame's edge" in found.rejected[0]
+    assert "cut by the frame's edge" in found.rejection_reasons[0]
 
 
 def test_spots_that_touch_are_rejected() -> None:
     found = spots(frame([(80.0, 80.0), (112.0, 86.0)]))
     assert found.good == ()
-    assert "not like a square" in found.rejected[0]
+    assert "not like a square" in found.rejection_reasons[0]
 
 
 def test_a_streak_is_rejected() -> None:
     streak = covered(SHAPE, square(np.array([100.0, 80.0]), 120.0, 10.0, 0.05))
     found = spots(raw(LED * streak, np.random.default_rng(1)))
     assert found.good == ()
-    assert "a streak" in found.rejected[0]
+    assert "a streak" in found.rejection_reasons[0]
 
 
 def test_perspective_within_an_led_moves_the_middle_of_its_outline_by_less_than_a_tenth_of_a_pixel() -> None:

@@ -9,7 +9,7 @@ import cells
 import pytest
 from photographed import write_folder
 
-from coupole.calibration.acceptance import Allowed, against_limits, asked, words_of
+from coupole.calibration.acceptance import Allowed, against_limits, parse_limits, words_of
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.lens.acceptance import CAMERA, CHROMATIC, HAND_EYE
 from coupole.calibration.record import read_record
@@ -17,7 +17,7 @@ from coupole.errors import InputError
 
 
 def test_a_limit_is_set_by_its_name() -> None:
-    assert asked(["ray_px=0.8", "rejected=0.1"], CAMERA) == {"ray_px": 0.8, "rejected": 0.1}
+    assert parse_limits(["ray_px=0.8", "rejected=0.1"], CAMERA) == {"ray_px": 0.8, "rejected": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -36,15 +36,15 @@ def test_a_limit_is_set_by_its_name() -> None:
 )
 def test_what_is_no_limit_is_refused(words: list[str], message: str) -> None:
     with pytest.raises(InputError) as refused:
-        asked(words, CAMERA)
+        parse_limits(words, CAMERA)
     assert message in str(refused.value)
 
 
 def test_a_limit_that_was_set_keeps_what_is_usual_beside_it() -> None:
     limits = (Allowed("a_px", "first", 1.0, "px"), Allowed("b_px", "second", 2.0, "px"))
     first, second = against_limits(limits, {"a_px": 3.0}, {"a_px": 2.5, "b_px": 2.5})
-    assert (first.passed, first.limit, first.usual, first.name) == (True, 3.0, 1.0, "a_px")
-    assert (second.passed, second.limit, second.usual) == (False, 2.0, None)
+    assert (first.is_met, first.limit, first.usual, first.name) == (True, 3.0, 1.0, "a_px")
+    assert (second.is_met, second.limit, second.usual) == (False, 2.0, None)
 
 
 @pytest.mark.parametrize("limits", [CAMERA, HAND_EYE, CHROMATIC, LEDS])
@@ -69,5 +69,5 @@ def test_the_command_holds_a_calibration_against_the_operators_limits(tmp_path: 
         "what": "uncertainty at the field's corners", "found": 0, "limit": 50.0, "unit": "px", "name": "ray_px",
         "usual": 0.5, "passed": True,
     }  # fmt: skip
-    assert not read_record(tmp_path / "strict.yaml").passed
+    assert not read_record(tmp_path / "strict.yaml").is_accepted
     assert "<code>ray_px</code>, usually 0.5" in (tmp_path / "strict.html").read_text()

@@ -88,7 +88,7 @@ def scene(
 
 def found(made: Scene, **stated: float) -> MeshPose:
     noise = {"robot_mm": 0.03, "robot_deg": 0.003, **stated}
-    return mesh_to_robot(made.views, INTRINSICS, made.targets_mm, made.names, stated=Stated(**noise))
+    return mesh_to_robot(made.views, INTRINSICS, made.targets_mm, made.names, stated_noise=Stated(**noise))
 
 
 def off(pose: MeshPose, made: Scene) -> Array:
@@ -108,7 +108,7 @@ def test_without_noise_the_mesh_is_found_exactly() -> None:
     made = scene(1, pixel_px=0.0, scanner_mm=0.0, robot_mm=0.0, robot_deg=0.0)
     pose = found(made)
     assert np.abs(off(pose, made)).max() < 1e-5
-    assert set(pose.matched) == set(made.names)
+    assert set(pose.recognised_names) == set(made.names)
 
 
 def test_the_centre_of_a_mesh_is_found_to_well_below_sixty_micrometres() -> None:
@@ -132,7 +132,7 @@ def test_a_third_of_the_stickers_missing_and_as_many_false_change_no_match(seed:
     made = scene(seed, stickers=30, lost=0.33, false=8)
     pose = found(made)
     assert np.abs(off(pose, made)[:3]).max() < 0.3
-    assert len(pose.matched) >= 14
+    assert len(pose.recognised_names) >= 14
     assert len(pose.missing) >= 9
 
 

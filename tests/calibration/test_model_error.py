@@ -86,10 +86,10 @@ def with_pattern(cell: Cell, shift_px: Callable[[np.ndarray, np.ndarray], np.nda
 
 def test_a_cell_of_the_model_s_form_raises_no_doubt() -> None:
     cell = make_cell(31, images=16)
-    plain, fit = (calibrate_camera(cell.sightings, cell.size_px, doubted=doubted) for doubted in (False, True))
+    plain, fit = (calibrate_camera(cell.sightings, cell.size_px, with_doubts=doubted) for doubted in (False, True))
     assert fit.doubts is not None
     assert max(one.evidence for one in fit.doubts.error.suspects) < 10
-    assert fit.doubts.predicted.ratio == pytest.approx(1.0, abs=0.1)
+    assert fit.doubts.predictions.ratio == pytest.approx(1.0, abs=0.1)
     assert fit.doubts.pattern < 0.5
     assert fit.sigma_px == pytest.approx(plain.sigma_px, rel=0.02)
     assert np.median(np.diag(fit.covariance) / np.diag(plain.covariance)) ** 0.5 < 1.15
@@ -101,7 +101,7 @@ def test_a_lens_of_another_form_is_named_and_refused_by_its_pattern() -> None:
     def wavy(pixels: np.ndarray, board_mm: np.ndarray) -> np.ndarray:
         return 0.5 * np.sin(7.0 * pixels[:, ::-1] / cell.size_px[0])
 
-    fit = calibrate_camera(with_pattern(cell, wavy).sightings, cell.size_px, doubted=True)
+    fit = calibrate_camera(with_pattern(cell, wavy).sightings, cell.size_px, with_doubts=True)
     assert fit.doubts is not None
     evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
     assert max(evidence, key=lambda name: evidence[name]) == LENS
@@ -109,7 +109,7 @@ def test_a_lens_of_another_form_is_named_and_refused_by_its_pattern() -> None:
     assert fit.doubts.pattern > 1.0
     assert any("form that its model lacks" in line for line in fit.doubts.sentences())
     field = Field.of(fit.intrinsics.vector(), fit.free, cell.size_px)
-    assert np.abs(field.modes(field.grid_px()).T @ field._own(field.grid_px())).max() < 1e-4
+    assert np.abs(field.modes(field.grid_px()).T @ field._own_derivatives(field.grid_px())).max() < 1e-4
 
 
 def test_a_focal_length_that_changes_from_view_to_view_is_named() -> None:
@@ -119,7 +119,7 @@ def test_a_focal_length_that_changes_from_view_to_view_is_named() -> None:
     def breathing(pixels: np.ndarray, board_mm: np.ndarray) -> np.ndarray:
         return 3e-3 * random.standard_normal() * (pixels - middle)
 
-    fit = calibrate_camera(with_pattern(cell, breathing).sightings, cell.size_px, doubted=True)
+    fit = calibrate_camera(with_pattern(cell, breathing).sightings, cell.size_px, with_doubts=True)
     assert fit.doubts is not None
     evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
     assert max(evidence, key=lambda name: evidence[name]) == FOCUS
@@ -146,7 +146,7 @@ def test_a_bent_board_is_named_and_no_longer_bends_the_lens() -> None:
         moved = fit.intrinsics.vector() - flat.intrinsics.vector()
         return float(np.sqrt(moved @ np.linalg.solve(fit.covariance, moved) / len(moved)))
 
-    plain, fit = (calibrate_camera(bent, cell.size_px, doubted=doubted) for doubted in (False, True))
+    plain, fit = (calibrate_camera(bent, cell.size_px, with_doubts=doubted) for doubted in (False, True))
     assert fit.doubts is not None
     evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
     assert max(evidence, key=lambda name: evidence[name]) == BOARD

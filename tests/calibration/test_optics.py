@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 from synthesis import Array, TrueLens
 
 from coupole.calibration.optics import project
-from coupole.calibration.rotations import between, inverses, moved, quaternion, rotation, rotation_vector
+from coupole.calibration.rotations import (
+    between,
+    inverses,
+    moved_transforms,
+    quaternion,
+    rotation,
+    rotation_vector,
+)
 
 STEP = 1e-6
 unit = st.floats(-1, 1)
@@ -52,5 +59,5 @@ def test_rotations_are_scipys(vector: Array) -> None:
 def test_a_step_between_transforms_leads_from_one_to_the_other(turn: Array, shift: Array, step: Array) -> None:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation(turn), 100 * shift
-    assert np.allclose(between(pose, moved(pose, step)), step, atol=1e-9)
+    assert np.allclose(between(pose, moved_transforms(pose, step)), step, atol=1e-9)
     assert np.allclose(inverses(pose[None])[0] @ pose, np.eye(4), atol=1e-9)

@@ -40,7 +40,7 @@ def test_a_third_missing_and_as_many_false_are_told_apart(seed: int) -> None:
     mixed = random.permutation(30)
     matched = match_points(np.concatenate([found, false])[mixed], known, TOLERANCE_MM)
     true = {(int(place), int(seen[row])) for place, row in enumerate(mixed) if row < 20}
-    pairs = set(zip(matched.found.tolist(), matched.known.tolist(), strict=True))
+    pairs = set(zip(matched.found_rows.tolist(), matched.known_rows.tolist(), strict=True))
     assert true <= pairs
     assert len(pairs - true) <= 1  # a false one may stand on a sticker by chance
     assert np.abs(matched.found_from_known - motion).max() < 0.2

@@ -19,7 +19,7 @@ from coupole.calibration.record import (
     Validity,
     intrinsics_of,
     read_record,
-    sealed,
+    seal_record,
     write_record,
 )
 from coupole.errors import InputError
@@ -27,7 +27,7 @@ from coupole.errors import InputError
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)
 HERE = Situation(
     now=NOW + timedelta(days=10),
-    simulated=False,
+    is_simulated=False,
     size_px=(4096, 3072),
     focal_length_mm=35.0,
     focus_distance_mm=335.0,
@@ -70,7 +70,7 @@ def record(kind: str = "camera", **changes: Any) -> Record:
         "remarks": ("a remark: with a colon, \u00fcmlauts and 'quotes'",),
         "inputs": (Input(name="run/run.json", sha256="0" * 64),),
     }
-    return sealed(**(content | changes))
+    return seal_record(**(content | changes))
 
 
 def named(*records: Record) -> list[InForce]:
@@ -146,18 +146,18 @@ def test_a_kind_that_is_missing_or_named_twice_is_refused() -> None:
     ],
 )
 def test_a_record_that_does_not_hold_here_is_refused_with_the_reason(here: dict[str, Any], reason: str) -> None:
-    found = refusals(named(record()), replace(HERE, **here), needed=("camera",))
+    found = refusals(named(record()), replace(HERE, **here), needed_kinds=("camera",))
     assert len(found) == 1
     assert reason in found[0]
 
 
 def test_a_simulated_record_is_refused_in_a_real_cell() -> None:
-    assert "simulated camera" in refusals(named(record(simulated=True)), HERE, needed=("camera",))[0]
+    assert "simulated camera" in refusals(named(record(simulated=True)), HERE, needed_kinds=("camera",))[0]
 
 
 def test_a_record_that_was_not_accepted_is_refused_with_the_limit() -> None:
     missed = record(limits=(Limit(what="noise of corners", found=0.5, limit=0.3, unit="px"),))
-    assert "noise of corners is 0.5 px" in refusals(named(missed), HERE, needed=("camera",))[0]
+    assert "noise of corners is 0.5 px" in refusals(named(missed), HERE, needed_kinds=("camera",))[0]
 
 
 def test_problems_of_all_records_come_at_once(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def photograph() -> Picture:
     for place, letter in enumerate("GBRG"):
         mosaic[place // 2 :: 2, place % 2 :: 2] = np.repeat(levels[:, RGB[letter]], SIDE // 2)
     about = {"shot": "top/led0417/e0", "simulated": True, "led": 417}
-    return Picture(mosaic, "GBRG", BLACK, WHITE, exposure_us=8000, taken="", about=about)
+    return Picture(mosaic, "GBRG", BLACK, WHITE, exposure_us=8000, taken_utc="", about=about)
 
 
 def differences(linear: np.ndarray) -> np.ndarray:
@@ -83,7 +83,7 @@ def test_a_tiff_for_the_eye_shows_the_colours_under_daylight(
 
 def test_what_is_saturated_is_white_in_a_tiff_for_the_eye(known: CameraColour) -> None:
     about = {"shot": "top/led0417/e0", "simulated": True, "led": 417}
-    full = Picture(np.full((16, 16), WHITE, np.uint16), "GBRG", BLACK, WHITE, 8000, taken="", about=about)
+    full = Picture(np.full((16, 16), WHITE, np.uint16), "GBRG", BLACK, WHITE, 8000, taken_utc="", about=about)
     codes, _ = opened(tiff_for_the_eye.encode(full, known, linear=True))
     np.testing.assert_allclose(codes, 1.0, atol=2e-3)
 
@@ -112,7 +112,7 @@ def test_a_monochrome_dng_refuses_colours_and_claims_none(photograph: Picture, k
 def test_white_of_a_record_goes_before_that_of_the_spectra(tables: tuple[Path, Path]) -> None:
     measured = camera_colour(*tables, lambda led: np.array([0.5, 1.0, 0.25]))
     assert measured.neutral(7).tolist() == [0.5, 1.0, 0.25]
-    assert "record" in measured.told
+    assert "record" in measured.origin
 
 
 @pytest.mark.parametrize(

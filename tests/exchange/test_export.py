@@ -39,7 +39,7 @@ def picture(pixels: Frame, *, pattern: str = "GBRG", black_dn: int = 64, white_d
     """Pixels with the least that must be known of them."""
     about = {"shot": "top/led0417/e0", "simulated": True, "camera": "memory camera sim-0"}
     return Picture(
-        pixels, pattern, black_dn, white_dn, exposure_us=8000, taken="2026-11-23T08:39:19.485Z", about=about
+        pixels, pattern, black_dn, white_dn, exposure_us=8000, taken_utc="2026-11-23T08:39:19.485Z", about=about
     )
 
 

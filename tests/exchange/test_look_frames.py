@@ -38,12 +38,12 @@ def pictured(result: RunResult) -> tuple[np.ndarray, np.ndarray]:
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     share = np.where(code > 0, about["frames"][0]["peak"] * linear, np.nan)
     surface = surface_of_view(result, view)
-    rows, columns = np.nonzero(surface.seen >= 0)
+    rows, columns = np.nonzero(surface.triangle_of_pixel >= 0)
     local = (surface.places_mm[rows, columns] - np.array(about["camera_mm"])) @ np.array(about["axes"]).T
     x, y = (local[:, :2] / local[:, 2:]).T
     powers = [x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
     column, row = (np.stack(powers, axis=1) @ np.array(about["lens"]) * share.shape[::-1]).astype(int).T
-    height, width = surface.seen.shape
+    height, width = surface.triangle_of_pixel.shape
     return share, np.stack([share[row, column], (columns + 0.5) / width, (rows + 0.5) / height], axis=1)
 
 

@@ -21,7 +21,7 @@ from coupole.exchange.look.light_planes import light_planes
 from coupole.exchange.look.look_blocks import Look, block_of
 from coupole.exchange.look.look_of_frames import _plane_tiles, look_of_run
 from coupole.exchange.look.look_page import write_page
-from coupole.exchange.look.look_tiles import halved, levels_of, tiles_of
+from coupole.exchange.look.look_tiles import halve_pictures, levels_of, tiles_of
 from coupole.reflectance.light_interpolation import weights
 from coupole.storage.run import Run
 
@@ -99,7 +99,7 @@ def test_tiles_are_means_of_what_they_stand_for() -> None:
     assert np.isnan(tiles[0, 2, 1][50, 0])
     assert np.isnan(tiles[1, 0, 0][0, 0])
     assert tiles[1, 0, 0][1, 1] == pytest.approx(np.nanmean(values[0, 2:4, 2:4]))
-    assert halved(values)[0, -1, -1] == pytest.approx(values[0, -2:, -1].mean())
+    assert halve_pictures(values)[0, -1, -1] == pytest.approx(values[0, -2:, -1].mean())
 
 
 @pytest.fixture(scope="module")

@@ -108,7 +108,7 @@ def test_gilding_looks_as_in_the_spectral_path_tracer(
     scene = scene_of(thing, illuminant="A", samples=32, depth=1, bands={"step_nm": 20}, observer="2 deg")
     opened(page, scene, tmp_path)
     mine = page.picture(16)
-    with rendering.opened(scene, tmp_path) as renderer:
+    with rendering.open_renderer(scene, tmp_path) as renderer:
         radiance = renderer.render(scene.cameras[0]).radiance
     functions, power = light.observer("2 deg")[:, ::4], light.illuminant("A")[::4]
     theirs = colour.XYZ_to_sRGB(
@@ -213,7 +213,7 @@ def test_nashiji_under_the_sky_looks_as_rays_through_a_closed_body_of_lacquer(pa
     opened(page, scene, tmp_path, distance=12.0)
     page.run("coupole.state = {...coupole.state, sky: 1}")
     mine = page.picture(64)
-    with rendering.opened(scene, tmp_path) as renderer:
+    with rendering.open_renderer(scene, tmp_path) as renderer:
         red = renderer.render(scene.cameras[0]).radiance[..., 6]  # 620 nm
     whole = mine[..., 3] > 0.999
     assert whole.mean() > 0.2

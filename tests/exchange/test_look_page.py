@@ -16,10 +16,10 @@ from relight_cases import sheet, waves, write_result, write_sources
 from coupole.errors import InputError, StorageError
 from coupole.exchange.look.coarse_mesh import coarse_mesh
 from coupole.exchange.look.look_blocks import block_of
-from coupole.exchange.look.look_of_runs import Look, welded
+from coupole.exchange.look.look_of_runs import Look, weld_corners
 from coupole.exchange.look.look_page import write_page
 from coupole.exchange.look.look_samples import samples_of_view
-from coupole.reflectance.sample_uncertainty import Places, Sources, drawn
+from coupole.reflectance.sample_uncertainty import Places, Sources, drawn_ratios
 
 
 def small(numbers: int = 30) -> Look:
@@ -30,7 +30,7 @@ def small(numbers: int = 30) -> Look:
 def test_corners_keep_their_triangle_and_move_by_less_than_half_a_step() -> None:
     corners_mm = np.random.default_rng(2).uniform(-70.0, 130.0, (600, 3))
     corners_mm[300:] = corners_mm[:300]  # every corner twice
-    places, triangles, origin_mm, step_mm = welded(corners_mm)
+    places, triangles, origin_mm, step_mm = weld_corners(corners_mm)
     assert len(places) == 300
     read = origin_mm + step_mm * places[triangles.reshape(-1)]
     assert np.abs(read - corners_mm).max() <= 0.5001 * step_mm
@@ -38,7 +38,7 @@ def test_corners_keep_their_triangle_and_move_by_less_than_half_a_step() -> None
 
 
 def test_a_coarse_mesh_has_the_shape_of_the_fine_one_in_few_triangles() -> None:
-    places, triangles, _, _ = welded(waves(120).reshape(-1, 3).astype(float))
+    places, triangles, _, _ = weld_corners(waves(120).reshape(-1, 3).astype(float))
     coarse = coarse_mesh(places, triangles, 2000)
     assert 1000 < len(coarse.triangles) <= 2000
 
@@ -185,7 +185,7 @@ def test_bars_of_samples_are_the_95_percent_of_all_that_is_uncertain(tmp_path: P
     sources = Sources(
         *of_signal, each(u["led_u_own"]), each(u["led_u_shared"]), each(scan_noise_um), each(u["led_u_mm"])
     )
-    ratios = drawn(places, sources, 20_000, np.random.default_rng(1))
+    ratios = drawn_ratios(places, sources, 20_000, np.random.default_rng(1))
     low, high = np.quantile(ratios, [0.025, 0.975], axis=1)
     np.testing.assert_allclose(below[:, 0], 1 - low, rtol=0.06)
     np.testing.assert_allclose(above[:, 0], high - 1, rtol=0.06)

@@ -333,7 +333,7 @@ def test_pictures_for_rti_are_counted_with_their_linear_ones(
             cv2.imwrite(str(out / f"led{led:04d}.png"), np.full((4, 6, 3), 9000 + led, np.uint16))
         (out / "filenames.txt").write_text("told")
         files = tuple(sorted(out.glob("*.png")))
-        return PicturedView(tuple(range(4)), files, 500.0 * lights(4), 60.0, simulated=True)
+        return PicturedView(tuple(range(4)), files, 500.0 * lights(4), 60.0, is_simulated=True)
 
     monkeypatch.setattr("coupole.exchange.rti.rti_pictures.write_pictures", write_pictures)
     run = make_run(tmp_path / "runs").run.folder

@@ -71,11 +71,11 @@ def before(head: Head, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def changed(head: Head, before: Path) -> Comparison:
     after = head.write(before.with_name("after.ply"), 2, dented=True, painted=True, moved=True)
-    return compare(before, after, "mm", None, aligned=False, say=silent)
+    return compare(before, after, "mm", None, is_aligned=False, say=silent)
 
 
 def test_a_dent_of_a_fifth_of_a_millimetre_is_found(head: Head, changed: Comparison) -> None:
-    assert changed.moved[head.dent].mean() > 0.5
+    assert changed.moved_points[head.dent].mean() > 0.5
     assert len(changed.shape_regions) == 1
     region = changed.shape_regions[0]
     assert np.linalg.norm(region.middle_mm - np.array(head.mesh.vertices)[head.dent].mean(axis=0)) < 1.0
@@ -83,14 +83,14 @@ def test_a_dent_of_a_fifth_of_a_millimetre_is_found(head: Head, changed: Compari
 
 
 def test_a_patch_of_another_colour_is_found(head: Head, changed: Comparison) -> None:
-    assert changed.recoloured is not None
-    assert changed.recoloured[head.patch].mean() > 0.6
+    assert changed.recoloured_points is not None
+    assert changed.recoloured_points[head.patch].mean() > 0.6
     assert changed.colour_regions[0].de00 == pytest.approx(3.0, abs=1.0)
 
 
 def test_of_what_is_marked_little_is_unchanged(head: Head, changed: Comparison) -> None:
-    assert changed.recoloured is not None
-    for marked, true in ((changed.moved, head.dent), (changed.recoloured, head.patch)):
+    assert changed.recoloured_points is not None
+    for marked, true in ((changed.moved_points, head.dent), (changed.recoloured_points, head.patch)):
         middle = np.array(head.mesh.vertices)[true].mean(axis=0)
         far = np.linalg.norm(np.array(head.mesh.vertices) - middle, axis=1) > 9.0  # local fits reach over the rim
         assert (marked & far).sum() <= 0.1 * marked.sum()  # 5 % on average
@@ -112,15 +112,15 @@ def test_nothing_is_marked_where_nothing_changed(head: Head, before: Path, tmp_p
     same.write_bytes(before.read_bytes())
     again = head.write(tmp_path / "again.ply", 9)
     for after, most in ((same, 0), (again, 3)):
-        found = compare(before, after, "mm", None, aligned=False, say=silent)
-        assert found.recoloured is not None
-        assert found.moved.sum() + found.recoloured.sum() <= most
+        found = compare(before, after, "mm", None, is_aligned=False, say=silent)
+        assert found.recoloured_points is not None
+        assert found.moved_points.sum() + found.recoloured_points.sum() <= most
     assert np.nanmedian(np.abs(found.distance_mm) / found.u_mm) == pytest.approx(0.674, abs=0.12)
 
 
 def test_uncertainties_hold_by_a_stated_noise(head: Head, before: Path, tmp_path: Path) -> None:
     again = head.write(tmp_path / "again.ply", 9)
-    stated = compare(before, again, "mm", NOISE_MM, aligned=True, say=silent)
+    stated = compare(before, again, "mm", NOISE_MM, is_aligned=True, say=silent)
     spread = stated.distance_mm[np.isfinite(stated.distance_mm)].std()
     assert np.nanmedian(stated.u_mm) == pytest.approx(spread, rel=0.25)
 
@@ -166,4 +166,4 @@ def test_other_objects_and_units_are_refused(head: Head, before: Path, tmp_path:
     trimesh.creation.box((90, 70, 12)).subdivide_to_size(1.5).export(tmp_path / "box.ply")
     for name, said in (("inches.ply", "another unit"), ("box.ply", "no motion brings")):
         with pytest.raises(InputError, match=said):
-            compare(before, tmp_path / name, "mm", None, aligned=False, say=silent)
+            compare(before, tmp_path / name, "mm", None, is_aligned=False, say=silent)

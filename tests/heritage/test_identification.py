@@ -14,7 +14,7 @@ from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_lib
 from coupole.errors import InputError
 from coupole.heritage.analysis.identification import Finding, identify
 from coupole.heritage.analysis.pigment_classes import PigmentClass, shipped_classes
-from coupole.heritage.analysis.references import Rate, References, make_references, measured
+from coupole.heritage.analysis.references import Rate, References, make_references, trimmed_spectrum
 from tests.places import SHARED_DATA
 
 PIGMENTS = SHARED_DATA / "pigments"
@@ -161,7 +161,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
     gap = np.where((WAVELENGTHS_NM > 450.0) & (WAVELENGTHS_NM < 500.0), np.nan, grains("azurite", 9))
 
     with pytest.raises(InputError, match=r"library.csv:1:1: spot: .* found none between 450 and 500 nm"):
-        measured(entry("spot", gap))
+        trimmed_spectrum(entry("spot", gap))
     with pytest.raises(InputError, match=r"16 or more bands of 10 nm .* found 11; it covers 400 to 500"):
         identify(Measured("spot", WAVELENGTHS_NM[4:25], grains("azurite", 9)[4:25], ()), library())
     with pytest.raises(InputError, match="classes for 5 of 5; name a table"):
@@ -197,7 +197,9 @@ def test_gamblins_paints_against_kremer_are_as_the_documentation_says() -> None:
     spectra = read_library(PIGMENTS / "GamblinConservationColors.rs")
     table = shipped_classes(spectra)
     found = [
-        (table[s.name].class_name, identify(measured(s), kremer())) for s in spectra if table[s.name].class_name
+        (table[s.name].class_name, identify(trimmed_spectrum(s), kremer()))
+        for s in spectra
+        if table[s.name].class_name
     ]
     inside = [(true, one) for true, one in found if true in kremer().class_of]
     matches = [true == one.class_name for true, one in inside if one.verdict == "match"]

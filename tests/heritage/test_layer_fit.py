@@ -50,7 +50,7 @@ def test_intervals_of_k_and_s_hold_the_truth_in_95_percent(kind: str) -> None:
     k, s, held = 10.0, 20.0, []
     for _ in range(ROUNDS):
         found = layer_fit.fit(films_of(kind, k, s, rng), FACE, NOISE)
-        assert found.determined.mean() > 0.9
+        assert found.determined_bands.mean() > 0.9
         held.append(np.abs(found.absorption - k) < COVERAGE_FACTOR * found.u_absorption)
         held.append(np.abs(found.scattering - s) < COVERAGE_FACTOR * found.u_scattering)
     # The error of a thickness is common to a round, so that chance is wider than that of 2000 draws.
@@ -90,8 +90,8 @@ def test_a_film_that_hides_its_ground_tells_no_scattering() -> None:
 
     found = layer_fit.fit(hiding, FACE, NOISE)
 
-    assert not found.determined.any()
-    assert layer_model.deserved(found, hiding, FACE, NOISE).model == "K/S only"
+    assert not found.determined_bands.any()
+    assert layer_model.deserved_model(found, hiding, FACE, NOISE).model == "K/S only"
     assert found.absorption / found.scattering == pytest.approx(np.full(EACH, 2.0), rel=0.4)
 
 
@@ -145,7 +145,7 @@ def test_four_fluxes_come_back_with_their_intervals() -> None:
     ):
         assert 0.85 <= np.mean(np.abs(value - truth) < COVERAGE_FACTOR * u) <= 1.0
         assert value.mean() == pytest.approx(truth, abs=4.0 * float(np.mean(u)) / np.sqrt(EACH))
-    measured = (films[0].seen, films[1].seen)
+    measured = (films[0].reflectance, films[1].reflectance)
     verdict = layer_model.deserved_by_measurement(
         measured, (light.over_black, light.over_white), light.transmittance, NOISE
     )
@@ -160,7 +160,7 @@ def test_a_hiding_white_deserves_two_fluxes_and_a_glaze_four() -> None:
         films = [
             Film(in_air(np.full(3, two_fluxes(k, s, h, g))), np.full(3, g), str(g), 0.0, h) for g in (BLACK, WHITE)
         ]
-        return layer_model.deserved(layer_fit.fit(films, FACE, NOISE), films, FACE, NOISE).model
+        return layer_model.deserved_model(layer_fit.fit(films, FACE, NOISE), films, FACE, NOISE).model
 
     assert verdict(0.2, 120.0, 0.1) == "two fluxes"
     assert verdict(8.0, 6.0, 0.03) == "four fluxes"

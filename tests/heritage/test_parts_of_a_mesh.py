@@ -209,11 +209,13 @@ def test_a_camera_sees_a_part_where_it_is_and_not_behind_something_else() -> Non
     sheet = np.array([[[0.0, -1, 0], [60, -1, 0], [60, -1, -60]], [[0, -1, 0], [60, -1, -60], [0, -1, -60]]])
     covered = Piece(sheet, Metal(kind="metal"))
     corners = np.concatenate([upper_left, -upper_left])
-    seen = SeenParts(corners, np.array([0, 1], np.int16), [covered]).seen(camera)
+    seen = SeenParts(corners, np.array([0, 1], np.int16), [covered]).part_of_pixel(camera)
     rows, columns = np.nonzero(seen == 0)
     assert set(np.unique(seen)) == {-1, 0}
     assert (rows.max() <= 5, columns.max() <= 5, rows.min() >= 1) == (True, True, True)
-    assert np.array_equal(np.unique(SeenParts(corners, np.array([0, 1], np.int16), []).seen(camera)), [-1, 0, 1])
+    assert np.array_equal(
+        np.unique(SeenParts(corners, np.array([0, 1], np.int16), []).part_of_pixel(camera)), [-1, 0, 1]
+    )
 
 
 def test_a_triangle_takes_the_part_of_two_of_its_corners_or_the_first_that_is_known(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_a_recipe_with_one_paint_less_is_never_nearer(tmp_path: Path) -> None:
 
     assert [len(one.shares) for one in found.recipes] == [1, 2, 3, 4]
     assert np.all(np.diff([one.rms for one in found.recipes]) < 1e-6)
-    assert found.chosen == 2
+    assert found.chosen_index == 2
 
 
 def test_a_large_palette_is_searched_by_growing_and_finds_the_same(

@@ -46,41 +46,41 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def compared(before: Path, after: Path) -> Comparison:
-    return compare(before, after, "mm", None, aligned=True, say=silent)
+    return compare(before, after, "mm", None, is_aligned=True, say=silent)
 
 
 def test_a_repainted_patch_is_found_in_its_place_and_by_its_difference(before: Path, tmp_path: Path) -> None:
     import colour
 
     found = compared(before, made(tmp_path / "after", 2, painted=True, u_kd=0.01))
-    assert found.recoloured is not None
+    assert found.recoloured_points is not None
     assert found.de00 is not None
     inside = patch(found.before.points_mm)
-    assert found.recoloured[inside].mean() > 0.7
-    assert (found.recoloured & ~inside).sum() < 0.1 * found.recoloured.sum() + 0.02 * inside.sum()
+    assert found.recoloured_points[inside].mean() > 0.7
+    assert (found.recoloured_points & ~inside).sum() < 0.1 * found.recoloured_points.sum() + 0.02 * inside.sum()
     white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
     one, two = (
         colour.XYZ_to_Lab(colour.RGB_to_XYZ(np.pi * kd, "sRGB", apply_cctf_decoding=False), white)
         for kd in (KD, KD * REDDER)
     )
     assert np.median(found.de00[inside]) == pytest.approx(colour.delta_E(one, two, method="CIE 2000"), rel=0.2)
-    assert found.moved.sum() == 0
+    assert found.moved_points.sum() == 0
 
 
 def test_what_a_fit_is_not_sure_of_is_not_marked(before: Path, tmp_path: Path) -> None:
     """The same patch, where both results state that red, green and blue may be off by a fifth."""
     unsure = [made(tmp_path / str(k), k, painted=k == 2, u_kd=0.2) for k in (1, 2)]
     sure, found = compared(before, made(tmp_path / "sure", 2, painted=True, u_kd=0.01)), compared(*unsure)
-    assert sure.recoloured is not None
-    assert found.recoloured is not None
-    assert sure.recoloured.sum() > 30
-    assert found.recoloured.sum() == 0
+    assert sure.recoloured_points is not None
+    assert found.recoloured_points is not None
+    assert sure.recoloured_points.sum() > 30
+    assert found.recoloured_points.sum() == 0
 
 
 def test_two_measurements_of_one_state_are_the_same(before: Path, tmp_path: Path) -> None:
     found = compared(before, made(tmp_path / "again", 3, painted=False, u_kd=0.01))
-    assert found.recoloured is not None
-    assert found.recoloured.sum() + found.moved.sum() <= 3
+    assert found.recoloured_points is not None
+    assert found.recoloured_points.sum() + found.moved_points.sum() <= 3
 
 
 def test_covariances_of_lab_are_those_of_many_draws() -> None:

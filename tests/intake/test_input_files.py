@@ -51,10 +51,10 @@ def test_a_file_that_changes_is_told_once_and_its_bytes_stay(
     path: Path, change: Callable[[Path], None], told: str
 ) -> None:
     files, was = InputFiles(), path.read_bytes()
-    assert files.read(path) == was
+    assert files.read_bytes(path) == was
     assert files.changes() == []
     change(path)
-    assert files.read(path) == was
+    assert files.read_bytes(path) == was
     assert files.sha256(path) == hashlib.sha256(was).hexdigest()
     assert files.there(path)
     assert files.changes() == [f"{path} {told}"]
@@ -63,7 +63,7 @@ def test_a_file_that_changes_is_told_once_and_its_bytes_stay(
 
 def test_a_file_that_is_touched_or_written_again_as_it_was_has_not_changed(path: Path) -> None:
     files = InputFiles()
-    files.read(path)
+    files.read_bytes(path)
     os.utime(path, (1, 1))
     path.write_bytes(path.read_bytes())
     assert files.changes() == []
@@ -74,13 +74,13 @@ def test_a_link_that_is_led_elsewhere_changes_nothing(path: Path, tmp_path: Path
     link.symlink_to(path)
     other.write_bytes(b"exposure_us: 16000\n")
     files = InputFiles()
-    files.read(link)
+    files.read_bytes(link)
     link.unlink()
     link.symlink_to(other)
-    assert files.read(link) == b"exposure_us: 8000\n"
+    assert files.read_bytes(link) == b"exposure_us: 8000\n"
     assert files.changes() == [f"{link} was changed"]
 
 
 def test_a_folder_is_not_read(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not a file"):
-        InputFiles().read(tmp_path)
+        InputFiles().read_bytes(tmp_path)

@@ -122,7 +122,7 @@ def test_poses_come_back_as_they_were(kind: str, count: int, tmp_path: Path) -> 
     for view, recorded in zip(poses.of(measured).views, measured.views, strict=True):
         np.testing.assert_allclose(view.base_from_camera, recorded.base_from_camera, atol=1e-8)
     assert poses.scale == pytest.approx(1.0, abs=1e-11)
-    assert poses.told()["fitted"] == (count == 4)
+    assert poses.summary()["fitted"] == (count == 4)
 
 
 def test_a_model_that_was_moved_turned_and_scaled_is_brought_back(tmp_path: Path) -> None:
@@ -142,8 +142,8 @@ def test_a_model_that_was_moved_turned_and_scaled_is_brought_back(tmp_path: Path
     recorded = np.stack([view.base_from_camera for view in measured.views])
     off_mm = found.base_from_camera[:, :3, 3] - recorded[:, :3, 3]
     np.testing.assert_allclose(off_mm.mean(axis=0), 0.0, atol=1e-9)
-    assert found.told()["median_moved_mm"] == pytest.approx(np.median(np.linalg.norm(off_mm, axis=1)), abs=1e-6)
-    assert 0.3 < found.told()["most_over_u"] < 5.0
+    assert found.summary()["median_moved_mm"] == pytest.approx(np.median(np.linalg.norm(off_mm, axis=1)), abs=1e-6)
+    assert 0.3 < found.summary()["most_over_u"] < 5.0
 
 
 def test_what_colmaps_own_bundle_adjustment_finds_is_taken(tmp_path: Path) -> None:

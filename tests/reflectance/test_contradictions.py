@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from triangle_cases import noisy_case
 
-from coupole.reflectance.contradictions import Neighbours, contradicted
+from coupole.reflectance.contradictions import Neighbours, contradiction_mask
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, fit_triangles
 
 NOISE = np.float16(0.01)
@@ -22,7 +22,7 @@ def shiny() -> TriangleSamples:
 def found(samples: TriangleSamples, fitted: TriangleMaterials | None = None) -> np.ndarray:
     materials = fitted or fit_triangles(samples, np.ones(len(samples.led_mm), bool), 30.0)
     beside = Neighbours.of(samples.led_mm, samples.centres_mm.mean(axis=0))
-    return contradicted(samples, materials, np.full(samples.values.shape, NOISE), beside)
+    return contradiction_mask(samples, materials, np.full(samples.values.shape, NOISE), beside)
 
 
 def test_of_what_nothing_shades_nothing_is_left_out(shiny: TriangleSamples) -> None:
@@ -62,8 +62,8 @@ def test_nothing_is_left_out_where_noise_is_not_known_or_there_is_one_led(shiny:
     dim = replace(shiny, values=values)
     materials = fit_triangles(dim, np.ones(len(shiny.led_mm), bool), 30.0)
     beside = Neighbours.of(shiny.led_mm, shiny.centres_mm.mean(axis=0))
-    assert contradicted(dim, materials, np.full(values.shape, NOISE), beside).any()
-    assert not contradicted(dim, materials, np.full(values.shape, np.nan, np.float16), beside).any()
+    assert contradiction_mask(dim, materials, np.full(values.shape, NOISE), beside).any()
+    assert not contradiction_mask(dim, materials, np.full(values.shape, np.nan, np.float16), beside).any()
     alone = replace(dim, values=values[:, 20:21], led_mm=shiny.led_mm[20:21], view_of=shiny.view_of[20:21])
     beside = Neighbours.of(alone.led_mm, alone.centres_mm.mean(axis=0))
-    assert not contradicted(alone, materials, np.full(alone.values.shape, NOISE), beside).any()
+    assert not contradiction_mask(alone, materials, np.full(alone.values.shape, NOISE), beside).any()

@@ -15,7 +15,7 @@ from residual_cases import write_backscatter
 from coupole.commands import completion
 from coupole.reflectance import run_fits
 from coupole.reflectance.fits import FITS, GGX, MATERIALS, RELIT, SLICES, MaterialFit, ViewFit, fitted_together
-from coupole.reflectance.run_fits import predicted
+from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices
 from coupole.reflectance.slice_basis import HARMONICS, fewer
@@ -54,7 +54,7 @@ def test_a_new_fit_is_made_and_foretells_by_its_place_in_the_registry_alone(resu
         path.parent.mkdir()
         with h5py.File(path, "w") as file:
             begin_slices(file, LOW, view, result.channels)[...] = found
-        made = predicted(result, LOW.name, view, rows, samples)
+        made = predict_samples(result, LOW.name, view, rows, samples)
         mae = {key: [[1.0, dict.fromkeys(FITS, 0.01)]] for key in ("LEDs", "coefficients")}
         page = "".join(ablation_page._page("x", {"triangles": 1, "mae": mae}))
     np.testing.assert_array_equal(made, slice_values(samples, found, LOW.basis))
@@ -68,9 +68,9 @@ def test_a_material_of_another_form_is_asked_for_its_own_values(result: RunResul
 
     (view,) = result.views
     samples = result.view_samples(view, slice(None))
-    plain = predicted(result, "ggx_normal", view, slice(None), samples)
+    plain = predict_samples(result, "ggx_normal", view, slice(None), samples)
     with mock.patch.dict(FITS, {"ggx_normal": Twice("ggx_normal", "", "", fits_normals=True)}):
-        twice = predicted(result, "ggx_normal", view, slice(None), samples)
+        twice = predict_samples(result, "ggx_normal", view, slice(None), samples)
     np.testing.assert_array_equal(twice, 2.0 * plain)
 
 
@@ -92,7 +92,7 @@ def test_a_material_of_another_form_states_its_own_uncertainty(result: RunResult
 def test_a_name_that_no_fit_has_is_no_ggx_fit(result: RunResult) -> None:
     (view,) = result.views
     with pytest.raises(KeyError, match="ggx_new"):
-        predicted(result, "ggx_new", view, slice(None), result.view_samples(view, slice(None)))
+        predict_samples(result, "ggx_new", view, slice(None), result.view_samples(view, slice(None)))
 
 
 def test_help_and_shell_know_all_fits(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from coupole.reflectance.ggx import drawn, lobe, reflected, shine
+from coupole.reflectance.ggx import lobe, lobe_density, sample_reflection, shine
 
 
 def unit(theta_deg: float, phi_deg: float) -> np.ndarray:
@@ -54,13 +54,13 @@ def test_rays_from_a_lobe_go_where_their_density_says(alpha: float) -> None:
     ways = np.empty((15_000, 3))
     numbers = np.random.default_rng(7).uniform(size=(len(ways), 2))
     for way, (first, second) in zip(ways, numbers, strict=True):
-        cosine = reflected(normal, *view, nv, alpha, first, second, way)
+        cosine = sample_reflection(normal, *view, nv, alpha, first, second, way)
         half = (way + view) / np.linalg.norm(way + view)
         assert cosine == pytest.approx(half @ normal, abs=1e-6)
     theta, phi = np.meshgrid((np.arange(150) + 0.5) / 150 * np.pi, np.arange(300) / 300 * 2 * np.pi)
     grid = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
     nh = (grid + view) @ normal / np.linalg.norm(grid + view, axis=-1)
-    density = np.array([drawn(nv, one, alpha) if one > 0 else 0.0 for one in nh.ravel()]).reshape(nh.shape)
+    density = np.array([lobe_density(nv, one, alpha) if one > 0 else 0.0 for one in nh.ravel()]).reshape(nh.shape)
     density *= np.sin(theta) * (np.pi / 150) * (2 * np.pi / 300)
     assert density.sum() == pytest.approx(1.0, abs=0.002)
     np.testing.assert_allclose(ways.mean(axis=0), np.einsum("tp,tpk->k", density, grid), atol=0.02)

@@ -10,12 +10,12 @@ from coupole.reflectance.lanes import (
     absolute,
     add_in_turns,
     four_gathered,
-    gathered,
+    gather_lanes,
     if_less,
     in_turns,
     lanes,
     larger,
-    loaded,
+    load_row,
     root,
     store,
     store_halves,
@@ -26,12 +26,12 @@ from coupole.reflectance.lanes import (
 @numba.njit
 def halves(numbers, bits):  # type: ignore[no-untyped-def]
     for row in range(len(numbers)):
-        store_halves(loaded(numbers, row), bits[row])
+        store_halves(load_row(numbers, row), bits[row])
 
 
 @numba.njit(error_model="numpy")
 def combined(numbers, bits):  # type: ignore[no-untyped-def]
-    one, other = loaded(numbers, 0), loaded(numbers, 1)
+    one, other = load_row(numbers, 0), load_row(numbers, 1)
     store_halves(root(absolute(one - other)) / np.float32(3.0), bits[0])
     store_halves(larger(one, np.float32(0.5) * other), bits[1])
     store_halves(if_less(one, other, one + other, np.float32(7.0)), bits[2])
@@ -39,7 +39,7 @@ def combined(numbers, bits):  # type: ignore[no-untyped-def]
 
 @numba.njit
 def picked(arrays, rows, place, bits):  # type: ignore[no-untyped-def]
-    store_halves(gathered(arrays, rows, place), bits)
+    store_halves(gather_lanes(arrays, rows, place), bits)
 
 
 def test_halves_are_those_of_numpy() -> None:
@@ -70,7 +70,7 @@ def test_lanes_are_reckoned_each_for_itself() -> None:
 
 @numba.njit
 def doubled(numbers, found):  # type: ignore[no-untyped-def]
-    made = lanes(3.0) / loaded(numbers, 1)
+    made = lanes(3.0) / load_row(numbers, 1)
     made -= 0.1
     store(made, found, 2)
     return total(made)
@@ -85,7 +85,7 @@ def test_lanes_of_double_precision_round_as_doubles_do() -> None:
 
 
 def test_lanes_of_two_precisions_are_not_mixed() -> None:
-    mixed = numba.njit(lambda one, other, found: store(loaded(one, 0) + loaded(other, 0), found, 0))
+    mixed = numba.njit(lambda one, other, found: store(load_row(one, 0) + load_row(other, 0), found, 0))
     with pytest.raises(numba.errors.TypingError, match="expected lanes of one precision"):
         mixed(np.zeros((1, 8)), np.zeros((1, 8), np.float32), np.zeros((1, 8)))
 

@@ -8,7 +8,7 @@ from coupole.reflectance.learned_correction import Lesson, Network
 
 def test_gradients_are_those_of_small_steps() -> None:
     generator = np.random.default_rng(2)
-    network = learned.begun(7, generator)
+    network = learned.initial_network(7, generator)
     for matrix, _ in network.layers:
         matrix[...] += generator.normal(0, 0.1, matrix.shape).astype(np.float32)
     features = generator.normal(size=(20, 7)).astype(np.float32)
@@ -47,6 +47,6 @@ def test_the_answer_stays_between_what_is_there() -> None:
     strip = learned.strip_of(mask, pictures.reshape(len(lights), -1, 3).astype(np.float32), 1e-3)
     sight = learned.look(strip, lights, lights[4] + [0.05, 0, 0], learned.all_kernels("linear"))
     wild = Network([(np.full((sight.features.shape[1], 1), 50.0, np.float32), np.zeros(1, np.float32))])
-    made = learned.corrected(strip, sight, wild)
+    made = learned.corrected_values(strip, sight, wild)
     assert np.all(made <= np.maximum(sight.high, 0) * strip.level[:, None] * (1 + 1e-6))
     assert made.min() >= 0

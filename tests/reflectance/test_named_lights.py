@@ -12,7 +12,7 @@ from relight_cases import write_exr
 from coupole.errors import InputError
 from coupole.reflectance.new_light.beams import lighting_of
 from coupole.reflectance.new_light.environment import OF_RUNS, Environment, read_environment
-from coupole.reflectance.new_light.light_kinds import AreaLight, EnvironmentLight, read_lights, turned
+from coupole.reflectance.new_light.light_kinds import AreaLight, EnvironmentLight, read_lights, turn_light
 
 LIGHTS = """\
 lights:
@@ -110,7 +110,7 @@ def test_an_area_turns_with_its_width(normal: tuple[float, float, float]) -> Non
     light = AreaLight(at_mm=(100, 0, 500), normal=normal, width_mm=300, height_mm=50)
     beams = [
         np.stack([beam.place for beam in lighting_of([one], (), np.eye(4), 3, 16, paper=False).beams])
-        for one in (light, turned(light, 90.0))
+        for one in (light, turn_light(light, 90.0))
     ]
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(beams[1], beams[0] @ quarter.T, atol=1e-9)

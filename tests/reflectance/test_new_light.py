@@ -20,10 +20,10 @@ from coupole.reflectance.new_light.light_kinds import (
     EnvironmentLight,
     LedLight,
     PointLight,
-    turned,
+    turn_light,
 )
 from coupole.reflectance.new_light.pictured_surface import FreeCamera
-from coupole.reflectance.new_light.shadow_edges import LIT, reached
+from coupole.reflectance.new_light.shadow_edges import LIT, trace_beam
 from coupole.reflectance.run_relighting import RelitScene, scene_from, scene_of_view
 
 WHITE = Coat(kd=(1 / np.pi, 0.5 / np.pi, 0.25 / np.pi))
@@ -46,18 +46,18 @@ def relief(tmp_path_factory: pytest.TempPathFactory) -> RelitScene:
 def places(scene: RelitScene) -> np.ndarray:
     """[pixels, 3] in the support frame."""
     inverse = np.linalg.inv(scene.result.base_from_support)
-    return moved(inverse, scene.surface.places_mm[scene.surface.seen >= 0].astype(float))
+    return moved(inverse, scene.surface.places_mm[scene.surface.triangle_of_pixel >= 0].astype(float))
 
 
 def shown(scene: RelitScene, *lights: AnyLight, samples: int = 256) -> np.ndarray:
     """[pixels, 3] of the same pixels."""
-    values: np.ndarray = scene.picture(lights, samples)[scene.surface.seen >= 0]
+    values: np.ndarray = scene.picture(lights, samples)[scene.surface.triangle_of_pixel >= 0]
     return values
 
 
 def test_pixels_of_a_view_see_the_place_that_its_lens_shows_there(relief: RelitScene) -> None:
     """The result does not keep the lens, whose distortion here is up to 4 px."""
-    seen = relief.surface.seen >= 0
+    seen = relief.surface.triangle_of_pixel >= 0
     pose = cases.camera_pose(np.array((60.0, -120.0, 330.0)), np.zeros(3))
     local = (places(relief) - pose[:3, 3]) @ pose[:3, :3]
     pixels = cv2.projectPoints(local, np.zeros(3), np.zeros(3), cases.LENS.matrix(), cases.LENS.distortion())[0]
@@ -172,11 +172,11 @@ def test_the_sun_of_an_environment_is_a_distant_light(relief: RelitScene, tmp_pa
     sun = shown(relief, light, samples=8)
     wanted = shown(relief, DistantLight(towards=(0, 1, 1), strength=strength))
     assert np.abs(sun - wanted).mean() < 0.01 * wanted.mean()
-    turned_sun = shown(relief, turned(light, 30.0), samples=8)
-    there = turned(DistantLight(towards=(0, 1, 1), strength=strength), 30.0)
+    turned_sun = shown(relief, turn_light(light, 30.0), samples=8)
+    there = turn_light(DistantLight(towards=(0, 1, 1), strength=strength), 30.0)
     assert np.abs(turned_sun - shown(relief, there)).mean() < 0.01 * wanted.mean()
     # and from y by 90 degrees to -x
-    np.testing.assert_allclose(turned(there, 60.0).towards, (-1, 0, 1), atol=1e-12)  # type: ignore[union-attr]
+    np.testing.assert_allclose(turn_light(there, 60.0).towards, (-1, 0, 1), atol=1e-12)  # type: ignore[union-attr]
 
 
 def test_an_led_gives_shares_of_the_cameras_range(plane: RelitScene) -> None:
@@ -195,7 +195,7 @@ def test_a_light_alone_gives_what_its_two_halves_give_together(tmp_path: Path, c
     result = write_result(tmp_path / "result", waves(30), GLOSSY, channels=channels)
     for size in ((13, 11), (16, 9), (3, 2)):
         scene = scene_from(result, FreeCamera(np.array([30.0, -40.0, 60.0]), np.zeros(3), size, 20.0))
-        assert (scene.surface.seen >= 0).reshape(-1)[-5:].all()
+        assert (scene.surface.triangle_of_pixel >= 0).reshape(-1)[-5:].all()
         for light in (DistantLight(towards=(0, 1, 2)), PointLight(at_mm=(5, 20, 40))):
             half = light.model_copy(update={"strength": 0.5})
             found, wanted = scene.picture([light]), scene.picture([half, half])
@@ -208,11 +208,11 @@ def test_a_light_alone_gives_what_its_two_halves_give_together(tmp_path: Path, c
 
 def reached_and_traced(scene: RelitScene, beam: Beam) -> tuple[np.ndarray, np.ndarray]:
     """[pixels] codes, and whether a ray from each pixel, one after the other, says that it is lit."""
-    surface, seen = scene.surface, scene.surface.seen >= 0
-    whole = np.empty(surface.seen.shape, np.uint8)
-    reached(scene.mesh, surface, beam, whole)
+    surface, seen = scene.surface, scene.surface.triangle_of_pixel >= 0
+    whole = np.empty(surface.triangle_of_pixel.shape, np.uint8)
+    trace_beam(scene.mesh, surface, beam, whole)
     codes = whole[seen]
-    normals, places_mm = surface.normals[surface.seen[seen]], surface.places_mm[seen]
+    normals, places_mm = surface.normals[surface.triangle_of_pixel[seen]], surface.places_mm[seen]
     starts = places_mm + 0.1 * normals
     ends = np.broadcast_to(beam.place, starts.shape) if beam.near else starts + 3000.0 * beam.place
     facing = np.sum((ends - places_mm) * normals, axis=1) > 0
@@ -264,7 +264,7 @@ def test_a_camera_anywhere_sees_what_it_looks_at(relief: RelitScene) -> None:
     camera = FreeCamera(np.array([100.0, 80.0, 200.0]), np.array([5.0, -3.0, 0.0]), (81, 61), 10.0)
     scene = scene_from(relief.result, camera)
     surface = scene.surface
-    rows, columns = np.nonzero(surface.seen >= 0)
+    rows, columns = np.nonzero(surface.triangle_of_pixel >= 0)
     local = places(scene) - camera.at_mm
     forward = unit(np.array([5.0, -3.0, 0.0]) - camera.at_mm)
     right = unit(np.cross(forward, [0, 0, 1]))
@@ -273,12 +273,15 @@ def test_a_camera_anywhere_sees_what_it_looks_at(relief: RelitScene) -> None:
     depth = local @ forward
     np.testing.assert_allclose(local @ right / depth * focal_px, columns - 40, atol=1e-3)
     np.testing.assert_allclose(local @ down / depth * focal_px, rows - 30, atol=1e-3)
-    assert len(rows) > 0.8 * surface.seen.size
+    assert len(rows) > 0.8 * surface.triangle_of_pixel.size
 
 
 def test_a_camera_without_field_of_view_sees_the_whole_object(relief: RelitScene) -> None:
     seen = (
-        scene_from(relief.result, FreeCamera(np.array([0.0, -200.0, 200.0]), size_px=(160, 120))).surface.seen >= 0
+        scene_from(
+            relief.result, FreeCamera(np.array([0.0, -200.0, 200.0]), size_px=(160, 120))
+        ).surface.triangle_of_pixel
+        >= 0
     )
     border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
     assert not border.any()
@@ -320,7 +323,7 @@ def test_highlights_of_large_lights_are_those_of_an_independent_renderer(
         # there y is up, the middle is z and its left is x
         place = transform(np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float))
         theirs = {"type": "envmap", "filename": str(path), "to_world": place}
-    whole = blocks(np.repeat((scene.surface.seen >= 0)[..., None], 3, axis=2))[..., 0] == 1
+    whole = blocks(np.repeat((scene.surface.triangle_of_pixel >= 0)[..., None], 3, axis=2))[..., 0] == 1
     assert whole.mean() > 0.8
     ratio = blocks(scene.picture([ours]))[whole] / blocks(other.render(theirs, 128))[whole]
     np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.02)

@@ -91,7 +91,7 @@ def test_stated_covariances_of_shifts_hold_what_noise_does() -> None:
     random = np.random.default_rng(2)
     pictures = [(painted(pose) + 0.6 * random.standard_normal(SIZE[::-1])).astype(np.float32) for pose in CAMERAS]
     found = matched(pictures)
-    off = found.found - found.computed
+    off = found.matched_blocks - found.expected_blocks
     square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance), off)
     assert len(off) > 80
     assert 0.8 < np.mean(square < 5.99) <= 1.0
@@ -163,7 +163,7 @@ def met(known: Unknowns, step: Floats, block: Floats) -> Floats:
     pixel = (2 * block + 0.5).reshape(1, 1, 2)
     straight = cv2.undistortPointsIter(pixel, lens.matrix(), lens.distortion(), None, None, end)[0, 0]
     way = pose[:3, :3] @ [*straight, 1.0]
-    corners = known.vertices_at(step)[known.given.triangles]
+    corners = known.vertices_at(step)[known.prior_geometry.triangles]
     for a, b, c in corners:
         far, u, v = np.linalg.solve(np.stack([-way, b - a, c - a], axis=1), pose[:3, 3] - a)
         if u >= -1e-9 and v >= -1e-9 and u + v <= 1 + 1e-9:
@@ -213,7 +213,7 @@ def test_views_without_anything_in_common_are_refused() -> None:
     known = unknowns()
     plain = [np.ones(SIZE[::-1], np.float32) for _ in CAMERAS]
     with pytest.raises(InputError, match="expected 30 matches or more, found 0"):
-        refine(known.given, plain, known.doubts, 1.0, 1, lambda step, done, of: None)
+        refine(known.prior_geometry, plain, known.doubts, 1.0, 1, lambda step, done, of: None)
 
 
 def test_what_is_clipped_is_not_compared() -> None:
@@ -237,7 +237,7 @@ def test_a_search_is_not_wider_than_it_was_asked_for(monkeypatch: pytest.MonkeyP
     pictures = [painted(pose) for pose in CAMERAS]
     for search_mm, after in ((0.1, 0.1), (0.6, 0.3)):
         searched.clear()
-        refine(known.given, pictures, known.doubts, search_mm, 1, lambda step, done, of: None)
+        refine(known.prior_geometry, pictures, known.doubts, search_mm, 1, lambda step, done, of: None)
         assert searched[:2] == [search_mm, after]
 
 

@@ -41,7 +41,7 @@ def test_records_are_made_from_nothing_and_not_made_twice(rig: Path, tmp_path: P
         record = read_record(Path(path))
         assert record.kind == kind
         assert record.simulated
-        assert record.passed
+        assert record.is_accepted
     runs = sorted((out / "runs").glob("2*"))
     assert len(runs) == 2
 

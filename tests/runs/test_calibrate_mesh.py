@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from coupole.calibration.campaign_steps import OBJECT
-from coupole.calibration.record import Input, Parameter, Record, Validity, read_record, sealed, write_record
+from coupole.calibration.record import Input, Parameter, Record, Validity, read_record, seal_record, write_record
 from coupole.errors import InputError
 from coupole.geometry import transform
 from coupole.plan.plan import Pose
@@ -60,7 +60,7 @@ def true_hand_eye(width_px: int, pitch_um: float) -> Record:
     values = lens | {f"flange_from_camera.{step}": value for step, value in zip(STEP_U, place, strict=True)}
     u = [*LENS_U.values(), *STEP_U.values()]
     now = datetime.now(UTC)
-    return sealed(
+    return seal_record(
         kind="hand-eye",
         name="true",
         created=now,
@@ -129,7 +129,7 @@ def test_a_campaign_finds_the_mesh_where_the_world_has_it(
     ended = cells.here("calibrate", "all", "--rig", rig, "--out", out, "--only", "mesh", "--json")
     assert ended.code == 0, ended.err
     record = read_record(Path(ended.document["records"]["mesh"]))
-    assert record.passed
+    assert record.is_accepted
     assert errors_mm(record, OBJECT, out / "scan").max() < 0.06
     assert record.remarks[1:] == ()
     assert {line.name for line in record.inputs} >= {

@@ -9,7 +9,7 @@ import cells
 import pytest
 from cells import CellFolder
 
-from coupole.calibration.record import Input, Limit, Parameter, Record, Validity, sealed, write_record
+from coupole.calibration.record import Input, Limit, Parameter, Record, Validity, seal_record, write_record
 
 
 def record(
@@ -21,7 +21,7 @@ def record(
     temperature_c: tuple[float, float] | None = None,
 ) -> Record:
     now = datetime.now(UTC)
-    return sealed(
+    return seal_record(
         kind=kind,
         name=f"{kind}-1",
         created=now - timedelta(days=60),

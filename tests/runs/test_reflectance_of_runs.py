@@ -530,7 +530,7 @@ def test_uncertainty_of_a_relit_picture_is_the_spread_of_pictures_of_drawn_mater
     own = materials_of(scene.result, "ggx_normal", scene.surface)
     with h5py.File(made[1] / "fits/ggx_normal.h5") as file:
         widths = [file[name][()][places] for name in ("u_kd", "u_ks")]
-        common = np.hypot(file["u_triangle"][()][places], file["u_shared"][()])[scene.surface.seen]
+        common = np.hypot(file["u_triangle"][()][places], file["u_shared"][()])[scene.surface.triangle_of_pixel]
     known = np.isfinite(covariance).all(axis=(1, 2))
     generator, pictures = np.random.default_rng(3), []
     roots, shorter = np.linalg.cholesky(covariance[known]), 0.25  # drawn at a quarter, where pictures are linear

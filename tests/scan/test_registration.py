@@ -58,14 +58,14 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Surveyed:
     paths = [scans[name].write(folder / name) for name in order]
     found = register(paths, "mm", processes=1, say=silent)
     (folder / "merged").mkdir()
-    placed = [found.scans[k] for k in found.placed]
-    poses = [found.first_from_scan[k] for k in found.placed]
+    placed = [found.scans[k] for k in found.placed_numbers]
+    poses = [found.first_from_scan[k] for k in found.placed_numbers]
     merged = merge(placed, poses, "mm", 16.0, (50.0, 250.0), folder / "merged", silent)
     return Surveyed(scans, paths, found, merged, folder)
 
 
 def true_pose(surveyed: Surveyed, number: int) -> np.ndarray:
-    first = surveyed.scans[surveyed.found.names[surveyed.found.placed[0]]].world_from_scan
+    first = surveyed.scans[surveyed.found.names[surveyed.found.placed_numbers[0]]].world_from_scan
     return np.linalg.inv(first) @ surveyed.scans[surveyed.found.names[number]].world_from_scan
 
 
@@ -76,8 +76,8 @@ def off_mm(one: np.ndarray, other: np.ndarray, points: np.ndarray) -> float:
 
 def test_poses_are_those_of_the_scanner(surveyed: Surveyed) -> None:
     found = surveyed.found
-    assert [found.names[k] for k in found.unplaced] == ["other.ply"]
-    for number in found.placed:
+    assert [found.names[k] for k in found.unplaced_numbers] == ["other.ply"]
+    for number in found.placed_numbers:
         points = surveyed.scans[found.names[number]].points_mm
         assert off_mm(found.first_from_scan[number], true_pose(surveyed, number), points) < 2.0
     assert len(found.loops) >= 1
@@ -85,7 +85,7 @@ def test_poses_are_those_of_the_scanner(surveyed: Surveyed) -> None:
 
 def test_the_truth_lies_in_the_stated_regions(surveyed: Surveyed) -> None:
     found = surveyed.found
-    for k, number in enumerate(found.placed[1:], start=1):
+    for k, number in enumerate(found.placed_numbers[1:], start=1):
         pose, true = found.first_from_scan[number], true_pose(surveyed, number)
         pivot = found.fit.pivots_mm[k]
         turn = true[:3, :3] @ pose[:3, :3].T
@@ -104,7 +104,7 @@ def test_the_merged_mesh_lies_on_the_object_and_is_a_surface(surveyed: Surveyed)
     mesh = read_mesh(path)
     defects = find_defects(mesh)
     assert defects.non_manifold_edges == defects.flipped_edges == 0
-    first = surveyed.scans[surveyed.found.names[surveyed.found.placed[0]]].world_from_scan
+    first = surveyed.scans[surveyed.found.names[surveyed.found.placed_numbers[0]]].world_from_scan
     vertices = mesh.vertices @ first[:3, :3].T + first[:3, 3]
     true, faces = trimesh.sample.sample_surface(TOWER, 400_000, seed=0)
     away, nearest = cKDTree(true).query(vertices)
@@ -141,8 +141,8 @@ def test_a_wrong_motion_is_rejected_by_the_others(surveyed: Surveyed) -> None:
     first, second = found.motions[0].first, found.motions[0].second
     false = PairMotion(first, second, wrong, found.motions[0].fit, "features")
     groups = join(found.scans, [*found.motions[1:], false])
-    assert groups.rejected == [false]
-    assert len(groups.members[groups.group_of[first]]) == len(found.placed)
+    assert groups.rejected_motions == [false]
+    assert len(groups.members[groups.group_of[first]]) == len(found.placed_numbers)
 
 
 def test_a_scan_in_the_space_that_another_saw_through_contradicts_it(surveyed: Surveyed) -> None:
@@ -152,7 +152,7 @@ def test_a_scan_in_the_space_that_another_saw_through_contradicts_it(surveyed: S
     before = motion.first_from_second.copy()
     before[:3, 3] *= 0.8  # nearer to the first scanner
     groups = join(found.scans, [PairMotion(motion.first, motion.second, before, motion.fit, "features")])
-    assert len(groups.rejected) == 1
+    assert len(groups.rejected_motions) == 1
 
 
 def test_control_points_place_the_scans_in_the_site(surveyed: Surveyed, tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_the_ten_scans_of_the_bunny_lie_as_published(seed: int) -> None:
     published = bunny_poses()
     order = [sorted(published)[k] for k in np.random.default_rng(seed).permutation(len(published))]
     found = register([BUNNY / name for name in order], "m", say=silent)
-    assert found.unplaced == () == found.rejected
+    assert found.unplaced_numbers == () == found.rejected_motions
     points = {scan.name: scan.fine.points_mm for scan in found.scans}
     first = np.linalg.inv(published[order[0]])
     for number, name in enumerate(order):

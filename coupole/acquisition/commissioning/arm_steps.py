@@ -128,7 +128,7 @@ def stopping(bench: Bench) -> None:
                 "deg",
             )
         delays_s.append(float((angles_deg / np.maximum(speeds_deg_s, 1e-6))[shares == 1.0].max()))
-        if not all(limit.passed for limit in findings.limits):
+        if not all(limit.is_met for limit in findings.limits):
             return
         bench.go_to(home_deg)
     findings.remarks.append(

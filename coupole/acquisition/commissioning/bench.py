@@ -72,12 +72,12 @@ class Findings:
         self.limits.append(
             Limit(what=what, found=round(finite_figure, 6), limit=round(float(limit), 6), unit=unit)
         )
-        return self.limits[-1].passed
+        return self.limits[-1].is_met
 
     @property
     def passed(self) -> bool:
         """True if all is well so far."""
-        return all(entry.passed for entry in self.limits) and all(entry.yes for entry in self.answers)
+        return all(entry.is_met for entry in self.limits) and all(entry.yes for entry in self.answers)
 
 
 @dataclass

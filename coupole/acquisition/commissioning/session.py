@@ -136,7 +136,7 @@ def shortcomings(result: StepResult) -> list[str]:
     sentences = [
         f"{entry.what}: {entry.found:.4g} {entry.unit}, at most {entry.limit:.4g}".replace(" ,", ",")
         for entry in result.limits
-        if not entry.passed
+        if not entry.is_met
     ]
     sentences += [f"answered with no: {entry.question}" for entry in result.answers if not entry.yes]
     return [*sentences, *([result.failure] if result.failure else [])]

@@ -194,7 +194,7 @@ def _about_half(theta_h: Array, phi_h: Array, theta_d: Array, phi_d: Array) -> t
     about = _way(theta_d, phi_d)
     cosine, sine = np.cos(theta_h), np.sin(theta_h)
 
-    def turned(x: Array, y: Array, z: Array) -> Array:
+    def about_half_vector(x: Array, y: Array, z: Array) -> Array:
         along = cosine * x + sine * z
         across, up = y, cosine * z - sine * x
         return np.stack(
@@ -203,16 +203,16 @@ def _about_half(theta_h: Array, phi_h: Array, theta_d: Array, phi_d: Array) -> t
         )
 
     x, y, z = about.T
-    return turned(-x, -y, z), turned(x, y, z)
+    return about_half_vector(-x, -y, z), about_half_vector(x, y, z)
 
 
-def _projected(theta_l: Array, along: Array, across: Array) -> tuple[Array, Array]:
+def _directions_of_projection(theta_l: Array, along: Array, across: Array) -> tuple[Array, Array]:
     light = _way(theta_l, np.zeros_like(theta_l))
     return light, _way(np.hypot(along, across), np.arctan2(across, along))
 
 
 WAYS: dict[str, tuple[int, Callable[..., tuple[Array, Array]]]] = {
-    "ISOTROPIC_TL_TV_PROJ_DPHI": (3, _projected),
+    "ISOTROPIC_TL_TV_PROJ_DPHI": (3, _directions_of_projection),
     "ISOTROPIC_TV_TL_DPHI": (3, lambda eye, led, dphi: (_way(led, dphi), _way(eye, 0.0 * eye))),
     "RUSIN_TH_TD": (2, lambda h, d: _about_half(h, 0.0 * h, d, 0.0 * h + 0.5 * np.pi)),
     "COS_TH_TD": (2, lambda h, d: _about_half(np.arccos(h), 0.0 * h, np.arccos(d), 0.0 * h)),
@@ -227,7 +227,7 @@ WAYS: dict[str, tuple[int, Callable[..., tuple[Array, Array]]]] = {
 # -- between samples ------------------------------------------------------------------------------------------
 
 
-def interpolated(samples: AltaSamples) -> Brdf:
+def interpolated_brdf(samples: AltaSamples) -> Brdf:
     """The reflectance [..., outputs] of an isotropic, reciprocal material by its samples.
 
     A pair of directions is a point: the root of theta_h, and the light about the half vector, theta_d at the
@@ -245,7 +245,7 @@ def interpolated(samples: AltaSamples) -> Brdf:
     above = (light[:, 2] > 0.0) & (eye[:, 2] > 0.0)
     if above.sum() < _FEWEST:
         raise InputError(f"{samples.path}: expected {_FEWEST} samples above the surface; found {above.sum()}")
-    points, values = _merged(_place(light[above], eye[above]), np.maximum(samples.values[above], 0.0))
+    points, values = _merge_points(_place(light[above], eye[above]), np.maximum(samples.values[above], 0.0))
     try:
         between = LinearNDInterpolator(points, values)
     except QhullError as error:
@@ -256,7 +256,7 @@ def interpolated(samples: AltaSamples) -> Brdf:
     return partial(_between, between=between, nearest=NearestNDInterpolator(points, values))
 
 
-def _merged(points: Array, values: Array) -> tuple[Array, Array]:
+def _merge_points(points: Array, values: Array) -> tuple[Array, Array]:
     """Points that differ, and the means of the values there."""
     _, first, group = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     total = np.zeros((len(first), values.shape[1]))

@@ -57,7 +57,7 @@ class BakedTable:
             }
         )
 
-    def read(self) -> RglTable:
+    def decoded_table(self) -> RglTable:
         """Return the table as a reader of the file has it; of all channels."""
         phi_i, theta_i, ndf, sigma, vndf = (
             np.asarray(self.fields[name], np.float64) for name in ("phi_i", "theta_i", "ndf", "sigma", "vndf")

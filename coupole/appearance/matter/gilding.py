@@ -31,7 +31,7 @@ class Gilt:
     """Surface without leaf: the bole's binder against air."""
     bole: InternalReflectance
     """[bands]."""
-    uncovered: float
+    bare_share: float
     """f."""
 
 
@@ -44,7 +44,7 @@ def leaf_index(
     return effective_medium.maxwell_garnett(metal, filling, holes_share, depolarisation)
 
 
-def uncovered(holes: float, crack_width_um: float, crack_length_mm_per_mm2: float) -> float:
+def bare_share_of(holes: float, crack_width_um: float, crack_length_mm_per_mm2: float) -> float:
     """Share of the surface left bare by holes (share of area) and cracks of burnishing, which overlap at
     random."""
     cracks = within("cracks", crack_width_um * 1e-3 * crack_length_mm_per_mm2, 0.0, 1.0)
@@ -56,7 +56,7 @@ def gilt(
     thickness_nm: float,
     bole: InternalReflectance,
     *,
-    uncovered: float = 0.0,
+    bare_share: float = 0.0,
     binder_index: float = indices.EGG_WHITE,
 ) -> Gilt:
     """A leaf of `index` and thickness on a bole [bands]; under the leaf there is no air.
@@ -67,16 +67,19 @@ def gilt(
         leaf=layered.sheet([Film(index, thickness_nm)], binder_index),
         bare=layered.sheet([], binder_index),
         bole=bole,
-        uncovered=float(within("uncovered", uncovered, 0.0, 1.0)),
+        bare_share=float(within("uncovered", bare_share, 0.0, 1.0)),
     )
 
 
-def reflectances(gilded: Gilt) -> tuple[Array, Array]:
+def reflectances(gilt_surface: Gilt) -> tuple[Array, Array]:
     """Specular and diffuse reflectance [bands] of a smooth gilt for light along the normal."""
     parts = []
-    for share, sheet in ((1.0 - gilded.uncovered, gilded.leaf), (gilded.uncovered, gilded.bare)):
+    for share, sheet in (
+        (1.0 - gilt_surface.bare_share, gilt_surface.leaf),
+        (gilt_surface.bare_share, gilt_surface.bare),
+    ):
         entering = sheet.transmittance[-1]
-        diffuse = entering * layered.emerging(sheet, gilded.bole)
+        diffuse = entering * layered.emerging(sheet, gilt_surface.bole)
         parts.append(share * np.stack([sheet.normal_reflectance, diffuse]))
     specular, diffuse = parts[0] + parts[1]
     return specular, diffuse

@@ -57,15 +57,15 @@ class Face:
     gloss: Array
     """Light that the face itself sends to the instrument."""
 
-    def seen(self, internal: InternalReflectance) -> MeasuredReflectance:
+    def reflectance_in_air(self, internal: InternalReflectance) -> MeasuredReflectance:
         """Return the reflectance in air of a layer under this face."""
         r = internal.values
         return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
 
-    def inside(self, measured: MeasuredReflectance) -> InternalReflectance:
+    def inside(self, measured_reflectance: MeasuredReflectance) -> InternalReflectance:
         """Return the reflectance of the layer under this face. Raises InputError where no layer can be the reason
         of what is seen."""
-        r = np.asarray(measured.values, dtype=float) - self.gloss
+        r = np.asarray(measured_reflectance.values, dtype=float) - self.gloss
         internal = np.asarray(r / (self.passing + self.inner * r))
         internal = np.where((internal > 1.0) & (internal < 1.0 + _ROUNDING), 1.0, internal)
         wrong = ~((internal >= 0.0) & (internal <= 1.0))
@@ -73,7 +73,7 @@ class Face:
             low, high = (np.broadcast_to(v, internal.shape)[wrong][0] for v in (self.gloss, self.brightest))
             raise InputError(
                 f"a paint under this face is seen with a reflectance of {low:.3g} to {high:.3g}; found "
-                f"{np.asarray(measured.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: see "
+                f"{np.asarray(measured_reflectance.values)[wrong][0]:.3g}, R inside the binder beyond 0 to 1: see "
                 "whether gloss is included, and whether the sample has a glossy face"
             )
         return InternalReflectance(internal)

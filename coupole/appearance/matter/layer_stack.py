@@ -32,7 +32,7 @@ class Ground:
 
     diffuse: Array
     """[bands], diffuse to diffuse."""
-    directed: Array
+    directional: Array
     """[angles, bands], directed to diffuse."""
     mirror: Array
     """[angles, bands], directed to its mirror image."""
@@ -60,9 +60,9 @@ class Binder:
 
     def mirroring(self, ground: Ground, share: ArrayLike, roughness: float) -> Ground:
         """A ground that has a mirror's reflectance as well, for directed light; diffuse light counts with both."""
-        mirror = np.broadcast_to(np.asarray(share, dtype=float), ground.directed.shape)
+        mirror = np.broadcast_to(np.asarray(share, dtype=float), ground.directional.shape)
         within("ground and its mirror together", ground.diffuse + mirror.max(axis=0), 0.0, 1.0 + 1e-9)
-        return Ground(ground.diffuse + self._mean(mirror), ground.directed, mirror, roughness)
+        return Ground(ground.diffuse + self._mean(mirror), ground.directional, mirror, roughness)
 
     def two_flux(
         self, ground: Ground, absorption: ArrayLike, scattering: ArrayLike, thickness_mm: float
@@ -80,7 +80,7 @@ class Binder:
             forward=np.asarray(layer.forward) * longer,
             backward=np.asarray(layer.backward) * longer,
         )
-        background = four_flux.Background(ground.diffuse, ground.directed, ground.mirror)
+        background = four_flux.Background(ground.diffuse, ground.directional, ground.mirror)
         directed_reflectance, mirror = four_flux.reflectances(slanted_layer, background)
         rho, tau = kubelka_munk.layer(layer.absorption, layer.scattering, layer.thickness_mm)
         diffuse = np.broadcast_to(kubelka_munk.over(rho, tau, ground.diffuse), BANDS)
@@ -91,7 +91,7 @@ class Binder:
         k = np.asarray(absorption, dtype=float)
         return self.four_flux(ground, four_flux.Layer(2.0 * k, 0.0, k, 0.0, 0.0, thickness_mm))
 
-    def leaf(self, ground: Ground, films: Sequence[Film], roughness: float, uncovered: float = 0.0) -> Ground:
+    def leaf(self, ground: Ground, films: Sequence[Film], roughness: float, bare_share: float = 0.0) -> Ground:
         """Thin films of metal with binder on both sides, on all but a share of the ground.
 
         The ground's own mirror image is seen through the leaf as if it lay in the leaf's facets.
@@ -103,13 +103,13 @@ class Binder:
         all_back, all_through = stack_power(mu, WAVELENGTHS_NM, films, outside=index, substrate=index)
         share = 2.0 * mu * weight
         rho, tau = share @ all_back, share @ all_through
-        directed_reflectance = through * tau * ground.directed / (1.0 - rho * ground.diffuse)
+        directed_reflectance = through * tau * ground.directional / (1.0 - rho * ground.diffuse)
         mirror = back + through**2 * ground.mirror / (1.0 - back * ground.mirror)
         diffuse = rho + tau**2 * ground.diffuse / (1.0 - rho * ground.diffuse)
-        f = float(within("uncovered", uncovered, 0.0, 1.0))
+        f = float(within("uncovered", bare_share, 0.0, 1.0))
         return Ground(
             (1.0 - f) * diffuse + f * ground.diffuse,
-            (1.0 - f) * directed_reflectance + f * ground.directed,
+            (1.0 - f) * directed_reflectance + f * ground.directional,
             (1.0 - f) * mirror + f * ground.mirror,
             roughness,
         )
@@ -147,7 +147,7 @@ def stack(binder: Binder, ground: Ground, roughness: float, films: Sequence[Film
     )
     again = 1.0 / (1.0 - inner * ground.mirror)
     diffuse_again = 1.0 / (1.0 - sheet.internal_reflectance * ground.diffuse)
-    body = coat.entering * again * ground.directed * sheet.internal_transmittance * diffuse_again
+    body = coat.entering * again * ground.directional * sheet.internal_transmittance * diffuse_again
     mirror = sheet.transmittance * out * ground.mirror * again
     mu = 0.5 * (_GAUSS + 1.0)
     mean = np.asarray((_WEIGHTS * mu) @ layered.at_cosine(body, mu))

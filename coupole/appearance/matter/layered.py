@@ -93,7 +93,7 @@ def coat(smooth: Sheet, roughness: float) -> Coat:
     return Coat(smooth, roughness, entering, entering / np.maximum(_over_angles(entering), 1e-300))
 
 
-def layered(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance) -> Array:
+def layered_brdf(wi: Array, wo: Array, *, coat: Coat, body: InternalReflectance) -> Array:
     """The coat's gloss, and the light of the body [bands] through it."""
     gloss = brdf.ggx(wi, wo, roughness=coat.roughness, fresnel=lambda c: at_cosine(coat.sheet.reflectance, c))
     exchange = at_cosine(coat.entering, wi[..., 2]) * at_cosine(coat.leaving, wo[..., 2])

@@ -36,7 +36,7 @@ class Makie:
     """[...], p: the share of metal."""
     residual: Array
     """[..., 3], the lacquers' part of the picture, in its unit."""
-    clamped: float
+    clamped_share: float
     """Share of the pixels whose p was beyond 0 or 1 by more than rounding: noise, shadow or a wrong sample
     colour."""
 

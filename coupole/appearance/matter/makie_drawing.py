@@ -40,14 +40,14 @@ def picture(path: Path, width_mm: float) -> Drawing:
     share = _shares(path)
     rows, columns = share.shape
 
-    def drawn(places_mm: Array) -> Array:
+    def metal_share_at(places_mm: Array) -> Array:
         from scipy.ndimage import map_coordinates
 
         scale = columns / width_mm
         place = [0.5 * (rows - 1) - places_mm[:, 1] * scale, 0.5 * (columns - 1) + places_mm[:, 0] * scale]
         return np.asarray(np.clip(map_coordinates(share, place, order=1, cval=0.0), 0.0, 1.0))
 
-    return drawn
+    return metal_share_at
 
 
 def _shares(path: Path) -> Array:

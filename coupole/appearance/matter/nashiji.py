@@ -87,32 +87,32 @@ def flakes(slab: Slab) -> Flakes:
     return Flakes(slab, centres, rotation, half_axes)
 
 
-def triangulate(found: Flakes, *, around: int = 24, along: int = 6) -> tuple[Array, NDArray[np.int64]]:
+def triangulate(all_flakes: Flakes, *, around: int = 24, along: int = 6) -> tuple[Array, NDArray[np.int64]]:
     """Corners [n * m, 3] in mm and triangles [n * k, 3] of all flakes, normals outwards, each flake closed.
 
     `around` corners about the normal on each of `along` - 1 rings between two poles.
     """
-    e1, e2 = found.slab.roundness
+    e1, e2 = all_flakes.slab.roundness
     eta = np.linspace(-0.5 * np.pi, 0.5 * np.pi, along + 1)[1:-1]
     omega = np.arange(around) * 2.0 * np.pi / around
     ring = np.stack([_power(np.cos(omega), e2), _power(np.sin(omega), e2), np.ones(around)], axis=-1)
     level = np.stack([_power(np.cos(eta), e1), _power(np.cos(eta), e1), _power(np.sin(eta), e1)], axis=-1)
     unit = np.concatenate([[[0.0, 0.0, -1.0]], (level[:, None] * ring).reshape(-1, 3), [[0.0, 0.0, 1.0]]])
-    local = unit * found.half_axes_mm[:, None, :]
-    corners = np.einsum("nij,nmj->nmi", found.slab_from_flake, local) + found.centres_mm[:, None, :]
+    local = unit * all_flakes.half_axes_mm[:, None, :]
+    corners = np.einsum("nij,nmj->nmi", all_flakes.slab_from_flake, local) + all_flakes.centres_mm[:, None, :]
     flake_faces = _faces(around, along)
     faces = flake_faces + (np.arange(len(corners)) * len(unit))[:, None, None]
     return corners.reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def settled(found: Flakes, tops_mm: Array, frames: Array) -> Flakes:
+def settle_flakes(all_flakes: Flakes, tops_mm: Array, frames: Array) -> Flakes:
     """The same flakes, each at its depth and tilt under a place [n, 3] of another surface than the slab's.
 
     `frames` [n, 3, 3] there have the surface's outward normals as third columns. Where the surface is curved, a
     flake is as flat as before: that is a deviation of its radius squared over twice the surface's radius.
     """
-    centres = tops_mm + found.centres_mm[:, 2:] * frames[:, :, 2]
-    return replace(found, centres_mm=centres, slab_from_flake=frames @ found.slab_from_flake)
+    centres = tops_mm + all_flakes.centres_mm[:, 2:] * frames[:, :, 2]
+    return replace(all_flakes, centres_mm=centres, slab_from_flake=frames @ all_flakes.slab_from_flake)
 
 
 def _power(base: Array, exponent: float) -> Array:

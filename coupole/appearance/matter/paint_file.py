@@ -51,7 +51,7 @@ class PaintFile:
     u_absorption: Array
     """0 where nothing is known of it."""
     u_scattering: Array
-    told: Mapping[str, Any] = field(default_factory=dict)
+    head_lines: Mapping[str, Any] = field(default_factory=dict)
     """Other lines of the head: how it was measured."""
     other: Mapping[str, Array] = field(default_factory=dict)
     """Further columns [n], such as those of four fluxes."""
@@ -63,7 +63,7 @@ class PaintFile:
             *(np.interp(WAVELENGTHS_NM, self.wavelengths_nm, v) for v in (self.absorption, self.scattering)),
         )
 
-    def covered(self) -> NDArray[np.bool_]:
+    def covered_bands(self) -> NDArray[np.bool_]:
         """[81] of bool: the bands that were measured."""
         nm = self.wavelengths_nm
         return np.asarray((nm[0] - STEP_NM / 2 <= WAVELENGTHS_NM) & (nm[-1] + STEP_NM / 2 >= WAVELENGTHS_NM))
@@ -78,7 +78,7 @@ class PaintFile:
 
 def encode(paint: PaintFile) -> str:
     """The file's text."""
-    head = {"name": paint.name, "unit": paint.unit, "binder_index": paint.binder_index, **paint.told}
+    head = {"name": paint.name, "unit": paint.unit, "binder_index": paint.binder_index, **paint.head_lines}
     lines = [FIRST_LINE, *(f"# {line}" for line in _yaml(head).splitlines())]
     names = (*_COLUMNS, "u_K", "u_S", *paint.other)
     columns = (

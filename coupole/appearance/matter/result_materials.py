@@ -29,12 +29,12 @@ def read_result(
     roughness. Raises InputError.
     """
     if cluster is not None:
-        kd, ks, alpha = _read(folder, "clusters")[1:]
+        kd, ks, alpha = _read_materials(folder, "clusters")[1:]
         if not 0 <= cluster < len(kd):
             raise InputError(f"{folder}: cluster: expected 0 to {len(kd) - 1}, found {cluster}")
         rows = np.array([cluster])
     else:
-        numbers, kd, ks, alpha = _read(folder, fit)
+        numbers, kd, ks, alpha = _read_materials(folder, fit)
         is_known = np.isfinite(alpha) & np.isfinite(kd).all(axis=1) & np.isfinite(ks).all(axis=1)
         rows = np.flatnonzero(is_known if triangles is None else is_known & np.isin(numbers, triangles))
         if not len(rows):
@@ -44,17 +44,17 @@ def read_result(
         (ks[part].sum(axis=0) / len(order), float(np.average(alpha[part], weights=ks[part].sum(axis=1) + 1e-12)))
         for part in np.array_split(order, min(_LOBES, len(order)))
     ]
-    return partial(_mixed, kd=kd[order].mean(axis=0), lobes=lobes)
+    return partial(_mixed_brdf, kd=kd[order].mean(axis=0), lobes=lobes)
 
 
-def _mixed(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array, float]]) -> Array:
+def _mixed_brdf(wi: Array, wo: Array, *, kd: Array, lobes: Sequence[tuple[Array, float]]) -> Array:
     total = brdf.lambert(wi, wo, reflectance=np.pi * kd)
     for ks, alpha in lobes:
         total = total + ks * brdf.ggx(wi, wo, roughness=alpha, fresnel=lambda c: np.ones((*np.shape(c), 1)))
     return total
 
 
-def _read(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:
+def _read_materials(folder: Path, name: str) -> tuple[Array, Array, Array, Array]:
     """Numbers [n] of triangles (of `clusters`: of themselves), kd and ks [n, 3], alpha [n]."""
     path = folder / "fits" / f"{name}.h5"
     if not path.is_file():

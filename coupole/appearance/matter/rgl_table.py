@@ -89,7 +89,7 @@ class RglTable:
             phi_m = phi_m - phi_i
         u_m = np.stack([_of_theta(theta_m), _of_phi(phi_m) % 1.0], axis=1)
         slices = self._slices(phi_i, theta_i)
-        values = _bilinear(self.values, slices, self._unwarped(u_m, slices))
+        values = _bilinear(self.values, slices, self._unwarped_positions(u_m, slices))
         if self.jacobian:
             u_i = np.stack([_of_theta(theta_i), _of_phi(phi_i)], axis=1)
             whole: Weighted = [(np.zeros(len(wi), np.intp), np.ones(len(wi)))]
@@ -133,7 +133,7 @@ class RglTable:
         whole = rows[:, -1]
         return density / whole[:, None, None], along / whole[:, None, None], rows / whole[:, None]
 
-    def _unwarped(self, u: Array, slices: Weighted) -> Array:
+    def _unwarped_positions(self, u: Array, slices: Weighted) -> Array:
         """[n, 2] where in the warped square half vectors [n, 2] are: share of the row's density to the left of
         it, share of all density below it."""
         density, along, rows = self._cumulative
@@ -141,20 +141,21 @@ class RglTable:
         column, x = _cell(u[:, 0], width)
         row, y = _cell(u[:, 1], height)
 
-        def mixed(table: Array, *place: Indices) -> Array:
+        def mix_slices(table: Array, *place: Indices) -> Array:
             return np.asarray(sum(share * table[number, *place] for number, share in slices))
 
         density_left, density_right = (
-            (1.0 - y) * mixed(density, row, column + k) + y * mixed(density, row + 1, column + k) for k in (0, 1)
+            (1.0 - y) * mix_slices(density, row, column + k) + y * mix_slices(density, row + 1, column + k)
+            for k in (0, 1)
         )
-        before = (1.0 - y) * mixed(along, row, column) + y * mixed(along, row + 1, column)
+        before = (1.0 - y) * mix_slices(along, row, column) + y * mix_slices(along, row + 1, column)
         last = np.full(len(u), width - 1)
-        lower, upper = mixed(along, row, last), mixed(along, row + 1, last)
+        lower, upper = mix_slices(along, row, last), mix_slices(along, row + 1, last)
         total = (1.0 - y) * lower + y * upper
         in_row = (before + x * (density_left + 0.5 * x * (density_right - density_left))) / np.maximum(
             total, np.finfo(float).tiny
         )
-        below = mixed(rows, row) + y * (lower + 0.5 * y * (upper - lower))
+        below = mix_slices(rows, row) + y * (lower + 0.5 * y * (upper - lower))
         return np.stack([in_row, below], axis=1)
 
 

@@ -58,7 +58,7 @@ def tabulate(source: Brdf, incidence_deg: Array, *, theta_nodes: int = 40, phi_n
     return SpecularTable(incidence, theta, np.einsum("kj,itjb->itkb", cosines, np.log(np.maximum(values, floor))))
 
 
-def tabulated(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
+def tabulated_brdf(wi: Array, wo: Array, *, table: SpecularTable) -> Array:
     """The table's BRDF, averaged over exchange of wi and wo, which makes it reciprocal."""
     above = ((wi[..., 2] > 0.0) & (wo[..., 2] > 0.0))[..., None]
     return (

@@ -42,7 +42,7 @@ def stack_power(
     """
     reflectances, transmittances = zip(
         *(
-            _polarised(cos_outside, wavelengths_nm, films, outside, substrate, polarisation)
+            _power_ratios(cos_outside, wavelengths_nm, films, outside, substrate, polarisation)
             for polarisation in (0, 1)
         ),
         strict=True,
@@ -50,7 +50,7 @@ def stack_power(
     return 0.5 * (reflectances[0] + reflectances[1]), 0.5 * (transmittances[0] + transmittances[1])
 
 
-def _polarised(
+def _power_ratios(
     cos_outside: ArrayLike,
     wavelengths_nm: ArrayLike,
     films: Sequence[Film],

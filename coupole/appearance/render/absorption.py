@@ -12,7 +12,7 @@ from coupole.appearance.matter import lacquer
 from coupole.appearance.render.model import Model, Positive
 from coupole.appearance.spectra.grid import BANDS, WAVELENGTHS_NM, Array
 from coupole.appearance.spectra.measured import read_spectrum
-from coupole.appearance.spectra.resampling import held, on_grid
+from coupole.appearance.spectra.resampling import fill_missing, on_grid
 
 NotNegative = Annotated[float, Field(ge=0)]
 
@@ -100,7 +100,7 @@ def per_mm(absorption: Absorption, index: float, folder: Path) -> Array:
             return coefficient(absorption.per_mm, folder)
         case Transmittance():
             spectrum = read_spectrum(folder / absorption.path, column=absorption.column)
-            return lacquer.absorption_from(held(on_grid(spectrum)), absorption.thickness_mm, index)
+            return lacquer.absorption_from(fill_missing(on_grid(spectrum)), absorption.thickness_mm, index)
         case _:
             assert_never(absorption)
 
@@ -115,4 +115,4 @@ def coefficient(value: PerMm, folder: Path) -> Array:
 def _numbers(path: Path, column: int | None) -> Array:
     """[81], not below 0."""
     spectrum = read_spectrum(path, unit="power", column=column)
-    return np.asarray(np.maximum(held(on_grid(spectrum)), 0.0))
+    return np.asarray(np.maximum(fill_missing(on_grid(spectrum)), 0.0))

@@ -41,18 +41,18 @@ class Sensitivity:
     quarter: int
 
 
-def chosen(step_nm: StepNm) -> list[int]:
+def rendered_bands(step_nm: StepNm) -> list[int]:
     """Return the numbers of those of the 81 bands that are rendered."""
     return list(range(0, BANDS, step_nm // int(STEP_NM)))
 
 
 def wavelengths(step_nm: StepNm) -> Array:
-    return np.asarray(WAVELENGTHS_NM[chosen(step_nm)])
+    return np.asarray(WAVELENGTHS_NM[rendered_bands(step_nm)])
 
 
 def around_nodes(power: Array, step_nm: StepNm) -> Array:
     """A light's power [81] with its mean about each rendered band at that band (a triangle of twice the step)."""
-    nodes = chosen(step_nm)
+    nodes = rendered_bands(step_nm)
     triangles = np.maximum(0.0, 1.0 - np.abs(WAVELENGTHS_NM[nodes][:, None] - WAVELENGTHS_NM) / step_nm)
     means = np.array(power, dtype=float)
     means[nodes] = (triangles @ power) / triangles.sum(axis=1)
@@ -64,7 +64,7 @@ def weights(functions: Array, power: Array, step_nm: StepNm) -> Array:
     `functions` [n, 81], under the light `power` [81], for reflectances that are cubic splines over the bands."""
     from scipy.interpolate import CubicSpline
 
-    nodes = chosen(step_nm)
+    nodes = rendered_bands(step_nm)
     if step_nm == STEP_NM:
         return np.asarray(functions * STEP_NM)
     splines = CubicSpline(WAVELENGTHS_NM[nodes], np.eye(len(nodes)))(WAVELENGTHS_NM)
@@ -75,7 +75,7 @@ def weights(functions: Array, power: Array, step_nm: StepNm) -> Array:
 
 def groups(step_nm: StepNm) -> list[list[int]]:
     """Bands in groups of four; the last group repeats its last band if it has fewer."""
-    bands = chosen(step_nm)
+    bands = rendered_bands(step_nm)
     parts = [bands[first : first + QUARTERS] for first in range(0, len(bands), QUARTERS)]
     return [part + [part[-1]] * (QUARTERS - len(part)) for part in parts]
 
@@ -92,12 +92,12 @@ def for_group(description: Any, group: Sequence[int], step_nm: StepNm, files: Pa
             key: for_group(value, group, step_nm, files) for key, value in description.items() if key != "table"
         }
         if (table := description.get("table")) is not None:
-            parts["filename"] = _written(table, group, step_nm, files)
+            parts["filename"] = _write_table(table, group, step_nm, files)
         return parts
     return description
 
 
-def _written(table: BakedTable, group: Sequence[int], step_nm: StepNm, files: Path) -> str:
+def _write_table(table: BakedTable, group: Sequence[int], step_nm: StepNm, files: Path) -> str:
     """A file of `measured` with the group's values over the quarters. The one before it is replaced, not changed:
     it may still be open."""
     path, new = files / f"{id(table)}.bsdf", files / "new.bsdf"

@@ -17,9 +17,9 @@ from coupole.appearance.render.model import unit
 from coupole.appearance.render.panes import Pane
 from coupole.appearance.render.photon_map import Matt, Mirror, Room, seen_by_gold
 from coupole.appearance.render.pieces import Ball
-from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.rendering import Spectral, open_renderer
 from coupole.appearance.render.scene_file import Camera, Gathered, PlainScene
-from coupole.appearance.render.spectra import Constant, matt, power, scaled
+from coupole.appearance.render.spectra import Constant, matt, power, scaled_power
 from coupole.appearance.render.wall import gold_reflectance
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
@@ -30,7 +30,7 @@ _RAYS = 2
 _BLACK = Diffuse(kind="diffuse", reflectance=Constant(kind="constant", value=0.0))
 
 
-def render(scene: PlainScene, wanted: Gathered, camera: Camera, folder: Path, progress: Progress) -> Spectral:
+def render(scene: PlainScene, gathering: Gathered, camera: Camera, folder: Path, progress: Progress) -> Spectral:
     """Radiance in three parts: other lights by paths; the suns by paths with black gold, where matt surfaces are
     seen, or with all there is, where gold is seen; the suns over gold on matt surfaces by photons.
 
@@ -39,14 +39,14 @@ def render(scene: PlainScene, wanted: Gathered, camera: Camera, folder: Path, pr
     suns = tuple(light for light in scene.lights if isinstance(light, Distant))
     other_lights = tuple(light for light in scene.lights if not isinstance(light, Distant))
     room = _room(scene, folder)
-    band_numbers = bands.chosen(scene.bands.step_nm)
+    band_numbers = bands.rendered_bands(scene.bands.step_nm)
     by_photons, is_gold = seen_by_gold(
         room,
         [_sun(light, scene, folder) for light in suns],
         eye_rays(camera),
         band_numbers,
-        wanted.photons,
-        wanted.radius_mm,
+        gathering.photons,
+        gathering.radius_mm,
         scene.seed,
         progress,
     )
@@ -81,12 +81,12 @@ def eye_rays(camera: Camera) -> tuple[Array, NDArray[np.float64]]:
 
 def _paths(scene: PlainScene, lights: tuple[PlainLight, ...], camera: Camera, folder: Path) -> Spectral:
     lit = scene.model_copy(update={"lights": lights, "polarisation": False})
-    with opened(lit, folder) as renderer:
+    with open_renderer(lit, folder) as renderer:
         return renderer.render(camera)
 
 
 def _sun(light: Distant, scene: PlainScene, folder: Path) -> Sun:
-    irradiance = scaled(power(light.spectrum, folder), light.illuminance_lux)
+    irradiance = scaled_power(power(light.spectrum, folder), light.illuminance_lux)
     means = bands.around_nodes(irradiance, scene.bands.step_nm)
     return Sun(np.array(unit(light.direction)), light.width_deg, means)
 

@@ -51,7 +51,7 @@ def flame(candle: Candle) -> Array:
     outline = np.sqrt(along) * (1.0 - along)
     radius = 0.5 * candle.flame_width_mm * outline / (np.sqrt(1.0 / 3.0) * 2.0 / 3.0)
     foot = np.add(candle.position_mm, [0.0, 0.0, candle.wax_height_mm + _GAP_MM])
-    body = _turned(radius, candle.flame_height_mm * along)
+    body = _revolved_corners(radius, candle.flame_height_mm * along)
     areas = np.linalg.norm(np.cross(body[:, 1] - body[:, 0], body[:, 2] - body[:, 0]), axis=1)
     return np.asarray(body[areas > 0.0] + foot)
 
@@ -59,7 +59,7 @@ def flame(candle: Candle) -> Array:
 def stem(candle: Candle) -> Array:
     """Corners [n, 3, 3] of the wax, in the scene's frame."""
     radius = 0.5 * candle.wax_diameter_mm
-    side = _turned(np.array([radius, radius]), np.array([0.0, candle.wax_height_mm]))
+    side = _revolved_corners(np.array([radius, radius]), np.array([0.0, candle.wax_height_mm]))
     top = disk(radius, _AROUND, z_mm=candle.wax_height_mm)
     return np.asarray(np.concatenate([side, top]) + np.asarray(candle.position_mm))
 
@@ -70,7 +70,7 @@ def seen_area_mm2(corners_mm: Array) -> float:
     return float(np.hypot(double_areas[:, 0], double_areas[:, 1]).sum() / (2.0 * np.pi))
 
 
-def _turned(radius_mm: Array, z_mm: Array) -> Array:
+def _revolved_corners(radius_mm: Array, z_mm: Array) -> Array:
     """Corners of the surface that an outline [n] makes about the z axis, facing outwards."""
     angle = np.linspace(0.0, 2.0 * np.pi, _AROUND + 1)
     x, y = radius_mm[:, None] * np.cos(angle), radius_mm[:, None] * np.sin(angle)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.shapes.triangles import flat_normals, welded
+from coupole.appearance.shapes.triangles import flat_normals, weld_corners
 from coupole.appearance.spectra.grid import BANDS, Array
 
 Reflectance = Callable[[Array], Array]
@@ -56,9 +56,9 @@ class Photons:
     """[n, 81], W/nm."""
     bounces: NDArray[np.int64]
     """[n], number of reflections at gold."""
-    started: Array
+    started_power: Array
     """[81], W/nm, of all photons together."""
-    escaped: Array
+    escaped_power: Array
     """[81], W/nm, that left the niche again; the remainder was absorbed by gold."""
 
 
@@ -77,13 +77,13 @@ def photons(
         starts = np.stack(
             [random.uniform(left_mm, right_mm, n), np.zeros(n), random.uniform(0.0, top_mm, n)], axis=1
         )
-        ways = blurred(sun, random, n)
+        ways = sun_directions(sun, random, n)
         # Sampled uniformly over the sun's disk; the weight is the opening's projected area for each direction.
         shares = np.maximum(0.0, ways[:, 1]) / (ways @ sun.direction)
         power = (shares[:, None] * facing).astype(np.float32)
         started_power += power.sum(axis=0, dtype=float)
         # Start slightly outside, so that the wall around the opening can stop them.
-        part, lost_power = _traced(ray_tracer, starts - ways, ways, power, random)
+        part, lost_power = _trace_photons(ray_tracer, starts - ways, ways, power, random)
         parts.append(part)
         escaped_power += lost_power
     places, powers, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -91,21 +91,21 @@ def photons(
 
 
 def irradiance(
-    found: Photons, width_mm: tuple[float, float], height_mm: float, cell_mm: float, y_mm: float
+    stopped_photons: Photons, width_mm: tuple[float, float], height_mm: float, cell_mm: float, y_mm: float
 ) -> Array:
     """[rows, columns, 81] W/(m^2 nm) on the plane y = `y_mm`: x over `width_mm`, z from 0 to `height_mm`, top
     first."""
     from scipy.sparse import csr_matrix
 
     columns, rows = round((width_mm[1] - width_mm[0]) / cell_mm), round(height_mm / cell_mm)
-    place = np.floor((found.places_mm[:, [0, 2]] - [width_mm[0], 0.0]) / cell_mm).astype(int)
-    inside = (np.abs(found.places_mm[:, 1] - y_mm) < 0.5) & np.all(
+    place = np.floor((stopped_photons.places_mm[:, [0, 2]] - [width_mm[0], 0.0]) / cell_mm).astype(int)
+    inside = (np.abs(stopped_photons.places_mm[:, 1] - y_mm) < 0.5) & np.all(
         (place >= 0) & (place < [columns, rows]), axis=1
     )
     cell = (rows - 1 - place[inside, 1]) * columns + place[inside, 0]
     here = np.flatnonzero(inside)
     gather = csr_matrix((np.ones(len(here), np.float32), (cell, here)), (rows * columns, len(inside)))
-    total = np.asarray(gather @ found.power, dtype=float)
+    total = np.asarray(gather @ stopped_photons.power, dtype=float)
     return total.reshape(rows, columns, BANDS) / (cell_mm**2 * 1e-6)
 
 
@@ -137,20 +137,20 @@ class _Met:
 
 def smooth_normals(corners_mm: Array) -> Array:
     """[triangles, 3, 3] unit normals at the corners [triangles, 3, 3]: means over triangles that share them."""
-    points, faces = welded(corners_mm)
+    points, faces = weld_corners(corners_mm)
     sums = np.zeros_like(points)
     np.add.at(sums, faces.ravel(), np.repeat(flat_normals(corners_mm), 3, axis=0))
     return np.asarray((sums / np.linalg.norm(sums, axis=1, keepdims=True))[faces])
 
 
-def _traced(
-    met: _Met, starts: Array, ways: Array, power: NDArray[np.float32], random: np.random.Generator
+def _trace_photons(
+    intersector: _Met, starts: Array, ways: Array, power: NDArray[np.float32], random: np.random.Generator
 ) -> tuple[tuple[Array, NDArray[np.float32], NDArray[np.int64]], Array]:
     places, powers, bounces = [], [], []
     escaped_power = np.zeros(BANDS)
-    gold_count = len(met.niche.gilded_mm)
+    gold_count = len(intersector.niche.gilded_mm)
     for bounce in range(_MOST_BOUNCES):
-        triangle, distance, normals = met.first(starts, ways)
+        triangle, distance, normals = intersector.first(starts, ways)
         here = starts + distance[:, None] * ways
         escaped_power += power[triangle < 0].sum(axis=0, dtype=float)
         stone, gold = triangle >= gold_count, (triangle >= 0) & (triangle < gold_count)
@@ -160,14 +160,16 @@ def _traced(
         if not gold.any():
             break
         facing = np.where(np.sum(normals[gold] * ways[gold], axis=1) > 0.0, -1.0, 1.0)[:, None] * normals[gold]
-        new_ways, share = reflected(ways[gold], facing, met.niche.reflectance, met.niche.roughness, random)
+        new_ways, share = reflect_at_gold(
+            ways[gold], facing, intersector.niche.reflectance, intersector.niche.roughness, random
+        )
         alive = np.sum(new_ways * facing, axis=1) > 0.0
         power = (power[gold] * share)[alive].astype(np.float32)
         starts, ways = (here[gold] + _OFFSET_MM * facing)[alive], new_ways[alive]
     return (np.concatenate(places), np.concatenate(powers), np.concatenate(bounces)), escaped_power
 
 
-def reflected(
+def reflect_at_gold(
     ways: Array, normals: Array, reflectance: Reflectance, roughness: float, random: np.random.Generator
 ) -> tuple[Array, Array]:
     """Directions [n, 3] after reflection at gold, and reflectances [n, 81]."""
@@ -178,7 +180,7 @@ def reflected(
     new_ways = ways + 2.0 * cosines[:, None] * facets
     share = reflectance(cosines)
     if roughness > 0.0:
-        share = share * _unmasked(np.sum(new_ways * normals, axis=1), roughness)[:, None]
+        share = share * _unmasked_share(np.sum(new_ways * normals, axis=1), roughness)[:, None]
     return new_ways, share
 
 
@@ -207,13 +209,13 @@ def _facets(towards: Array, normals: Array, alpha: float, random: np.random.Gene
     return np.asarray(h[:, :1] * t1 + h[:, 1:2] * t2 + h[:, 2:] * normals)
 
 
-def _unmasked(cosine: Array, alpha: float) -> Array:
+def _unmasked_share(cosine: Array, alpha: float) -> Array:
     """Smith's G1 of GGX: G2/G1 of separable masking."""
     c = np.maximum(cosine, 0.0)
     return np.asarray(2.0 * c / np.maximum(c + np.sqrt(alpha**2 + (1.0 - alpha**2) * c**2), 1e-12))
 
 
-def blurred(sun: Sun, random: np.random.Generator, count: int) -> Array:
+def sun_directions(sun: Sun, random: np.random.Generator, count: int) -> Array:
     """Directions [count, 3] of light from the sun's disk."""
     sine = np.sin(np.radians(sun.width_deg / 2)) * np.sqrt(random.random(count))
     phi = 2.0 * np.pi * random.random(count)

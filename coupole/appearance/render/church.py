@@ -59,20 +59,20 @@ class Church:
 
 def church(size: Size) -> Church:
     half, bay = 0.5 * size.width_mm, size.length_mm / size.bays
-    outline = _pointed(size.width_mm, size.spring_mm)
+    outline = _pointed_arch(size.width_mm, size.spring_mm)
     stone, openings = [_vault(outline, size)], []
     bounds = [-0.5 * size.length_mm + n * bay for n in range(size.bays + 1)]
     for turned_deg, x in ((90.0, -half), (-90.0, half)):
         for y in bounds[:-1]:
             wall, reveal = _wall(bay, size.spring_mm, size)
             place = _upright(turned_deg, [x, y + 0.5 * bay, 0.0])
-            stone.append(_placed(np.concatenate([wall, reveal]), place))
+            stone.append(_place_corners(np.concatenate([wall, reveal]), place))
             openings.append(_opening(place, size))
     stone += [_rib(outline, y, size) for y in bounds]
     for turned_deg, y in ((180.0, -0.5 * size.length_mm), (0.0, 0.5 * size.length_mm)):
         wall, reveal = _wall(size.width_mm, size.spring_mm, size)
         place = _upright(turned_deg, [0.0, y, 0.0])
-        stone.append(_placed(np.concatenate([wall, reveal, _gable(outline)]), place))
+        stone.append(_place_corners(np.concatenate([wall, reveal, _gable(outline)]), place))
         openings.append(_opening(place, size))
     tiles = rectangle(size.width_mm, size.length_mm, _TILES, round(_TILES * size.length_mm / size.width_mm))
     number = np.arange(len(tiles)) // 2
@@ -80,7 +80,7 @@ def church(size: Size) -> Church:
     return Church(np.concatenate(stone), tiles[~dark], tiles[dark], tuple(openings))
 
 
-def _pointed(width_mm: float, spring_mm: float) -> Array:
+def _pointed_arch(width_mm: float, spring_mm: float) -> Array:
     """Points [n, 2] of x and z of a pointed arch from left to right: each half is about the other's springing."""
     angle = np.linspace(0.0, np.pi / 3.0, _ARC + 1)
     right_arc = width_mm * np.stack([np.cos(angle) - 0.5, np.sin(angle)], axis=1)
@@ -92,7 +92,7 @@ def _pointed(width_mm: float, spring_mm: float) -> Array:
 def _wall(width_mm: float, height_mm: float, size: Size) -> tuple[Array, Array]:
     """A wall in y = 0 with one window, seen from -y, and the window's reveal behind it."""
     half, side = 0.5 * size.window_width_mm, 0.5 * width_mm
-    arch = _pointed(size.window_width_mm, size.window_spring_mm)
+    arch = _pointed_arch(size.window_width_mm, size.window_spring_mm)
     sill = size.window_sill_mm
     above = np.stack([arch[:, 0], np.full(len(arch), height_mm)], axis=1)
     low, high = np.array([[-half, 0.0], [half, 0.0]]), np.array([[-half, sill], [half, sill]])
@@ -150,7 +150,7 @@ def _upright(turned_deg: float, at_mm: list[float]) -> Array:
     return pose
 
 
-def _placed(corners_mm: Array, place: Array) -> Array:
+def _place_corners(corners_mm: Array, place: Array) -> Array:
     return np.asarray(corners_mm @ place[:3, :3].T + place[:3, 3])
 
 

@@ -55,7 +55,7 @@ def eye(observer: light.Observer, power: Array, white_power: Array, step_nm: Ste
     return Eye(bands.weights(curves, power, step_nm), white / white[1])
 
 
-def adapted(xyz: Array, white: Array, transform: str) -> Array:
+def adapted_xyz(xyz: Array, white: Array, transform: str) -> Array:
     """Corresponding XYZ [..., 3] under D65 for XYZ under `white` [3] (von Kries adaptation)."""
     if transform == "none":
         return xyz
@@ -64,7 +64,7 @@ def adapted(xyz: Array, white: Array, transform: str) -> Array:
     return np.asarray(xyz @ (np.linalg.inv(cones) @ np.diag(gains) @ cones).T)
 
 
-def displayed(xyz: Array) -> tuple[NDArray[np.uint8], float]:
+def displayed_srgb(xyz: Array) -> tuple[NDArray[np.uint8], float]:
     """sRGB [h, w, 3] of XYZ with white at Y = 1, and the share of pixels outside the gamut.
 
     Pixels that are too bright are scaled down with constant hue; too saturated ones are clipped at 0.

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from coupole.appearance.render.variant import needed
+from coupole.appearance.render.variant import import_extra
 from coupole.appearance.spectra.grid import Array
 
 DENOISED = "denoised by Open Image Denoise"
 
 
-def denoised(xyz: Array) -> Array:
+def denoised_xyz(xyz: Array) -> Array:
     """XYZ [h, w, 3] with less noise. Raises InputError without the library (extra `denoiser`)."""
-    pyoidn = needed("pyoidn", extra="denoiser")
+    pyoidn = import_extra("pyoidn", extra="denoiser")
     level = max(float(xyz.mean()), 1e-30)
     picture = pyoidn.denoise(np.ascontiguousarray(xyz / level, np.float32), hdr=True)
     return np.asarray(picture, dtype=float) * level

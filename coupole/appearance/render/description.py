@@ -18,7 +18,7 @@ from coupole.appearance.render.pieces import Ball, Piece
 from coupole.appearance.render.scene_file import Camera, PlainScene
 from coupole.appearance.render.spectra import Constant
 from coupole.appearance.shapes.solids import unit_sphere
-from coupole.appearance.shapes.triangles import welded
+from coupole.appearance.shapes.triangles import weld_corners
 from coupole.errors import InputError
 
 Filter = float | Literal["circular"]
@@ -43,7 +43,7 @@ def contents(scene: PlainScene, folder: Path, meshes: Path, mi: Any, more: Seque
             material = piece.material
             reach_mm = max(reach_mm, _reach_mm(piece))
             if isinstance(material, Worn | Dusty) and needs_mesh(material):
-                shape = _weathered(piece, material, meshes / f"{name}.ply")
+                shape = _weathered_shape(piece, material, meshes / f"{name}.ply")
             elif isinstance(piece, Ball):
                 shape = {"type": "sphere", "center": piece.centre_mm.tolist(), "radius": piece.radius_mm}
             else:
@@ -87,7 +87,7 @@ def _surface(material: Material | Pane, folder: Path) -> Description:
     return panes.bsdf(material, folder) if isinstance(material, Pane) else bsdf(material, folder)
 
 
-def seen(
+def scene_description(
     scene: PlainScene, camera: Camera, parts: Description, mi: Any, through: Filter | None = None
 ) -> Description:
     """The whole scene, seen by `camera`, optionally through a polariser. Raises InputError."""
@@ -109,7 +109,7 @@ def seen(
     description = {
         "type": "scene",
         "integrator": {
-            "type": _integrator(parts, polarised=scene.polarisation),
+            "type": _integrator(parts, is_polarised=scene.polarisation),
             "max_depth": depth,
             "rr_depth": depth + 1,
         },
@@ -129,7 +129,7 @@ def _inside(material: Material | Pane, folder: Path) -> Description:
     return {"interior": {"type": "homogeneous", "sigma_t": absorption_per_mm, "albedo": 0.0}}
 
 
-def _integrator(parts: Description, *, polarised: bool) -> str:
+def _integrator(parts: Description, *, is_polarised: bool) -> str:
     """Choose the integrator. The one for media weighs a way by all bands of a group, as their absorption may
     differ by far. The one for panes looks for light through panes.
 
@@ -139,7 +139,7 @@ def _integrator(parts: Description, *, polarised: bool) -> str:
     if not any("interior" in part for part in bodies):
         has_panes = any(part.get("bsdf", {}).get("type") == panes.PLUGIN for part in bodies)
         return "volpath" if has_panes else "path"
-    if polarised:
+    if is_polarised:
         raise InputError(
             "polarisation: expected no absorbing body (glass with absorption, nashiji), through which Mitsuba "
             "has no Stokes vectors; leave out either"
@@ -157,7 +157,7 @@ def _filter(camera: Camera, look: Any, through: Filter, mi: Any) -> Description:
     return {"type": "rectangle", "to_world": look @ place, "bsdf": kind}
 
 
-def _weathered(piece: Piece | Ball, material: Weathered, path: Path) -> Description:
+def _weathered_shape(piece: Piece | Ball, material: Weathered, path: Path) -> Description:
     if isinstance(piece, Ball):
         corners_mm, smooth = piece.centre_mm + piece.radius_mm * unit_sphere(_BALL_PARTS), True
     else:
@@ -169,7 +169,7 @@ def _weathered(piece: Piece | Ball, material: Weathered, path: Path) -> Descript
 def _mesh(piece: Piece, path: Path) -> Description:
     import trimesh
 
-    points, faces = welded(piece.corners_mm)
+    points, faces = weld_corners(piece.corners_mm)
     normals = None
     if piece.normals is not None:
         normals = np.empty_like(points)

@@ -91,10 +91,10 @@ def read_map(path: Path, mi: Any) -> Array:
             f"{path}: expected colours within sRGB, found {100 * negative:.1f} % of the pixels negative; "
             "convert the map to linear sRGB"
         )
-    return _reduced(np.maximum(pixels, 0.0))
+    return _reduced_map(np.maximum(pixels, 0.0))
 
 
-def _reduced(pixels: Array) -> Array:
+def _reduced_map(pixels: Array) -> Array:
     height, width = pixels.shape[:2]
     if width <= MOST_COLUMNS:
         return pixels
@@ -132,14 +132,14 @@ def emitter(source: EnvironmentMap, folder: Path, mi: Any) -> Any:
     return mi.load_dict(
         {
             "type": "envmap",
-            "bitmap": mi.Bitmap(_refined(pixels).astype(np.float32)),
+            "bitmap": mi.Bitmap(_refined_map(pixels).astype(np.float32)),
             "scale": source.white_luminance_cd_m2(pixels) / float(luminous(d65)),
             "to_world": _scene_from_map(source.centre_azimuth_deg, mi),
         }
     )
 
 
-def _refined(pixels: Array) -> Array:
+def _refined_map(pixels: Array) -> Array:
     """The map at nodes of Mitsuba's, whose rows go from zenith to nadir, where pixels are half a step from the
     poles.
 

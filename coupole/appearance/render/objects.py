@@ -197,7 +197,7 @@ def pieces(thing: Object, folder: Path) -> list[Piece | Ball]:
     if isinstance(thing, Sphere):
         centre = thing.scene_from_thing() @ [0.0, 0.0, thing.radius_mm, 1.0]
         return [Ball(centre[:3], thing.radius_mm, thing.material)]
-    return [placed(piece, thing) for piece in _local(thing, folder)]
+    return [placed_piece(piece, thing) for piece in _local(thing, folder)]
 
 
 def _local(thing: LocalObject, folder: Path) -> list[Piece]:
@@ -228,7 +228,7 @@ def _local(thing: LocalObject, folder: Path) -> list[Piece]:
             parts = arcature.arcature(thing.radius_mm, thing.height_mm, thing.depth_mm)
             return [Piece(parts.gilded_mm, thing.gilt, smooth=True), Piece(parts.stone_mm, thing.stone)]
         case StainedGlass():
-            return _glazed(thing, thing.lead, thing.width_mm, thing.height_mm)
+            return _glazed_window(thing, thing.lead, thing.width_mm, thing.height_mm)
         case Church():
             return _church(thing)
         case _:
@@ -245,12 +245,12 @@ def _church(thing: Church) -> list[Piece]:
     ]
     for opening in parts.openings if thing.glazing else ():
         assert thing.glazing is not None
-        window_pieces = _glazed(thing.glazing, thing.lead, opening.width_mm, opening.height_mm)
-        pieces += [_moved(piece, opening.church_from_window) for piece in window_pieces]
+        window_pieces = _glazed_window(thing.glazing, thing.lead, opening.width_mm, opening.height_mm)
+        pieces += [_moved_piece(piece, opening.church_from_window) for piece in window_pieces]
     return pieces
 
 
-def _glazed(glazing: Glazing, lead: Material, width_mm: float, height_mm: float) -> list[Piece]:
+def _glazed_window(glazing: Glazing, lead: Material, width_mm: float, height_mm: float) -> list[Piece]:
     panes, cames = window(glazing, width_mm, height_mm)
     glass = [Piece(corners, Pane(colour=glazing.panes[letter])) for letter, corners in panes.items()]
     return [*glass, Piece(cames, lead)]
@@ -316,12 +316,12 @@ def _clear(width: float, length: float, thickness_mm: float, rim_mm: float) -> P
     return Piece(box + lift, Glass(kind="glass", index=indices.URUSHI, absorption=Urushi(kind="urushi")))
 
 
-def placed(piece: Piece, pose: Pose) -> Piece:
+def placed_piece(piece: Piece, pose: Pose) -> Piece:
     """A piece of a thing's own frame, in the scene's."""
-    return _moved(piece, pose.scene_from_thing())
+    return _moved_piece(piece, pose.scene_from_thing())
 
 
-def _moved(piece: Piece, place: Array) -> Piece:
+def _moved_piece(piece: Piece, place: Array) -> Piece:
     rotation = place[:3, :3]
     corners: NDArray[np.float64] = piece.corners_mm @ rotation.T + place[:3, 3]
     normals = None if piece.normals is None else np.asarray(piece.normals @ rotation.T)

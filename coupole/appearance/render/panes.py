@@ -96,11 +96,11 @@ def passage(pane: Pane, folder: Path) -> Array:
     path = folder / colour.path
     if isinstance(colour, Absorbed):
         spectrum = measured.read_spectrum(path, unit="power", column=colour.column)
-        per_mm = resampling.held(resampling.on_grid(spectrum))
+        per_mm = resampling.fill_missing(resampling.on_grid(spectrum))
         if per_mm.min() < 0.0:
             raise InputError(f"{path}: expected 0 or more per mm, found {per_mm.min():.3g}; correct it")
         return np.asarray(np.exp(-per_mm * colour.thickness_mm))
-    through = resampling.held(resampling.on_grid(measured.read_spectrum(path, column=colour.column)))
+    through = resampling.fill_missing(resampling.on_grid(measured.read_spectrum(path, column=colour.column)))
     most = float(sheet(np.ones(1), _face(pane))[1][0])
     if through.min() < 0.0 or through.max() > most + 0.01:
         raise InputError(
@@ -110,11 +110,11 @@ def passage(pane: Pane, folder: Path) -> Array:
     return _inside(np.clip(through, 0.0, most), _face(pane))
 
 
-def sheet(left: Array, face: float) -> tuple[Array, Array]:
-    """Reflectance and transmittance of a sheet that leaves `left` of light on each way, and whose faces reflect
-    `face`: the sums over all reflections between them."""
-    through = (1.0 - face) ** 2 * left / (1.0 - (face * left) ** 2)
-    return np.asarray(face + face * left * through), np.asarray(through)
+def sheet(internal_transmittance: Array, face: float) -> tuple[Array, Array]:
+    """Reflectance and transmittance of a sheet that leaves `internal_transmittance` of light on each way, and
+    whose faces reflect `face`: the sums over all reflections between them."""
+    through = (1.0 - face) ** 2 * internal_transmittance / (1.0 - (face * internal_transmittance) ** 2)
+    return np.asarray(face + face * internal_transmittance * through), np.asarray(through)
 
 
 def _inside(through: Array, face: float) -> Array:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.render.caustic import Reflectance, Sun, blurred, reflected, smooth_normals
+from coupole.appearance.render.caustic import Reflectance, Sun, reflect_at_gold, smooth_normals, sun_directions
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra.grid import Array
 
@@ -124,12 +124,14 @@ def photons(room: Room, sun: Sun, bands: Sequence[int], count: int, seed: tuple[
         n = min(_CHUNK, count - first)
         out, turn = radius_mm * np.sqrt(random.random(n)), 2.0 * np.pi * random.random(n)
         across = (out * np.cos(turn))[:, None] * right + (out * np.sin(turn))[:, None] * above
-        ways = blurred(sun, random, n)
+        ways = sun_directions(sun, random, n)
         starts = middle + across - 10.0 * radius_mm * ways
-        yield _traced(room, starts, ways, np.tile(photon_power.astype(np.float32), (n, 1)), list(bands), random)
+        yield _trace_photons(
+            room, starts, ways, np.tile(photon_power.astype(np.float32), (n, 1)), list(bands), random
+        )
 
 
-def _traced(
+def _trace_photons(
     room: Room,
     starts: Array,
     ways: Array,
@@ -150,9 +152,11 @@ def _traced(
             if isinstance(surface, Matt):
                 stays = here & by_gold
                 deposits.append((hits.places_mm[stays], hits.normals[stays], power[stays]))
-                new_ways, share = _scattered(normals, surface.reflectance[bands], random)
+                new_ways, share = _scatter_diffusely(normals, surface.reflectance[bands], random)
             else:
-                new_ways, share = reflected(ways[here], normals, surface.reflectance, surface.roughness, random)
+                new_ways, share = reflect_at_gold(
+                    ways[here], normals, surface.reflectance, surface.roughness, random
+                )
                 share = share[:, bands]
             alive = (np.sum(new_ways * normals, axis=1) > 0.0) & share.any(axis=1)
             onward_power = (power[here] * share)[alive].astype(np.float32)
@@ -169,7 +173,7 @@ def _traced(
     return Kept(places, normals, powers)
 
 
-def _scattered(normals: Array, reflectance: Array, random: np.random.Generator) -> tuple[Array, Array]:
+def _scatter_diffusely(normals: Array, reflectance: Array, random: np.random.Generator) -> tuple[Array, Array]:
     """Lambert's directions [n, 3], and shares [n, bands]: 0 for those that Russian roulette ends."""
     n, lives = len(normals), float(min(1.0, max(reflectance.max(), 0.0)))
     ball = random.normal(size=(n, 3))
@@ -190,20 +194,20 @@ class Gathering:
         self._radius_mm = radius_mm
         self._sums = np.zeros((len(self._normals), bands), np.float32)
 
-    def add(self, found: Kept) -> None:
+    def add(self, kept_photons: Kept) -> None:
         from scipy.sparse import csr_matrix
         from scipy.spatial import cKDTree
 
-        if not len(found.places_mm):
+        if not len(kept_photons.places_mm):
             return
         near = self._tree.sparse_distance_matrix(
-            cKDTree(found.places_mm), self._radius_mm, output_type="coo_matrix"
+            cKDTree(kept_photons.places_mm), self._radius_mm, output_type="coo_matrix"
         )
-        same = np.sum(self._normals[near.row] * found.normals[near.col], axis=1) > _SAME_SIDE
+        same = np.sum(self._normals[near.row] * kept_photons.normals[near.col], axis=1) > _SAME_SIDE
         weights = csr_matrix(
             (np.ones(int(same.sum()), np.float32), (near.row[same], near.col[same])), shape=near.shape
         )
-        self._sums += weights @ found.power
+        self._sums += weights @ kept_photons.power
 
     def irradiance(self) -> Array:
         """[matt hits, bands], W/(m^2 nm)."""

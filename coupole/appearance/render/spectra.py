@@ -149,7 +149,7 @@ def internal(spectrum: Reflectance, folder: Path, index: ArrayLike) -> InternalR
         return typical.reflectance(spectrum.name)
     if isinstance(spectrum, Bole):
         return typical.bole()
-    measured_reflectance = _measured(spectrum, folder)
+    measured_reflectance = _measured_reflectance(spectrum, folder)
     if spectrum.sample == "bare":
         return BARE.inside(measured_reflectance)
     try:
@@ -171,12 +171,12 @@ def coefficients(paint: MeasuredPaint, folder: Path, *, needs_mm: bool) -> Pigme
 
 def matt(spectrum: Reflectance, folder: Path) -> MeasuredReflectance:
     """[81], of something without a face. Raises InputError."""
-    return BARE.seen(internal(spectrum, folder, 1.0))
+    return BARE.reflectance_in_air(internal(spectrum, folder, 1.0))
 
 
-def _measured(spectrum: Measured, folder: Path) -> MeasuredReflectance:
+def _measured_reflectance(spectrum: Measured, folder: Path) -> MeasuredReflectance:
     path = folder / spectrum.path
-    values = resampling.held(resampling.on_grid(measured.read_spectrum(path, column=spectrum.column)))
+    values = resampling.fill_missing(resampling.on_grid(measured.read_spectrum(path, column=spectrum.column)))
     if values.min() < -0.02 or values.max() > 1.02:
         raise InputError(
             f"{path}: expected reflectances from 0 to 1, found {values.min():.3g} to {values.max():.3g}; "
@@ -200,7 +200,7 @@ def power(spectrum: Power, folder: Path) -> Array:
     if isinstance(spectrum, Values):
         return np.array(spectrum.values)
     measured_power = measured.read_spectrum(folder / spectrum.path, unit="power", column=spectrum.column)
-    return np.maximum(resampling.held(resampling.on_grid(measured_power)), 0.0)
+    return np.maximum(resampling.fill_missing(resampling.on_grid(measured_power)), 0.0)
 
 
 def luminous(spectral: Array) -> Array:
@@ -208,7 +208,7 @@ def luminous(spectral: Array) -> Array:
     return np.asarray(LM_PER_W * STEP_NM * (spectral @ light.observer("2 deg")[1]))
 
 
-def scaled(relative: Array, photometric: float) -> Array:
+def scaled_power(relative: Array, photometric: float) -> Array:
     """Spectral power per nm [81] of the shape `relative` whose photometric amount is `photometric`."""
     return np.asarray(relative * (photometric / luminous(relative)))
 

@@ -28,7 +28,7 @@ class Glazing(Model):
     """Width of the lead between panes, half of it around."""
 
     @model_validator(mode="after")
-    def _known(self) -> Glazing:
+    def _check_layout(self) -> Glazing:
         if len({len(row) for row in self.layout}) > 1:
             raise ValueError("the rows of `layout` differ in length: give each as many letters")
         if missing := sorted({*"".join(self.layout)} - {*self.panes, OPEN}):

@@ -12,7 +12,7 @@ from typing import Any
 
 from coupole.appearance.render import by_gold, pictures, variant, wall
 from coupole.appearance.render.film import write_film
-from coupole.appearance.render.rendering import Renderer, Spectral, opened
+from coupole.appearance.render.rendering import Renderer, Spectral, open_renderer
 from coupole.appearance.render.scene_file import Camera, Scene, remarks
 from coupole.appearance.render.spectra import power
 from coupole.intake.plain_data import read_json
@@ -21,7 +21,7 @@ Progress = Callable[[str, int, int], None]
 """Camera, passes done, passes in all."""
 
 
-def reduced(
+def reduced_scene(
     scene: Scene,
     *,
     samples: int | None = None,
@@ -30,7 +30,7 @@ def reduced(
     noise: float | None = None,
 ) -> Scene:
     """The scene with fewer samples, narrower pictures or coarser bands, for a quick look."""
-    cameras = [camera.narrowed(width_px) if width_px else camera for camera in scene.cameras]
+    cameras = [camera.narrowed_to(width_px) if width_px else camera for camera in scene.cameras]
     fields = {**scene.model_dump(mode="json"), "cameras": [camera.model_dump() for camera in cameras]}
     if samples:
         fields["samples"] = samples
@@ -43,7 +43,7 @@ def reduced(
 
 def variant_of(scene: Scene) -> str:
     """Mitsuba's variant for rendering."""
-    return variant.spectral(polarised=scene.polarisation)
+    return variant.spectral(is_polarised=scene.polarisation)
 
 
 def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
@@ -67,12 +67,12 @@ def render(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[st
 
 
 def _still(scene: Scene, folder: Path, out: Path, progress: Progress) -> dict[str, Any]:
-    with opened(scene, folder) as renderer:
+    with open_renderer(scene, folder) as renderer:
         eye = pictures.eye_of(renderer.scene, folder)
         written_by = _written_by(renderer)
         summaries = {}
         for camera in scene.cameras:
-            spectral = _seen(renderer, camera, folder, partial(progress, camera.name))
+            spectral = _render_view(renderer, camera, folder, partial(progress, camera.name))
             stem = out / f"{scene.name}-{camera.name}"
             summaries[camera.name] = pictures.write(renderer.scene, spectral, stem, eye=eye, written_by=written_by)
         summary: dict[str, Any] = {"renderer": written_by, "cameras": summaries}
@@ -91,7 +91,7 @@ class _Moves:
 
     steps: Sequence[Callable[[Scene], Scene]]
     frames_per_s: int
-    told: str
+    description: str
 
 
 def _moves(scene: Scene) -> _Moves | None:
@@ -127,7 +127,7 @@ def _film(scene: Scene, moves: _Moves, folder: Path, out: Path, progress: Progre
                 still_scene = still_scene.model_copy(update={"display": display})
         progress(camera.name, count, count)
         path = out / f"{scene.name}-{camera.name}.mp4"
-        comment = f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {moves.told}"
+        comment = f"{scene.name}: {pictures.SYNTHETIC}; {written_by}; {moves.description}"
         write_film(
             [frames / summary["files"]["png"] for summary in frame_summaries], path, moves.frames_per_s, comment
         )
@@ -148,8 +148,8 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
         old_summary: dict[str, Any] = read_json(summary_path, allow_nan=True)
         if old_summary["of"] == digest:
             return old_summary
-    with opened(scene, folder) as renderer:
-        spectral = _seen(renderer, scene.cameras[0], folder, lambda done, total: None)
+    with open_renderer(scene, folder) as renderer:
+        spectral = _render_view(renderer, scene.cameras[0], folder, lambda done, total: None)
         eye = pictures.eye_of(renderer.scene, folder)
         written_by = _written_by(renderer)
         picture_summary = pictures.write(
@@ -160,7 +160,9 @@ def _frame(scene: Scene, folder: Path, stem: Path) -> dict[str, Any]:
     return summary
 
 
-def _seen(renderer: Renderer, camera: Camera, folder: Path, progress: Callable[[int, int], None]) -> Spectral:
+def _render_view(
+    renderer: Renderer, camera: Camera, folder: Path, progress: Callable[[int, int], None]
+) -> Spectral:
     gathering = renderer.scene.gathered
     if gathering is None:
         return renderer.render(camera, progress)

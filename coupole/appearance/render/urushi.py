@@ -18,7 +18,7 @@ from coupole.appearance.render.pieces import Piece
 from coupole.appearance.render.spectra import Constant
 from coupole.appearance.shapes import sprinkled, turned
 from coupole.appearance.shapes.mesh_file import mesh_and_uv, mesh_corners
-from coupole.appearance.shapes.skin import grown, scattered, skin_of
+from coupole.appearance.shapes.skin import grown, scatter_points, skin_of
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -112,7 +112,7 @@ def body_corners(body: Body, folder: Path) -> Array:
     """[n, 3, 3] in mm; paths are relative to `folder`. Raises InputError."""
     match body:
         case Turned():
-            return turned.turned(body.profile_mm)
+            return turned.turned_body(body.profile_mm)
         case Box():
             return turned.rounded_box(body.size_mm, body.edge_mm)
         case MeshBody():
@@ -139,7 +139,7 @@ def makie_grains(thing: Makie, folder: Path) -> sprinkled.Grains:
             "make them coarser"
         )
     return sprinkled.grains(
-        corners, uv, parts, _drawing(thing, folder), wrapped=thing.wrapped, raised_mm=thing.raised_mm
+        corners, uv, parts, _drawing(thing, folder), wrapping=thing.wrapped, raised_mm=thing.raised_mm
     )
 
 
@@ -182,9 +182,9 @@ def nashiji_pieces(thing: Nashiji, folder: Path) -> list[Piece]:
             flattens=True,
         )
     )
-    places, frames = scattered(middle, len(flat.centres_mm), np.random.default_rng(thing.seed))
+    places, frames = scatter_points(middle, len(flat.centres_mm), np.random.default_rng(thing.seed))
     tops = places + (0.5 * thing.depth_mm - _CLEAR_MM) * frames[:, :, 2]
-    points, faces = nashiji.triangulate(nashiji.settled(flat, tops, frames), around=8, along=2)
+    points, faces = nashiji.triangulate(nashiji.settle_flakes(flat, tops, frames), around=8, along=2)
     gold = thing.metal.model_copy(update={"depth_mm": 0.0, "face": False})
     clear = Glass(kind="glass", index=indices.URUSHI, absorption=thing.absorption)
     return [

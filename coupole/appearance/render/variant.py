@@ -17,12 +17,12 @@ LEAST_LLVM = 19
 
 def mitsuba(variant: str) -> Any:
     """The module, set to `variant`. Raises InputError if it is not installed."""
-    module = needed("mitsuba")
+    module = import_extra("mitsuba")
     module.set_variant(variant)
     return module
 
 
-def loaded(mi: Any, description: Any) -> Any:
+def load_scene(mi: Any, description: Any) -> Any:
     """Mitsuba's scene of a description, with lights in the given order.
 
     With parallel loading or merging of equal parts, the order of lights varies and with it their random numbers.
@@ -30,7 +30,7 @@ def loaded(mi: Any, description: Any) -> Any:
     return mi.load_dict(description, parallel=False, optimize=False)
 
 
-def needed(name: str, extra: str = "mitsuba,materials") -> Any:
+def import_extra(name: str, extra: str = "mitsuba,materials") -> Any:
     """An optional module. Raises InputError if it is not installed, with the extra that has it."""
     try:
         return importlib.import_module(name)
@@ -40,14 +40,14 @@ def needed(name: str, extra: str = "mitsuba,materials") -> Any:
         ) from error
 
 
-def spectral(*, polarised: bool) -> str:
+def spectral(*, is_polarised: bool) -> str:
     """Name of the spectral variant: LLVM if a suitable library is found, otherwise scalar."""
     library = os.environ.get("DRJIT_LIBLLVM_PATH") or ctypes.util.find_library("LLVM") or ""
     kind = "scalar"
     if llvm_version(library) >= LEAST_LLVM:
         kind = "llvm_ad"
         os.environ["DRJIT_LIBLLVM_PATH"] = library  # Dr.Jit's own search might find another library
-    return f"{kind}_spectral_polarized" if polarised else f"{kind}_spectral"
+    return f"{kind}_spectral_polarized" if is_polarised else f"{kind}_spectral"
 
 
 def llvm_version(library: str) -> int:

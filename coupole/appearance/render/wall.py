@@ -16,7 +16,7 @@ from coupole.appearance.render.model import unit
 from coupole.appearance.render.objects import Arcature
 from coupole.appearance.render.pictures import SYNTHETIC, write_png
 from coupole.appearance.render.scene_file import Caustic, PlainScene
-from coupole.appearance.render.spectra import luminous, power, scaled
+from coupole.appearance.render.spectra import luminous, power, scaled_power
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -39,7 +39,7 @@ def write_wall(
     eye = colour.eye(scene.observer, sun.irradiance, white_power, 5)
     xyz = eye.tristimulus(lit / np.pi)
     brightest = float(np.quantile(xyz[..., 1], 0.995))
-    picture, _ = colour.displayed(colour.adapted(xyz / brightest, eye.white, scene.display.adaptation))
+    picture, _ = colour.displayed_srgb(colour.adapted_xyz(xyz / brightest, eye.white, scene.display.adaptation))
     about = f"{scene.name}, light on the back wall: {SYNTHETIC}; {scene.caustic.photons} photons"
     write_png(stem.with_suffix(".png"), picture, about)
     return {
@@ -52,7 +52,7 @@ def write_wall(
 
 
 def _lit(
-    wanted: Caustic,
+    settings: Caustic,
     seed: int,
     thing: Arcature,
     niche: caustic.Niche,
@@ -64,16 +64,16 @@ def _lit(
     In parts, as a photon takes 324 bytes.
     """
     sides, top_mm = (-thing.radius_mm, thing.radius_mm), thing.height_mm + thing.radius_mm
-    counts = [min(_PART, wanted.photons - first) for first in range(0, wanted.photons, _PART)]
+    counts = [min(_PART, settings.photons - first) for first in range(0, settings.photons, _PART)]
     lit: Array | float = 0.0
     by_gold = 0.0
     for part, count in enumerate(counts):
         progress(part, len(counts))
-        weight = count / wanted.photons
+        weight = count / settings.photons
         photons = caustic.photons(niche, sun, (*sides, top_mm), count, (seed, part))
-        lit = lit + weight * caustic.irradiance(photons, sides, top_mm, wanted.cell_mm, thing.depth_mm)
+        lit = lit + weight * caustic.irradiance(photons, sides, top_mm, settings.cell_mm, thing.depth_mm)
         on_stone = luminous(photons.power[photons.bounces > 0].sum(axis=0, dtype=float))
-        by_gold += weight * float(on_stone / luminous(photons.started))
+        by_gold += weight * float(on_stone / luminous(photons.started_power))
     progress(len(counts), len(counts))
     return np.asarray(lit), by_gold
 
@@ -92,7 +92,9 @@ def _sun(light: Distant, thing: Arcature, folder: Path, scene_name: str) -> caus
             f"{scene_name}: expected a sun that shines into the arcature, found it behind the wall; "
             "turn one of them"
         )
-    return caustic.Sun(direction, light.width_deg, scaled(power(light.spectrum, folder), light.illuminance_lux))
+    return caustic.Sun(
+        direction, light.width_deg, scaled_power(power(light.spectrum, folder), light.illuminance_lux)
+    )
 
 
 def _niche(thing: Arcature, folder: Path) -> caustic.Niche:

@@ -18,7 +18,7 @@ from coupole.appearance.render.materials.weathering import (
 )
 from coupole.appearance.shapes import solid_masks
 from coupole.appearance.shapes.solid_masks import Divided
-from coupole.appearance.shapes.triangles import flat_normals, welded
+from coupole.appearance.shapes.triangles import flat_normals, weld_corners
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 
@@ -31,21 +31,21 @@ _MOST_OFF = 0.01
 
 def write(corners_mm: Array, material: Weathered, path: Path, *, smooth: bool) -> None:
     """Triangles [n, 3, 3] as a PLY file for Mitsuba. Raises InputError for a share that it cannot have."""
-    mesh = weathered(corners_mm, material, smooth=smooth)
+    mesh = weathered_triangles(corners_mm, material, smooth=smooth)
     numbers = {WORN: np.repeat(mesh.off.astype(float), 3)}
     if isinstance(material, Dusty):
-        numbers[DUSTY] = material.covered(mesh.normals[..., 2].ravel())
+        numbers[DUSTY] = material.covered_share(mesh.normals[..., 2].ravel())
     _write_ply(mesh, numbers, path)
 
 
-def weathered(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divided:
+def weathered_triangles(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divided:
     """Triangles, divided as the pattern needs, with its mask. Raises InputError."""
     normals = _corner_normals(corners_mm, smooth=smooth)
     wear = material.over if isinstance(material, Dusty) else material
     if not isinstance(wear, Worn) or isinstance(wear.pattern, Uniform):
         return Divided(corners_mm, normals, np.zeros(len(corners_mm), bool))
     pattern, share = wear.pattern, wear.share
-    points, ways = solid_masks.spread(corners_mm, normals, pattern.seed)
+    points, ways = solid_masks.spread_points(corners_mm, normals, pattern.seed)
     if isinstance(pattern, Cracks):
         field = solid_masks.cracks(points, pattern.cell_mm, pattern.seed)
     else:
@@ -57,7 +57,7 @@ def weathered(corners_mm: Array, material: Weathered, *, smooth: bool) -> Divide
     else:
         level_mm = solid_masks.level_of(field, share, points, ways)
     finest_mm = pattern.reach_mm / _FINE_EDGE if isinstance(pattern, Edges) else 2.0 * level_mm / _FINE
-    mesh = solid_masks.divided(corners_mm, normals, field, level_mm, max(finest_mm, 1e-4), share)
+    mesh = solid_masks.divide_triangles(corners_mm, normals, field, level_mm, max(finest_mm, 1e-4), share)
     if share is not None and abs(mesh.share - share) > _MOST_OFF:
         raise InputError(
             f"worn: expected a share of {share:g} by {pattern.kind}, found {mesh.share:.3f} on this surface; take "
@@ -71,7 +71,7 @@ def _corner_normals(corners_mm: Array, *, smooth: bool) -> Array:
     flat = flat_normals(corners_mm)
     if not smooth:
         return np.repeat(flat[:, None], 3, axis=1)
-    points, faces = welded(corners_mm)
+    points, faces = weld_corners(corners_mm)
     across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     total = np.zeros_like(points)
     for corner in range(3):
@@ -80,13 +80,13 @@ def _corner_normals(corners_mm: Array, *, smooth: bool) -> Array:
     return np.asarray(total[faces])
 
 
-def _write_ply(made: Divided, numbers: dict[str, Array], path: Path) -> None:
+def _write_ply(divided_mesh: Divided, numbers: dict[str, Array], path: Path) -> None:
     """Binary, three vertices for each triangle; Mitsuba names a number `worn_0` of vertices `vertex_worn`."""
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"{name}_0" for name in numbers)]
-    columns = [made.corners_mm.reshape(-1, 3), made.normals.reshape(-1, 3)]
+    columns = [divided_mesh.corners_mm.reshape(-1, 3), divided_mesh.normals.reshape(-1, 3)]
     vertices = np.concatenate([*columns, *(column[:, None] for column in numbers.values())], axis=1).astype("<f4")
-    faces = np.empty(len(made.off), [("count", "u1"), ("rows", "<i4", 3)])
-    faces["count"], faces["rows"] = 3, np.arange(3 * len(made.off)).reshape(-1, 3)
+    faces = np.empty(len(divided_mesh.off), [("count", "u1"), ("rows", "<i4", 3)])
+    faces["count"], faces["rows"] = 3, np.arange(3 * len(divided_mesh.off)).reshape(-1, 3)
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     head += [*(f"property float {name}" for name in names), f"element face {len(faces)}"]
     head += ["property list uchar int vertex_indices", "end_header", ""]

@@ -15,7 +15,7 @@ _UNIT_MM = {"mm": 1.0, "m": 1000.0, "um": 1e-3}
 
 def mesh_corners(path: Path, unit: str) -> Array:
     """Corners [triangles, 3, 3] in mm of any mesh that trimesh reads; no vertex is merged. Raises InputError."""
-    mesh = _read(path)
+    mesh = _load_mesh(path)
     corners: Array = np.asarray(mesh.vertices)[np.asarray(mesh.faces)] * _UNIT_MM[unit]
     return corners
 
@@ -23,7 +23,7 @@ def mesh_corners(path: Path, unit: str) -> Array:
 def mesh_and_uv(path: Path, unit: str) -> tuple[Array, Array]:
     """Return corners as `mesh_corners` does, and their texture coordinates [triangles, 3, 2]. Raises
     InputError."""
-    mesh = _read(path)
+    mesh = _load_mesh(path)
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or len(uv) != len(mesh.vertices):
         raise InputError(f"{path}: expected a mesh with texture coordinates (OBJ, glTF); found none")
@@ -31,7 +31,7 @@ def mesh_and_uv(path: Path, unit: str) -> tuple[Array, Array]:
     return np.asarray(mesh.vertices)[faces] * _UNIT_MM[unit], np.asarray(uv, dtype=float)[faces]
 
 
-def _read(path: Path) -> Any:
+def _load_mesh(path: Path) -> Any:
     import trimesh
 
     try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.appearance.shapes.triangles import Array, flat_normals, welded
+from coupole.appearance.shapes.triangles import Array, flat_normals, weld_corners
 from coupole.errors import InputError
 
 
@@ -36,7 +36,7 @@ class Skin:
 def skin_of(corners_mm: Array) -> Skin:
     """Return the skin of corners [m, 3, 3]; a point's normal is the mean of its triangles' by their angles
     (Thuermer 1998)."""
-    points, faces = welded(corners_mm)
+    points, faces = weld_corners(corners_mm)
     sides = corners_mm[:, [1, 2, 0]] - corners_mm
     length = np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-300)
     unit = sides / length
@@ -61,7 +61,7 @@ def grown(skin: Skin, by_mm: float) -> Skin:
     return grown_skin
 
 
-def scattered(skin: Skin, count: int, random: np.random.Generator) -> tuple[Array, Array]:
+def scatter_points(skin: Skin, count: int, random: np.random.Generator) -> tuple[Array, Array]:
     """`count` points [count, 3], evenly by area, and the frames [count, 3, 3] there: normals are the third
     columns, the first ones lie anywhere in the surface."""
     areas = skin.areas_mm2()

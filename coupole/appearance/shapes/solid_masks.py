@@ -80,7 +80,7 @@ def edges(points_mm: Array, normals: Array, reach_mm: float) -> Field:
     return depth
 
 
-def spread(corners_mm: Array, normals: Array, seed: int, count: int = SAMPLES) -> tuple[Array, Array]:
+def spread_points(corners_mm: Array, normals: Array, seed: int, count: int = SAMPLES) -> tuple[Array, Array]:
     """Points [n, 3] spread evenly over the area of triangles, and their normals."""
     random = np.random.default_rng(seed)
     areas = _areas(corners_mm)
@@ -95,7 +95,7 @@ def level_of(field: Field, share: float, points_mm: Array, normals: Array) -> fl
     return float(np.quantile(field(points_mm, normals), share))
 
 
-def divided(
+def divide_triangles(
     corners_mm: Array, normals: Array, field: Field, level_mm: float, finest_mm: float, share: float | None = None
 ) -> Divided:
     """Triangles halved along their longest edges where the level may cross them, to edges of `finest_mm`.
@@ -120,7 +120,7 @@ def divided(
                 "take larger cells, wider cracks or a smaller object"
             )
         edge = sides[again].argmax(axis=1)
-        corners, ways = _halved(corners[again], edge), _halved(ways[again], edge)
+        corners, ways = _halved_triangles(corners[again], edge), _halved_triangles(ways[again], edge)
     corners = np.concatenate([part for part, _ in finished_parts])
     ways = _unit(np.concatenate([part for _, part in finished_parts]))
     values = field(corners.mean(axis=1), _unit(ways.mean(axis=1)))
@@ -131,7 +131,7 @@ def divided(
     return Divided(corners, ways, values < level_mm)
 
 
-def _halved(corners: Array, edge: NDArray[np.int64]) -> Array:
+def _halved_triangles(corners: Array, edge: NDArray[np.int64]) -> Array:
     """[2n, 3, 3] of [n, 3, 3], by the middle of the edge that begins at the corner `edge` [n]."""
     rows = np.arange(len(corners))
     begin, end, apex = (corners[rows, (edge + step) % 3] for step in range(3))

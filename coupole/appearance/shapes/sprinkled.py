@@ -40,7 +40,7 @@ def grains(
     parts: NDArray[np.int64],
     drawing: Callable[[Array], Array],
     *,
-    wrapped: Wrapping,
+    wrapping: Wrapping,
     raised_mm: float,
 ) -> Grains:
     """The body's triangles [m, 3, 3] in `parts` [m] squared grains each, raised by `raised_mm` where the drawing
@@ -50,12 +50,14 @@ def grains(
     normals = skin.normals[skin.faces]
     flat = np.zeros((len(corners_mm), 3, 2)) if uv is None else uv - 0.5
     whole = np.concatenate([corners_mm, normals, flat], axis=2)
-    small_triangles = np.concatenate([_cut(whole[parts == count], int(count)) for count in np.unique(parts)])
+    small_triangles = np.concatenate(
+        [_cut_triangles(whole[parts == count], int(count)) for count in np.unique(parts)]
+    )
     places, along = small_triangles[..., :3], small_triangles[..., 3:6]
     along = along / np.maximum(np.linalg.norm(along, axis=2, keepdims=True), 1e-300)
 
     def share(place: Array, normal: Array, texture: Array) -> Array:
-        return drawing(texture if wrapped == "uv" else _projected(place - middle, normal, wrapped))
+        return drawing(texture if wrapping == "uv" else _project_on_drawing(place - middle, normal, wrapping))
 
     centres = [small_triangles[..., first:last].mean(axis=1) for first, last in ((0, 3), (3, 6), (6, 8))]
     metal_shares = share(*centres)
@@ -65,7 +67,7 @@ def grains(
     return Grains(places, metal_shares)
 
 
-def _cut(corners: Array, count: int) -> Array:
+def _cut_triangles(corners: Array, count: int) -> Array:
     """[m count^2, 3, k] of triangles with values [m, 3, k] at their corners."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
     is_upright, is_inverted = i + j < count, i + j < count - 1
@@ -86,12 +88,12 @@ def _cut(corners: Array, count: int) -> Array:
     return np.asarray(np.einsum("gcs,msk->mgck", shares, corners)).reshape(-1, 3, corners.shape[2])
 
 
-def _projected(place: Array, normal: Array, wrapped: Wrapping) -> Array:
+def _project_on_drawing(place: Array, normal: Array, wrapping: Wrapping) -> Array:
     """[n, 2] in mm on the drawing; +y is up on walls."""
     x, y, z = place.T
-    if wrapped == "above":
+    if wrapping == "above":
         return np.stack([x, y], axis=1)
-    if wrapped == "around":
+    if wrapping == "around":
         radius = float(np.hypot(x, y).max())
         return np.stack([radius * np.arctan2(y, x), z], axis=1)
     side = np.argmax(np.abs(normal), axis=1)

@@ -68,7 +68,7 @@ def skirt(top: Array, bottom_mm: float = 0.0) -> Array:
     The rim consists of the edges with one triangle only. The bottom is a fan about the rim's centre, from
     which all of the rim must be visible.
     """
-    points, faces = welded(top)
+    points, faces = weld_corners(top)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, place, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     rim = points[edges[place[count == 1]]]
@@ -79,7 +79,7 @@ def skirt(top: Array, bottom_mm: float = 0.0) -> Array:
     return np.concatenate([np.stack(corners, axis=1) for corners in walls])
 
 
-def welded(corners_mm: Array) -> tuple[Array, NDArray[np.int64]]:
+def weld_corners(corners_mm: Array) -> tuple[Array, NDArray[np.int64]]:
     """Points [n, 3] and triangles [m, 3] of corners; points that are equal to the nanometre are one."""
     keys, faces = np.unique(np.round(corners_mm.reshape(-1, 3), 6) + 0.0, axis=0, return_inverse=True)
     return keys, faces.reshape(-1, 3)

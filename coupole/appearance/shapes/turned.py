@@ -18,7 +18,7 @@ BOWL_MM = (
 """A bowl on a foot: radius and height from the middle of its inside over the rim to the middle of its foot."""
 
 
-def turned(profile_mm: Sequence[tuple[float, float]], *, around: int = 256, step_mm: float = 0.5) -> Array:
+def turned_body(profile_mm: Sequence[tuple[float, float]], *, around: int = 256, step_mm: float = 0.5) -> Array:
     """Corners [n, 3, 3] of a closed body turned about z.
 
     `profile_mm` has radius and height of points of its outline, from the axis to the axis, the body on the right

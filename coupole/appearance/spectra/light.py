@@ -35,7 +35,7 @@ def illuminant(name: str) -> Array:
         planck = WAVELENGTHS_NM**-5.0 / np.expm1(1.435e7 / (2848.0 * WAVELENGTHS_NM))
         power = 100.0 * planck / planck[np.searchsorted(WAVELENGTHS_NM, 560.0)]
     else:
-        power = _on_grid(_named(_colour().SDS_ILLUMINANTS, "illuminant", name))
+        power = _on_grid(_choose(_colour().SDS_ILLUMINANTS, "illuminant", name))
     power.setflags(write=False)
     return power
 
@@ -56,7 +56,7 @@ def led(name: str) -> Array:
     'Phosphor LED YAG'; its peak is 1."""
     colour = _colour()
     sources = {**colour.SDS_LIGHT_SOURCES, **colour.SDS_ILLUMINANTS}
-    power = _on_grid(_named(sources, "light source", name))
+    power = _on_grid(_choose(sources, "light source", name))
     power /= power.max()
     power.setflags(write=False)
     return power
@@ -68,7 +68,7 @@ def camera(name: str = "Nikon 5100 (NPL)") -> Array:
 
     Measured by the NPL; used in place of a sensor whose curves have not been measured.
     """
-    sensitivities = _on_grid(_named(_colour().MSDS_CAMERA_SENSITIVITIES, "camera", name)).T.copy()
+    sensitivities = _on_grid(_choose(_colour().MSDS_CAMERA_SENSITIVITIES, "camera", name)).T.copy()
     sensitivities.setflags(write=False)
     return sensitivities
 
@@ -92,10 +92,12 @@ def linear_srgb(xyz: Array) -> Array:
     return np.asarray(np.asarray(xyz, dtype=float) @ _SRGB_FROM_XYZ.T)
 
 
-def _named(known: Any, what: str, name: str) -> Any:
-    if name not in known:
-        raise InputError(f"{what}: expected one of {', '.join(sorted(known))}; found {name!r}; choose one of them")
-    return known[name]
+def _choose(choices: Any, quantity: str, name: str) -> Any:
+    if name not in choices:
+        raise InputError(
+            f"{quantity}: expected one of {', '.join(sorted(choices))}; found {name!r}; choose one of them"
+        )
+    return choices[name]
 
 
 def _on_grid(distribution: Any) -> Array:

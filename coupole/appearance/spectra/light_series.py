@@ -58,7 +58,7 @@ def read_series(path: Path) -> LightSeries:
             )
     body = "#" + text  # the reader of spectra takes the names as a comment, and lines keep their numbers
     spectra = [parse_spectrum(body, str(path), unit="power", column=column) for column in range(1, len(times) + 1)]
-    irradiances = [np.maximum(resampling.held(resampling.on_grid(spectrum)), 0.0) for spectrum in spectra]
+    irradiances = [np.maximum(resampling.fill_missing(resampling.on_grid(spectrum)), 0.0) for spectrum in spectra]
     return LightSeries(str(path), times, np.array(irradiances))
 
 

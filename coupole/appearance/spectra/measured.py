@@ -61,7 +61,7 @@ class _Table:
 
 def read_spectrum(path: Path, *, unit: Unit = "auto", column: int | None = None) -> Measured:
     """The spectrum in a file. `column` (from 1, after the wavelength) is needed where there are several."""
-    return parse_spectrum(decoded(path.read_bytes()), str(path), name=path.stem, unit=unit, column=column)
+    return parse_spectrum(decode_text(path.read_bytes()), str(path), name=path.stem, unit=unit, column=column)
 
 
 def parse_spectrum(
@@ -88,7 +88,7 @@ def parse_spectrum(
     return Measured(name, nm[order].copy(), values[order].copy(), table.remarks)
 
 
-def decoded(raw: bytes) -> str:
+def decode_text(raw: bytes) -> str:
     """Text of an instrument: UTF-16 or UTF-8 by its mark, otherwise UTF-8, otherwise Latin-1."""
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16")

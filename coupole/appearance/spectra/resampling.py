@@ -37,7 +37,7 @@ class OnGrid:
 
 def on_grid(spectrum: Measured) -> OnGrid:
     """`spectrum` on the grid. Bands outside its range, or in a gap wider than 20 nm, are NaN."""
-    result, error = resampled(spectrum, WAVELENGTHS_NM, STEP_NM)
+    result, error = resample(spectrum, WAVELENGTHS_NM, STEP_NM)
     if not np.isfinite(result).any():
         nm = spectrum.wavelengths_nm
         raise InputError(
@@ -47,7 +47,7 @@ def on_grid(spectrum: Measured) -> OnGrid:
     return OnGrid(spectrum.name, result, error)
 
 
-def resampled(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array, float]:
+def resample(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Array, float]:
     """`spectrum` at rising `bands_nm` [n], NaN outside its range and in gaps wider than 20 nm, and the error as in
     `OnGrid`. Samples coarser than `step_nm` are interpolated, finer ones averaged."""
     nm, values = spectrum.wavelengths_nm, spectrum.values
@@ -60,13 +60,13 @@ def resampled(spectrum: Measured, bands_nm: Array, step_nm: float) -> tuple[Arra
     if not is_covered.any():
         return result, 0.0
     if np.median(np.diff(nm)) < step_nm - 1e-6:
-        result[is_covered], error = _averaged(nm, values, bands[is_covered], step_nm)
+        result[is_covered], error = _average(nm, values, bands[is_covered], step_nm)
     else:
-        result[is_covered], error = _interpolated(nm, values, bands[is_covered])
+        result[is_covered], error = _interpolate(nm, values, bands[is_covered])
     return result, error
 
 
-def held(spectrum: OnGrid) -> Array:
+def fill_missing(spectrum: OnGrid) -> Array:
     """[81] with missing ends filled by the nearest measured value, and gaps by straight lines.
 
     That is a guess; rendering needs one, identification does not.
@@ -75,7 +75,7 @@ def held(spectrum: OnGrid) -> Array:
     return np.interp(WAVELENGTHS_NM, WAVELENGTHS_NM[is_known], spectrum.values[is_known])
 
 
-def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
+def _interpolate(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
     from scipy.interpolate import PchipInterpolator
 
     # Ends within rounding of the range belong to it.
@@ -90,7 +90,7 @@ def _interpolated(nm: Array, values: Array, at: Array) -> tuple[Array, float]:
     return band_values, 0.25 * float(np.abs(again - values[left_out]).max())
 
 
-def _averaged(nm: Array, values: Array, at: Array, step_nm: float) -> tuple[Array, float]:
+def _average(nm: Array, values: Array, at: Array, step_nm: float) -> tuple[Array, float]:
     # At the ends of the range the triangle is narrower, so that it remains symmetric about the band's centre.
     half = np.minimum(step_nm, np.maximum(np.minimum(at - nm[0], nm[-1] - at), 0.0))
     u = np.linspace(-1.0, 1.0, _TRIANGLE)

@@ -18,7 +18,7 @@ import numpy as np
 
 from coupole.appearance.matter import kubelka_munk
 from coupole.appearance.spectra.grid import Array
-from coupole.appearance.spectra.measured import Unit, decoded, parse_spectrum
+from coupole.appearance.spectra.measured import Unit, decode_text, parse_spectrum
 from coupole.errors import InputError, Problem, reason
 
 WAVELENGTHS = "spectra.txt"
@@ -75,11 +75,11 @@ def read_library(path: Path, *, unit: Unit = "auto") -> tuple[LibrarySpectrum, .
 
 def _read_file(path: Path, unit: Unit) -> list[LibrarySpectrum]:
     try:
-        text = decoded(path.read_bytes())
+        text = decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: {reason(error)}") from error
     lines = [(number, line.strip("\r ")) for number, line in enumerate(text.split("\n"), start=1)]
-    rows = [(number, *_named(line)) for number, line in lines if line.strip() and not line.startswith("#")]
+    rows = [(number, *_parse_row(line)) for number, line in lines if line.strip() and not line.startswith("#")]
     if not any(_are_numbers(fields) for _, name, fields in rows if name and not _NUMBER.fullmatch(name)):
         spectrum = parse_spectrum(text, str(path), name=path.stem, unit=unit)
         return [LibrarySpectrum(spectrum.name, str(path), 0, spectrum.wavelengths_nm, spectrum.values)]
@@ -105,7 +105,7 @@ def _spectrum(path: Path, nm: Array, values: Array, line: int, name: str) -> Lib
     return LibrarySpectrum(name, str(path), line, nm[order], reflectance, k, s)
 
 
-def _named(line: str) -> tuple[str, list[str]]:
+def _parse_row(line: str) -> tuple[str, list[str]]:
     """Name and fields of a row. Tabs may be several, to align columns; of other separators each begins a field."""
     quote = re.match(r'"([^"]*)"', line)
     rest = line[quote.end() :] if quote else line
@@ -134,7 +134,7 @@ def _wavelengths(path: Path, rows: list[Row]) -> tuple[Array, list[Row]]:
         source, rows = str(path), rows[1:]
     elif beside.is_file():
         source, number = str(beside), 1
-        words = decoded(beside.read_bytes()).split()
+        words = decode_text(beside.read_bytes()).split()
         if wrong := [word for word in words if not _NUMBER.fullmatch(word)]:
             raise _wrong(source, 1, f"expected wavelengths in nm, found {wrong[0]!r}; correct the file")
         first = np.array([_value(word) for word in words])

@@ -28,7 +28,7 @@ class Case:
 
     name: str
     records: tuple[InForce, ...]
-    spread: Spread | None = None
+    sample_spread: Spread | None = None
 
     @property
     def robot(self) -> str:
@@ -45,17 +45,17 @@ class Case:
 class Accuracy:
     """One line of the table."""
 
-    what: str
+    quantity: str
     unit: str
     """Empty for relative intervals."""
     paper: str
     """The paper's figure in its own words."""
-    ours: tuple[tuple[float, ...] | None, ...]
+    our_figures: tuple[tuple[float, ...] | None, ...]
     """Our figure for each case: one number, or the two ends of an interval; None without a record."""
 
     def cell(self, case: int) -> str:
         """Our figure as text."""
-        figure = self.ours[case]
+        figure = self.our_figures[case]
         if figure is None:
             return "no record"
         if len(figure) == 2:
@@ -70,7 +70,9 @@ def accuracies(cases: Sequence[Case]) -> tuple[Accuracy, ...]:
         for label, unit, paper, kind, figure in _LINES
     ]
     for key, (low, high) in PAPER_SPREAD.items():
-        our_figures = tuple(None if case.spread is None else getattr(case.spread, key) for case in cases)
+        our_figures = tuple(
+            None if case.sample_spread is None else getattr(case.sample_spread, key) for case in cases
+        )
         paper = f"[{low:+.2%}, {high:+.2%}]"
         lines.append(Accuracy(f"samples, {SPREAD_WORDS[key]}", "", paper, our_figures))
     return tuple(lines)

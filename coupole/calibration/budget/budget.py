@@ -143,7 +143,7 @@ class Share:
     said_by: str
     linear: float
     """Share of the linear variance."""
-    removed: float
+    width_decrease: float
     """Relative decrease of the width of the 68 % interval without it."""
     alone: float
     """Half the width of its own 68 % interval, relative to the value."""
@@ -169,7 +169,9 @@ class Budget:
         return interval.low / self.nominal - 1.0, interval.high / self.nominal - 1.0
 
 
-def sample_inputs(known: Known, geometry: Geometry, *, emission: Emission = "lambertian") -> tuple[Inputs, Floats]:
+def sample_inputs(
+    uncertainties: Known, geometry: Geometry, *, emission: Emission = "lambertian"
+) -> tuple[Inputs, Floats]:
     """The quantities of one sample and the LED's normal [3]. Raises InputError for a light below the horizon."""
     if not 0.0 <= geometry.incidence_deg < 88.0:
         raise InputError(f"budget: expected an incidence from 0 to 88 deg, found {geometry.incidence_deg:g}")
@@ -180,38 +182,45 @@ def sample_inputs(known: Known, geometry: Geometry, *, emission: Emission = "lam
     led_normal = np.cos(b) * towards + np.sin(b) * aside
     # An equilateral triangle about the origin whose normal is z.
     around = np.radians([90.0, 210.0, 330.0])
-    vertices = known.edge_mm / np.sqrt(3.0) * np.stack([np.cos(around), np.sin(around), 0.0 * around], axis=1)
+    vertices = (
+        uncertainties.edge_mm / np.sqrt(3.0) * np.stack([np.cos(around), np.sin(around), 0.0 * around], axis=1)
+    )
     cosine = np.cos(a) * np.cos(b) ** (2 if emission == "paper" else 1)
-    signal = known.full_scale_dn * geometry.exposure_share * geometry.reflectance * cosine
-    noise = np.sqrt((known.read_noise_dn**2 + 1.0 / 12.0 + known.gain_dn_per_e * signal) / known.pixels)
-    led_axis, mesh_axis = known.led_mm / np.sqrt(3.0), known.mesh_mm / np.sqrt(3.0)
-    robot, lens_mm = known.robot_mm / np.sqrt(3.0), known.lens_px / np.sqrt(2.0) * known.pixel_mm
+    signal = uncertainties.full_scale_dn * geometry.exposure_share * geometry.reflectance * cosine
+    noise = np.sqrt(
+        (uncertainties.read_noise_dn**2 + 1.0 / 12.0 + uncertainties.gain_dn_per_e * signal) / uncertainties.pixels
+    )
+    led_axis, mesh_axis = uncertainties.led_mm / np.sqrt(3.0), uncertainties.mesh_mm / np.sqrt(3.0)
+    robot, lens_mm = (
+        uncertainties.robot_mm / np.sqrt(3.0),
+        uncertainties.lens_px / np.sqrt(2.0) * uncertainties.pixel_mm,
+    )
 
-    def one(name: str, value: float, u: float, group: str) -> Quantity:
-        return Quantity(name, value, u, source=known.source(group), group=group)
+    def quantity_of(name: str, value: float, u: float, group: str) -> Quantity:
+        return Quantity(name, value, u, source=uncertainties.source(group), group=group)
 
     def vertex(name: str, value: float) -> Quantity:
-        u, said_by = known.vertex_mm / np.sqrt(3.0), known.source("vertices")
+        u, said_by = uncertainties.vertex_mm / np.sqrt(3.0), uncertainties.source("vertices")
         return Quantity(name, value, u, "rectangular", source=said_by, group="vertices")
 
     quantities = [
         *(vertex(n, float(v)) for n, v in zip(VERTICES, vertices.ravel(), strict=True)),
-        *(one(n, float(v), led_axis, "LED position") for n, v in zip(LED_PLACE, led, strict=True)),
-        *(one(n, 0.0, known.led_deg / np.sqrt(2.0), "LED normal") for n in LED_TURN),
-        *(one(n, 0.0, mesh_axis, "mesh to robot") for n in MESH_STEP[:3]),
-        *(one(n, 0.0, known.mesh_deg / np.sqrt(3.0), "mesh to robot") for n in MESH_STEP[3:]),
-        one(SEEN_OFF[0], 0.0, lens_mm, "lens"),
-        one(SEEN_OFF[1], 0.0, known.camera_mm / np.sqrt(2.0), "camera"),
-        Quantity("contrast_per_mm", known.contrast_per_mm, 0.0, source="stated", group="camera"),
-        one("signal_dn", signal, noise, "pixel value"),
+        *(quantity_of(n, float(v), led_axis, "LED position") for n, v in zip(LED_PLACE, led, strict=True)),
+        *(quantity_of(n, 0.0, uncertainties.led_deg / np.sqrt(2.0), "LED normal") for n in LED_TURN),
+        *(quantity_of(n, 0.0, mesh_axis, "mesh to robot") for n in MESH_STEP[:3]),
+        *(quantity_of(n, 0.0, uncertainties.mesh_deg / np.sqrt(3.0), "mesh to robot") for n in MESH_STEP[3:]),
+        quantity_of(SEEN_OFF[0], 0.0, lens_mm, "lens"),
+        quantity_of(SEEN_OFF[1], 0.0, uncertainties.camera_mm / np.sqrt(2.0), "camera"),
+        Quantity("contrast_per_mm", uncertainties.contrast_per_mm, 0.0, source="stated", group="camera"),
+        quantity_of("signal_dn", signal, noise, "pixel value"),
         Quantity("exposure_s", 0.01, 0.0, source="camera's clock", group="pixel value"),
         Quantity("flat", 1.0, 0.0, source="at the field's middle", group="flat field"),
-        one("flat_field", 1.0, known.flat_field, "flat field"),
-        one("response", 1.0, known.response, "response"),
+        quantity_of("flat_field", 1.0, uncertainties.flat_field, "flat field"),
+        quantity_of("response", 1.0, uncertainties.response, "response"),
         Quantity("power_dn_m2_sr_per_s", 1e4, 0.0, source="scale", group="LED power, common"),
-        one("power.own", 1.0, known.power_own, "LED power, own"),
-        one("power.common", 1.0, known.power_common, "LED power, common"),
-        one("drift", 1.0, known.drift, "drift"),
+        quantity_of("power.own", 1.0, uncertainties.power_own, "LED power, own"),
+        quantity_of("power.common", 1.0, uncertainties.power_common, "LED power, common"),
+        quantity_of("drift", 1.0, uncertainties.drift, "drift"),
     ]
     share = robot**2 / max(led_axis * mesh_axis, 1e-30)
     correlations = tuple((LED_PLACE[i], MESH_STEP[i], float(min(share, 0.99))) for i in range(3) if share > 0)
@@ -219,7 +228,7 @@ def sample_inputs(known: Known, geometry: Geometry, *, emission: Emission = "lam
 
 
 def budget_of(
-    known: Known,
+    uncertainties: Known,
     geometry: Geometry,
     *,
     emission: Emission = "lambertian",
@@ -229,7 +238,7 @@ def budget_of(
     seed: int = 1,
 ) -> Budget:
     """Propagate one sample's uncertainty: with all sources, without each of them, and with each alone."""
-    inputs, led_normal = sample_inputs(known, geometry, emission=emission)
+    inputs, led_normal = sample_inputs(uncertainties, geometry, emission=emission)
     model = partial(_model, led_normal=led_normal, emission=emission)
     numeric = monte_carlo(model, inputs, coverages=coverages, digits=digits, most_trials=most_trials, seed=seed)
     linearly = linear(model, inputs, coverages)
@@ -240,19 +249,19 @@ def budget_of(
         numeric,
         linearly,
         (*validate(linearly.result, numeric, digits=1), *validate(linearly.result, numeric, digits=2)),
-        shares_of(model, inputs, linearly, known, seed=seed),
+        shares_of(model, inputs, linearly, uncertainties, seed=seed),
     )
 
 
 def shares_of(
-    model: Model, inputs: Inputs, linearly: Linear, known: Known, *, seed: int = 1, trials: int = 20_000
+    model: Model, inputs: Inputs, linearly: Linear, uncertainties: Known, *, seed: int = 1, trials: int = 20_000
 ) -> tuple[Share, ...]:
     """Contribution of each group of inputs, the largest first. All propagations use the same random numbers, so
     that their differences have little noise."""
     groups = list(dict.fromkeys(q.source_group for q in inputs.quantities if q.u > 0.0))
 
-    def half_width(fixed: frozenset[str]) -> float:
-        low, high = ends(trials_of(model, inputs, trials, seed, fixed), 0.68)
+    def half_width(fixed_groups: frozenset[str]) -> float:
+        low, high = ends(trials_of(model, inputs, trials, seed, fixed_groups), 0.68)
         return 0.5 * (high - low)
 
     whole = half_width(frozenset())
@@ -264,7 +273,14 @@ def shares_of(
         alone = half_width(frozenset(groups) - {group})
         share = float(linearly.shares[members].sum())
         shares.append(
-            Share(group, known.figure(group), known.source(group), share, 1.0 - without / whole, alone / nominal)
+            Share(
+                group,
+                uncertainties.figure(group),
+                uncertainties.source(group),
+                share,
+                1.0 - without / whole,
+                alone / nominal,
+            )
         )
     return tuple(sorted(shares, key=lambda share: -share.alone))
 
@@ -283,12 +299,17 @@ class Spread:
 
 
 def spread_over(
-    known: Known, geometries: Sequence[Geometry], *, coverage: float = 0.68, trials: int = 10_000, seed: int = 1
+    uncertainties: Known,
+    geometries: Sequence[Geometry],
+    *,
+    coverage: float = 0.68,
+    trials: int = 10_000,
+    seed: int = 1,
 ) -> Spread:
     """Relative intervals of many samples (seed 003, section 6.1)."""
     relative = []
     for number, geometry in enumerate(geometries):
-        inputs, led_normal = sample_inputs(known, geometry)
+        inputs, led_normal = sample_inputs(uncertainties, geometry)
         model = partial(_model, led_normal=led_normal, emission="lambertian")
         nominal = float(model({name: np.array([value]) for name, value in inputs.values().items()})[0])
         low, high = ends(trials_of(model, inputs, trials, seed + number), coverage)

@@ -66,7 +66,7 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
     normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     step = np.stack([q[name] for name in MESH_STEP], axis=-1)
     point = point + step[..., :3]
-    normal = _turned(normal, np.radians(step[..., 3:]))
+    normal = _turned_vectors(normal, np.radians(step[..., 3:]))
     led = np.stack([q[name] for name in LED_PLACE], axis=-1)
     across = np.linalg.svd(led_normal[None])[2][1:]
     turns = np.radians(np.stack([q[name] for name in LED_TURN], axis=-1)) @ across
@@ -80,12 +80,12 @@ def reflectance_of(q: Mapping[str, Floats], led_normal: Floats, *, emission: Emi
         point,
         normal,
         led,
-        _turned(np.broadcast_to(led_normal, led.shape), turns),
+        _turned_vectors(np.broadcast_to(led_normal, led.shape), turns),
         emission=emission,
     )
 
 
-def _turned(vectors: Floats, turns_rad: Floats) -> Floats:
+def _turned_vectors(vectors: Floats, turns_rad: Floats) -> Floats:
     """Vectors [..., 3] turned by small rotation vectors [..., 3], to second order, at unit length."""
     once = np.cross(turns_rad, vectors)
     turned_vectors = vectors + once + 0.5 * np.cross(turns_rad, once)

@@ -14,7 +14,7 @@ from coupole.calibration.report import HEAD, STYLE, table
 
 def page(
     budget: Budget,
-    spread: Spread,
+    sample_spread: Spread,
     cases: Sequence[Case],
     accuracies: Sequence[Accuracy],
     picture: bytes,
@@ -28,7 +28,7 @@ def page(
         f"<h1>Uncertainty of a reflectance</h1>"
         f"<p>Light at {budget.geometry.incidence_deg:g} deg; relative to the value. {budget.numeric.trials} trials"
         f"{'' if budget.numeric.stable else ', too few for two digits of u'}.{doubt_lines}{_result(budget)}"
-        f"<h2>Samples over a dome, 68 %</h2>{_spread(spread)}"
+        f"<h2>Samples over a dome, 68 %</h2>{_spread_table(sample_spread)}"
         f"<h2>What dominates</h2>{_sources(budget)}"
         f'<img src="data:image/png;base64,{data}" alt="distribution, sources, samples">'
         f"<h2>Accuracies beside the paper's</h2><p>Standard uncertainties, all directions together; samples "
@@ -41,7 +41,7 @@ def verdict(validation: Validation) -> str:
     """Say in words whether the linear formula is sufficient."""
     if not validation.sure:
         return "may do or not: more trials would tell"
-    return "will do" if validation.passed else "will not do"
+    return "will do" if validation.is_within_tolerance else "will not do"
 
 
 def _result(budget: Budget) -> str:
@@ -67,10 +67,10 @@ def _result(budget: Budget) -> str:
     )
 
 
-def _spread(spread: Spread) -> str:
+def _spread_table(sample_spread: Spread) -> str:
     rows = []
     for key, words in SPREAD_WORDS.items():
-        (low, high), (paper_low, paper_high) = getattr(spread, key), PAPER_SPREAD[key]
+        (low, high), (paper_low, paper_high) = getattr(sample_spread, key), PAPER_SPREAD[key]
         rows.append(f"<td>{words}<td>[{low:+.2%}, {high:+.2%}]<td>[{paper_low:+.2%}, {paper_high:+.2%}]")
     return table("<th>samples<th>here<th>seed 003, section 6.1", rows)
 
@@ -78,7 +78,7 @@ def _spread(spread: Spread) -> str:
 def _sources(budget: Budget) -> str:
     rows = [
         f"<td>{html.escape(s.source)}<td>{html.escape(s.figure)}<td>{html.escape(s.said_by)}"
-        f"<td class=n>{s.alone:.2%}<td class=n>{s.linear:.1%}<td class=n>{s.removed:.1%}"
+        f"<td class=n>{s.alone:.2%}<td class=n>{s.linear:.1%}<td class=n>{s.width_decrease:.1%}"
         for s in budget.shares
     ]
     head = "<th>source<th>taken as<th>said by"
@@ -88,7 +88,7 @@ def _sources(budget: Budget) -> str:
 
 def _accuracies(cases: Sequence[Case], accuracies: Sequence[Accuracy]) -> str:
     rows = [
-        f"<td>{html.escape(line.what)}<td>{html.escape(line.paper)}"
+        f"<td>{html.escape(line.quantity)}<td>{html.escape(line.paper)}"
         + "".join(f"<td>{html.escape(line.cell(n))}" for n in range(len(cases)))
         for line in accuracies
     ]

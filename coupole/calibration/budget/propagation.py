@@ -141,7 +141,7 @@ class Validation:
     """Numerical accuracy of Monte Carlo's ends; 8.2 advises a fifth of the tolerance."""
 
     @property
-    def passed(self) -> bool:
+    def is_within_tolerance(self) -> bool:
         return max(self.d_low, self.d_high) <= self.tolerance
 
     @property
@@ -205,14 +205,16 @@ def monte_carlo(
     scatter = np.full(2 + 2 * len(coverages), np.inf)
     stable = False
     while not stable and (len(batches) + 1) * batch <= max(most_trials, batch):
-        samples = _sorted(model(draw(inputs, half, batch, random)))
+        samples = _sorted_values(model(draw(inputs, half, batch, random)))
         batches.append(samples)
         limits = [end for p in coverages for end in ends(samples, p)]
         figures.append([float(samples.mean()), float(samples.std(ddof=1)), *limits])
         if len(batches) > 1:
             table = np.array(figures)
             scatter = 2.0 * table.std(axis=0, ddof=1) / np.sqrt(len(batches))
-            stable = bool((scatter <= within * tolerance(_pooled(table[:, 0], table[:, 1]), digits)).all())
+            stable = bool(
+                (scatter <= within * tolerance(_pooled_uncertainty(table[:, 0], table[:, 1]), digits)).all()
+            )
     samples = np.sort(np.concatenate(batches))
     intervals = []
     for p, numerical in zip(coverages, scatter[2:].reshape(-1, 2).max(axis=1), strict=True):
@@ -222,19 +224,19 @@ def monte_carlo(
     return Propagated(mean, u, tuple(intervals), len(samples), samples, stable)
 
 
-def _pooled(means: Floats, us: Floats) -> float:
+def _pooled_uncertainty(means: Floats, batch_uncertainties: Floats) -> float:
     """u of all trials so far (7.9.4, step j), from means and u of batches of equal size."""
-    return float(np.sqrt(np.mean(us**2) + np.var(means)))
+    return float(np.sqrt(np.mean(batch_uncertainties**2) + np.var(means)))
 
 
 def trials_of(
-    model: Model, inputs: Inputs, trials: int, seed: int = 1, fixed: frozenset[str] = frozenset()
+    model: Model, inputs: Inputs, trials: int, seed: int = 1, fixed_groups: frozenset[str] = frozenset()
 ) -> Floats:
-    """[trials] sorted values of the output. Inputs of the groups `fixed` keep their values; the others get the
-    same random numbers as if none were fixed. Up to 1 % of the values may be infinite, which leaves the ends of
-    intervals as they are. Raises InputError if there are more, or a NaN."""
+    """[trials] sorted values of the output. Inputs of the groups `fixed_groups` keep their values; the others get
+    the same random numbers as if none were fixed. Up to 1 % of the values may be infinite, which leaves the ends
+    of intervals as they are. Raises InputError if there are more, or a NaN."""
     random = np.random.default_rng(seed)
-    return _sorted(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed)), infinite=0.01)
+    return _sorted_values(model(draw(inputs, _root(inputs.matrix()), trials, random, fixed_groups)), infinite=0.01)
 
 
 def validate(linear_result: Propagated, numeric: Propagated, *, digits: int = 1) -> tuple[Validation, ...]:
@@ -266,7 +268,11 @@ def tolerance(u: float, digits: int) -> float:
 
 
 def draw(
-    inputs: Inputs, half: Floats, trials: int, random: np.random.Generator, fixed: frozenset[str] = frozenset()
+    inputs: Inputs,
+    half: Floats,
+    trials: int,
+    random: np.random.Generator,
+    fixed_groups: frozenset[str] = frozenset(),
 ) -> dict[str, Floats]:
     """Samples [trials] of each quantity (JCGM 101, section 6.4). `half` [n, n] is a root of the correlations. The
     half widths of bounded distributions are those of JCGM 101, table 1."""
@@ -283,11 +289,11 @@ def draw(
             standard = np.sqrt(6.0) * random.triangular(-1.0, 0.0, 1.0, trials)
         else:
             standard = np.sqrt(2.0) * np.sin(2.0 * np.pi * random.random(trials))
-        samples[q.name] = q.value + (0.0 if q.source_group in fixed else q.u) * standard
+        samples[q.name] = q.value + (0.0 if q.source_group in fixed_groups else q.u) * standard
     return samples
 
 
-def _sorted(values: Floats, *, infinite: float = 0.0) -> Floats:
+def _sorted_values(values: Floats, *, infinite: float = 0.0) -> Floats:
     """Sorted values. Raises InputError if more than the share `infinite` of them is infinite, or one is NaN."""
     if np.isnan(values).any() or float(np.mean(np.isinf(values))) > infinite:
         raise InputError(
@@ -303,17 +309,17 @@ def _root(correlation: Floats) -> Floats:
     return root
 
 
-def ends(ordered: Floats, coverage: float) -> tuple[float, float]:
+def ends(sorted_samples: Floats, coverage: float) -> tuple[float, float]:
     """Ends of the probabilistically symmetric interval of sorted samples (JCGM 101, 7.7.2)."""
-    count = len(ordered)
+    count = len(sorted_samples)
     inside = round(coverage * count)
     first = (count - inside) // 2
-    return float(ordered[first]), float(ordered[first + inside])
+    return float(sorted_samples[first]), float(sorted_samples[first + inside])
 
 
-def _shortest(ordered: Floats, coverage: float) -> tuple[float, float]:
+def _shortest(sorted_samples: Floats, coverage: float) -> tuple[float, float]:
     """JCGM 101, 7.7.4."""
-    inside = round(coverage * len(ordered))
-    widths = ordered[inside:] - ordered[:-inside]
+    inside = round(coverage * len(sorted_samples))
+    widths = sorted_samples[inside:] - sorted_samples[:-inside]
     first = int(np.argmin(widths))
-    return float(ordered[first]), float(ordered[first + inside])
+    return float(sorted_samples[first]), float(sorted_samples[first + inside])

@@ -66,7 +66,7 @@ def doubts(items: Sequence[InForce], now: datetime) -> tuple[str, ...]:
         f"{item.path}: not accepted: {limit.what} is {limit.found:.3g} {limit.unit}, at most {limit.limit:.3g}"
         for item in items
         for limit in item.record.limits
-        if not limit.passed
+        if not limit.is_met
     ]
     expired_records = [
         f"{item.path}: expired on {item.record.validity.expires:%Y-%m-%d %H:%M} UTC"
@@ -88,7 +88,7 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
         assert reader is not None  # `read_records` and `of_use` let no other pass
         statement = reader(item.record, item.path)
         changes |= statement.figures
-        sources += [(group, _called(item.record)) for group in statement.sources]
+        sources += [(group, _display_name(item.record)) for group in statement.sources]
     if {"leds", "mesh"} <= kinds:
         # No record keeps the share of the hand-eye's error in LEDs and mesh, so they count as independent. A tenth
         # of a millimetre between LED and mesh, which is more than that share, changes an irradiance by 0.02 %.
@@ -96,7 +96,7 @@ def known_from(items: Sequence[InForce], start: Known) -> Known:
     return replace(start, **changes, sources=tuple(sources))
 
 
-def _called(record: Record) -> str:
+def _display_name(record: Record) -> str:
     return record.name if record.kind in record.name else f"{record.kind} {record.name}"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from coupole.calibration.budget.accuracy import PAPER_SPREAD, Accuracy, Case
 from coupole.calibration.budget.budget import Budget, Spread
+from coupole.calibration.budget.propagation import Interval, Validation
 from coupole.calibration.report import BLUE, DARK, GREY, RED
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def as_json(
-    budget: Budget, spread: Spread, cases: Sequence[Case] = (), table: Sequence[Accuracy] = ()
+    budget: Budget, sample_spread: Spread, cases: Sequence[Case] = (), table: Sequence[Accuracy] = ()
 ) -> dict[str, Any]:
     """The figures, for programs."""
     return {
@@ -27,34 +28,15 @@ def as_json(
         "u_relative_linear": budget.linear.result.u / budget.nominal,
         "trials": budget.numeric.trials,
         "stable": budget.numeric.stable,
-        "intervals": [
-            {
-                "coverage": i.coverage,
-                "kind": i.kind,
-                "low": i.low / budget.nominal - 1.0,
-                "high": i.high / budget.nominal - 1.0,
-            }
-            for i in budget.numeric.intervals
-        ],
-        "linear_formula_will_do": [
-            {
-                "coverage": v.coverage,
-                "digits": v.digits,
-                "d_low": v.d_low,
-                "d_high": v.d_high,
-                "tolerance": v.tolerance,
-                "passed": v.passed,
-                "sure": v.sure,
-            }
-            for v in budget.validations
-        ],
+        "intervals": [_interval(interval, budget.nominal) for interval in budget.numeric.intervals],
+        "linear_formula_will_do": [_validation(validation) for validation in budget.validations],
         "sources": [
             {
                 "source": share.source,
                 "figure": share.figure,
                 "said_by": share.said_by,
                 "share_of_linear_variance": share.linear,
-                "width_falls_without": share.removed,
+                "width_falls_without": share.width_decrease,
                 "alone": share.alone,
             }
             for share in budget.shares
@@ -63,9 +45,15 @@ def as_json(
             {"name": q.name, "value": q.value, "u": q.u, "distribution": q.shape, "source": q.source}
             for q in budget.inputs.quantities
         ],
-        "samples": {"best": spread.best, "half": spread.half, "most": spread.most, "paper": PAPER_SPREAD},
+        "samples": {
+            "best": sample_spread.best,
+            "half": sample_spread.half,
+            "most": sample_spread.most,
+            "paper": PAPER_SPREAD,
+        },
         "accuracies": [
-            {"what": line.what, "unit": line.unit, "paper": line.paper, "ours": line.ours} for line in table
+            {"what": line.quantity, "unit": line.unit, "paper": line.paper, "ours": line.our_figures}
+            for line in table
         ],
         "cases": [
             {
@@ -78,7 +66,28 @@ def as_json(
     }
 
 
-def draw_budget(budget: Budget, spread: Spread) -> bytes:
+def _interval(interval: Interval, nominal: float) -> dict[str, Any]:
+    return {
+        "coverage": interval.coverage,
+        "kind": interval.kind,
+        "low": interval.low / nominal - 1.0,
+        "high": interval.high / nominal - 1.0,
+    }
+
+
+def _validation(validation: Validation) -> dict[str, Any]:
+    return {
+        "coverage": validation.coverage,
+        "digits": validation.digits,
+        "d_low": validation.d_low,
+        "d_high": validation.d_high,
+        "tolerance": validation.tolerance,
+        "passed": validation.is_within_tolerance,
+        "sure": validation.sure,
+    }
+
+
+def draw_budget(budget: Budget, sample_spread: Spread) -> bytes:
     """PNG, 1600 x 1200: the distribution, the dominant sources, and the uncertainty over the incidence."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -88,7 +97,7 @@ def draw_budget(budget: Budget, spread: Spread) -> bytes:
     grid = figure.add_gridspec(2, 2)
     _draw_distribution(figure, grid[0, 0], budget)
     _draw_sources(figure, grid[0, 1], budget)
-    _draw_spread(figure, grid[1, :], spread)
+    _draw_spread(figure, grid[1, :], sample_spread)
     coverage = budget.numeric.intervals[0].coverage
     low, high = budget.relative(coverage)
     figure.suptitle(
@@ -146,9 +155,9 @@ def _draw_sources(figure: Figure, place: Any, budget: Budget) -> None:
     ax.legend(frameon=False, loc="lower right")
 
 
-def _draw_spread(figure: Figure, place: Any, spread: Spread) -> None:
+def _draw_spread(figure: Figure, place: Any, sample_spread: Spread) -> None:
     ax = figure.add_subplot(place)
-    ends = 100 * spread.ends[np.argsort(spread.ends[:, 1] - spread.ends[:, 0])]
+    ends = 100 * sample_spread.ends[np.argsort(sample_spread.ends[:, 1] - sample_spread.ends[:, 0])]
     share = 100 * (np.arange(len(ends)) + 0.5) / len(ends)
     ax.fill_between(share, ends[:, 0], ends[:, 1], color=BLUE, alpha=0.25, lw=0)
     ax.plot(share, ends, color=BLUE, lw=1)

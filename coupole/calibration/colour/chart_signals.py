@@ -132,7 +132,9 @@ def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
     return Reading(mean, u, sd, full)
 
 
-def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, lit: Sequence[str]) -> Signals:
+def combined_signals(
+    names: Sequence[str], readings: Sequence[Reading], lights: Floats, lit: Sequence[str]
+) -> Signals:
     """One signal for each patch, from its readings under all lights.
 
     `lights` [lights, patches] or [lights, patches, 3] are irradiances, `lit` the lights' names. Raises InputError
@@ -165,7 +167,7 @@ def combined(names: Sequence[str], readings: Sequence[Reading], lights: Floats, 
         strength, patch = _split(mean, good)
     else:
         remarks.append("fewer than three lights: shadows and gloss on the chart cannot be told")
-    return _averaged(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
+    return _averaged_signals(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
 
 
 def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
@@ -181,7 +183,9 @@ def _split(mean: Floats, good: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     return strength, patch
 
 
-def _averaged(mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], remarks: tuple[str, ...]) -> Signals:
+def _averaged_signals(
+    mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], remarks: tuple[str, ...]
+) -> Signals:
     """Means over the lights; their uncertainty is the larger of noise and scatter."""
     count = good.sum(axis=0)[:, None]
     good_mean = np.where(good[:, :, None], mean, np.nan)
@@ -192,14 +196,14 @@ def _averaged(mean: Floats, u: Floats, sd: Floats, good: NDArray[np.bool_], rema
     return Signals(average, np.maximum(noise, scatter), typical, remarks)
 
 
-def _with(marked: NDArray[np.bool_]) -> list[int]:
-    return [int(k) for k in np.flatnonzero(marked.any(axis=1))]
+def _with(marks: NDArray[np.bool_]) -> list[int]:
+    return [int(k) for k in np.flatnonzero(marks.any(axis=1))]
 
 
-def _refuse(numbers: Sequence[int], names: Sequence[str], what: str, remedy: str) -> None:
+def _refuse(numbers: Sequence[int], names: Sequence[str], fault: str, remedy: str) -> None:
     if len(numbers):
         raise InputError(
-            f"colour: {what}: the patches {_list([names[n] for n in numbers])}; {remedy}, or leave them out with "
+            f"colour: {fault}: the patches {_list([names[n] for n in numbers])}; {remedy}, or leave them out with "
             "--without"
         )
 

@@ -64,14 +64,14 @@ class ChartReader:
         self._straight = {channel: linearise(setting.response, channel, frames) for channel in CHANNELS}
         self._masks = {channel: channel_mask((height, width), frames.pattern, channel) for channel in CHANNELS}
         self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
-        self._base_from_chart = self._found()
+        self._base_from_chart = self._find_chart()
 
     def pictures(self) -> Iterator[tuple[LightFrame, ChartPicture]]:
         """Each frame whose light suits, when it is asked for."""
-        for frame in self.suited():
+        for frame in self.suitable_frames():
             yield frame, self.picture(frame, self._light(frame))
 
-    def suited(self) -> list[LightFrame]:
+    def suitable_frames(self) -> list[LightFrame]:
         """Frames under light that does not graze the chart or shine from it into the camera. Raises InputError if
         there is none."""
         frames = [frame for frame in self._frames.lit if self._suits(frame)]
@@ -92,13 +92,13 @@ class ChartReader:
             signal = signal / self._flat
         signal /= frame.exposure_us * 1e-6
         patches, edges = (
-            self._seen(polygons, frame)
+            self._projected_polygons(polygons, frame)
             for polygons in (self._setting.chart.patch_polygons_mm(), self._setting.chart.edge_polygons_mm())
         )
         full = raw >= self._frames.white_dn
         return ChartPicture(str(frame.shot), signal, full, self._frames.pattern, patches, edges, light)
 
-    def _found(self) -> Floats:
+    def _find_chart(self) -> Floats:
         """base_from_chart [4, 4], by the description or by the corners of the first view."""
         setting = self._setting
         if setting.corners_px is None:
@@ -123,7 +123,7 @@ class ChartReader:
             )
         return np.asarray(self._frames.lit[0].base_from_camera @ camera_from_chart)
 
-    def _seen(self, polygons_mm: Floats, frame: LightFrame) -> Floats:
+    def _projected_polygons(self, polygons_mm: Floats, frame: LightFrame) -> Floats:
         """[n, 4, 2] px of polygons [n, 4, 2] of the chart's face. Raises InputError if it is behind the camera."""
         flat = np.column_stack([polygons_mm.reshape(-1, 2), np.zeros(4 * len(polygons_mm))])
         camera_from_chart = np.linalg.inv(frame.base_from_camera) @ self._base_from_chart
@@ -164,7 +164,7 @@ def white_of(frames: LightFrames, setting: ChartSetting) -> dict[tuple[str, str]
     """Pictures of a white sheet in the chart's place, by view and light, in place of the known irradiance."""
     reader = ChartReader(frames, setting)
     ones = np.ones(len(setting.chart.centres_mm))
-    return {key_of(frame): reader.picture(frame, ones) for frame in reader.suited()}
+    return {key_of(frame): reader.picture(frame, ones) for frame in reader.suitable_frames()}
 
 
 def key_of(frame: LightFrame) -> tuple[str, str]:

@@ -73,28 +73,28 @@ class Profile:
         """[n, 3] of signals [n, 3]."""
         return self.xyz_of_balanced(signal / self.white_signal)
 
-    def xyz_of_balanced(self, balanced: Floats) -> Floats:
+    def xyz_of_balanced(self, balanced_channels: Floats) -> Floats:
         """[n, 3] of channels [n, 3] of which white has 1, 1, 1."""
-        return np.asarray(terms_of(balanced, self.form) @ self.coefficients.T)
+        return np.asarray(terms_of(balanced_channels, self.form) @ self.coefficients.T)
 
 
-def terms_of(balanced: Floats, form: Form) -> Floats:
+def terms_of(balanced_channels: Floats, form: Form) -> Floats:
     """[n, 3] or [n, 6] terms; roots of negative products, which noise makes, are 0."""
     if form == "matrix":
-        return balanced
-    r, g, b = np.maximum(balanced, 0.0).T
-    return np.column_stack([balanced, np.sqrt(r * g), np.sqrt(r * b), np.sqrt(g * b)])
+        return balanced_channels
+    r, g, b = np.maximum(balanced_channels, 0.0).T
+    return np.column_stack([balanced_channels, np.sqrt(r * g), np.sqrt(r * b), np.sqrt(g * b)])
 
 
-def fit_profile(seen: Balanced, form: Form) -> Profile:
+def fit_profile(patch_signals: Balanced, form: Form) -> Profile:
     """The profile of patches. Raises InputError: no grey patch is left, or the channels do not tell colours
     apart."""
-    if not seen.neutral and seen.white is None:
+    if not patch_signals.neutral and patch_signals.white is None:
         raise InputError("colour: no grey patch can be used; the channels cannot be balanced. Expose anew")
-    white = seen.white_signal()
-    terms = terms_of(seen.signal / white, form)
-    first = _least_squares(terms, seen.xyz)
-    return Profile(form, _least_de00(terms, lab_of(seen.xyz), first), white)
+    white = patch_signals.white_signal()
+    terms = terms_of(patch_signals.signal / white, form)
+    first = _least_squares(terms, patch_signals.xyz)
+    return Profile(form, _least_de00(terms, lab_of(patch_signals.xyz), first), white)
 
 
 def _free(coefficients: Floats) -> Floats:
@@ -125,11 +125,11 @@ def _least_de00(terms: Floats, lab: Floats, first: Floats) -> Floats:
     from scipy.optimize import least_squares
 
     shape = _free(first).shape
-    fit = least_squares(partial(_missed, terms, lab, first, shape), _free(first).ravel(), method="lm")
+    fit = least_squares(partial(_residuals, terms, lab, first, shape), _free(first).ravel(), method="lm")
     return _whole(fit.x.reshape(shape))
 
 
-def _missed(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int], free: Floats) -> Floats:
+def _residuals(terms: Floats, lab: Floats, first: Floats, shape: tuple[int, int], free: Floats) -> Floats:
     """Residuals: CIEDE2000's parts of all patches, and departures from the first solution."""
     coefficients = _whole(free.reshape(shape))
     parts = de00_parts(lab_of(terms @ coefficients.T), lab).ravel()
@@ -158,15 +158,15 @@ class LeftOut:
         return float(self.de.max())
 
 
-def leave_out(seen: Balanced, form: Form, tell: Callable[[], None] = lambda: None) -> LeftOut:
+def leave_out(patch_signals: Balanced, form: Form, tell: Callable[[], None] = lambda: None) -> LeftOut:
     """Each patch by the profile of the others, with their balance. `tell` is called after each. Raises InputError
     if there is one grey patch only."""
-    de = np.empty(len(seen.signal))
-    lab = lab_of(seen.xyz)
+    de = np.empty(len(patch_signals.signal))
+    lab = lab_of(patch_signals.xyz)
     for patch in range(len(de)):
-        rest = seen.without(patch)
+        rest = patch_signals.without(patch)
         profile = fit_profile(rest, form)
-        de[patch] = de00(lab_of(profile.xyz(seen.signal[[patch]])), lab[[patch]])[0]
+        de[patch] = de00(lab_of(profile.xyz(patch_signals.signal[[patch]])), lab[[patch]])[0]
         tell()
     return LeftOut(de)
 
@@ -179,7 +179,7 @@ def better(matrix: LeftOut, roots: LeftOut) -> Form:
 # -- uncertainty ----------------------------------------------------------------------------------------------
 
 
-def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
+def covariance_of(patch_signals: Balanced, profile: Profile) -> tuple[Floats, Floats]:
     """Covariances [3 terms, 3 terms] of the coefficients, row by row: by the noise of signals, and by the patches'
     own uncertainty.
 
@@ -187,13 +187,13 @@ def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
     function theorem on the normal equations, with Gauss and Newton's approximation). What the form itself cannot
     follow (metamerism) is no noise: `leave_out` has it.
     """
-    lab = lab_of(seen.xyz)
-    signal = seen.signal / profile.white_signal
+    lab = lab_of(patch_signals.xyz)
+    signal = patch_signals.signal / profile.white_signal
     free = _free(profile.coefficients)
 
-    def parts(balanced: Floats, free: Floats, lab: Floats) -> Floats:
+    def parts(balanced_channels: Floats, free: Floats, lab: Floats) -> Floats:
         coefficients = _whole(free)
-        return de00_parts(lab_of(terms_of(balanced, profile.form) @ coefficients.T), lab)
+        return de00_parts(lab_of(terms_of(balanced_channels, profile.form) @ coefficients.T), lab)
 
     rows = []
     for n in range(free.size):
@@ -205,8 +205,10 @@ def covariance_of(seen: Balanced, profile: Profile) -> tuple[Floats, Floats]:
     inverse = np.linalg.inv(design.T @ design + _HELD**2 * np.eye(free.size))
     gain = inverse @ design.T
     full = np.asarray(np.kron(np.eye(3), np.vstack([np.eye(free.shape[1]), -np.ones(free.shape[1])])), np.float64)
-    by_noise: list[Floats] = [gain @ column for column in _by_noise(seen, profile, signal, parts, free, lab)]
-    by_chart: list[Floats] = [gain @ column for column in _by_chart(seen, signal, parts, free, lab)]
+    by_noise: list[Floats] = [
+        gain @ column for column in _by_noise(patch_signals, profile, signal, parts, free, lab)
+    ]
+    by_chart: list[Floats] = [gain @ column for column in _by_chart(patch_signals, signal, parts, free, lab)]
     return _outer(by_noise, full), _outer(by_chart, full)
 
 
@@ -214,41 +216,48 @@ Parts = Callable[[Floats, Floats, Floats], Floats]
 
 
 def _by_noise(
-    seen: Balanced, profile: Profile, balanced: Floats, parts: Parts, free: Floats, lab: Floats
+    patch_signals: Balanced, profile: Profile, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
 ) -> Sequence[Floats]:
     """Changes of the misses by one standard uncertainty of each signal, with that of the balance it makes."""
     columns = []
-    grey = list(seen.neutral)
-    luminance = seen.xyz[grey, 1]
-    share = dict(zip(grey, luminance / (luminance @ luminance), strict=True)) if seen.white is None else {}
-    for patch in range(len(balanced)):
+    grey = list(patch_signals.neutral)
+    luminance = patch_signals.xyz[grey, 1]
+    share = (
+        dict(zip(grey, luminance / (luminance @ luminance), strict=True)) if patch_signals.white is None else {}
+    )
+    for patch in range(len(balanced_channels)):
         for channel in range(3):
-            step = np.zeros_like(balanced)
-            u = seen.u[patch, channel] / profile.white_signal[channel]
+            step = np.zeros_like(balanced_channels)
+            u = patch_signals.u[patch, channel] / profile.white_signal[channel]
             step[patch, channel] = u
-            step[:, channel] -= balanced[:, channel] * share.get(patch, 0.0) * u
-            columns.append(0.5 * (parts(balanced + step, free, lab) - parts(balanced - step, free, lab)).ravel())
+            step[:, channel] -= balanced_channels[:, channel] * share.get(patch, 0.0) * u
+            columns.append(
+                0.5
+                * (parts(balanced_channels + step, free, lab) - parts(balanced_channels - step, free, lab)).ravel()
+            )
     return columns
 
 
-def _by_chart(seen: Balanced, balanced: Floats, parts: Parts, free: Floats, lab: Floats) -> Sequence[Floats]:
+def _by_chart(
+    patch_signals: Balanced, balanced_channels: Floats, parts: Parts, free: Floats, lab: Floats
+) -> Sequence[Floats]:
     """The same by the patches' L*, a*, b*; a grey's L* moves the balance too."""
     columns = []
-    grey = list(seen.neutral)
+    grey = list(patch_signals.neutral)
     for patch in range(len(lab)):
         for axis in range(3):
             moved_parts = []
             for sign in (1.0, -1.0):
                 moved_lab = lab.copy()
                 moved_lab[patch, axis] += sign * _LAB_STEP
-                here = balanced
-                if seen.white is None and patch in grey:
+                here = balanced_channels
+                if patch_signals.white is None and patch in grey:
                     luminance = xyz_of(moved_lab)[grey, 1]
-                    white = luminance @ balanced[grey] / (luminance @ luminance)
-                    first = seen.xyz[grey, 1]
-                    here = balanced * (first @ balanced[grey] / (first @ first)) / white
+                    white = luminance @ balanced_channels[grey] / (luminance @ luminance)
+                    first = patch_signals.xyz[grey, 1]
+                    here = balanced_channels * (first @ balanced_channels[grey] / (first @ first)) / white
                 moved_parts.append(parts(here, free, moved_lab))
-            columns.append((seen.u_lab / (2.0 * _LAB_STEP)) * (moved_parts[0] - moved_parts[1]).ravel())
+            columns.append((patch_signals.u_lab / (2.0 * _LAB_STEP)) * (moved_parts[0] - moved_parts[1]).ravel())
     return columns
 
 

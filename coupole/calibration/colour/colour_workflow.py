@@ -12,7 +12,7 @@ import numpy as np
 from coupole.calibration.acceptance import against_limits
 from coupole.calibration.colour.acceptance import COLOUR
 from coupole.calibration.colour.chart import KnownChart
-from coupole.calibration.colour.chart_signals import ChartPicture, Reading, Signals, combined, read_patches
+from coupole.calibration.colour.chart_signals import ChartPicture, Reading, Signals, combined_signals, read_patches
 from coupole.calibration.colour.chart_views import ChartReader, ChartSetting, key_of, mean_picture, white_of
 from coupole.calibration.colour.colorimetry import de00, lab_of
 from coupole.calibration.colour.colour_profile import (
@@ -34,7 +34,7 @@ from coupole.calibration.colour.image_quality import (
     edge_figures,
     edges_of,
     noise_figures,
-    said,
+    sentence_of,
     tone_figures,
     uniformity_figure,
 )
@@ -68,7 +68,7 @@ def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames |
     reader = ChartReader(frames, setting)
     names = setting.chart.patch_names
     whites = {} if white is None else white_of(white, setting)
-    tell = counter(progress, len(reader.suited()))
+    tell = counter(progress, len(reader.suitable_frames()))
     readings: list[Reading] = []
     lights: list[Floats] = []
     lit: list[str] = []
@@ -85,7 +85,7 @@ def see_in_runs(frames: LightFrames, setting: ChartSetting, white: LightFrames |
         if setting.chart.edges and len(sharp) < _MOST_EDGE_PICTURES and frame.view == frames.lit[0].view:
             sharp.append(picture)
         tell()
-    signals = combined(names, readings, np.stack(lights), lit)
+    signals = combined_signals(names, readings, np.stack(lights), lit)
     edges = edges_of(mean_picture(sharp), [edge.name for edge in setting.chart.edges]) if sharp else {}
     return Seen(signals, edges, next(iter(whites.values()), None))
 
@@ -99,23 +99,28 @@ class _Made:
     form: Form
 
     @property
-    def chosen(self) -> Profile:
+    def chosen_profile(self) -> Profile:
         return self.profiles[self.form]
 
     @property
-    def missed(self) -> LeftOut:
+    def left_out_errors(self) -> LeftOut:
         return self.left_out[self.form]
 
 
 def colour_outcome(
-    seen: Seen, known: KnownChart, setting: ChartSetting, frames: LightFrames, request: Request, progress: Progress
+    measurements: Seen,
+    known_chart: KnownChart,
+    setting: ChartSetting,
+    frames: LightFrames,
+    request: Request,
+    progress: Progress,
 ) -> Outcome:
     """The record of a profile, with the profile as ICC file and a table of the patches beside it."""
-    forms, balanced_signals = make_profiles(seen.signals, known, progress)
-    lab = lab_of(forms.chosen.xyz(balanced_signals.signal))
-    figures = figures_of(seen, known, forms, balanced_signals, lab)
+    forms, balanced_signals = make_profiles(measurements.signals, known_chart, progress)
+    lab = lab_of(forms.chosen_profile.xyz(balanced_signals.signal))
+    figures = figures_of(measurements, known_chart, forms, balanced_signals, lab)
     by_noise, by_chart = covariance_of(balanced_signals, forms.profiles["matrix"])
-    edges = [(name, colours[1]) for name, colours in seen.edges.items()]
+    edges = [(name, colours[1]) for name, colours in measurements.edges.items()]
     return sealed_outcome(
         "colour",
         request,
@@ -123,45 +128,59 @@ def colour_outcome(
         frames.size_px,
         _parameters(forms.profiles["matrix"], by_noise, by_chart, len(balanced_signals.signal)),
         by_noise + by_chart,
-        partial(draw_colour, known, lab, forms.missed.de, edges),
-        limits=against_limits(COLOUR, request.limits, {"mean": forms.missed.mean, "worst": forms.missed.worst}),
+        partial(draw_colour, known_chart, lab, forms.left_out_errors.de, edges),
+        limits=against_limits(
+            COLOUR, request.limits, {"mean": forms.left_out_errors.mean, "worst": forms.left_out_errors.worst}
+        ),
         files={
-            f"{request.name}.icc": icc_profile(forms.chosen, forms.profiles["matrix"], request.name, request.now),
-            f"{request.name}.csv": _patch_table(known, balanced_signals, forms, lab).encode(),
+            f"{request.name}.icc": icc_profile(
+                forms.chosen_profile, forms.profiles["matrix"], request.name, request.now
+            ),
+            f"{request.name}.csv": _patch_table(known_chart, balanced_signals, forms, lab).encode(),
         },
-        fixed=_fixed(forms, figures),
-        remarks=(_chosen(forms), *(said(figure) for figure in figures), *seen.signals.remarks),
+        fixed_figures=_fixed_figures(forms, figures),
+        remarks=(
+            _choice_remark(forms),
+            *(sentence_of(figure) for figure in figures),
+            *measurements.signals.remarks,
+        ),
         more_inputs=setting.inputs,
     )
 
 
-def make_profiles(signals: Signals, known: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
+def make_profiles(signals: Signals, known_chart: KnownChart, progress: Progress) -> tuple[_Made, Balanced]:
     """Both forms with their errors on patches left out."""
-    balanced_signals = Balanced(signals.mean, signals.u, known.xyz, known.chart.u_lab, known.neutral)
+    balanced_signals = Balanced(
+        signals.mean, signals.u, known_chart.xyz, known_chart.chart.u_lab, known_chart.neutral
+    )
     tell: Callable[[], None] = counter(progress, len(FORMS) * len(balanced_signals.signal))
     profiles = {form: fit_profile(balanced_signals, form) for form in FORMS}
     de00_of = {form: leave_out(balanced_signals, form, tell) for form in FORMS}
     return _Made(profiles, de00_of, better(de00_of["matrix"], de00_of["root-polynomial"])), balanced_signals
 
 
-def figures_of(seen: Seen, known: KnownChart, made: _Made, balanced: Balanced, lab: Floats) -> list[Figure]:
+def figures_of(
+    measurements: Seen, known_chart: KnownChart, profile_choice: _Made, patch_signals: Balanced, lab: Floats
+) -> list[Figure]:
     """All figures of image quality that these pictures give."""
-    figures = colour_figures(made.missed.de)
-    figures += tone_figures(lab, known.lab, known.neutral)
-    figures += noise_figures(balanced.signal, seen.signals.pixel_sd, made.chosen, known.neutral)
-    if seen.edges:
-        figures += edge_figures(seen.edges)
-    if seen.white is not None:
-        figures.append(uniformity_figure(seen.white))
+    figures = colour_figures(profile_choice.left_out_errors.de)
+    figures += tone_figures(lab, known_chart.lab, known_chart.neutral)
+    figures += noise_figures(
+        patch_signals.signal, measurements.signals.pixel_sd, profile_choice.chosen_profile, known_chart.neutral
+    )
+    if measurements.edges:
+        figures += edge_figures(measurements.edges)
+    if measurements.white is not None:
+        figures.append(uniformity_figure(measurements.white))
     return figures
 
 
-def _chosen(made: _Made) -> str:
+def _choice_remark(profile_choice: _Made) -> str:
     errors = "; ".join(
         f"{form}: mean {form_de00.mean:.2f}, 95 % {form_de00.quantile(0.95):.2f}, largest {form_de00.worst:.2f}"
-        for form, form_de00 in made.left_out.items()
+        for form, form_de00 in profile_choice.left_out.items()
     )
-    return f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {made.form}"
+    return f"CIEDE2000 of patches left out: {errors}. The ICC profile has the {profile_choice.form}"
 
 
 def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: int) -> list[Parameter]:
@@ -181,9 +200,9 @@ def _parameters(matrix: Profile, by_noise: Floats, by_chart: Floats, patches: in
     return parameters
 
 
-def _fixed(made: _Made, figures: Sequence[Figure]) -> dict[str, float]:
+def _fixed_figures(profile_choice: _Made, figures: Sequence[Figure]) -> dict[str, float]:
     """Balance, DNG's matrix, the root-polynomial, errors and figures."""
-    matrix, roots = made.profiles["matrix"], made.profiles["root-polynomial"]
+    matrix, roots = profile_choice.profiles["matrix"], profile_choice.profiles["root-polynomial"]
     white = matrix.white_signal
     fixed_figures = {
         f"neutral.{channel}": float(w) for channel, w in zip(CHANNELS, white / white.max(), strict=True)
@@ -199,7 +218,7 @@ def _fixed(made: _Made, figures: Sequence[Figure]) -> dict[str, float]:
         for a, axis in enumerate("XYZ")
         for t, term in enumerate(_TERMS)
     }
-    for form, form_de00 in made.left_out.items():
+    for form, form_de00 in profile_choice.left_out.items():
         fixed_figures |= {
             f"left_out.{form}.mean_de00": form_de00.mean,
             f"left_out.{form}.q95_de00": form_de00.quantile(0.95),
@@ -208,16 +227,23 @@ def _fixed(made: _Made, figures: Sequence[Figure]) -> dict[str, float]:
     return fixed_figures | {f"figure.{figure.name}": figure.value for figure in figures}
 
 
-def _patch_table(known: KnownChart, balanced: Balanced, made: _Made, lab: Floats) -> str:
+def _patch_table(known_chart: KnownChart, patch_signals: Balanced, profile_choice: _Made, lab: Floats) -> str:
     """CSV: each patch's balanced channels, its L*a*b* on the chart and by the profile, CIEDE2000 with and without
     it."""
     text = io.StringIO()
     text.write("# channels of which the perfect white has 1; L*, a*, b* under D50, 1931 observer\n")
     text.write("patch,r,g,b,u_r,u_g,u_b,L,a,b_star,L_found,a_found,b_found,de00,de00_left_out\n")
-    white = made.chosen.white_signal
+    white = profile_choice.chosen_profile.white_signal
     table = np.column_stack(
-        [balanced.signal / white, balanced.u / white, known.lab, lab, de00(lab, known.lab), made.missed.de]
+        [
+            patch_signals.signal / white,
+            patch_signals.u / white,
+            known_chart.lab,
+            lab,
+            de00(lab, known_chart.lab),
+            profile_choice.left_out_errors.de,
+        ]
     )
-    for name, row in zip(known.chart.patch_names, table, strict=True):
+    for name, row in zip(known_chart.chart.patch_names, table, strict=True):
         text.write(f"{name}," + ",".join(f"{value:.6g}" for value in row) + "\n")
     return text.getvalue()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def draw_colour(
-    known: KnownChart,
+    known_chart: KnownChart,
     lab: Floats,
     de: Floats,
     edges: Sequence[tuple[str, SlantedEdge]],
@@ -28,20 +28,20 @@ def draw_colour(
 ) -> None:
     """Fill the figure; `lab` [patches, 3] is by the profile, `de` [patches] CIEDE2000 of patches left out."""
     axes = figure.subplots(2, 2)
-    names = known.chart.patch_names
+    names = known_chart.chart.patch_names
     axes[0, 0].bar(range(len(de)), de, color=BLUE)
     axes[0, 0].set_xticks(range(len(de)), names, rotation=90, fontsize=8)
     axes[0, 0].axhline(float(np.mean(de)), color=GREY)
     axes[0, 0].set(title="CIEDE2000 of each patch, left out of the profile", ylabel="dE00")
-    for seen_lab, true_lab in zip(lab, known.lab, strict=True):
+    for seen_lab, true_lab in zip(lab, known_chart.lab, strict=True):
         axes[0, 1].plot([true_lab[1], seen_lab[1]], [true_lab[2], seen_lab[2]], color=GREY)
-    axes[0, 1].plot(known.lab[:, 1], known.lab[:, 2], "o", color=DARK, mfc="none", label="chart")
+    axes[0, 1].plot(known_chart.lab[:, 1], known_chart.lab[:, 2], "o", color=DARK, mfc="none", label="chart")
     axes[0, 1].plot(lab[:, 1], lab[:, 2], ".", color=RED, label="by the profile")
     axes[0, 1].legend(frameon=False)
     axes[0, 1].set(title="a*, b*", xlabel="a*", ylabel="b*", aspect="equal")
-    grey = list(known.neutral)
+    grey = list(known_chart.neutral)
     axes[1, 0].axhline(0.0, color=GREY)
-    axes[1, 0].plot(known.lab[grey, 0], (lab - known.lab)[grey, 0], "o-", color=BLUE)
+    axes[1, 0].plot(known_chart.lab[grey, 0], (lab - known_chart.lab)[grey, 0], "o-", color=BLUE)
     axes[1, 0].set(title="Tone: greys by the profile less the chart", xlabel="L*", ylabel="difference of L*")
     for name, edge in edges:
         axes[1, 1].plot(edge.frequencies, edge.response, label=name)

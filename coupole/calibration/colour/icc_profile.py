@@ -25,9 +25,9 @@ _LARGEST_XYZ = 1.0 + 32767.0 / 32768.0
 """Value that the largest code of X, Y, Z stands for (ICC.1:2022, 6.3.4.2)."""
 
 
-def icc_profile(chosen: Profile, matrix: Profile, name: str, created: datetime) -> bytes:
-    """The whole file. `chosen` goes into the table if it is a root-polynomial, `matrix` into matrix and curves.
-    `name` is its description, in ASCII."""
+def icc_profile(chosen_profile: Profile, matrix: Profile, name: str, creation_time: datetime) -> bytes:
+    """The whole file. `chosen_profile` goes into the table if it is a root-polynomial, `matrix` into matrix and
+    curves. `name` is its description, in ASCII."""
     columns = matrix.coefficients.T
     tags: dict[bytes, bytes] = {
         b"desc": _text(name),
@@ -39,12 +39,12 @@ def icc_profile(chosen: Profile, matrix: Profile, name: str, created: datetime) 
     }
     linear = b"curv" + bytes(8)
     tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), linear)
-    if chosen.form != "matrix":
-        tags[b"A2B0"] = _table(chosen)
-    return _file(tags, created)
+    if chosen_profile.form != "matrix":
+        tags[b"A2B0"] = _table(chosen_profile)
+    return _file(tags, creation_time)
 
 
-def _file(tags: dict[bytes, bytes], created: datetime) -> bytes:
+def _file(tags: dict[bytes, bytes], creation_time: datetime) -> bytes:
     start = _HEAD_BYTES + 4 + _TAG_BYTES * len(tags)
     tag_table, content = struct.pack(">I", len(tags)), b""
     places: dict[bytes, int] = {}
@@ -53,25 +53,25 @@ def _file(tags: dict[bytes, bytes], created: datetime) -> bytes:
             places[data] = start + len(content)
             content += data + bytes(-len(data) % 4)
         tag_table += struct.pack(">4sII", name, places[data], len(data))
-    when = created.astimezone(UTC)
+    when = creation_time.astimezone(UTC)
     head = struct.pack(
         ">I4sI4s4s4s6H4s4sI4sIQI12s4s",
         start + len(content), bytes(4), 0x04400000, b"scnr", b"RGB ", b"XYZ ",
         when.year, when.month, when.day, when.hour, when.minute, when.second,
-        b"acsp", bytes(4), 0, bytes(4), 0, 0, 0, _fixed(D50_WHITE), bytes(4),
+        b"acsp", bytes(4), 0, bytes(4), 0, 0, 0, _s15_fixed16(D50_WHITE), bytes(4),
     )  # fmt: skip
     whole = head + bytes(_HEAD_BYTES - len(head)) + tag_table + content
     # The identity is over the file without flags, rendering intent and itself (7.2.18), which are 0 here.
     return whole[:84] + hashlib.md5(whole, usedforsecurity=False).digest() + whole[100:]
 
 
-def _fixed(values: Floats) -> bytes:
+def _s15_fixed16(values: Floats) -> bytes:
     """s15Fixed16Number."""
     return np.rint(np.asarray(values) * 65536.0).astype(">i4").tobytes()
 
 
 def _xyz(values: Floats) -> bytes:
-    return b"XYZ " + bytes(4) + _fixed(values)
+    return b"XYZ " + bytes(4) + _s15_fixed16(values)
 
 
 def _text(text: str) -> bytes:
@@ -82,7 +82,7 @@ def _text(text: str) -> bytes:
 
 def _power(exponent: float) -> bytes:
     """parametricCurveType 0: x to the exponent."""
-    return b"para" + bytes(8) + _fixed(np.array([exponent]))
+    return b"para" + bytes(8) + _s15_fixed16(np.array([exponent]))
 
 
 def _table(profile: Profile) -> bytes:
@@ -92,7 +92,7 @@ def _table(profile: Profile) -> bytes:
     xyz = profile.xyz_of_balanced(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
     codes = np.rint(65535.0 * np.clip(xyz / _LARGEST_XYZ, 0.0, 1.0) ** (1.0 / _POWER)).astype(">u2")
     identity, powers, roots = (curve * 3 for curve in (b"curv" + bytes(8), _power(_POWER), _power(1.0 / _POWER)))
-    matrix = _fixed(np.concatenate([np.eye(3).ravel(), np.zeros(3)]))
+    matrix = _s15_fixed16(np.concatenate([np.eye(3).ravel(), np.zeros(3)]))
     grid = bytes([_GRID] * 3 + [0] * 13) + struct.pack(">B3x", 2) + codes.tobytes()
     grid += bytes(-len(grid) % 4)
     at = 32

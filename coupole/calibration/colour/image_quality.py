@@ -32,7 +32,7 @@ class Figure:
     name: str
     value: float
     unit: str
-    what: str
+    description: str
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,10 @@ class Tolerance:
             levels.append(f"FADGI {stars[0]} star{'s' if stars[0] > 1 else ''}" if stars else "below FADGI 1 star")
         return ", ".join(levels)
 
-    def _within(self, value: float, bound: float, reached: bool) -> bool:
+    def _within(self, value: float, bound: float, inclusive: bool) -> bool:
         if self.at_least:
-            return value >= bound if reached else value > bound
-        return value <= bound if reached else value < bound
+            return value >= bound if inclusive else value > bound
+        return value <= bound if inclusive else value < bound
 
 
 TOLERANCES: Mapping[str, Tolerance] = {
@@ -77,12 +77,12 @@ TOLERANCES: Mapping[str, Tolerance] = {
 """Tolerances by the name of a figure; the other figures have none that could be verified."""
 
 
-def said(figure: Figure) -> str:
+def sentence_of(figure: Figure) -> str:
     """A figure in words, with its level."""
     unit = f" {figure.unit}" if figure.unit else ""
     tolerance = TOLERANCES.get(figure.name)
     level = tolerance.level(figure.value) if tolerance else "no verified tolerance"
-    return f"{figure.what}: {figure.value:.3g}{unit} ({level})"
+    return f"{figure.description}: {figure.value:.3g}{unit} ({level})"
 
 
 def colour_figures(de: Floats) -> list[Figure]:
@@ -94,9 +94,9 @@ def colour_figures(de: Floats) -> list[Figure]:
     ]
 
 
-def tone_figures(found: Floats, known: Floats, neutral: Sequence[int]) -> list[Figure]:
+def tone_figures(found_lab: Floats, known_lab: Floats, neutral: Sequence[int]) -> list[Figure]:
     """Return figures of the greys' lightness and hue, from L*a*b* [patches, 3] as found and as known."""
-    off = (found - known)[list(neutral)]
+    off = (found_lab - known_lab)[list(neutral)]
     return [
         Figure("tone", float(np.abs(off[:, 0]).max()), "L*", "tone (OECF), largest departure of a grey's L*"),
         Figure("white_balance", float(np.hypot(off[:, 1], off[:, 2]).max()), "a*b*", "white balance, worst grey"),

@@ -70,10 +70,10 @@ def slanted_edge(x_px: Floats, y_px: Floats, values: Floats, where: str = "edge"
     towards = np.array([x[bright].mean() - x[~bright].mean(), y[bright].mean() - y[~bright].mean()])
     start = [np.arctan2(towards[1], towards[0]), 0.0, 0.0, 0.7, dark, light]
 
-    def left(unknowns: Floats) -> Floats:
+    def residuals_of(unknowns: Floats) -> Floats:
         return np.asarray((_model(unknowns, x, y) - values) / (light - dark))
 
-    fit = least_squares(left, start, x_scale=[0.01, 0.1, 1e-4, 0.2, light - dark, light - dark])
+    fit = least_squares(residuals_of, start, x_scale=[0.01, 0.1, 1e-4, 0.2, light - dark, light - dark])
     angle, offset, bend, _, low, high = fit.x
     slant_deg = np.degrees(abs((angle + np.pi / 4.0) % (np.pi / 2.0) - np.pi / 4.0))
     if slant_deg < _LEAST_SLANT_DEG:

@@ -37,12 +37,12 @@ from coupole.calibration.leds.equations import (
     at_centres,
     camera_step,
     cost_of,
-    linearised,
+    linearisation,
     pose_errors,
     problem_of,
-    stepped,
+    stepped_state,
     table_sigmas,
-    whitened,
+    whitened_residuals,
 )
 from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.point_sets import Indices
@@ -74,7 +74,7 @@ class LedGeometry:
     """[groups]."""
     residuals_px: Floats
     """[k, 2] observed minus computed."""
-    kept: NDArray[np.bool_]
+    accepted_mask: NDArray[np.bool_]
     """[k] False for spots left out as gross errors."""
     prior_step: Floats
     """[free + 6 + k] change of lens, hand-eye and axes, over the standard uncertainties of their record."""
@@ -87,13 +87,13 @@ class LedGeometry:
 
 
 def adjust_leds(
-    seen: LedSightings,
+    sightings: LedSightings,
     place: Indices,
     base_from_flange: Floats,
     boards: Boards,
     start: Floats,
     prior: CameraPrior,
-    stated: Stated,
+    stated_noise: Stated,
 ) -> LedGeometry:
     """Adjust boards, LEDs, poses [v, 4, 4] as reported, lens and hand-eye.
 
@@ -108,7 +108,7 @@ def adjust_leds(
         prior.lens.vector(),
         np.zeros(len(prior.covariance) - len(prior.free) - 6),
     )
-    problem = problem_of(seen, place, boards, base_from_flange, prior, stated)
+    problem = problem_of(sightings, place, boards, base_from_flange, prior, stated_noise)
     factors, keep, step_count = np.ones(len(GROUPS)), np.ones(len(place), np.bool_), 0
     state, step_count = _descend(problem, state, factors, keep, 3.0 * HUBER)
     problem = at_centres(problem, state)
@@ -116,13 +116,13 @@ def adjust_leds(
         for _ in range(_MOST_ROUNDS):
             state, steps = _descend(problem, state, factors, keep, HUBER if robust else np.inf)
             step_count += steps
-            residuals = whitened(problem, state)
+            residuals = whitened_residuals(problem, state)
             off = np.sqrt(np.mean(residuals**2, axis=1))
             before, seen_factors = keep, factors.copy()
             if robust:
                 seen_factors[SPOTS] = max(1.4826 * float(np.median(np.abs(residuals))), _LEAST_FACTOR)
             else:
-                seen_factors = _solved(problem, state, factors, keep).seen
+                seen_factors = _solution(problem, state, factors, keep).noise_factors
             is_settled = bool(np.all(np.abs(seen_factors / factors - 1) < _SETTLED))
             factors = seen_factors
             keep = off <= REJECT_SIGMA * factors[SPOTS] / np.sqrt(2)
@@ -139,7 +139,7 @@ class _BoardPart:
     """One board's part of the normal equations: its own parameters (pose, then its LEDs' offsets) and their
     coupling with the shared ones in `columns`."""
 
-    own: Floats
+    own_normal: Floats
     """[m, m]."""
     cross: Floats
     """[m, columns]."""
@@ -155,7 +155,7 @@ def _board_parts(
 ) -> Iterator[tuple[_BoardPart, Floats]]:
     """The part of each board, and the residuals [2 k] of its spots."""
     off_table = between(state.base_from_board, problem.boards.base_from_board)
-    tolerance = problem.stated.tolerance_mm * factors[TOLERANCE]
+    tolerance = problem.stated_noise.tolerance_mm * factors[TOLERANCE]
     root = np.sqrt(weights)[:, None] / factors[SPOTS]
     for board, (rows, columns) in enumerate(zip(problem.sightings_of, problem.columns_of, strict=True)):
         places = problem.boards.rows_of(board)
@@ -186,11 +186,11 @@ def _normal(
     the shared parameters."""
     parts: list[_BoardPart] = []
     solutions: list[Floats] = []
-    views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
-    matrix, side = np.zeros((problem.shared, problem.shared)), np.zeros(problem.shared)
-    for part, residuals in _board_parts(problem, state, linearised(problem, state), factors, weights):
-        shared_jacobian = part.jacobian[:, len(part.own) :]
-        solution = _solve(part.own, np.column_stack([part.cross, part.side]))
+    views, axes = 6 * len(problem.reported_poses), slice(6 * len(problem.reported_poses) + problem.of_camera, None)
+    matrix, side = np.zeros((problem.shared_count, problem.shared_count)), np.zeros(problem.shared_count)
+    for part, residuals in _board_parts(problem, state, linearisation(problem, state), factors, weights):
+        shared_jacobian = part.jacobian[:, len(part.own_normal) :]
+        solution = _solve(part.own_normal, np.column_stack([part.cross, part.side]))
         matrix[np.ix_(part.columns, part.columns)] += (
             shared_jacobian.T @ shared_jacobian - part.cross.T @ solution[:, :-1]
         )
@@ -200,7 +200,7 @@ def _normal(
     pose_weights = (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** -2
     off = pose_weights * pose_errors(problem, state)
     by_axes = pose_weights[:, None] * problem.by_axes
-    matrix[np.arange(views), np.arange(views)] += np.tile(pose_weights, len(problem.reported))
+    matrix[np.arange(views), np.arange(views)] += np.tile(pose_weights, len(problem.reported_poses))
     matrix[:views, axes] -= by_axes.reshape(views, -1)
     matrix[axes, :views] -= by_axes.reshape(views, -1).T
     matrix[axes, axes] += np.einsum("vij,vik->jk", problem.by_axes, by_axes)
@@ -213,20 +213,22 @@ def _normal(
 
 
 def _descend(
-    problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], huber: float
 ) -> tuple[LedState, int]:
     """Gauss-Newton with Huber's weights; a step that does not lower the cost is halved."""
-    cost = cost_of(problem, state, factors, kept, huber)
+    cost = cost_of(problem, state, factors, accepted_mask, huber)
     for step in range(1, _MOST_STEPS + 1):
-        off = np.sqrt(np.sum(whitened(problem, state) ** 2, axis=1)) / factors[SPOTS]
-        weights = np.where(kept, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
+        off = np.sqrt(np.sum(whitened_residuals(problem, state) ** 2, axis=1)) / factors[SPOTS]
+        weights = np.where(accepted_mask, np.minimum(1.0, huber / np.maximum(off, 1e-12)), 0.0)
         parts, solutions, matrix, side = _normal(problem, state, factors, weights)
-        shared_step = cho_solve(_factored(matrix), side)
+        shared_step = cho_solve(_cholesky_factor(matrix), side)
         own_steps = [s[:, -1] - s[:, :-1] @ shared_step[p.columns] for p, s in zip(parts, solutions, strict=True)]
-        share, tried_state = 1.0, stepped(problem, state, shared_step, own_steps, 1.0)
-        while (now := cost_of(problem, tried_state, factors, kept, huber)) > cost * (1 + 1e-12) and share > 1e-3:
+        share, tried_state = 1.0, stepped_state(problem, state, shared_step, own_steps, 1.0)
+        while (now := cost_of(problem, tried_state, factors, accepted_mask, huber)) > cost * (
+            1 + 1e-12
+        ) and share > 1e-3:
             share /= 2
-            tried_state = stepped(problem, state, shared_step, own_steps, share)
+            tried_state = stepped_state(problem, state, shared_step, own_steps, share)
         if now > cost * (1 + 1e-12):
             return state, step
         state, gain, cost = tried_state, cost - now, now
@@ -242,7 +244,7 @@ def _solve(matrix: Floats, side: Floats) -> Floats:
     return np.asarray(np.linalg.solve(matrix, side), dtype=np.float64)
 
 
-def _factored(matrix: Floats) -> tuple[Floats, bool]:
+def _cholesky_factor(matrix: Floats) -> tuple[Floats, bool]:
     try:
         return cho_factor(matrix, lower=True)  # type: ignore[no-any-return]
     except LinAlgError:
@@ -258,37 +260,37 @@ def _factored(matrix: Floats) -> tuple[Floats, bool]:
 class _Solved:
     """Covariances at the solution, and the noise by the residuals."""
 
-    own: list[Floats]
+    own_covariances: list[Floats]
     """[b] of each board's own parameters."""
     alone: list[Floats]
     """[b] the same if the shared parameters were known."""
-    seen: Floats
+    noise_factors: Floats
     redundancy: Floats
 
 
-def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_]) -> _Solved:
-    parts, solutions, matrix, _ = _normal(problem, state, factors, kept.astype(np.float64))
-    shared_covariance = cho_solve(_factored(matrix), np.eye(len(matrix)))
+def _solution(problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_]) -> _Solved:
+    parts, solutions, matrix, _ = _normal(problem, state, factors, accepted_mask.astype(np.float64))
+    shared_covariance = cho_solve(_cholesky_factor(matrix), np.eye(len(matrix)))
     own_covariances: list[Floats] = []
     alone: list[Floats] = []
     used_freedom = np.zeros(len(GROUPS))
     for part, solution in zip(parts, solutions, strict=True):
-        count, gain = len(part.own), solution[:, :-1]
+        count, gain = len(part.own_normal), solution[:, :-1]
         block = shared_covariance[np.ix_(part.columns, part.columns)]
-        alone.append(_solve(part.own, np.eye(count)))
+        alone.append(_solve(part.own_normal, np.eye(count)))
         own_covariances.append(alone[-1] + gain @ block @ gain.T)
         whole = np.block([[own_covariances[-1], -gain @ block], [-block @ gain.T, block]])
         used_freedom[SPOTS] += float(np.sum((part.jacobian @ whole) * part.jacobian))
         used_freedom[TOLERANCE] += float(np.trace(own_covariances[-1][6:, 6:]))
         assert count == len(own_covariances[-1])
     variance = _of_pose_errors(problem, shared_covariance)
-    used_freedom[TOLERANCE] /= (problem.stated.tolerance_mm * factors[TOLERANCE]) ** 2
+    used_freedom[TOLERANCE] /= (problem.stated_noise.tolerance_mm * factors[TOLERANCE]) ** 2
     scaled_variance = variance / (problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)) ** 2
     used_freedom[POSITION], used_freedom[ORIENTATION] = scaled_variance[:, :3].sum(), scaled_variance[:, 3:].sum()
     off = pose_errors(problem, state) / problem.sigmas
     groups = (
-        whitened(problem, state)[kept],
-        state.offsets_mm / problem.stated.tolerance_mm,
+        whitened_residuals(problem, state)[accepted_mask],
+        state.offsets_mm / problem.stated_noise.tolerance_mm,
         off[:, :3],
         off[:, 3:],
     )
@@ -304,25 +306,27 @@ def _solved(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
     )
 
 
-def _of_pose_errors(problem: Problem, shared: Floats) -> Floats:
+def _of_pose_errors(problem: Problem, shared_covariance: Floats) -> Floats:
     """[v, 6] variance of `pose_errors` by the covariance of the shared parameters."""
-    views, axes = 6 * len(problem.reported), slice(6 * len(problem.reported) + problem.of_camera, None)
-    with_axes = shared[:views, axes].reshape(*problem.by_axes.shape)
+    views, axes = 6 * len(problem.reported_poses), slice(6 * len(problem.reported_poses) + problem.of_camera, None)
+    with_axes = shared_covariance[:views, axes].reshape(*problem.by_axes.shape)
     by = problem.by_axes
-    own_variance = np.diag(shared)[:views].reshape(-1, 6)
-    joint: Floats = np.einsum("vij,jk,vik->vi", by, shared[axes, axes], by) - 2 * np.sum(with_axes * by, axis=2)
+    own_variance = np.diag(shared_covariance)[:views].reshape(-1, 6)
+    joint: Floats = np.einsum("vij,jk,vik->vi", by, shared_covariance[axes, axes], by) - 2 * np.sum(
+        with_axes * by, axis=2
+    )
     return own_variance + joint
 
 
 def _summary(
-    problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], steps: int
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], steps: int
 ) -> LedGeometry:
-    solution = _solved(problem, state, factors, kept)
+    solution = _solution(problem, state, factors, accepted_mask)
     boards = problem.boards
     centres = np.empty((len(boards.places_mm), 3, 3))
     shared_part = np.empty(len(centres))
     normals = np.empty((len(boards.numbers), 2, 2))
-    for board, (own_covariance, alone) in enumerate(zip(solution.own, solution.alone, strict=True)):
+    for board, (own_covariance, alone) in enumerate(zip(solution.own_covariances, solution.alone, strict=True)):
         turn = state.base_from_board[board, :3, :3]
         normals[board] = np.degrees(np.degrees(own_covariance[3:5, 3:5]))
         for led, place in enumerate(boards.rows_of(board)):
@@ -332,7 +336,7 @@ def _summary(
             by[:, 6 + 3 * led : 9 + 3 * led] = turn
             centres[place] = by @ own_covariance @ by.T
             shared_part[place] = 1 - np.trace(by @ alone @ by.T) / np.trace(centres[place])
-    residuals = _solve(problem.whiten, whitened(problem, state)[:, :, None])[:, :, 0]
+    residuals = _solve(problem.whiten, whitened_residuals(problem, state)[:, :, None])[:, :, 0]
     step = camera_step(problem, state) / np.sqrt(np.diag(problem.prior.covariance))
     return LedGeometry(
         state,
@@ -343,7 +347,7 @@ def _summary(
         factors,
         solution.redundancy,
         residuals,
-        kept,
+        accepted_mask,
         step,
         steps,
     )

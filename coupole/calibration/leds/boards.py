@@ -45,7 +45,7 @@ class Boards:
         return turned_mm + pose[:, :3, 3]
 
 
-def placed(boards: Boards, found_mm: Floats) -> Floats:
+def board_poses(boards: Boards, found_mm: Floats) -> Floats:
     """`base_from_board` [b, 4, 4] by the LEDs found at places [n, 3] (NaN where none was found); by the table for
     a board with fewer than three."""
     poses = boards.base_from_board.copy()

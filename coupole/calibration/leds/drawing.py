@@ -17,32 +17,32 @@ _ARROW_MM = 120.0
 """Length of the arrow of a typical shift."""
 
 
-def draw_leds(found: LedsFound, figure: Figure) -> None:
+def draw_leds(result: LedsFound, figure: Figure) -> None:
     """Fill the figure."""
     axes = figure.subplots(2, 3)
     for ax, (across, up, title) in zip(
         axes[0], ((0, 1, "From above"), (0, 2, "From the side"), (1, 2, "From the front")), strict=True
     ):
-        _draw_dome(ax, found, across, up, title)
-    _draw_uncertainty(axes[1, 0], found)
-    _draw_residuals(axes[1, 1], found)
-    _draw_robot(axes[1, 2], found)
+        _draw_dome(ax, result, across, up, title)
+    _draw_uncertainty(axes[1, 0], result)
+    _draw_residuals(axes[1, 1], result)
+    _draw_robot(axes[1, 2], result)
 
 
-def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> None:
+def _draw_dome(ax: Axes, result: LedsFound, across: int, up: int, title: str) -> None:
     """LEDs by uncertainty; arrows from the table's place of a board to the one found, enlarged; red rings for LEDs
     not found."""
-    place = found.new_table.positions_mm
-    is_known = np.isfinite(found.u_mm)
-    order = np.argsort(np.nan_to_num(found.u_mm))
+    place = result.new_table.positions_mm
+    is_known = np.isfinite(result.u_mm)
+    order = np.argsort(np.nan_to_num(result.u_mm))
     order = order[is_known[order]]
     x, y = place[:, across], place[:, up]
-    dots = ax.scatter(x[order], y[order], c=1e3 * found.u_mm[order], s=9, cmap="viridis", linewidths=0)
+    dots = ax.scatter(x[order], y[order], c=1e3 * result.u_mm[order], s=9, cmap="viridis", linewidths=0)
     ax.figure.colorbar(dots, ax=ax, label="u of the centre (um)", shrink=0.8)
     ax.scatter(x[~is_known], y[~is_known], s=40, facecolors="none", edgecolors=RED, linewidths=1.5)
-    boards = np.unique(found.table.boards)
-    before = np.array([found.table.positions_mm[found.table.boards == b].mean(axis=0) for b in boards])
-    after = np.array([place[found.table.boards == b].mean(axis=0) for b in boards])
+    boards = np.unique(result.table.boards)
+    before = np.array([result.table.positions_mm[result.table.boards == b].mean(axis=0) for b in boards])
+    after = np.array([place[result.table.boards == b].mean(axis=0) for b in boards])
     shift = after - before
     enlargement = _round(_ARROW_MM / max(float(np.median(np.linalg.norm(shift, axis=1))), 1e-6))
     ax.quiver(
@@ -63,8 +63,8 @@ def _draw_dome(ax: Axes, found: LedsFound, across: int, up: int, title: str) -> 
         ax.invert_yaxis()  # the arm hangs: z of its base points down
 
 
-def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
-    u_um = found.u_mm[np.isfinite(found.u_mm)] * 1e3
+def _draw_uncertainty(ax: Axes, result: LedsFound) -> None:
+    u_um = result.u_mm[np.isfinite(result.u_mm)] * 1e3
     ax.hist(u_um, bins=40, range=(0, float(np.percentile(u_um, 99.5)) * 1.1), color=BLUE)
     for share, style in ((50, "-"), (95, "--")):
         value = float(np.percentile(u_um, share))
@@ -73,9 +73,9 @@ def _draw_uncertainty(ax: Axes, found: LedsFound) -> None:
     ax.set(title="Uncertainty of centres", xlabel="u (um)", ylabel="LEDs")
 
 
-def _draw_residuals(ax: Axes, found: LedsFound) -> None:
+def _draw_residuals(ax: Axes, result: LedsFound) -> None:
     """Residuals of all spots; those left out in red, at the rim if they are larger."""
-    residuals, keep = found.geometry.residuals_px, found.geometry.kept
+    residuals, keep = result.geometry.residuals_px, result.geometry.accepted_mask
     reach = 6.0 * float(np.sqrt(np.mean(residuals[keep] ** 2)))
     x, y = np.clip(residuals, -reach, reach).T
     ax.scatter(x[keep], y[keep], s=3, color=BLUE, alpha=0.4, linewidths=0)
@@ -89,13 +89,18 @@ def _draw_residuals(ax: Axes, found: LedsFound) -> None:
     )  # fmt: skip
 
 
-def _draw_robot(ax: Axes, found: LedsFound) -> None:
+def _draw_robot(ax: Axes, result: LedsFound) -> None:
     """Errors of the arm at each view."""
-    views = np.arange(len(found.view_errors))
+    views = np.arange(len(result.view_errors))
     ax.plot(
-        views, 1e3 * np.linalg.norm(found.view_errors[:, :3], axis=1), "o", color=BLUE, ms=4, label="position (um)"
+        views,
+        1e3 * np.linalg.norm(result.view_errors[:, :3], axis=1),
+        "o",
+        color=BLUE,
+        ms=4,
+        label="position (um)",
     )
-    turn = 1e3 * np.linalg.norm(found.view_errors[:, 3:], axis=1)
+    turn = 1e3 * np.linalg.norm(result.view_errors[:, 3:], axis=1)
     ax.plot(views, turn, "s", color=RED, ms=4, label="orientation (mdeg)")
     ax.set(title="Errors of the arm", xlabel="view", ylim=(0, None))
     ax.legend(frameon=False)

@@ -13,7 +13,7 @@ from coupole.calibration.leds.matching import LedSightings
 from coupole.calibration.leds.spots import outline_offsets
 from coupole.calibration.point_sets import Indices
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.rotations import Floats, between, inverses, moved, skew
+from coupole.calibration.rotations import Floats, between, inverses, moved_transforms, skew
 
 SPOTS, TOLERANCE, POSITION, ORIENTATION = range(4)
 GROUPS = ("spots", "LEDs on their boards", "robot position", "robot orientation")
@@ -60,12 +60,12 @@ class Problem:
     observed: Floats
     whiten: Floats
     """[k, 2, 2] factors that bring residuals to unit variance."""
-    reported: Floats
+    reported_poses: Floats
     prior: CameraPrior
     prior_whiten: Floats
     by_axes: Floats
     """[v, 6, k] step of each pose per degree of each axis of the arm."""
-    stated: Stated
+    stated_noise: Stated
     sightings_of: tuple[Indices, ...]
     """[b] spots on each board."""
     columns_of: tuple[Indices, ...]
@@ -74,12 +74,12 @@ class Problem:
     @property
     def sigmas(self) -> Floats:
         """[6] stated noise of one pose's step."""
-        return np.repeat([self.stated.robot_mm, np.radians(self.stated.robot_deg)], 3)
+        return np.repeat([self.stated_noise.robot_mm, np.radians(self.stated_noise.robot_deg)], 3)
 
     @property
-    def shared(self) -> int:
+    def shared_count(self) -> int:
         """Number of shared parameters: six for each view, then lens, hand-eye and axes."""
-        return 6 * len(self.reported) + len(self.prior_whiten)
+        return 6 * len(self.reported_poses) + len(self.prior_whiten)
 
     @property
     def of_camera(self) -> int:
@@ -88,28 +88,33 @@ class Problem:
 
 
 def problem_of(
-    seen: LedSightings, place: Indices, boards: Boards, reported: Floats, prior: CameraPrior, stated: Stated
+    sightings: LedSightings,
+    place: Indices,
+    boards: Boards,
+    reported_poses: Floats,
+    prior: CameraPrior,
+    stated_noise: Stated,
 ) -> Problem:
-    whiten = np.linalg.inv(np.linalg.cholesky(seen.covariance))
+    whiten = np.linalg.inv(np.linalg.cholesky(sightings.covariance))
     board = boards.board_of[place]
     sightings_of = tuple(np.flatnonzero(board == b) for b in range(len(boards.numbers)))
-    tail = 6 * len(reported) + np.arange(6 + len(prior.free))
+    tail = 6 * len(reported_poses) + np.arange(6 + len(prior.free))
     columns_of = tuple(
-        np.concatenate([(6 * np.unique(seen.view[rows])[:, None] + np.arange(6)).ravel(), tail])
+        np.concatenate([(6 * np.unique(sightings.view[rows])[:, None] + np.arange(6)).ravel(), tail])
         for rows in sightings_of
     )
     prior_whiten = np.linalg.inv(np.linalg.cholesky(prior.covariance))
     return Problem(
         boards,
         place,
-        seen.view,
-        seen.pixels,
+        sightings.view,
+        sightings.pixels,
         whiten,
-        reported,
+        reported_poses,
         prior,
         prior_whiten,
-        prior.by_axes(reported),
-        stated,
+        prior.by_axes(reported_poses),
+        stated_noise,
         sightings_of,
         columns_of,
     )
@@ -120,7 +125,7 @@ def at_centres(problem: Problem, state: LedState) -> Problem:
     board_pose = state.base_from_board[problem.boards.board_of[problem.place]]
     centres = problem.boards.in_base(state.base_from_board, state.offsets_mm)[problem.place]
     camera_from_base = inverses(state.base_from_flange @ state.flange_from_camera)[problem.view]
-    off = outline_offsets(board_pose, centres, camera_from_base, state.lens, problem.stated.side_mm)
+    off = outline_offsets(board_pose, centres, camera_from_base, state.lens, problem.stated_noise.side_mm)
     return replace(problem, observed=problem.observed - off)
 
 
@@ -138,7 +143,7 @@ def points_seen(problem: Problem, state: LedState) -> tuple[Floats, Floats, Floa
     return on_board, in_flange, in_camera
 
 
-def whitened(problem: Problem, state: LedState) -> Floats:
+def whitened_residuals(problem: Problem, state: LedState) -> Floats:
     """Residuals [k, 2] over the stated noise."""
     projection = optics.project(points_seen(problem, state)[2], state.lens)
     result: Floats = np.einsum("kij,kj->ki", problem.whiten, problem.observed - projection.pixels)
@@ -161,7 +166,7 @@ class Linear:
     """[k, 2, free + 6]: lens, then hand-eye."""
 
 
-def linearised(problem: Problem, state: LedState) -> Linear:
+def linearisation(problem: Problem, state: LedState) -> Linear:
     on_board, in_flange, in_camera = points_seen(problem, state)
     projection = optics.project(in_camera, state.lens)
     by_point = problem.whiten @ projection.by_point
@@ -184,7 +189,7 @@ def linearised(problem: Problem, state: LedState) -> Linear:
 
 def pose_errors(problem: Problem, state: LedState) -> Floats:
     """[v, 6] error of the arm at each view, without that of its axis zeros."""
-    off: Floats = between(problem.reported, state.base_from_flange) - problem.by_axes @ state.axis_zeros_deg
+    off: Floats = between(problem.reported_poses, state.base_from_flange) - problem.by_axes @ state.axis_zeros_deg
     return off
 
 
@@ -195,10 +200,12 @@ def camera_step(problem: Problem, state: LedState) -> Floats:
     return np.concatenate([(state.lens - problem.prior.lens.vector())[free], hand_eye, state.axis_zeros_deg])
 
 
-def cost_of(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np.bool_], huber: float) -> float:
-    off = np.sqrt(np.sum(whitened(problem, state)[kept] ** 2, axis=1)) / factors[SPOTS]
+def cost_of(
+    problem: Problem, state: LedState, factors: Floats, accepted_mask: NDArray[np.bool_], huber: float
+) -> float:
+    off = np.sqrt(np.sum(whitened_residuals(problem, state)[accepted_mask] ** 2, axis=1)) / factors[SPOTS]
     spots = np.where(off <= huber, off**2, huber * (2 * off - huber)) if np.isfinite(huber) else off**2
-    tolerance = state.offsets_mm / problem.stated.tolerance_mm / factors[TOLERANCE]
+    tolerance = state.offsets_mm / problem.stated_noise.tolerance_mm / factors[TOLERANCE]
     sigmas = problem.sigmas * np.repeat(factors[[POSITION, ORIENTATION]], 3)
     poses = pose_errors(problem, state) / sigmas
     table = between(problem.boards.base_from_board, state.base_from_board) / table_sigmas(problem)
@@ -207,20 +214,26 @@ def cost_of(problem: Problem, state: LedState, factors: Floats, kept: NDArray[np
 
 
 def table_sigmas(problem: Problem) -> Floats:
-    return np.repeat([problem.stated.table_mm, np.radians(problem.stated.table_deg)], 3)
+    return np.repeat([problem.stated_noise.table_mm, np.radians(problem.stated_noise.table_deg)], 3)
 
 
-def stepped(problem: Problem, state: LedState, shared: Floats, own: list[Floats], share: float) -> LedState:
-    views, free = len(problem.reported), len(problem.prior.free)
+def stepped_state(
+    problem: Problem, state: LedState, shared_step: Floats, own_steps: list[Floats], share: float
+) -> LedState:
+    views, free = len(problem.reported_poses), len(problem.prior.free)
     offsets, lens = state.offsets_mm.copy(), state.lens.copy()
-    for board, step in enumerate(own):
+    for board, step in enumerate(own_steps):
         offsets[problem.boards.rows_of(board)] += share * step[6:].reshape(-1, 3)
-    lens[[optics.NAMES.index(name) for name in problem.prior.free]] += share * shared[6 * views : 6 * views + free]
+    lens[[optics.NAMES.index(name) for name in problem.prior.free]] += (
+        share * shared_step[6 * views : 6 * views + free]
+    )
     return LedState(
-        moved(state.base_from_board, share * np.array([step[:6] for step in own])),
+        moved_transforms(state.base_from_board, share * np.array([step[:6] for step in own_steps])),
         offsets,
-        moved(state.base_from_flange, share * shared[: 6 * views].reshape(-1, 6)),
-        moved(state.flange_from_camera, share * shared[6 * views + free : 6 * views + problem.of_camera]),
+        moved_transforms(state.base_from_flange, share * shared_step[: 6 * views].reshape(-1, 6)),
+        moved_transforms(
+            state.flange_from_camera, share * shared_step[6 * views + free : 6 * views + problem.of_camera]
+        ),
         lens,
-        state.axis_zeros_deg + share * shared[6 * views + problem.of_camera :],
+        state.axis_zeros_deg + share * shared_step[6 * views + problem.of_camera :],
     )

@@ -56,7 +56,7 @@ def led_plan(
     name: str,
     rig: str,
     seed: int = 1,
-    drawn: int = _DRAWN,
+    draw_count: int = _DRAWN,
     enough: int = ENOUGH,
     tell: Callable[[str], None] = lambda what: None,
 ) -> str:
@@ -64,7 +64,7 @@ def led_plan(
     boards = boards_of(cell.leds)
     bodies = bodies_of(cell.rig, cell.leds, np.zeros((0, 3, 3)))
     tell("drawing postures of the arm")
-    joints_deg = _candidates(cell.rig, boards, bodies, np.random.default_rng(seed), drawn)
+    joints_deg = _candidates(cell.rig, boards, bodies, np.random.default_rng(seed), draw_count)
     for _ in range(_ROUNDS):
         tell(f"choosing views among {len(joints_deg)} postures")
         lens, size_px, margin_px = _camera(cell.rig)
@@ -91,13 +91,15 @@ def led_plan(
     raise InputError(f"leds: no paths to all of the views were found in {_ROUNDS} rounds. Try another --seed")
 
 
-def _candidates(rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.Generator, drawn: int) -> Floats:
+def _candidates(
+    rig: Rig, boards: Boards, bodies: CellBodies, random: np.random.Generator, draw_count: int
+) -> Floats:
     """[n, 6] postures without collision and singularity from which some boards are seen completely."""
     arm = arm_of(rig)
     low, high = np.array(arm.limits_deg).T
     low[3], high[3] = max(low[3], -_WRIST_DEG), min(high[3], _WRIST_DEG)
     low[5], high[5] = max(low[5], -_TURN_DEG), min(high[5], _TURN_DEG)
-    joints_deg = np.round(random.uniform(np.ceil(low), np.floor(high), (drawn, 6)))
+    joints_deg = np.round(random.uniform(np.ceil(low), np.floor(high), (draw_count, 6)))
     lens, size_px, margin_px = _camera(rig)
     visible = boards_seen(boards, _cameras(rig, joints_deg), lens, size_px, margin_px)
     keep = np.flatnonzero(visible.sum(axis=1) >= _LEAST_BOARDS)

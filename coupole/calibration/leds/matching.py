@@ -70,7 +70,7 @@ class Matching:
 
 
 def match_leds(
-    seen: LedSightings,
+    sightings: LedSightings,
     base_from_camera: Floats,
     lens: Intrinsics,
     ids: NDArray[np.int64],
@@ -85,26 +85,28 @@ def match_leds(
     the table.
     """
     table_mm = boards.in_base(boards.base_from_board)
-    rays = np.einsum("kij,kj->ki", base_from_camera[seen.view, :3, :3], unproject(seen.pixels, lens))
-    eyes_mm = base_from_camera[seen.view, :3, 3]
+    rays = np.einsum("kij,kj->ki", base_from_camera[sightings.view, :3, :3], unproject(sightings.pixels, lens))
+    eyes_mm = base_from_camera[sightings.view, :3, 3]
     tolerance_rad = tolerance_px / lens.fx
     found_mm = np.full((len(ids), 3), np.nan)
     agreeing: list[NDArray[np.intp]] = []
     near = cKDTree(table_mm)
-    order = np.argsort(seen.led, kind="stable")
-    for led_rows in np.split(order, np.flatnonzero(np.diff(seen.led[order])) + 1) if len(order) else []:
-        inside = _agreeing(rays[led_rows], eyes_mm[led_rows], seen.view[led_rows], tolerance_rad, near, reach_mm)
+    order = np.argsort(sightings.led, kind="stable")
+    for led_rows in np.split(order, np.flatnonzero(np.diff(sightings.led[order])) + 1) if len(order) else []:
+        inside = _agreeing(
+            rays[led_rows], eyes_mm[led_rows], sightings.view[led_rows], tolerance_rad, near, reach_mm
+        )
         if len(inside):
             rows = led_rows[inside]
-            found_mm[seen.led[rows[0]]] = _meeting(rays[rows], eyes_mm[rows])
+            found_mm[sightings.led[rows[0]]] = _meeting(rays[rows], eyes_mm[rows])
             agreeing.append(rows)
-    agreeing_sightings = seen.only(np.concatenate(agreeing) if agreeing else np.zeros(0, np.intp))
+    agreeing_sightings = sightings.only(np.concatenate(agreeing) if agreeing else np.zeros(0, np.intp))
     place_of, wiring = _places(found_mm, table_mm, ids, boards)
-    return Matching(found_mm, place_of, agreeing_sightings, (*_unseen(seen, found_mm, ids), *wiring))
+    return Matching(found_mm, place_of, agreeing_sightings, (*_unseen(sightings, found_mm, ids), *wiring))
 
 
 def _agreeing(
-    rays: Floats, eyes_mm: Floats, views: Indices, spread: float, near: cKDTree, reach_mm: float
+    rays: Floats, eyes_mm: Floats, views: Indices, tolerance_rad: float, near: cKDTree, reach_mm: float
 ) -> Indices:
     """Spots of one LED, at most one of each view, that agree with one point; empty if there is no such point."""
     a, b = np.triu_indices(len(rays), 1)
@@ -117,7 +119,7 @@ def _agreeing(
     if not len(points):
         return np.zeros(0, np.intp)
     for _ in range(2):
-        off = _off(points, rays, eyes_mm) / spread
+        off = _off(points, rays, eyes_mm) / tolerance_rad
         score = np.maximum(1 - off**2, 0.0)
         by_view = np.stack([score[:, views == view].max(axis=1) for view in np.unique(views)], axis=1)
         best = int(np.argmax(by_view.sum(axis=1)))
@@ -171,10 +173,10 @@ def _meeting(rays: Floats, eyes_mm: Floats) -> Floats:
 # -- faults -----------------------------------------------------------------------------------------------
 
 
-def _unseen(seen: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Iterator[LedFault]:
-    spots = np.bincount(seen.led, minlength=len(ids))
-    views = np.bincount(np.unique(np.stack([seen.led, seen.view]), axis=1)[0], minlength=len(ids))
-    frames = np.bincount(seen.frames[:, 1], minlength=len(ids))
+def _unseen(sightings: LedSightings, found_mm: Floats, ids: NDArray[np.int64]) -> Iterator[LedFault]:
+    spots = np.bincount(sightings.led, minlength=len(ids))
+    views = np.bincount(np.unique(np.stack([sightings.led, sightings.view]), axis=1)[0], minlength=len(ids))
+    frames = np.bincount(sightings.frames[:, 1], minlength=len(ids))
     for row in np.flatnonzero(np.isnan(found_mm[:, 0])):
         led = int(ids[row])
         if not frames[row]:
@@ -211,7 +213,8 @@ def _places(
     moved_boards = [
         b
         for b in np.unique(boards.board_of[astray])
-        if _moved(boards.rows_of(b), found_mm, table_mm) and not _on_another(b, found_mm, tree, near_mm, boards)
+        if _is_moved_board(boards.rows_of(b), found_mm, table_mm)
+        and not _on_another(b, found_mm, tree, near_mm, boards)
     ]
     faults = []
     for row in astray[~np.isin(boards.board_of[astray], moved_boards)]:
@@ -233,7 +236,7 @@ def _places(
     return here, faults + list(_wiring(here, ids, boards))
 
 
-def _moved(rows: Indices, found_mm: Floats, table_mm: Floats) -> bool:
+def _is_moved_board(rows: Indices, found_mm: Floats, table_mm: Floats) -> bool:
     """True if the LEDs of a board have the table's layout in the right order: then the board was moved and its
     wiring is right."""
     rows = rows[np.isfinite(found_mm[rows, 0])]

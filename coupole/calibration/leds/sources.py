@@ -109,7 +109,7 @@ def find_leds(
 
 
 def _collect(
-    collected: _Collected,
+    collection: _Collected,
     run: Run,
     view: str,
     name: str,
@@ -122,45 +122,45 @@ def _collect(
     file = read_view(path, proven)
     records, reported_poses = file.records, file.poses
     camera = about_of(run, file), (file.layout.width_px, file.layout.height_px)
-    if collected.camera is not None and camera != collected.camera:
+    if collection.camera is not None and camera != collection.camera:
         raise InputError(
             f"{path}: another camera, lens or focus than in the frames before it: {camera[0]}, "
-            f"{collected.camera[0]}"
+            f"{collection.camera[0]}"
         )
-    collected.camera = camera
+    collection.camera = camera
     lit = _single_leds(proven, records, view)
     unknown = sorted({f.led for f in lit} - set(row_of))
     if unknown:
         raise InputError(f"{path}: LEDs {unknown[:5]} are not in the dome's table; name the rig of this run")
     number_of: dict[int, int] = {}
     for pose in sorted({frame.pose[1] for frame in lit}):
-        number_of[pose] = len(collected.views)
-        collected.views.append(name)
-        collected.poses.append(np.array(reported_poses[pose]["base_from_flange"], dtype=np.float64))
-        collected.joints_deg.append(np.array(reported_poses[pose]["joints_deg"], dtype=np.float64))
-    collected.lit_records += [records[frame.frame.index] for frame in lit]
+        number_of[pose] = len(collection.views)
+        collection.views.append(name)
+        collection.poses.append(np.array(reported_poses[pose]["base_from_flange"], dtype=np.float64))
+        collection.joints_deg.append(np.array(reported_poses[pose]["joints_deg"], dtype=np.float64))
+    collection.lit_records += [records[frame.frame.index] for frame in lit]
     darks = _darks(file, proven)
     for frame in lit:
         pixels = file.proven_pixels(frame.frame)
         dark = darks.get(frame.exposure_us, float(file.black_dn))
         spots = find_spots(pixels, dark, file.pattern, file.white_dn)
         key = number_of[frame.pose[1]], row_of[frame.led]
-        collected.frames.append(key)
-        collected.spots += [(*key, spot.pixel, spot.covariance) for spot in spots.good]
-        collected.left_out += [f"{frame.shot} {reason}" for reason in spots.rejected]
+        collection.frames.append(key)
+        collection.spots += [(*key, spot.pixel, spot.covariance) for spot in spots.good]
+        collection.left_out += [f"{frame.shot} {reason}" for reason in spots.rejection_reasons]
         frame_done()
     digest = frames_sha256([*(f.frame for f in lit), *_dark_frames(proven)])
-    collected.inputs.append((f"{run.folder.name}/views/{path.name}", digest))
+    collection.inputs.append((f"{run.folder.name}/views/{path.name}", digest))
 
 
-def _sightings(collected: _Collected) -> LedSightings:
-    spots = collected.spots
+def _sightings(collection: _Collected) -> LedSightings:
+    spots = collection.spots
     return LedSightings(
         np.array([spot[0] for spot in spots], dtype=np.intp),
         np.array([spot[1] for spot in spots], dtype=np.intp),
         np.array([spot[2] for spot in spots]).reshape(-1, 2),
         np.array([spot[3] for spot in spots]).reshape(-1, 2, 2),
-        np.array(collected.frames, dtype=np.intp).reshape(-1, 2),
+        np.array(collection.frames, dtype=np.intp).reshape(-1, 2),
     )
 
 

@@ -58,7 +58,7 @@ class Spots:
 
     good: tuple[Spot, ...]
     """Largest first."""
-    rejected: tuple[str, ...]
+    rejection_reasons: tuple[str, ...]
     """Reasons why other bright regions are not spots."""
     brightest: float
     """Largest green signal over white."""

@@ -96,9 +96,11 @@ def boards_seen(
     return _sightings(boards, base_from_camera, lens, size_px, margin_px)[0]
 
 
-def _gain(known: Floats, information: Floats) -> Floats:
+def _gain(known_information: Floats, information: Floats) -> Floats:
     """Gain of each board [b] by each view [c]: growth of log det."""
-    return np.asarray(np.linalg.slogdet(known[None] + information)[1] - np.linalg.slogdet(known)[1])
+    return np.asarray(
+        np.linalg.slogdet(known_information[None] + information)[1] - np.linalg.slogdet(known_information)[1]
+    )
 
 
 def _sightings(

@@ -15,7 +15,7 @@ from coupole.calibration.acceptance import against_limits
 from coupole.calibration.calibrated_arm import ZEROS, CalibratedArm, calibrated_poses
 from coupole.calibration.leds.acceptance import LEDS
 from coupole.calibration.leds.adjustment import LedGeometry, adjust_leds
-from coupole.calibration.leds.boards import Boards, boards_of, placed
+from coupole.calibration.leds.boards import Boards, board_poses, boards_of
 from coupole.calibration.leds.equations import GROUPS, ORIENTATION, POSITION, SPOTS, TOLERANCE, Stated
 from coupole.calibration.leds.matching import Matching, fault_lines, match_leds
 from coupole.calibration.leds.sources import LedImages
@@ -29,7 +29,7 @@ from coupole.calibration.record import (
     Parameter,
     Record,
     Validity,
-    sealed,
+    seal_record,
 )
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats, rotation_vector
@@ -66,7 +66,7 @@ def leds_from(
     prior: CameraPrior,
     request: Request,
     *,
-    stated: Stated,
+    stated_noise: Stated,
     arm: CalibratedArm | None = None,
     accept_faults: bool = False,
 ) -> LedsFound:
@@ -79,11 +79,11 @@ def leds_from(
         poses, prior = calibrated_poses(images.base_from_flange, images.joints_deg, arm, prior)
         images = replace(images, base_from_flange=poses)
     boards = boards_of(table)
-    matching = _matched(images, table, boards, prior, stated)
+    matching = _match_spots(images, table, boards, prior, stated_noise)
     sightings = matching.sightings.only(np.flatnonzero(matching.place_of[matching.sightings.led] >= 0))
     place = matching.place_of[sightings.led]
-    start = placed(boards, matching.by_place_mm)
-    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated)
+    start = board_poses(boards, matching.by_place_mm)
+    geometry = adjust_leds(sightings, place, images.base_from_flange, boards, start, prior, stated_noise)
     leds = _in_table_order(geometry, matching, boards)
     normals = geometry.normals[boards.board_of[leds.place]]
     new_table = LedTable(
@@ -93,14 +93,14 @@ def leds_from(
     of_faults = _of_faults(faults, accept_faults)
     limits = (*against_limits(LEDS, request.limits, _figures(geometry, leds)), of_faults)
     files = {f"{request.name}.h5": _h5(geometry, matching, boards, leds.place, place, len(table.ids))}
-    if of_faults.passed:
+    if of_faults.is_met:
         files[f"{request.name}.csv"] = led_csv(new_table, request.name).encode("ascii")
     record = _record(
         images,
         request,
         geometry,
         leds,
-        stated,
+        stated_noise,
         files=files,
         lines=_views(images.views, sightings.view, geometry),
         limits=limits,
@@ -114,8 +114,8 @@ def leds_from(
         new_table,
         geometry,
         matching,
-        np.where(leds.found, leds.u_mm, np.nan),
-        np.where(leds.found, leds.u_deg, np.nan),
+        np.where(leds.found_mask, leds.u_mm, np.nan),
+        np.where(leds.found_mask, leds.u_deg, np.nan),
         _view_errors(geometry, images.base_from_flange),
     )
 
@@ -124,7 +124,7 @@ def leds_from(
 class _InTableOrder:
     """The dome's LEDs by row of the table [n]."""
 
-    found: NDArray[np.bool_]
+    found_mask: NDArray[np.bool_]
     place: NDArray[np.intp]
     """Place on the boards at which the LED was found; that of its row where it was not found."""
     u_mm: Floats
@@ -141,7 +141,9 @@ def _in_table_order(geometry: LedGeometry, matching: Matching, boards: Boards) -
     return _InTableOrder(is_found, place, u_mm[place], u_deg[place])
 
 
-def _matched(images: LedImages, table: LedTable, boards: Boards, prior: CameraPrior, stated: Stated) -> Matching:
+def _match_spots(
+    images: LedImages, table: LedTable, boards: Boards, prior: CameraPrior, stated_noise: Stated
+) -> Matching:
     """Spots assigned to LEDs. Raises InputError if no spot belongs to a place of the table."""
     base_from_camera = images.base_from_flange @ prior.flange_from_camera
     matching = match_leds(
@@ -150,7 +152,7 @@ def _matched(images: LedImages, table: LedTable, boards: Boards, prior: CameraPr
         prior.lens,
         table.ids,
         boards,
-        tolerance_px=tolerance_px(prior, stated, table, base_from_camera),
+        tolerance_px=tolerance_px(prior, stated_noise, table, base_from_camera),
     )
     if not np.any(matching.place_of[matching.sightings.led] >= 0):
         lines = "\n".join(fault_lines(matching.faults)[:5])
@@ -163,7 +165,7 @@ def _record(
     request: Request,
     geometry: LedGeometry,
     leds: _InTableOrder,
-    stated: Stated,
+    stated_noise: Stated,
     *,
     files: Mapping[str, bytes],
     lines: tuple[ImageResidual, ...],
@@ -171,22 +173,22 @@ def _record(
     faults: tuple[LedFault, ...],
     remarks: tuple[str, ...],
 ) -> Record:
-    median_u_mm, median_u_deg = float(np.median(leds.u_mm[leds.found])), float(np.median(leds.u_deg[leds.found]))
-    return sealed(
+    median_u_mm, median_u_deg = (float(np.median(u[leds.found_mask])) for u in (leds.u_mm, leds.u_deg))
+    return seal_record(
         kind="leds",
         **request.head(),
-        simulated=images.about.simulated,
+        simulated=images.about.is_simulated,
         validity=Validity(expires=request.expires),
         transforms={},
-        **_parameters(geometry, stated, median_u_mm, median_u_deg),
+        **_parameters(geometry, stated_noise, median_u_mm, median_u_deg),
         fixed={
-            "leds": float(len(leds.found)),
-            "leds_found": float(leds.found.sum()),
+            "leds": float(len(leds.found_mask)),
+            "leds_found": float(leds.found_mask.sum()),
             "views": float(len(images.base_from_flange)),
             "images": float(len(images.seen.frames)),
         },
         files=tuple(Input(name=name, sha256=hashlib.sha256(data).hexdigest()) for name, data in files.items()),
-        noise=_noise(geometry, stated),
+        noise=_noise(geometry, stated_noise),
         images=lines,
         limits=limits,
         faults=faults,
@@ -195,14 +197,14 @@ def _record(
     )
 
 
-def tolerance_px(prior: CameraPrior, stated: Stated, table: LedTable, base_from_camera: Floats) -> float:
+def tolerance_px(prior: CameraPrior, stated_noise: Stated, table: LedTable, base_from_camera: Floats) -> float:
     """Largest distance of the spots of one LED from one point: 4 sigma of the camera's poses at the dome's
     distance, and 3 px for all other errors."""
     eyes_mm = base_from_camera[:, :3, 3].mean(axis=0)
     distance_mm = float(np.median(np.linalg.norm(table.positions_mm - eyes_mm, axis=1)))
     hand_eye = np.sqrt(np.diag(prior.hand_eye_covariance))
-    shift_mm = float(np.hypot(stated.robot_mm, hand_eye[:3].max()))
-    turn = float(np.hypot(np.radians(stated.robot_deg), hand_eye[3:].max()))
+    shift_mm = float(np.hypot(stated_noise.robot_mm, hand_eye[:3].max()))
+    turn = float(np.hypot(np.radians(stated_noise.robot_deg), hand_eye[3:].max()))
     return 3.0 + 4.0 * prior.lens.fx * (shift_mm / distance_mm + turn)
 
 
@@ -229,38 +231,38 @@ def _h5(
     count: int,
 ) -> bytes:
     """Uncertainties by LED, in the table's order; equal numbers give equal bytes."""
-    keep = geometry.kept
+    keep = geometry.accepted_mask
     views = np.bincount(place[keep], minlength=count)
     square = np.bincount(place[keep], np.sum(geometry.residuals_px[keep] ** 2, axis=1), minlength=count)
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", track_order=True) as file:
         file.attrs["frame"] = "base"
 
-        def put(name: str, data: NDArray[np.generic], unit: str, what: str) -> None:
+        def write_dataset(name: str, data: NDArray[np.generic], unit: str, long_name: str) -> None:
             dataset = file.create_dataset(name, data=data, track_times=False)
             dataset.attrs["units"] = unit
-            dataset.attrs["long_name"] = what
+            dataset.attrs["long_name"] = long_name
 
-        put("centre_covariance", geometry.centre_covariance[where], "mm^2", "[leds, 3, 3] of the centre")
+        write_dataset("centre_covariance", geometry.centre_covariance[where], "mm^2", "[leds, 3, 3] of the centre")
         normal = geometry.normal_covariance[boards.board_of[where]]
-        put("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
+        write_dataset("normal_covariance", normal, "deg^2", "[leds, 2, 2] of turns about the board's x and y")
         axes = geometry.state.base_from_board[boards.board_of[where], :3, :2]
-        put("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
+        write_dataset("board_axes", axes, "", "[leds, 3, 2] x and y of its board in the base")
         shared_text = (
             "[leds] of the centre's variance that comes from poses, lens and hand-eye, as its neighbours' does"
         )
-        put("shared_part", geometry.shared_part[where], "", shared_text)
-        put("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
-        put("views", views[where], "", "[leds] that it was found in")
-        put("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
-        put("found", matching.place_of >= 0, "", "[leds] False: placed by its board alone")
+        write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
+        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
+        write_dataset("views", views[where], "", "[leds] that it was found in")
+        write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
+        write_dataset("found", matching.place_of >= 0, "", "[leds] False: placed by its board alone")
     return buffer.getvalue()
 
 
-def _of_faults(faults: Sequence[LedFault], accepted: bool) -> Limit:
+def _of_faults(faults: Sequence[LedFault], are_accepted: bool) -> Limit:
     count = float(sum(fault.is_wrong for fault in faults))
     label = "faults of LEDs and wires"
-    if accepted and count:
+    if are_accepted and count:
         return Limit(what=label, found=count, limit=count, unit="", usual=0.0)
     return Limit(what=label, found=count, limit=0.0, unit="")
 
@@ -282,11 +284,13 @@ def _moved_boards(boards: Boards, geometry: LedGeometry, place: NDArray[np.intp]
     ]
 
 
-def _parameters(geometry: LedGeometry, stated: Stated, centre_mm: float, normal_deg: float) -> dict[str, object]:
+def _parameters(
+    geometry: LedGeometry, stated_noise: Stated, centre_mm: float, normal_deg: float
+) -> dict[str, object]:
     """Figures of the whole dome. Their own uncertainty is that of a standard deviation, s / sqrt(2 nu)."""
     robot_mm, robot_deg = (
-        stated.robot_mm * geometry.noise[POSITION],
-        stated.robot_deg * geometry.noise[ORIENTATION],
+        stated_noise.robot_mm * geometry.noise[POSITION],
+        stated_noise.robot_deg * geometry.noise[ORIENTATION],
     )
     freedom = np.maximum(geometry.redundancy, 1.0)
     poses = float(freedom[POSITION] + freedom[ORIENTATION])
@@ -298,7 +302,7 @@ def _parameters(geometry: LedGeometry, stated: Stated, centre_mm: float, normal_
         ("robot_orientation_deg", robot_deg, float(freedom[ORIENTATION]), "residuals"),
         (
             "led_on_board_mm",
-            stated.tolerance_mm * geometry.noise[TOLERANCE],
+            stated_noise.tolerance_mm * geometry.noise[TOLERANCE],
             float(freedom[TOLERANCE]),
             "residuals",
         ),
@@ -317,14 +321,14 @@ def _parameters(geometry: LedGeometry, stated: Stated, centre_mm: float, normal_
     return {"parameters": parameters, "covariance": tuple(map(tuple, covariance.tolist()))}
 
 
-def _noise(geometry: LedGeometry, stated: Stated) -> tuple[Noise, ...]:
-    spot_px = float(np.sqrt(np.mean(geometry.residuals_px[geometry.kept] ** 2)))
+def _noise(geometry: LedGeometry, stated_noise: Stated) -> tuple[Noise, ...]:
+    spot_px = float(np.sqrt(np.mean(geometry.residuals_px[geometry.accepted_mask] ** 2)))
     units = ("px", "mm", "mm", "deg")
     numbers = (
         (spot_px / max(float(geometry.noise[SPOTS]), 1e-9), spot_px),
-        (stated.tolerance_mm, stated.tolerance_mm * geometry.noise[TOLERANCE]),
-        (stated.robot_mm, stated.robot_mm * geometry.noise[POSITION]),
-        (stated.robot_deg, stated.robot_deg * geometry.noise[ORIENTATION]),
+        (stated_noise.tolerance_mm, stated_noise.tolerance_mm * geometry.noise[TOLERANCE]),
+        (stated_noise.robot_mm, stated_noise.robot_mm * geometry.noise[POSITION]),
+        (stated_noise.robot_deg, stated_noise.robot_deg * geometry.noise[ORIENTATION]),
     )
     return tuple(
         Noise(name=name, unit=unit, stated=float(before), found=float(after), redundancy=float(freedom))
@@ -337,7 +341,7 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
     lines = []
     for number, name in enumerate(names):
         rows = np.flatnonzero(view == number)
-        good = rows[geometry.kept[rows]]
+        good = rows[geometry.accepted_mask[rows]]
         square = np.sum(geometry.residuals_px[good] ** 2, axis=1)
         rms_px = float(np.sqrt(square.mean())) if len(good) else 0.0
         lines.append(ImageResidual(name=name, corners=len(good), rejected=len(rows) - len(good), rms_px=rms_px))
@@ -347,11 +351,11 @@ def _views(names: Sequence[str], view: NDArray[np.intp], geometry: LedGeometry) 
 def _figures(geometry: LedGeometry, leds: _InTableOrder) -> dict[str, float]:
     """The figures that `acceptance.LEDS` limits."""
     return {
-        "missing": float(1 - leds.found.mean()),
-        "centre_mm": float(np.median(leds.u_mm[leds.found])),
-        "normal_deg": float(np.median(leds.u_deg[leds.found])),
+        "missing": float(1 - leds.found_mask.mean()),
+        "centre_mm": float(np.median(leds.u_mm[leds.found_mask])),
+        "normal_deg": float(np.median(leds.u_deg[leds.found_mask])),
         "robot_ratio": float(max(geometry.noise[POSITION], geometry.noise[ORIENTATION])),
-        "rejected": float(1 - geometry.kept.mean()),
+        "rejected": float(1 - geometry.accepted_mask.mean()),
         "record_step": float(np.abs(geometry.prior_step).max()),
     }
 
@@ -367,7 +371,7 @@ def _remarks(
 
 
 def _of_records(geometry: LedGeometry, prior: CameraPrior, limits: Sequence[Limit]) -> list[str]:
-    if next(limit.passed for limit in limits if limit.name == "record_step"):
+    if next(limit.is_met for limit in limits if limit.name == "record_step"):
         return []
     names = [*prior.free, *(f"flange_from_camera.{s}" for s in ("x", "y", "z", "rx", "ry", "rz")), *ZEROS]
     worst = int(np.argmax(np.abs(geometry.prior_step)))
@@ -389,7 +393,7 @@ def _of_spots(left_out: Sequence[str]) -> list[str]:
     return [f"{len(left_out)} bright regions are not spots, e.g. {left_out[0]}"]
 
 
-def _view_errors(geometry: LedGeometry, reported: Floats) -> Floats:
-    shift = geometry.state.base_from_flange[:, :3, 3] - reported[:, :3, 3]
-    turn = np.swapaxes(reported[:, :3, :3], 1, 2) @ geometry.state.base_from_flange[:, :3, :3]
+def _view_errors(geometry: LedGeometry, reported_poses: Floats) -> Floats:
+    shift = geometry.state.base_from_flange[:, :3, 3] - reported_poses[:, :3, 3]
+    turn = np.swapaxes(reported_poses[:, :3, :3], 1, 2) @ geometry.state.base_from_flange[:, :3, :3]
     return np.concatenate([shift, np.degrees(rotation_vector(turn))], axis=1)

@@ -47,7 +47,7 @@ class Board(Model):
 
     @field_validator("dictionary")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _check_dictionary(cls, name: str) -> str:
         import cv2
 
         if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
@@ -108,7 +108,7 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
     if (share := float(np.mean(part >= picture.white))) > CLIPPED_SHARE:
         return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
-    sighting = _refined(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
+    sighting = _refined_corners(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
     if len(sighting.ids) < LEAST_CORNERS:
         return f"{len(sighting.ids)} of {len(ids)} corners are sharp enough, {LEAST_CORNERS} needed"
     if np.linalg.matrix_rank(sighting.board_mm[:, :2] - sighting.board_mm[0, :2]) < 2:
@@ -118,14 +118,14 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:
     """The corners of a sighting in green, fitted in another colour of its picture."""
-    return _refined(green, board, picture, channel)
+    return _refined_corners(green, board, picture, channel)
 
 
-def _refined(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
+def _refined_corners(rough: Sighting, board: Board, picture: Picture, channel: Channel) -> Sighting:
     """The corners to a fraction of a pixel, without false ones. Corners that are too close together for a fit are
     located by OpenCV's gradient method."""
     window_px = _window_px(board, rough.ids, rough.pixels)
-    values, mask = picture.measured(channel)
+    values, mask = picture.values_and_mask(channel)
     if not enough_pixels(mask, window_px):
         side_px = max(2, int(window_px / np.sqrt(2)))
         return replace(rough, pixels=refine(picture.plane(channel), rough.pixels, side_px))

@@ -161,59 +161,61 @@ def calibrate_hand_eye(
         problem.evaluate,
         problem.move,
         problem.groups,
-        layout.shared + 6 * len(sightings),
-        what="hand-eye",
+        layout.shared_count + 6 * len(sightings),
+        calibration_name="hand-eye",
     )
     if size_px is None:
         return _result(adjustment, problem, start, stated_sigmas, tuple(sightings))
-    better, doubts = _doubted(adjustment, problem, size_px)
+    better, doubts = _with_doubts(adjustment, problem, size_px)
     result = _result(better, problem, start, stated_sigmas, tuple(sightings))
     return replace(result, noise=replace(result.noise, pixel_px=doubts.sigma_px), doubts=doubts)
 
 
-def _doubted(found: Adjusted[State], problem: Bundle, size_px: tuple[int, int]) -> tuple[Adjusted[State], Doubts]:
+def _with_doubts(
+    adjustment: Adjusted[State], problem: Bundle, size_px: tuple[int, int]
+) -> tuple[Adjusted[State], Doubts]:
     """The result with what the model may lack."""
-    state, count = found.state, len(problem.corners.parts)
+    state, count = adjustment.state, len(problem.corners.parts)
     field = Field.of(state.intrinsics, problem.layout.free, size_px)
     scene = Seen(field, problem.corners, problem.camera_from_board(state))
     views = [(view, count + 2 * view, count + 2 * view + 1) for view in range(count)]
     doubts, step, covariance = doubts_of(
-        found, problem.evaluate(state), views, scene, range(problem.layout.hand_eye)
+        adjustment, problem.evaluate(state), views, scene, range(problem.layout.hand_eye)
     )
-    return replace(found, state=problem.move(state, step), covariance=covariance), doubts
+    return replace(adjustment, state=problem.move(state, step), covariance=covariance), doubts
 
 
 def _result(
-    found: Adjusted[State],
+    adjustment: Adjusted[State],
     problem: Bundle,
     start: Solution,
-    stated: tuple[float, float],
+    stated_sigmas: tuple[float, float],
     sightings: tuple[Sighting, ...],
 ) -> HandEyeCalibration:
-    layout, state = problem.layout, found.state
-    shared_count, units = layout.shared, layout.units
+    layout, state = problem.layout, adjustment.state
+    shared_count, units = layout.shared_count, layout.units
     turns_deg = np.degrees(rotation_vector(state.pose_errors[:, :3, :3]))
     return HandEyeCalibration(
         state.flange_from_camera,
         state.base_from_board,
         Intrinsics(*map(float, state.intrinsics)),
         layout.names,
-        found.covariance[:shared_count, :shared_count] * np.outer(units, units),
-        found.degrees[:shared_count],
-        found.contributions[:, :shared_count],
-        found.components,
+        adjustment.covariance[:shared_count, :shared_count] * np.outer(units, units),
+        adjustment.degrees[:shared_count],
+        adjustment.contributions[:, :shared_count],
+        adjustment.components,
         state.scale,
         state.axis_zeros_deg,
         np.hstack([state.pose_errors[:, :3, 3], turns_deg]),
-        tuple(PIXEL_SIGMA_PX * r.reshape(-1, 2) for r in found.residuals[: len(sightings)]),
+        tuple(PIXEL_SIGMA_PX * r.reshape(-1, 2) for r in adjustment.residuals[: len(sightings)]),
         start,
         RobotFound(
-            PIXEL_SIGMA_PX * found.factor(CORNERS),
-            problem.sigmas[0] * found.factor(POSITION),
-            float(np.degrees(problem.sigmas[1] * found.factor(ORIENTATION))),
-            stated[0],
-            float(np.degrees(stated[1])),
+            PIXEL_SIGMA_PX * adjustment.factor(CORNERS),
+            problem.sigmas[0] * adjustment.factor(POSITION),
+            float(np.degrees(problem.sigmas[1] * adjustment.factor(ORIENTATION))),
+            stated_sigmas[0],
+            float(np.degrees(stated_sigmas[1])),
         ),
         sightings,
-        found.steps,
+        adjustment.steps,
     )

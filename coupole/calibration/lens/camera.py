@@ -18,7 +18,7 @@ from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.lens.doubts import Doubts, Seen, doubts_of
 from coupole.calibration.lens.suspects import Field
 from coupole.calibration.optics import Intrinsics
-from coupole.calibration.rotations import Floats, moved, rotation, skew
+from coupole.calibration.rotations import Floats, moved_transforms, rotation, skew
 from coupole.errors import InputError
 
 LEAST_VIEWS, MOST_VIEWS = 4, 400
@@ -49,7 +49,7 @@ class CameraCalibration:
     """[views, 4, 4]."""
     residuals_px: tuple[Floats, ...]
     """[n, 2] of each image, observed minus computed."""
-    kept: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
+    accepted_masks: tuple[np.ndarray[tuple[int], np.dtype[np.bool_]], ...]
     """[n] of each image: False for corners left out as gross errors."""
     sightings: tuple[Sighting, ...]
     size_px: tuple[int, int]
@@ -59,9 +59,9 @@ class CameraCalibration:
 
 
 def calibrate_camera(
-    sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5", *, doubted: bool = False
+    sightings: Sequence[Sighting], size_px: tuple[int, int], model: str = "brown5", *, with_doubts: bool = False
 ) -> CameraCalibration:
-    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`. With `doubted` the
+    """Intrinsics from images [views] of one board; `model` is a key of `optics.MODELS`. With `with_doubts` the
     residuals are searched for what the model lacks (`lens.doubts`).
 
     Raises InputError: too few images, or views that do not determine the model.
@@ -96,11 +96,13 @@ def calibrate_camera(
     def move(state: CameraState, change: Floats) -> CameraState:
         intrinsics = state.intrinsics.copy()
         intrinsics[columns] += change[:free_count]
-        return CameraState(intrinsics, moved(state.camera_from_board, change[free_count:].reshape(-1, 6)))
+        return CameraState(
+            intrinsics, moved_transforms(state.camera_from_board, change[free_count:].reshape(-1, 6))
+        )
 
-    groups = [Group("corners", estimated=True, rejects=2)]
-    adjustment = adjust(start, evaluate, move, groups, free_count + 6 * len(sightings), what="camera")
-    if not doubted:
+    groups = [Group("corners", is_estimated=True, rejects=2)]
+    adjustment = adjust(start, evaluate, move, groups, free_count + 6 * len(sightings), calibration_name="camera")
+    if not with_doubts:
         return _result(adjustment, free, sightings, size_px)
     state = adjustment.state
     field = Field.of(state.intrinsics, free, size_px)
@@ -113,19 +115,22 @@ def calibrate_camera(
 
 
 def _result(
-    found: Adjusted[CameraState], free: tuple[str, ...], sightings: Sequence[Sighting], size_px: tuple[int, int]
+    adjustment: Adjusted[CameraState],
+    free: tuple[str, ...],
+    sightings: Sequence[Sighting],
+    size_px: tuple[int, int],
 ) -> CameraCalibration:
     free_count = len(free)
-    intrinsics = Intrinsics(*map(float, found.state.intrinsics))
+    intrinsics = Intrinsics(*map(float, adjustment.state.intrinsics))
     return CameraCalibration(
         intrinsics,
         free,
-        found.covariance[:free_count, :free_count],
-        found.degrees[:free_count],
-        PIXEL_SIGMA_PX * found.factor("corners"),
-        found.state.camera_from_board,
-        tuple(PIXEL_SIGMA_PX * residuals.reshape(-1, 2) for residuals in found.residuals),
-        tuple(keep.reshape(-1, 2)[:, 0] for keep in found.kept),
+        adjustment.covariance[:free_count, :free_count],
+        adjustment.degrees[:free_count],
+        PIXEL_SIGMA_PX * adjustment.factor("corners"),
+        adjustment.state.camera_from_board,
+        tuple(PIXEL_SIGMA_PX * residuals.reshape(-1, 2) for residuals in adjustment.residuals),
+        tuple(keep.reshape(-1, 2)[:, 0] for keep in adjustment.accepted_masks),
         tuple(sightings),
         size_px,
     )
@@ -182,5 +187,5 @@ def without_gross_errors(calibration: CameraCalibration) -> tuple[Sighting, ...]
     """The sightings, less the corners that were left out."""
     return tuple(
         replace(sighting, ids=sighting.ids[keep], board_mm=sighting.board_mm[keep], pixels=sighting.pixels[keep])
-        for sighting, keep in zip(calibration.sightings, calibration.kept, strict=True)
+        for sighting, keep in zip(calibration.sightings, calibration.accepted_masks, strict=True)
     )

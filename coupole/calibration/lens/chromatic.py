@@ -19,7 +19,7 @@ from coupole.calibration.lens.board import Sighting
 from coupole.calibration.lens.camera import calibrate_camera
 from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.optics import Intrinsics
-from coupole.calibration.rotations import Floats, moved, skew
+from coupole.calibration.rotations import Floats, moved_transforms, skew
 from coupole.errors import InputError
 
 OWN = ("fx", "fy", "cx", "cy", "k1")
@@ -109,11 +109,11 @@ def calibrate_channels(
         lenses = at[0].copy()
         lenses[:, own_columns] += change[: width * len(channels)].reshape(len(channels), width)
         lenses[:, common] += change[width * len(channels) : of_lens]
-        return lenses, moved(at[1], change[of_lens:].reshape(-1, 6))
+        return lenses, moved_transforms(at[1], change[of_lens:].reshape(-1, 6))
 
-    groups = [Group(channel, estimated=True, rejects=2) for channel in channels]
+    groups = [Group(channel, is_estimated=True, rejects=2) for channel in channels]
     state = (lenses, first.camera_from_board)
-    adjustment = adjust(state, evaluate, move, groups, of_lens + 6 * images, what="camera")
+    adjustment = adjust(state, evaluate, move, groups, of_lens + 6 * images, calibration_name="camera")
     names = [f"{channel}.{optics.NAMES[column]}" for channel in channels for column in own_columns]
     names += [f"{SHARED}.{optics.NAMES[column]}" for column in common]
     return ChannelLenses(

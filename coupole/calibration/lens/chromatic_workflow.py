@@ -16,7 +16,7 @@ from coupole.calibration.lens.camera import calibrate_camera, without_gross_erro
 from coupole.calibration.lens.chromatic import SHARED, ChannelLenses, calibrate_channels
 from coupole.calibration.lens.images import Found
 from coupole.calibration.lens.workflow import content_of, image_figures, image_lines, unit_name
-from coupole.calibration.record import Noise, Parameter, Record, rows_of, sealed
+from coupole.calibration.record import Noise, Parameter, Record, rows_of, seal_record
 from coupole.calibration.report import BLUE, DARK, RED
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
@@ -42,21 +42,23 @@ class ChromaticFound:
     """Shifts by channel: against green, px [k, 2], and their covariance, px^2 [k, 2, 2]."""
 
 
-def chromatic_from(found: Found, sources: Sources, board: Board, model: str, request: Request) -> ChromaticFound:
+def chromatic_from(
+    board_images: Found, sources: Sources, board: Board, model: str, request: Request
+) -> ChromaticFound:
     """A lens for each colour from the same images. Raises InputError for images without colours."""
-    fit = calibrate_camera(found.sightings, found.size_px, model)
+    fit = calibrate_camera(board_images.sightings, board_images.size_px, model)
     good_sightings = without_gross_errors(fit)
     sightings: dict[str, list[Sighting]] = {
-        channel: _in_channel(channel, good_sightings, found, sources, board) for channel in CHANNELS
+        channel: _in_channel(channel, good_sightings, board_images, sources, board) for channel in CHANNELS
     }
-    lenses = calibrate_channels(sightings, found.size_px, model)
-    field_px = _field(found.size_px)
+    lenses = calibrate_channels(sightings, board_images.size_px, model)
+    field_px = _field(board_images.size_px)
     shifts: dict[str, tuple[Floats, Floats]] = {
         channel: lenses.shift(channel, "green", field_px) for channel in CHANNELS[1:]
     }
     u_px = max(float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max())) for _, covariance in shifts.values())
-    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
-    record = sealed(
+    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.accepted_masks, strict=True))
+    record = seal_record(
         kind="chromatic",
         transforms={},
         parameters=_parameters(lenses),
@@ -71,8 +73,8 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
             )
             for channel, sigma in lenses.sigma_px.items()
         ),
-        limits=against_limits(CHROMATIC, request.limits, {**image_figures(fit, found), "shift_px": u_px}),
-        remarks=(*(_remark(channel, *shift) for channel, shift in shifts.items()), *found.left_out),
+        limits=against_limits(CHROMATIC, request.limits, {**image_figures(fit, board_images), "shift_px": u_px}),
+        remarks=(*(_remark(channel, *shift) for channel, shift in shifts.items()), *board_images.left_out),
         fixed={
             f"{channel}.{unit_name(name)}": getattr(lenses.intrinsics[channel], name)
             for channel in CHANNELS
@@ -80,20 +82,20 @@ def chromatic_from(found: Found, sources: Sources, board: Board, model: str, req
             if name not in fit.free
         },
         images=image_lines(good_sightings, residuals, fit.sightings),
-        **content_of(found, sources, request),
+        **content_of(board_images, sources, request),
     )
-    return ChromaticFound(record, lenses, found.size_px, field_px, shifts)
+    return ChromaticFound(record, lenses, board_images.size_px, field_px, shifts)
 
 
 def _in_channel(
-    channel: Channel, kept: tuple[Sighting, ...], found: Found, sources: Sources, board: Board
+    channel: Channel, accepted_sightings: tuple[Sighting, ...], board_images: Found, sources: Sources, board: Board
 ) -> list[Sighting]:
     """The sightings in a channel, from those in green."""
     if channel == "green":
-        return list(kept)
+        return list(accepted_sightings)
     return [
         in_channel(board, sources.images[number].read(), channel, sighting)
-        for number, sighting in zip(found.chosen, kept, strict=True)
+        for number, sighting in zip(board_images.image_numbers, accepted_sightings, strict=True)
     ]
 
 
@@ -121,15 +123,19 @@ def _parameters(lenses: ChannelLenses) -> tuple[Parameter, ...]:
     return tuple(parameters)
 
 
-def _redundancy(kept: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
+def _redundancy(accepted_sightings: tuple[Sighting, ...], free: tuple[str, ...]) -> float:
     """Redundancy of one channel, which shares the poses of the images with the others."""
-    return float(sum(2 * len(sighting.ids) for sighting in kept) - len(free) - 6 * len(kept) / len(CHANNELS))
+    return float(
+        sum(2 * len(sighting.ids) for sighting in accepted_sightings)
+        - len(free)
+        - 6 * len(accepted_sightings) / len(CHANNELS)
+    )
 
 
-def _remark(channel: str, shift: Floats, spread: Floats) -> str:
+def _remark(channel: str, shift: Floats, shift_covariance: Floats) -> str:
     length = np.linalg.norm(shift, axis=1)
     worst = int(np.argmax(length))
-    u = float(np.sqrt(np.trace(spread[worst])))
+    u = float(np.sqrt(np.trace(shift_covariance[worst])))
     return (
         f"{channel} is seen up to {length[worst]:.3f} px (u {u:.3f} px) beside green, root mean square over the "
         f"field {np.sqrt(np.mean(length**2)):.3f} px"
@@ -139,33 +145,39 @@ def _remark(channel: str, shift: Floats, spread: Floats) -> str:
 # -- the picture ----------------------------------------------------------------------------------------------
 
 
-def draw_chromatic(found: ChromaticFound, figure: Figure) -> None:
+def draw_chromatic(result: ChromaticFound, figure: Figure) -> None:
     """Fill the figure: shifts over the field above, along the radius below, red to the left, blue to the right."""
     axes = figure.subplots(2, 2)
-    longest = max(float(np.linalg.norm(shift, axis=1).max()) for shift, _ in found.shifts.values())
-    enlargement = float(f"{0.06 * found.size_px[0] / max(longest, 1e-6):.1g}")
+    longest = max(float(np.linalg.norm(shift, axis=1).max()) for shift, _ in result.shifts.values())
+    enlargement = float(f"{0.06 * result.size_px[0] / max(longest, 1e-6):.1g}")
     for column, (channel, colour) in enumerate((("red", RED), ("blue", BLUE))):
-        _draw_field(axes[0, column], found, channel, colour, enlargement)
-        _draw_radius(axes[1, column], found, channel, colour)
+        _draw_field(axes[0, column], result, channel, colour, enlargement)
+        _draw_radius(axes[1, column], result, channel, colour)
 
 
-def _draw_field(ax: Axes, found: ChromaticFound, channel: str, colour: str, enlarged: float) -> None:
-    shift, _ = found.shifts[channel]
-    width, height = found.size_px
+def _draw_field(ax: Axes, result: ChromaticFound, channel: str, colour: str, enlargement: float) -> None:
+    shift, _ = result.shifts[channel]
+    width, height = result.size_px
     ax.quiver(
-        *found.field_px.T, *shift.T * enlarged, angles="xy", scale_units="xy", scale=1, width=0.003, color=colour
+        *result.field_px.T,
+        *shift.T * enlargement,
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.003,
+        color=colour,
     )
     ax.set(
         xlim=(-0.05 * width, 1.05 * width), ylim=(1.05 * height, -0.05 * height), aspect="equal", xlabel="x (px)",
-        ylabel="y (px)", title=f"{channel} against green, {enlarged:g} times enlarged",
+        ylabel="y (px)", title=f"{channel} against green, {enlargement:g} times enlarged",
     )  # fmt: skip
 
 
-def _draw_radius(ax: Axes, found: ChromaticFound, channel: str, colour: str) -> None:
+def _draw_radius(ax: Axes, result: ChromaticFound, channel: str, colour: str) -> None:
     """The shift away from the principal point, with its 95 % interval."""
-    shift, covariance = found.shifts[channel]
-    lens = found.lenses.intrinsics["green"]
-    away = found.field_px - (lens.cx, lens.cy)
+    shift, covariance = result.shifts[channel]
+    lens = result.lenses.intrinsics["green"]
+    away = result.field_px - (lens.cx, lens.cy)
     radius = np.linalg.norm(away, axis=1)
     outward = away / np.maximum(radius, 1e-9)[:, None]
     along = np.einsum("ki,ki->k", shift, outward)

@@ -54,20 +54,20 @@ class Corners:
     """[n] blur of the image."""
 
 
-def enough_pixels(known: NDArray[np.bool_], radius_px: float) -> bool:
+def enough_pixels(mask_tile: NDArray[np.bool_], radius_px: float) -> bool:
     """Tell whether a window of that radius has enough pixels for a fit."""
-    return bool(np.pi * radius_px**2 * known.mean() >= _LEAST_PIXELS)
+    return bool(np.pi * radius_px**2 * mask_tile.mean() >= _LEAST_PIXELS)
 
 
-def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
+def fit_corners(image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats, radius_px: float) -> Corners:
     """Corners about `rough` [n, 2] from the pixels within `radius_px`, of which there must be `enough_pixels`.
 
-    `image` [H, W] are RAW values; `known` [h, w] is the mask of the pixels to use, a tile that repeats over the
-    image.
+    `image` [H, W] are RAW values; `mask_tile` [h, w] is the mask of the pixels to use, a tile that repeats over
+    the image.
     """
     values = np.ascontiguousarray(image, dtype=np.float32)
     unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
-    mask, starts = np.ascontiguousarray(known), np.ascontiguousarray(rough, dtype=np.float64)
+    mask, starts = np.ascontiguousarray(mask_tile), np.ascontiguousarray(rough, dtype=np.float64)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
         list(pool.map(lambda part: _fit_all(values, mask, starts[part], radius_px, unknowns[part]), parts))
@@ -76,32 +76,36 @@ def fit_corners(image: NDArray[Any], known: NDArray[np.bool_], rough: Floats, ra
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_all(image, known, rough, radius, found):  # type: ignore[no-untyped-def]
+def _fit_all(image, mask_tile, rough, radius, solutions):  # type: ignore[no-untyped-def]
     for n in range(len(rough)):
         unknowns = np.zeros(_UNKNOWNS)
         unknowns[_X], unknowns[_Y] = rough[n]
-        if not _start(image, known, radius, unknowns):
+        if not _start(image, mask_tile, radius, unknowns):
             continue
         # Again about the corner found: a window that is not centred on it would bias the result.
-        fits = _fit(image, known, rough[n, 0], rough[n, 1], radius, unknowns)
-        if fits and _fit(image, known, unknowns[_X], unknowns[_Y], radius, unknowns):
+        fits = _fit(image, mask_tile, rough[n, 0], rough[n, 1], radius, unknowns)
+        if fits and _fit(image, mask_tile, unknowns[_X], unknowns[_Y], radius, unknowns):
             # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
             spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
             unknowns[_X] += spread2 * unknowns[_ALONG_X]
             unknowns[_Y] += spread2 * unknowns[_ALONG_Y]
             for k in range(_UNKNOWNS):
-                found[n, k] = unknowns[k]
+                solutions[n, k] = unknowns[k]
 
 
 @numba.njit(cache=True, nogil=True)
-def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
+def _start(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def]
     """Directions of both edges, level and contrast by the values around the corner; False without four sectors."""
     sums, counts = np.zeros(_SECTORS), np.zeros(_SECTORS)
     x, y = unknowns[_X], unknowns[_Y]
     for row in range(max(0, math.ceil(y - radius)), min(image.shape[0], math.floor(y + radius) + 1)):
         for col in range(max(0, math.ceil(x - radius)), min(image.shape[1], math.floor(x + radius) + 1)):
             far = math.hypot(col - x, row - y)
-            if far > radius or far < 0.4 * radius or not known[row % known.shape[0], col % known.shape[1]]:
+            if (
+                far > radius
+                or far < 0.4 * radius
+                or not mask_tile[row % mask_tile.shape[0], col % mask_tile.shape[1]]
+            ):
                 continue
             angle = math.atan2(row - y, col - x) % (2.0 * math.pi)
             sector = int(angle / (2.0 * math.pi) * _SECTORS) % _SECTORS
@@ -138,9 +142,9 @@ def _start(image, known, radius, unknowns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
+def _fit(image, mask_tile, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt; False if it diverges or the residual is too large."""
-    squares, count, normal, right = _equations(image, known, x, y, radius, unknowns)
+    squares, count, normal, right = _equations(image, mask_tile, x, y, radius, unknowns)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
         damped_normal = normal.copy()
@@ -151,7 +155,7 @@ def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
         trial[_SIGMA] = min(max(trial[_SIGMA], _LEAST_SIGMA_PX), 0.5 * radius)
         if math.hypot(trial[_X] - x, trial[_Y] - y) > 0.5 * radius or not np.all(np.isfinite(trial)):
             return False
-        tried_squares, count, tried_normal, tried_right = _equations(image, known, x, y, radius, trial)
+        tried_squares, count, tried_normal, tried_right = _equations(image, mask_tile, x, y, radius, trial)
         if tried_squares <= squares:
             change = math.hypot(trial[_X] - unknowns[_X], trial[_Y] - unknowns[_Y])
             for k in range(_UNKNOWNS):
@@ -168,7 +172,7 @@ def _fit(image, known, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ignore[no-untyped-def]
+def _equations(image, mask_tile, middle_x, middle_y, radius, unknowns):  # type: ignore[no-untyped-def]
     """Sum of squared residuals, number of pixels, normal matrix [9, 9] and right-hand side [9] of one step."""
     x, y, sigma = unknowns[_X], unknowns[_Y], unknowns[_SIGMA]
     level, contrast = unknowns[_LEVEL], unknowns[_CONTRAST]
@@ -181,7 +185,7 @@ def _equations(image, known, middle_x, middle_y, radius, unknowns):  # type: ign
     blur_px = math.sqrt(sigma * sigma + 1.0 / 12.0)
     for row in range(max(0, math.ceil(middle_y - radius)), min(height, math.floor(middle_y + radius) + 1)):
         for col in range(max(0, math.ceil(middle_x - radius)), min(width, math.floor(middle_x + radius) + 1)):
-            if not known[row % known.shape[0], col % known.shape[1]]:
+            if not mask_tile[row % mask_tile.shape[0], col % mask_tile.shape[1]]:
                 continue
             if (col - middle_x) ** 2 + (row - middle_y) ** 2 > radius * radius:
                 continue

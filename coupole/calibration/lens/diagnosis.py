@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 from coupole.calibration.lens.hand_eye import METHODS, motions, solution
 from coupole.calibration.lens.hypotheses import Expected, Hypothesis, faults, rereadings, scatter_of
 from coupole.calibration.poses import ReportedPoses
-from coupole.calibration.rotations import Floats, between, inverses, moved
+from coupole.calibration.rotations import Floats, between, inverses, moved_transforms
 from coupole.errors import InputError
 
 CONTRADICTION = 3.0
@@ -55,14 +55,14 @@ class Diagnosis:
 
     scatter_mm: float
     scatter_deg: float
-    expected: Expected
+    noise_scatter: Expected
     likely: tuple[Hypothesis, ...]
     """Best first; empty if all is well or no hypothesis helps."""
     disagreements: tuple[Disagreement, ...]
 
     @property
     def contradicts(self) -> bool:
-        return bool(self.likely) or self.expected.score(self.scatter_mm, self.scatter_deg) > CONTRADICTION
+        return bool(self.likely) or self.noise_scatter.score(self.scatter_mm, self.scatter_deg) > CONTRADICTION
 
     @property
     def cause(self) -> str | None:
@@ -76,7 +76,7 @@ class Diagnosis:
             lines.append(
                 f"robot and camera contradict each other: seen from the poses, the board's place scatters by "
                 f"{self.scatter_mm:.3g} mm and {self.scatter_deg:.3g} deg, where noise explains "
-                f"{self.expected.position_mm:.2g} mm and {self.expected.orientation_deg:.2g} deg"
+                f"{self.noise_scatter.position_mm:.2g} mm and {self.noise_scatter.orientation_deg:.2g} deg"
             )
             lines += [
                 f"likely cause: {h.sentence}: then {h.scatter_mm:.3g} mm and {h.scatter_deg:.3g} deg are left"
@@ -118,23 +118,23 @@ def expected_scatter(
 
 
 def diagnose(
-    poses: ReportedPoses, camera_from_board: Floats, expected: Expected, names: Sequence[str]
+    poses: ReportedPoses, camera_from_board: Floats, noise_scatter: Expected, names: Sequence[str]
 ) -> Diagnosis:
     """Compare poses [n] with the board's poses by the images [n, 4, 4]; `names` are those of the images."""
     scatter = scatter_of(poses.base_from_flange, camera_from_board)
-    diagnosis, score = Diagnosis(*scatter, expected, (), ()), expected.score(*scatter)
+    diagnosis, score = Diagnosis(*scatter, noise_scatter, (), ()), noise_scatter.score(*scatter)
     if score > _WORTH_A_LOOK:
         candidates = list(rereadings(poses, camera_from_board)) if score > CONTRADICTION else []
-        candidates += faults(poses.base_from_flange, camera_from_board, names, expected)
-        diagnosis = replace(diagnosis, likely=_likely(candidates, expected, scatter))
+        candidates += faults(poses.base_from_flange, camera_from_board, names, noise_scatter)
+        diagnosis = replace(diagnosis, likely=_likely(candidates, noise_scatter, scatter))
     if np.isfinite(scatter[0]):
-        apart = disagreements(poses.base_from_flange, camera_from_board, expected)
+        apart = disagreements(poses.base_from_flange, camera_from_board, noise_scatter)
         diagnosis = replace(diagnosis, disagreements=apart)
     return diagnosis
 
 
 def disagreements(
-    base_from_flange: Floats, camera_from_board: Floats, expected: Expected
+    base_from_flange: Floats, camera_from_board: Floats, noise_scatter: Expected
 ) -> tuple[Disagreement, ...]:
     """Difference of each two methods, and whether it is larger than expected noise explains.
 
@@ -147,9 +147,13 @@ def disagreements(
         board = solution(base_from_flange, camera_from_board, hand_eye_of["Park"]).base_from_board
         consistent = inverses(base_from_flange @ hand_eye_of["Park"]) @ board
         random = np.random.default_rng(0)
-        per_axis = np.repeat([expected.position_mm, np.radians(expected.orientation_deg)], 3) / np.sqrt(3)
+        per_axis = np.repeat([noise_scatter.position_mm, np.radians(noise_scatter.orientation_deg)], 3) / np.sqrt(
+            3
+        )
         draws = [
-            _by_method(base_from_flange, moved(consistent, per_axis * random.normal(size=(len(consistent), 6))))
+            _by_method(
+                base_from_flange, moved_transforms(consistent, per_axis * random.normal(size=(len(consistent), 6)))
+            )
             for _ in range(_RESAMPLED)
         ]
     except InputError:
@@ -176,23 +180,25 @@ def _by_method(base_from_flange: Floats, camera_from_board: Floats) -> dict[str,
     return {name: method(pairs) for name, method in METHODS.items()}
 
 
-def _likely(tried: list[Hypothesis], expected: Expected, given: tuple[float, float]) -> tuple[Hypothesis, ...]:
+def _likely(
+    hypotheses: list[Hypothesis], noise_scatter: Expected, measured_scatter: tuple[float, float]
+) -> tuple[Hypothesis, ...]:
     """Hypotheses that remove the contradiction; equally good ones ordered by how little they change.
 
     Such a hypothesis reduces the scatter of positions or of orientations by the factor `CURE` and does not
     increase the other; or it explains what noise cannot.
     """
     cures = []
-    for h in tried:
-        gains = given[0] / max(h.scatter_mm, 1e-12), given[1] / max(h.scatter_deg, 1e-12)
+    for h in hypotheses:
+        gains = measured_scatter[0] / max(h.scatter_mm, 1e-12), measured_scatter[1] / max(h.scatter_deg, 1e-12)
         if (max(gains) > CURE or h.sure) and min(gains) > _NO_WORSE:
             cures.append(h)
     if not cures:
         return ()
-    best = min(expected.score(h.scatter_mm, h.scatter_deg) for h in cures)
+    best = min(noise_scatter.score(h.scatter_mm, h.scatter_deg) for h in cures)
 
     def rank(h: Hypothesis) -> tuple[bool, int, float]:
-        score = expected.score(h.scatter_mm, h.scatter_deg)
+        score = noise_scatter.score(h.scatter_mm, h.scatter_deg)
         return score > _AS_GOOD * best, len(h.causes), score
 
     return tuple(sorted(cures, key=rank))

@@ -44,7 +44,7 @@ class Doubts:
 
     error: ModelError
     field: Field
-    predicted: LeftOut
+    predictions: LeftOut
     pattern: float
     """Root mean square over the field of what the lens's form leaves of the true one, over the standard
     uncertainty of a direction's image by the record's lens."""
@@ -57,7 +57,7 @@ class Doubts:
     @property
     def predicted_px(self) -> float:
         """Root mean square over the views of the corners' prediction errors, per coordinate."""
-        return float(PIXEL_SIGMA_PX * np.sqrt(np.mean(self.predicted.off**2)))
+        return float(PIXEL_SIGMA_PX * np.sqrt(np.mean(self.predictions.off**2)))
 
     def sentences(self) -> Iterator[str]:
         """Yield the findings as sentences, for the record's remarks."""
@@ -69,31 +69,37 @@ class Doubts:
                     f"(log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
                 )
         yield (
-            f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predicted.ratio:.2f} of "
+            f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predictions.ratio:.2f} of "
             "the stated uncertainty"
         )
 
 
 def doubts_of(
-    found: Adjusted[Any], blocks: Sequence[Block], views: Sequence[Sequence[int]], seen: Seen, lens: Sequence[int]
+    adjustment: Adjusted[Any],
+    blocks: Sequence[Block],
+    views: Sequence[Sequence[int]],
+    computed_corners: Seen,
+    lens: Sequence[int],
 ) -> tuple[Doubts, Floats, Floats]:
     """The doubts, the step of the parameters and their covariance with them.
 
-    `blocks` are those of `found`, the corners' (group 0) first and in their order; `views` the numbers of each
-    view's blocks; `lens` the columns of the free intrinsics.
+    `blocks` are those of `adjustment`, the corners' (group 0) first and in their order; `views` the numbers of
+    each view's blocks; `lens` the columns of the free intrinsics.
     """
-    factors = np.array([component.factor for component in found.components])
-    weights = [keep.astype(np.float64) for keep in found.kept]
-    corners = seen.corners
-    projection = optics.project(corners.in_camera(seen.camera_from_board), seen.field.lens)
-    suspects = suspects_of(seen.field, corners, seen.camera_from_board, projection.by_point, projection.pixels)
-    redundancy = found.components[0].redundancy
-    error = with_suspects(blocks, weights, factors, len(found.covariance), redundancy, suspects)
+    factors = np.array([component.factor for component in adjustment.components])
+    weights = [keep.astype(np.float64) for keep in adjustment.accepted_masks]
+    corners = computed_corners.corners
+    projection = optics.project(corners.in_camera(computed_corners.camera_from_board), computed_corners.field.lens)
+    suspects = suspects_of(
+        computed_corners.field, corners, computed_corners.camera_from_board, projection.by_point, projection.pixels
+    )
+    redundancy = adjustment.components[0].redundancy
+    error = with_suspects(blocks, weights, factors, len(adjustment.covariance), redundancy, suspects)
     of_lens = error.of(LENS)
     columns = np.ix_(lens, lens)
     covariance = error.covariance.copy()
-    left_px = seen.field.rms_px(of_lens.coefficients, of_lens.coefficient_covariance)
-    pattern = left_px / seen.field.ray_u_px(covariance[columns])
+    left_px = computed_corners.field.rms_px(of_lens.coefficients, of_lens.coefficient_covariance)
+    pattern = left_px / computed_corners.field.ray_u_px(covariance[columns])
     covariance[columns] *= 1.0 + pattern**2
-    prediction = left_out(views, blocks, weights, factors, found.covariance)
-    return Doubts(error, seen.field, prediction, pattern), error.step, covariance
+    prediction = left_out(views, blocks, weights, factors, adjustment.covariance)
+    return Doubts(error, computed_corners.field, prediction, pattern), error.step, covariance

@@ -20,7 +20,7 @@ from coupole.calibration.adjustment import Block, Group
 from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.record import step_names
-from coupole.calibration.rotations import Floats, inverses, moved, rotation, rotation_vector, skew
+from coupole.calibration.rotations import Floats, inverses, moved_transforms, rotation, rotation_vector, skew
 
 CORNERS, POSITION, ORIENTATION, BOARD_SCALE, AXIS_ZEROS, EARLIER = (
     "corners",
@@ -71,7 +71,7 @@ class Layout:
 
     free: tuple[str, ...]
     axes: int
-    scaled: bool
+    has_scale: bool
 
     @property
     def hand_eye(self) -> int:
@@ -87,16 +87,16 @@ class Layout:
 
     @property
     def zeros(self) -> int:
-        return self.scale + int(self.scaled)
+        return self.scale + int(self.has_scale)
 
     @property
-    def shared(self) -> int:
+    def shared_count(self) -> int:
         return self.zeros + self.axes
 
     @property
     def names(self) -> tuple[str, ...]:
         lens = tuple(name + ("_px" if name[0] in "fc" else "") for name in self.free)
-        scale = ("board_scale",) if self.scaled else ()
+        scale = ("board_scale",) if self.has_scale else ()
         zeros = tuple(f"axis_zero.a{axis + 1}_deg" for axis in range(self.axes))
         return (*lens, *step_names("flange_from_camera"), *step_names("base_from_board"), *scale, *zeros)
 
@@ -104,7 +104,7 @@ class Layout:
     def units(self) -> Floats:
         """[s] factors from the adjustment's units (mm, radians) to those of `names`."""
         return np.concatenate(
-            [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared - self.scale)]
+            [np.ones(len(self.free)), _STEP_UNITS, _STEP_UNITS, np.ones(self.shared_count - self.scale)]
         )
 
 
@@ -124,7 +124,7 @@ class Bundle:
     @property
     def groups(self) -> list[Group]:
         groups = [Group(CORNERS, True), Group(POSITION, True), Group(ORIENTATION, True)]
-        groups += [Group(BOARD_SCALE, False)] if self.layout.scaled else []
+        groups += [Group(BOARD_SCALE, False)] if self.layout.has_scale else []
         groups += [Group(AXIS_ZEROS, False)] if self.layout.axes else []
         return groups + ([Group(EARLIER, False)] if self._lens_weight is not None else [])
 
@@ -153,11 +153,11 @@ class Bundle:
         return replace(
             state,
             intrinsics=intrinsics,
-            flange_from_camera=moved(state.flange_from_camera, change[at.hand_eye : at.board]),
-            base_from_board=moved(state.base_from_board, change[at.board : at.scale]),
-            scale=state.scale + float(change[at.scale]) if at.scaled else state.scale,
-            axis_zeros_deg=state.axis_zeros_deg + change[at.zeros : at.shared],
-            pose_errors=moved(state.pose_errors, change[at.shared :].reshape(-1, 6)),
+            flange_from_camera=moved_transforms(state.flange_from_camera, change[at.hand_eye : at.board]),
+            base_from_board=moved_transforms(state.base_from_board, change[at.board : at.scale]),
+            scale=state.scale + float(change[at.scale]) if at.has_scale else state.scale,
+            axis_zeros_deg=state.axis_zeros_deg + change[at.zeros : at.shared_count],
+            pose_errors=moved_transforms(state.pose_errors, change[at.shared_count :].reshape(-1, 6)),
         )
 
     def _corner_blocks(self, state: State) -> list[Block]:
@@ -189,7 +189,7 @@ class Bundle:
             by_base,
             -by_base @ (board[:3, :3] @ skew(board_mm)),
         ]
-        if at.scaled:
+        if at.has_scale:
             columns.append(by_base @ (printed_mm @ board[:3, :3].T)[:, :, None])
         if self.poses.axis_sensitivity is not None:
             by_step = np.concatenate([-by_reported, by_zeroed @ skew(in_zeroed)], axis=-1)
@@ -200,8 +200,8 @@ class Bundle:
         return [
             Block(
                 residuals[part].ravel(),
-                jacobian[part].reshape(-1, at.shared + 6),
-                np.r_[0 : at.shared, self._own(number)],
+                jacobian[part].reshape(-1, at.shared_count + 6),
+                np.r_[0 : at.shared_count, self._own_columns(number)],
                 0,
             )
             for number, part in enumerate(self.corners.parts)
@@ -214,7 +214,7 @@ class Bundle:
         position_mm, orientation_rad = self.sigmas
         blocks = []
         for number in range(len(turns_rad)):
-            columns = np.arange(*self._own(number).indices(2**31))
+            columns = np.arange(*self._own_columns(number).indices(2**31))
             shift = state.pose_errors[number, :3, 3]
             blocks.append(Block(-shift / position_mm, np.eye(3) / position_mm, columns[:3], 1))
             blocks.append(Block(-turns_rad[number] / orientation_rad, np.eye(3) / orientation_rad, columns[3:], 2))
@@ -223,13 +223,13 @@ class Bundle:
     def _held_blocks(self, state: State, names: list[str]) -> list[Block]:
         """Priors: the board's scale, the axis zeros, an earlier lens."""
         at, blocks = self.layout, []
-        if at.scaled:
+        if at.has_scale:
             sigma = self.scale_sigma
             scale_block = Block(np.array([-state.scale / sigma]), np.eye(1) / sigma, np.array([at.scale]), 3)
             blocks.append(replace(scale_block, group=names.index(BOARD_SCALE)))
         if at.axes:
             sigma = self.zero_sigma_deg
-            columns = np.arange(at.zeros, at.shared)
+            columns = np.arange(at.zeros, at.shared_count)
             weight = np.eye(at.axes) / sigma
             blocks.append(Block(-state.axis_zeros_deg / sigma, weight, columns, names.index(AXIS_ZEROS)))
         weight_of_lens = self._lens_weight
@@ -240,8 +240,8 @@ class Bundle:
             blocks.append(Block(weight_of_lens @ off, weight_of_lens, columns, names.index(EARLIER)))
         return blocks
 
-    def _own(self, number: int) -> slice:
-        first = self.layout.shared + 6 * number
+    def _own_columns(self, number: int) -> slice:
+        first = self.layout.shared_count + 6 * number
         return slice(first, first + 6)
 
     def _zero_steps(self, state: State) -> Floats:

@@ -77,11 +77,11 @@ def rereadings(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypo
 
 
 def faults(
-    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
+    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], noise_scatter: Expected
 ) -> Iterator[Hypothesis]:
     """Hypotheses on single poses and images."""
     yield from _wrong_pairs(base_from_flange, camera_from_board, names)
-    yield from _moved_board(base_from_flange, camera_from_board, names, expected)
+    yield from _moved_board(base_from_flange, camera_from_board, names, noise_scatter)
 
 
 def _other_conventions(poses: ReportedPoses, camera_from_board: Floats) -> Iterator[Hypothesis]:
@@ -113,25 +113,34 @@ def _other_conventions(poses: ReportedPoses, camera_from_board: Floats) -> Itera
 
 
 def _if_read_as(
-    numbers: Floats, said: Convention, read: Convention, words: str, camera_from_board: Floats
+    numbers: Floats,
+    stated_convention: Convention,
+    assumed_convention: Convention,
+    words: str,
+    camera_from_board: Floats,
 ) -> Iterator[Hypothesis]:
-    as_read = replace(ReportedPoses(numbers, said), convention=read).base_from_flange
+    as_read = replace(ReportedPoses(numbers, stated_convention), convention=assumed_convention).base_from_flange
     way_mm = float(np.median(np.linalg.norm(as_read[:, :3, 3] - as_read[:, :3, 3].mean(axis=0), axis=1)))
     if not _PLAUSIBLE_MM[0] < way_mm < _PLAUSIBLE_MM[1]:
         return
     causes, says = [], []
-    if read.length_unit != said.length_unit:
+    if assumed_convention.length_unit != stated_convention.length_unit:
         causes.append(UNITS)
-        says.append(f"positions are in {read.length_unit}, not {said.length_unit}")
-    if read.angle_unit != said.angle_unit:
+        says.append(f"positions are in {assumed_convention.length_unit}, not {stated_convention.length_unit}")
+    if assumed_convention.angle_unit != stated_convention.angle_unit:
         causes.append(UNITS)
-        says.append(f"angles are in {_WORDS[read.angle_unit]}, not {_WORDS[said.angle_unit]}")
-    if (read.rotation, read.order) != (said.rotation, said.order):
+        says.append(
+            f"angles are in {_WORDS[assumed_convention.angle_unit]}, not {_WORDS[stated_convention.angle_unit]}"
+        )
+    if (assumed_convention.rotation, assumed_convention.order) != (
+        stated_convention.rotation,
+        stated_convention.order,
+    ):
         causes.append(ANGLES)
         says.append(f"rotations are {words}")
-    if read.gives != said.gives:
+    if assumed_convention.gives != stated_convention.gives:
         causes.append(INVERSE)
-        says.append(f"poses are {read.gives}, not {said.gives}")
+        says.append(f"poses are {assumed_convention.gives}, not {stated_convention.gives}")
     yield Hypothesis(tuple(causes), " and ".join(says), *scatter_of(as_read, camera_from_board))
 
 
@@ -188,7 +197,7 @@ def _worst(base_from_flange: Floats, camera_from_board: Floats) -> list[int]:
 
 
 def _moved_board(
-    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], expected: Expected
+    base_from_flange: Floats, camera_from_board: Floats, names: Sequence[str], noise_scatter: Expected
 ) -> Iterator[Hypothesis]:
     """The board was in two places: motions within each part are valid, those between the parts are not."""
     count = len(base_from_flange)
@@ -211,7 +220,7 @@ def _moved_board(
             f"the board was moved between {names[change - 1]} and {names[change]}, by {step_mm:.3g} mm and "
             f"{step_deg:.3g} deg"
         )
-        sure = expected.score(step_mm, step_deg) > 1.0 and _by_chance(before, after) * count < _SURE
+        sure = noise_scatter.score(step_mm, step_deg) > 1.0 and _by_chance(before, after) * count < _SURE
         yield Hypothesis((MOVED_BOARD,), sentence, pooled_solution.scatter_mm, pooled_solution.scatter_deg, sure)
 
 

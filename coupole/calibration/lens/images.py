@@ -18,7 +18,7 @@ class Found:
     """The board in the images, and why other images were left out."""
 
     sightings: tuple[Sighting, ...]
-    chosen: NDArray[np.intp]
+    image_numbers: NDArray[np.intp]
     """[sightings] which of the images they are."""
     size_px: tuple[int, int]
     """Width and height."""
@@ -33,7 +33,7 @@ def find_board(
     sightings, numbers, left_out = [], [], []
     size_px: tuple[int, int] | None = None
     for number, source in enumerate(sources.images):
-        picture = source.read()
+        picture = source.read_picture()
         size = picture.size_px
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")

@@ -38,7 +38,7 @@ class Field:
     def of(lens: Floats, free: Sequence[str], size_px: tuple[int, int]) -> Field:
         bare = Field(lens, tuple(free), size_px, np.zeros((0, 0)))
         grid = bare.grid_px()
-        slopes, polynomials = bare._own(grid), bare._polynomials(grid)
+        slopes, polynomials = bare._own_derivatives(grid), bare._polynomials(grid)
         return Field(
             lens, tuple(free), size_px, np.asarray(np.linalg.lstsq(slopes, polynomials, rcond=None)[0], np.float64)
         )
@@ -51,12 +51,12 @@ class Field:
 
     def modes(self, pixels: Floats) -> Floats:
         """[2 n, modes] px at pixels [n, 2]; each is about 1 px."""
-        return np.asarray(self._polynomials(pixels) - self._own(pixels) @ self.best)
+        return np.asarray(self._polynomials(pixels) - self._own_derivatives(pixels) @ self.best)
 
     def ray_u_px(self, covariance: Floats) -> float:
         """Root mean square over the field of the standard uncertainty of a direction's image, both coordinates, of
         a lens with this covariance [free, free]; a turn of the camera does not count."""
-        slopes = self._own(self.grid_px())
+        slopes = self._own_derivatives(self.grid_px())
         turns, lens = slopes[:, -3:], slopes[:, :-3]
         without_turns = lens - turns @ np.linalg.lstsq(turns, lens, rcond=None)[0]
         return float(np.sqrt(2.0 * np.mean(np.einsum("ki,ij,kj->k", without_turns, covariance, without_turns))))
@@ -67,7 +67,7 @@ class Field:
         squares = (modes @ coefficients) ** 2 + np.einsum("ki,ij,kj->k", modes, covariance, modes)
         return float(np.sqrt(2.0 * np.mean(squares)))
 
-    def _own(self, pixels: Floats) -> Floats:
+    def _own_derivatives(self, pixels: Floats) -> Floats:
         """[2 n, free + 3] derivatives by the free lens parameters and by a turn of the camera."""
         rays = np.column_stack([(pixels - self.lens[2:4]) / self.lens[:2], np.ones(len(pixels))])
         projection = optics.project(rays, self.lens)

@@ -33,7 +33,7 @@ from coupole.calibration.record import (
     Record,
     pose_of,
     rows_of,
-    sealed,
+    seal_record,
 )
 from coupole.calibration.request import Request
 from coupole.calibration.rotations import Floats
@@ -61,11 +61,13 @@ class Shown:
     """[n, 6] of the robot, mm and degrees."""
 
 
-def camera_from(found: Found, sources: Sources, model: str, request: Request) -> tuple[CameraCalibration, Shown]:
+def camera_from(
+    board_images: Found, sources: Sources, model: str, request: Request
+) -> tuple[CameraCalibration, Shown]:
     """Calibrate a lens from the images of a board."""
-    fit = calibrate_camera(found.sightings, found.size_px, model, doubted=True)
+    fit = calibrate_camera(board_images.sightings, board_images.size_px, model, with_doubts=True)
     good_sightings = without_gross_errors(fit)
-    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.kept, strict=True))
+    residuals = tuple(r[keep] for r, keep in zip(fit.residuals_px, fit.accepted_masks, strict=True))
     u = np.sqrt(np.diag(fit.covariance))
     parameters = [
         Parameter(
@@ -77,8 +79,8 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         )
         for i, name in enumerate(fit.free)
     ]
-    redundancy = float(np.sum([2 * k.sum() for k in fit.kept]) - len(fit.free) - 6 * len(good_sightings))
-    record = sealed(
+    redundancy = float(np.sum([2 * k.sum() for k in fit.accepted_masks]) - len(fit.free) - 6 * len(good_sightings))
+    record = seal_record(
         kind="camera",
         transforms={},
         parameters=tuple(parameters),
@@ -87,18 +89,18 @@ def camera_from(found: Found, sources: Sources, model: str, request: Request) ->
         limits=against_limits(
             CAMERA,
             request.limits,
-            {**image_figures(fit, found), "ray_px": ray_u_px(fit), **doubted_figures(fit.doubts)},
+            {**image_figures(fit, board_images), "ray_px": ray_u_px(fit), **doubted_figures(fit.doubts)},
         ),
-        remarks=(*found.left_out, *sentences_of(fit.doubts)),
-        fixed=held(fit.intrinsics, fit.free),
+        remarks=(*board_images.left_out, *sentences_of(fit.doubts)),
+        fixed=held_parameters(fit.intrinsics, fit.free),
         images=image_lines(good_sightings, residuals, fit.sightings),
-        **content_of(found, sources, request),
+        **content_of(board_images, sources, request),
     )
-    return fit, _shown(record, found, good_sightings, residuals, fit.sigma_px, None)
+    return fit, _lens_report(record, board_images, good_sightings, residuals, fit.sigma_px, None)
 
 
 def hand_eye_from(
-    found: Found,
+    board_images: Found,
     sources: Sources,
     board: Board,
     model: str,
@@ -117,10 +119,10 @@ def hand_eye_from(
             "hand-eye: this chess board looks the same upside down; use one whose corners are even in one "
             "direction and odd in the other, or a ChArUco board"
         )
-    fit = calibrate_camera(found.sightings, found.size_px, model)
+    fit = calibrate_camera(board_images.sightings, board_images.size_px, model)
     good_sightings = without_gross_errors(fit)
-    reported_poses = ReportedPoses(sources.poses.numbers[found.chosen], sources.poses.convention)
-    joints = [sources.images[i].joints_deg for i in found.chosen]
+    reported_poses = ReportedPoses(sources.poses.numbers[board_images.image_numbers], sources.poses.convention)
+    joints = [sources.images[i].joints_deg for i in board_images.image_numbers]
     joints_deg = [j for j in joints if j is not None]
     axes = axis_sensitivity(arm, joints_deg) if arm is not None and len(joints_deg) == len(joints) else None
     diagnosis = _refused_if_contradicting(fit, reported_poses, robot, [s.name for s in good_sightings])
@@ -131,9 +133,9 @@ def hand_eye_from(
         lens=lens or fit.intrinsics,
         robot=robot,
         board_scale_u_ppm=board.scale_u_ppm,
-        size_px=found.size_px,
+        size_px=board_images.size_px,
     )
-    record = sealed(
+    record = seal_record(
         kind="hand-eye",
         transforms={
             "flange_from_camera": pose_of(result.flange_from_camera),
@@ -145,22 +147,22 @@ def hand_eye_from(
         limits=against_limits(
             HAND_EYE,
             request.limits,
-            {**image_figures(fit, found), **_hand_eye_figures(result), **doubted_figures(result.doubts)},
+            {**image_figures(fit, board_images), **_hand_eye_figures(result), **doubted_figures(result.doubts)},
         ),
         remarks=(
-            *filter(None, (*found.left_out, *diagnosis.sentences(), diagnosis.of_methods())),
+            *filter(None, (*board_images.left_out, *diagnosis.sentences(), diagnosis.of_methods())),
             *sentences_of(result.doubts),
         ),
-        fixed=held(result.intrinsics, lens.free if lens else optics.MODELS[model]),
+        fixed=held_parameters(result.intrinsics, lens.free if lens else optics.MODELS[model]),
         images=image_lines(good_sightings, result.residuals_px, fit.sightings),
-        **content_of(found, sources, request),
+        **content_of(board_images, sources, request),
     )
-    drawing = _shown(record, found, good_sightings, result.residuals_px, result.noise.pixel_px, result.pose_errors)
-    return result, diagnosis, drawing
+    errors = result.residuals_px, result.noise.pixel_px, result.pose_errors
+    return result, diagnosis, _lens_report(record, board_images, good_sightings, *errors)
 
 
 def _refused_if_contradicting(
-    fit: CameraCalibration, reported: ReportedPoses, robot: RobotNoise, names: Sequence[str]
+    fit: CameraCalibration, reported_poses: ReportedPoses, robot: RobotNoise, names: Sequence[str]
 ) -> Diagnosis:
     """Diagnose how well robot and camera agree. Raises InputError if they do not and the cause is known."""
     robot_mm, robot_rad = robot.pose_sigmas(axes_known=False)
@@ -171,22 +173,22 @@ def _refused_if_contradicting(
         robot_mm=robot_mm,
         robot_deg=float(np.degrees(robot_rad)),
     )
-    diagnosis = diagnose(reported, fit.camera_from_board, expectation, names)
+    diagnosis = diagnose(reported_poses, fit.camera_from_board, expectation, names)
     if diagnosis.cause is not None:
         raise InputError("hand-eye: " + ".\n".join(diagnosis.sentences()[:2]) + ".")
     return diagnosis
 
 
-def _shown(
+def _lens_report(
     record: Record,
-    found: Found,
-    kept: Sequence[Sighting],
+    board_images: Found,
+    accepted_sightings: Sequence[Sighting],
     residuals_px: tuple[Floats, ...],
     pixel_px: float,
     pose_errors: Floats | None,
 ) -> Shown:
-    names, pixels = tuple(s.name for s in kept), tuple(s.pixels for s in kept)
-    return Shown(record, found.size_px, names, pixels, residuals_px, pixel_px, pose_errors)
+    names, pixels = tuple(s.name for s in accepted_sightings), tuple(s.pixels for s in accepted_sightings)
+    return Shown(record, board_images.size_px, names, pixels, residuals_px, pixel_px, pose_errors)
 
 
 def ray_u_px(fit: CameraCalibration) -> float:
@@ -219,7 +221,7 @@ def field_without_corners(sightings: Sequence[Sighting], size_px: tuple[int, int
 
 
 def image_lines(
-    kept: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
+    accepted_sightings: Sequence[Sighting], residuals: Sequence[Floats], all_seen: Sequence[Sighting]
 ) -> tuple[ImageResidual, ...]:
     """Number of corners and residual of each image."""
     return tuple(
@@ -229,41 +231,41 @@ def image_lines(
             rejected=len(before.ids) - len(sighting.ids),
             rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         )
-        for sighting, residual, before in zip(kept, residuals, all_seen, strict=True)
+        for sighting, residual, before in zip(accepted_sightings, residuals, all_seen, strict=True)
     )
 
 
-def content_of(found: Found, sources: Sources, request: Request) -> dict[str, object]:
+def content_of(board_images: Found, sources: Sources, request: Request) -> dict[str, object]:
     """The content that all records from a board's images share."""
     about = sources.about
     return {
         **request.head(),
-        "simulated": about.simulated,
-        "validity": request.validity(about, found.size_px, about.temperature_c),
+        "simulated": about.is_simulated,
+        "validity": request.validity(about, board_images.size_px, about.temperature_c),
         "inputs": tuple(Input(name=name, sha256=digest) for name, digest in sources.inputs),
     }
 
 
-def held(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]:
+def held_parameters(intrinsics: optics.Intrinsics, free: Sequence[str]) -> dict[str, float]:
     """The lens parameters that were not estimated, by the record's names."""
     return {unit_name(n): getattr(intrinsics, n) for n in optics.NAMES if n not in free}
 
 
-def image_figures(fit: CameraCalibration, found: Found) -> dict[str, float]:
+def image_figures(fit: CameraCalibration, board_images: Found) -> dict[str, float]:
     """The figures that `acceptance.IMAGES` limits."""
-    is_rejected = np.concatenate([~keep for keep in fit.kept])
-    clipped_count = sum(": clipped" in line for line in found.left_out)
+    is_rejected = np.concatenate([~keep for keep in fit.accepted_masks])
+    clipped_count = sum(": clipped" in line for line in board_images.left_out)
     return {
         "pixel_px": fit.sigma_px,
         "bare_field": field_without_corners(fit.sightings, fit.size_px),
         "rejected": float(is_rejected.mean()),
-        "clipped": clipped_count / (len(found.sightings) + len(found.left_out)),
+        "clipped": clipped_count / (len(board_images.sightings) + len(board_images.left_out)),
     }
 
 
 def doubted_figures(doubts: Doubts | None) -> dict[str, float]:
     """The figures that `acceptance.DOUBTS` limits."""
-    return {} if doubts is None else {"pattern": doubts.pattern, "predicted": doubts.predicted.ratio}
+    return {} if doubts is None else {"pattern": doubts.pattern, "predicted": doubts.predictions.ratio}
 
 
 def sentences_of(doubts: Doubts | None) -> tuple[str, ...]:
@@ -326,8 +328,10 @@ def _hand_eye_noise(result: HandEyeCalibration) -> tuple[Noise, ...]:
     )
 
 
-def _noise(name: str, unit: Literal["px", "mm", "deg"], stated: float, found: float, redundancy: float) -> Noise:
-    return Noise(name=name, unit=unit, stated=stated, found=found, redundancy=redundancy)
+def _noise(
+    name: str, unit: Literal["px", "mm", "deg"], stated_sigma: float, found_sigma: float, redundancy: float
+) -> Noise:
+    return Noise(name=name, unit=unit, stated=stated_sigma, found=found_sigma, redundancy=redundancy)
 
 
 def unit_name(name: str) -> str:

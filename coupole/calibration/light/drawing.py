@@ -67,7 +67,7 @@ def draw_response(
     axes = figure.subplots(2, 2)
     for channel, transfer in transfers.items():
         colour = CHANNEL_COLOURS[channel]
-        x, y, use = transfer.signal_dn, transfer.variance_dn2, transfer.used
+        x, y, use = transfer.signal_dn, transfer.variance_dn2, transfer.used_levels
         line = transfer.read_noise_dn.value**2 + 1.0 / 12.0 + transfer.gain_dn_per_e.value * x
         per_dn = transfer.electrons_per_dn
         label = f"{channel}: {per_dn.value:.3f} ({per_dn.u:.1g}) e/DN, read {transfer.read_noise_e.value:.3g} e"

@@ -59,7 +59,7 @@ class Drift:
     """Time of the first reading, on the frames' clock."""
     noise: float
     """Relative noise of one reading: the estimated one, but not less than the stated one."""
-    used: tuple[Reading, ...]
+    used_readings: tuple[Reading, ...]
     """Readings that were used, in their order."""
     residuals: Floats
     """[used] relative."""
@@ -70,7 +70,7 @@ class Drift:
     @property
     def hours(self) -> float:
         """Time from the first to the last reading; beyond them the factor is an extrapolation."""
-        return (self.used[-1].t_s - self.used[0].t_s) / 3600.0
+        return (self.used_readings[-1].t_s - self.used_readings[0].t_s) / 3600.0
 
     def factor(self, warmer_k: ArrayLike, t_s: ArrayLike) -> Floats:
         """Power over calibrated power [...], by boards' temperatures relative to the calibration (K) and times."""
@@ -114,18 +114,18 @@ def fit_drift(
     precision[:3, :3] = np.diag(np.array([_UNKNOWN, u_rate_per_h, u_per_k]) ** -2.0)
     precision[3:, 3:] = np.linalg.inv(shared_covariance)
     first = _solve(ordered_readings, prior, precision)
-    odd = _odd(first.left, first.noise)
+    odd = _odd(first.residuals, first.noise)
     used_readings = [reading for reading, out in zip(ordered_readings, odd, strict=True) if not out]
     _refuse_few(used_readings)
     solution = _solve(used_readings, prior, precision) if odd.any() else first
-    _refuse_sudden([reading.name for reading in used_readings], solution.left, solution.noise)
+    _refuse_sudden([reading.name for reading in used_readings], solution.residuals, solution.noise)
     return Drift(
         solution.parameters[:3],
         solution.covariance[:3, :3],
         used_readings[0].t_s,
         float(np.median(solution.noise) * solution.scale),
         tuple(used_readings),
-        solution.left,
+        solution.residuals,
         tuple(reading for reading, out in zip(ordered_readings, odd, strict=True) if out),
         solution.freedom,
     )
@@ -138,7 +138,7 @@ def fit_drift(
 class _Solved:
     parameters: Floats
     covariance: Floats
-    left: Floats
+    residuals: Floats
     """[readings] residuals, relative."""
     noise: Floats
     """[readings] as stated, relative."""
@@ -174,29 +174,29 @@ def _refuse_few(readings: Sequence[Reading]) -> None:
         )
 
 
-def _excess(left: Floats, noise: Floats) -> float:
+def _excess(residuals: Floats, noise: Floats) -> float:
     """Estimated over stated noise, by the median of neighbours' differences, which a single step hardly
     changes."""
-    differences = np.abs(np.diff(left)) / np.hypot(noise[1:], noise[:-1])
+    differences = np.abs(np.diff(residuals)) / np.hypot(noise[1:], noise[:-1])
     return max(1.0, float(np.median(differences) * 1.4826))
 
 
-def _odd(left: Floats, noise: Floats) -> NDArray[np.bool_]:
+def _odd(residuals: Floats, noise: Floats) -> NDArray[np.bool_]:
     """Mark single readings [n] that are far from their neighbours' median; a lasting step does not count."""
     from scipy.ndimage import median_filter
 
-    if len(left) < _NEIGHBOURS:
-        return np.zeros(len(left), np.bool_)
-    off = np.abs(left - median_filter(left, _NEIGHBOURS, mode="nearest"))
-    return np.asarray(off > np.maximum(_ODD, _ODD_SIGMA * _excess(left, noise) * noise))
+    if len(residuals) < _NEIGHBOURS:
+        return np.zeros(len(residuals), np.bool_)
+    off = np.abs(residuals - median_filter(residuals, _NEIGHBOURS, mode="nearest"))
+    return np.asarray(off > np.maximum(_ODD, _ODD_SIGMA * _excess(residuals, noise) * noise))
 
 
-def _refuse_sudden(names: Sequence[str], left: Floats, noise: Floats) -> None:
+def _refuse_sudden(names: Sequence[str], residuals: Floats, noise: Floats) -> None:
     """Raise InputError if the level of the readings has a step, by the largest difference of means before and
     after, over its noise."""
-    weight = (_excess(left, noise) * noise) ** -2.0
-    before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * left)[:-1]
-    after, rest = weight.sum() - before, (weight * left).sum() - sums
+    weight = (_excess(residuals, noise) * noise) ** -2.0
+    before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * residuals)[:-1]
+    after, rest = weight.sum() - before, (weight * residuals).sum() - sums
     steps = rest / after - sums / before
     over = np.abs(steps) / np.sqrt(1.0 / before + 1.0 / after)
     at = int(np.argmax(over))

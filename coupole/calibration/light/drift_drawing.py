@@ -21,8 +21,8 @@ _MOST = 4000
 def draw_drift(drift: Drift, warmer_k: Floats, t_s: Floats, record: Record, figure: Figure) -> None:
     """Fill the figure; `warmer_k` and `t_s` [n] are those of the run's frames."""
     axes = figure.subplots(2, 2)
-    minutes = np.array([reading.t_s - drift.start_s for reading in drift.used]) / 60.0
-    warm = np.array([reading.warmer_k for reading in drift.used])
+    minutes = np.array([reading.t_s - drift.start_s for reading in drift.used_readings]) / 60.0
+    warm = np.array([reading.warmer_k for reading in drift.used_readings])
     by_fit = drift.factor(warm, 60.0 * minutes + drift.start_s)
     read_factors = by_fit * np.exp(drift.residuals)
     axes[0, 0].plot(minutes, 100 * read_factors, ".", color=GREY, ms=4, label="readings of the tile")

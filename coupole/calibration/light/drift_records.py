@@ -50,7 +50,7 @@ class Powers:
     names: tuple[str, ...]
     covariance: Floats
     """[c, c]."""
-    found: dict[str, float]
+    departures: dict[str, float]
     """Departure of the shared figures from their description, by the calibration."""
 
 
@@ -126,9 +126,10 @@ def drift_outcome(
         partial(draw_drift, drift, warmer_k, t_s),
         limits=against_limits(DRIFT, request.limits, {"factor": float(u.max()), "left_out": left_out}),
         files={f"{request.name}.csv": _table(drift).encode()},
-        fixed={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
+        fixed_figures={"start_s": drift.start_s, "hours": drift.hours, "noise": drift.noise},
         remarks=(
-            f"{len(drift.used)} readings in {len(views)} views; factor {factor.min():.4f} to {factor.max():.4f}",
+            f"{len(drift.used_readings)} readings in {len(views)} views; factor {factor.min():.4f} to "
+            f"{factor.max():.4f}",
             "ln factor = level + rate_per_h (t - start_s) / 3600 + per_k (T - board_c); T is the board's, board_c "
             "that of the LED in the powers' table",
             *remarks,
@@ -141,8 +142,8 @@ def drift_outcome(
 
 
 def _readings(
-    shown: Sequence[Sequence[LightFrame]],
-    read: TileReader,
+    frames_of_views: Sequence[Sequence[LightFrame]],
+    tile_reader: TileReader,
     setting: Setting,
     powers: Powers,
     remarks: list[str],
@@ -152,15 +153,15 @@ def _readings(
 
     Observations that cannot be used are added to `remarks`. Raises InputError if no view shows the tile.
     """
-    if not shown:
+    if not frames_of_views:
         raise InputError(
             "drift: no view shows the whole reference tile where its description has it; correct the description, "
             "or add a view of the tile to the plan"
         )
     readings: list[Reading] = []
-    frame_done = counter(progress, sum(map(len, shown)))
-    for view_frames in shown:
-        view = read.view(view_frames, frame_done)[CHANNEL]
+    frame_done = counter(progress, sum(map(len, frames_of_views)))
+    for view_frames in frames_of_views:
+        view = tile_reader.view(view_frames, frame_done)[CHANNEL]
         rows, _ = rows_of(0, view, setting.positions, setting.tile, setting.emission, remarks=remarks)
         frame_of = {frame.led: frame for frame in view_frames if frame.led is not None}
         readings += [
@@ -186,7 +187,7 @@ def _reading(frame: LightFrame, value: float, u: float, design: Floats, powers: 
     row = powers.row[frame.led]
     ratio, u_own = value / powers.power[row], float(powers.u_own[row])
     # Reflectance and Minnaert's k of the tile are those that the powers were calibrated with.
-    ratio *= np.exp(-design[3] * powers.found["ln_reflectance"] - design[4] * powers.found["minnaert"])
+    ratio *= np.exp(-design[3] * powers.departures["ln_reflectance"] - design[4] * powers.departures["minnaert"])
     common = powers.common[row].copy()
     common[powers.names.index("ln_reflectance")] += design[3]
     common[powers.names.index("minnaert")] += design[4]
@@ -231,7 +232,7 @@ def _table(drift: Drift) -> str:
     text = io.StringIO()
     text.write("# the reference tile: signal over that expected from the calibrated power; residual of the fit\n")
     text.write("shot,t_s,warmer_k,ratio,u_ratio,residual\n")
-    for reading, residual in zip(drift.used, drift.residuals, strict=True):
+    for reading, residual in zip(drift.used_readings, drift.residuals, strict=True):
         text.write(
             f"{reading.name},{reading.t_s:.6f},{reading.warmer_k:.2f},{reading.ratio:.6f},{reading.u_ratio:.2g},"
             f"{residual:.6f}\n"

@@ -68,7 +68,7 @@ class FlatField:
     """Relative, robust standard deviation of a block."""
     residuals: tuple[Floats, ...]
     """Relative residuals of each view; NaN where a block was not used."""
-    rejected: float
+    rejected_share: float
     """Share of the blocks with weight 0."""
     views: tuple[str, ...]
     degrees_of_freedom: float
@@ -119,10 +119,10 @@ def fit_flat_field(
             f"{len(views)} with {least} or more; photograph the panel, shifted and turned, filling the field, "
             "unsaturated"
         )
-    blocks = _gathered(views, usable, panel_scale_mm)
+    blocks = _gathered_blocks(views, usable, panel_scale_mm)
     fit = _fit(blocks, len(views), focal_px, size_px)
-    covariance = _clustered(fit.design, fit.weight, fit.left, blocks.pixels)
-    parts = np.split(fit.left, np.cumsum([int(u.sum()) for u in usable])[:-1])
+    covariance = _clustered_covariance(fit.design, fit.weight, fit.residuals, blocks.pixels)
+    parts = np.split(fit.residuals, np.cumsum([int(u.sum()) for u in usable])[:-1])
     residuals = []
     for use, part in zip(usable, parts, strict=True):
         whole = np.full(len(use), np.nan)
@@ -159,11 +159,13 @@ class _Blocks:
     """[b, 5] derivatives of ln s by `PANEL_NAMES`."""
 
 
-def _gathered(views: Sequence[FlatView], used: Sequence[NDArray[np.bool_]], panel_scale_mm: float) -> _Blocks:
-    pixels = np.concatenate([view.pixels[u] for view, u in zip(views, used, strict=True)])
-    logs = np.log(np.concatenate([view.signal[u] for view, u in zip(views, used, strict=True)]))
-    places = np.concatenate([view.panel_mm[u] for view, u in zip(views, used, strict=True)]) / panel_scale_mm
-    number = np.concatenate([np.full(int(u.sum()), i) for i, u in enumerate(used)])
+def _gathered_blocks(
+    views: Sequence[FlatView], used_masks: Sequence[NDArray[np.bool_]], panel_scale_mm: float
+) -> _Blocks:
+    pixels = np.concatenate([view.pixels[u] for view, u in zip(views, used_masks, strict=True)])
+    logs = np.log(np.concatenate([view.signal[u] for view, u in zip(views, used_masks, strict=True)]))
+    places = np.concatenate([view.panel_mm[u] for view, u in zip(views, used_masks, strict=True)]) / panel_scale_mm
+    number = np.concatenate([np.full(int(u.sum()), i) for i, u in enumerate(used_masks)])
     x, y = places.T
     return _Blocks(pixels, logs, number, np.column_stack([x, y, x * x, x * y, y * y]))
 
@@ -176,7 +178,7 @@ class _Fit:
     """[5] as `PANEL_NAMES`."""
     design: Floats
     """[b, 10 + views] derivatives of the logarithms."""
-    left: Floats
+    residuals: Floats
     """[b] residuals."""
     weight: Floats
     """[b] Tukey's."""
@@ -217,7 +219,7 @@ def _fit(blocks: _Blocks, views: int, focal_px: float, size_px: tuple[int, int])
 
 
 def block_means(
-    image: Floats, mask: NDArray[np.bool_], block_px: int, *, saturated: NDArray[np.bool_] | None = None
+    image: Floats, mask: NDArray[np.bool_], block_px: int, *, saturation_mask: NDArray[np.bool_] | None = None
 ) -> tuple[Floats, Floats]:
     """Centres [n, 2] and means [n] of the masked pixels of square blocks; NaN for a block with saturated pixels.
 
@@ -231,7 +233,7 @@ def block_means(
             part = slice(i * block_px, (i + 1) * block_px), slice(j * block_px, (j + 1) * block_px)
             values = image[part][mask[part]]
             centres.append(((j + 0.5) * block_px - 0.5, (i + 0.5) * block_px - 0.5))
-            full = saturated is not None and bool(saturated[part][mask[part]].mean() > 1e-3)
+            full = saturation_mask is not None and bool(saturation_mask[part][mask[part]].mean() > 1e-3)
             middle = np.median(values)
             scatter = _MAD * np.median(np.abs(values - middle))
             inliers = values[np.abs(values - middle) <= 4.0 * max(float(scatter), 1e-9)]
@@ -298,7 +300,7 @@ def _radial(pixels: Floats, centre: Floats, focal_px: float, size_px: tuple[int,
     return radial, -2.0 * away[:, None] * by_square[None]
 
 
-def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> Floats:
+def _clustered_covariance(design: Floats, weight: Floats, residuals: Floats, pixels: Floats) -> Floats:
     """Covariance of a weighted fit in which the errors of a block are the same in all views."""
     scale = np.linalg.norm(design, axis=0)
     scaled_design = design / scale
@@ -311,7 +313,7 @@ def _clustered(design: Floats, weight: Floats, left: Floats, pixels: Floats) -> 
         member_design, root = scaled_design[members], np.sqrt(weight[members])
         hat = (root[:, None] * member_design) @ bread @ (member_design * root[:, None]).T
         # A block at the field's rim has leverage on the fit; its residual is that of a fit without it.
-        alone = np.linalg.solve(np.eye(len(members)) - hat, root * left[members])
+        alone = np.linalg.solve(np.eye(len(members)) - hat, root * residuals[members])
         scores.append((member_design * root[:, None]).T @ alone)
     middle = np.array(scores).T @ np.array(scores)
     # Derivative of the weighted residuals by a step: that of Tukey's psi, which is less than its weight.

@@ -70,7 +70,7 @@ def flat_field_outcome(
     width, height = size_px = frames.size_px
     views: dict[str, list[FlatView]] = {channel: [] for channel in channels}
     for number, ((view, light), group) in enumerate(by_view.items()):
-        for channel, block_view in _reduced(
+        for channel, block_view in _flat_views(
             f"{view}/{light}", group, frames, dark, straight, base_from_panel
         ).items():
             views[channel].append(block_view)
@@ -85,7 +85,7 @@ def flat_field_outcome(
     parameters, covariance = _flat_parameters(fits)
     corners = np.array([(0.0, 0.0), (width - 1.0, 0.0), (0.0, height - 1.0), (width - 1.0, height - 1.0)])
     worst = max(float(fit.u_at(corners).max()) for fit in fits.values())
-    rejected_share = max(fit.rejected for fit in fits.values())
+    rejected_share = max(fit.rejected_share for fit in fits.values())
     deepest = max((spot.depth for spot in spots), default=0.0)
     dust = [f"({s.column_px:.0f}, {s.row_px:.0f}) by {s.depth:.1%}" for s in spots[:5]]
     remarks = [f"{len(spots)} dust spots on the sensor, the deepest at {', '.join(dust)}"] if spots else []
@@ -104,31 +104,31 @@ def flat_field_outcome(
             limit_of("deepest dust", deepest, _MOST_DUST_DEPTH),
         ),
         files={f"{request.name}.h5": h5_of({"g": g, "pixel_response": ratio, "dust_x_y_pixels_depth": table})},
-        fixed={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
+        fixed_figures={"focal_px": frames.focal_px, "u_pixel_response": u_ratio},
         remarks=remarks,
         more_inputs=(*record_input(dark_record), *record_input(response_record), *record_input(hand_eye)),
     )
 
 
-def _reduced(
+def _flat_views(
     name: str,
-    found: Sequence[LightFrame],
+    view_frames: Sequence[LightFrame],
     frames: LightFrames,
     dark: Callable[[LightFrame], NDArray[np.float32]],
     straight: Mapping[str, Callable[[Floats], Floats]],
     base_from_panel: Floats,
 ) -> dict[str, FlatView]:
     """One view's frames as means of blocks, by channel."""
-    mean, black = mean_of(found), dark(found[0])
+    mean, black = mean_of(view_frames), dark(view_frames[0])
     height, width = mean.shape
     block_px = max(8, 2 * round(width / _BLOCKS / 2))
-    is_saturated = _any_saturated(found, frames.white_dn)
+    is_saturated = _any_saturated(view_frames, frames.white_dn)
     views = {}
     for channel, linear in straight.items():
         mask = channel_mask((height, width), frames.pattern, channel)
         signal = linear(np.asarray(mean - black, np.float64))
-        pixels, values = block_means(signal, mask, block_px, saturated=is_saturated)
-        pose = found[0].base_from_camera
+        pixels, values = block_means(signal, mask, block_px, saturation_mask=is_saturated)
+        pose = view_frames[0].base_from_camera
         places = panel_places(pixels, frames.focal_px, (width, height), pose, base_from_panel)
         views[channel] = FlatView(name, pixels, values, places)
     return views

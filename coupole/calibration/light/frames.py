@@ -92,14 +92,14 @@ class LightFrames:
     def seen_through(self, flange_from_camera: Floats, arm: CalibratedArm | None = None) -> LightFrames:
         """The same frames with another pose [4, 4] of the camera on the flange, and the flange's own corrected by
         the axis zeros of `arm`. Raises InputError for frames without joints that an arm is to correct."""
-        flanges = [frame.base_from_flange for frame in self.frames] if arm is None else self._corrected(arm)
+        flanges = [frame.base_from_flange for frame in self.frames] if arm is None else self._corrected_poses(arm)
         frames = (
             replace(frame, base_from_flange=flange, base_from_camera=flange @ flange_from_camera)
             for frame, flange in zip(self.frames, flanges, strict=True)
         )
         return replace(self, frames=tuple(frames))
 
-    def _corrected(self, arm: CalibratedArm) -> list[Floats]:
+    def _corrected_poses(self, arm: CalibratedArm) -> list[Floats]:
         joints_deg = [frame.joints_deg for frame in self.frames if frame.joints_deg is not None]
         if len(joints_deg) < len(self.frames):
             raise InputError("frames without the arm's joints cannot be corrected by its axis zeros")

@@ -55,7 +55,7 @@ class LedPower:
     common_names: tuple[str, ...]
     common_covariance: Floats
     """[c, c]."""
-    found: Floats
+    departures: Floats
     """[c] the common figures' departures from the description."""
     noise: float
     """Relative, of one LED in one view, as found."""
@@ -127,9 +127,9 @@ def calibrate_led_power(
     y, w, led, view_of, design = arrays_of(rows, ids, flash_noise)
     solution = _solve(y, w, led, design, len(ids), prior_of(tile, len(places)))
     redundancy = max(1.0, float(len(y) - len(np.unique(led))))
-    chi2 = float(np.sum(w * solution.left**2))
+    chi2 = float(np.sum(w * solution.residuals**2))
     factor = max(1.0, chi2 / redundancy) if len(y) > len(np.unique(led)) else 1.0
-    _refuse_moved(views, view_of, solution.left, w, design, redundancy)
+    _refuse_moved(views, view_of, solution.residuals, w, design, redundancy)
     is_used = np.zeros(len(ids), bool)
     is_used[np.unique(led)] = True
     power = np.where(is_used, np.exp(np.where(is_used, solution.log_power, 0.0)), np.nan)
@@ -147,14 +147,14 @@ def calibrate_led_power(
         solution.covariance,
         solution.theta,
         float(np.sqrt(factor / np.median(w))),
-        _by_view(views, view_of, ids[led], solution.left),
+        _by_view(views, view_of, ids[led], solution.residuals),
         tuple(remarks),
         redundancy,
     )
 
 
 def _by_view(
-    views: Sequence[TileView], view_of: NDArray[np.intp], led_of: NDArray[np.int64], left: Floats
+    views: Sequence[TileView], view_of: NDArray[np.intp], led_of: NDArray[np.int64], row_residuals: Floats
 ) -> tuple[Floats, ...]:
     """Residuals of each view in the order of its LEDs [n]; NaN where an LED was not used."""
     residuals = []
@@ -162,7 +162,7 @@ def _by_view(
         view_residuals = np.full(len(view.leds), np.nan)
         where = {int(i): n for n, i in enumerate(view.leds)}
         for n in np.flatnonzero(view_of == v):
-            view_residuals[where[int(led_of[n])]] = left[n]
+            view_residuals[where[int(led_of[n])]] = row_residuals[n]
         residuals.append(view_residuals)
     return tuple(residuals)
 
@@ -176,7 +176,7 @@ class _Solved:
     """[leds, c]."""
     theta: Floats
     covariance: Floats
-    left: Floats
+    residuals: Floats
 
 
 def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: int, prior: Floats) -> _Solved:
@@ -196,7 +196,7 @@ def _solve(y: Floats, w: Floats, led: NDArray[np.intp], design: Floats, leds: in
 def _refuse_moved(
     views: Sequence[TileView],
     view_of: NDArray[np.intp],
-    left: Floats,
+    residuals: Floats,
     w: Floats,
     design: Floats,
     redundancy: float,
@@ -214,11 +214,11 @@ def _refuse_moved(
                 continue
             part = np.column_stack([design[at][:, columns], np.ones(int(at.sum()))])
             normal = part.T @ (part * w[at, None])
-            step = np.linalg.solve(normal, part.T @ (w[at] * left[at]))
+            step = np.linalg.solve(normal, part.T @ (w[at] * residuals[at]))
             # The fit absorbs a part of a view's own tilt, which the residuals therefore do not show.
             share = len(members) / (len(members) - 1.0)
             gain = float(step @ normal @ step) * share
-            noise = max(1.0, (float(np.sum(w * left**2)) - gain) / redundancy)
+            noise = max(1.0, (float(np.sum(w * residuals**2)) - gain) / redundancy)
             gain /= noise
             best = max(best, (gain, v, float(np.hypot(*step[: len(columns)])) * share))
         gain, v, tilt_deg = best

@@ -64,7 +64,7 @@ def led_power_outcome(frames: LightFrames, setting: Setting, request: Request, p
         partial(pictures.draw_led_power, powers, setting.positions),
         limits=against_limits(LED_POWER, request.limits, {"power": typical, "unusable": unusable}),
         files={f"{request.name}.csv": power_table(powers, warm).encode()},
-        fixed={
+        fixed_figures={
             "tile.reflectance": setting.tile.reflectance,
             "tile.minnaert": setting.tile.minnaert,
             "gain_db": frames.gain_db,
@@ -114,7 +114,7 @@ def _parameters(powers: Mapping[str, LedPower], covariance: Floats) -> list[Para
     u = iter(np.sqrt(np.diag(covariance)))
     for channel, power in powers.items():
         names = ["mean_power", *power.common_names]
-        values = [_mean_and_slopes(power)[0], *power.found]
+        values = [_mean_and_slopes(power)[0], *power.departures]
         parameters += [
             Parameter(
                 name=f"{name}.{channel}",

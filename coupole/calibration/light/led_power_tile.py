@@ -75,25 +75,25 @@ class TileReader:
         self._masks = {channel: channel_mask(self.shape, frames.pattern, channel) for channel in channels}
         self._flat = None if setting.flat is None else map_beside(setting.flat, "flat-field", "g", frames)
 
-    def view(self, found: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
+    def view(self, view_frames: Sequence[LightFrame], tell: Callable[[], None]) -> dict[str, TileView]:
         """The tile in the frames of one view, each under one LED, by channel; `tell` is called after each.
 
         Raises InputError if the view does not show the whole tile.
         """
-        base_from_camera = found[0].base_from_camera
+        base_from_camera = view_frames[0].base_from_camera
         points_mm, pixels = self.patches(base_from_camera)
         _refuse_few(min(map(len, pixels)))
-        signals = {channel: np.zeros((2, len(found), len(points_mm))) for channel in self._masks}
-        is_saturated = np.zeros(len(found), np.bool_)
-        for n, frame in enumerate(found):
+        signals = {channel: np.zeros((2, len(view_frames), len(points_mm))) for channel in self._masks}
+        is_saturated = np.zeros(len(view_frames), np.bool_)
+        for n, frame in enumerate(view_frames):
             for channel, (mean, u, full) in self.means(frame, pixels).items():
                 signals[channel][:, n] = mean, u
                 is_saturated[n] |= full
             tell()
-        leds = np.array([frame.led for frame in found], dtype=np.int64)
+        leds = np.array([frame.led for frame in view_frames], dtype=np.int64)
         return {
             channel: TileView(
-                found[0].view,
+                view_frames[0].view,
                 0,
                 self._setting.base_from_tile,
                 points_mm,

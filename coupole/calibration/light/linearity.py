@@ -68,7 +68,7 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     """
     refuse_all_clipped(pairs)
     ordered_pairs = sorted(pairs, key=lambda pair: pair.exposure_us)
-    signals, u_signals = _grouped(ordered_pairs)
+    signals, u_signals = _grouped_signals(ordered_pairs)
     is_seen = np.asarray(np.isfinite(signals).any(axis=0))
     ordered_pairs = [pair for pair, use in zip(ordered_pairs, is_seen, strict=True) if use]
     signals, u_signals = signals[:, is_seen], u_signals[:, is_seen]
@@ -88,7 +88,7 @@ def linearity(pairs: Sequence[Pair], range_dn: float, *, significance: float = 1
     worst = int(np.argmax(np.abs(deviation)))
     u_worst = float(np.sqrt(max(float(basis[:, worst] @ c_covariance @ basis[:, worst]), 0.0)))
     unlikely = float(chdtrc(2, coefficients @ np.linalg.solve(c_covariance, coefficients)))
-    _refuse_other_scene(ordered_pairs, fit.left, np.isfinite(signals), signals, u_signals)
+    _refuse_other_scene(ordered_pairs, fit.residuals, np.isfinite(signals), signals, u_signals)
     return Linearity(
         coefficients if unlikely < significance else np.zeros(2),
         c_covariance,
@@ -111,7 +111,7 @@ class _Fit:
     time_offset_us: float
     covariance: Floats
     """[3, 3] of c2, c3 and the time offset in ms."""
-    left: Floats
+    residuals: Floats
     """Residuals of the unsaturated signals over their uncertainties."""
     deviations: Floats
     """[groups, exposures] relative deviations of the uncorrected signals from a line."""
@@ -123,7 +123,7 @@ def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float,
     start = np.nanmedian(signals / exposures, axis=1)
     scatter = max(flicker / np.sqrt(2.0), 1e-6)
 
-    def expected(p: Floats) -> Floats:
+    def expected_signals(p: Floats) -> Floats:
         rates, light = start * np.exp(p[3 : 3 + len(start)]), p[-len(exposures) :]
         signal: Floats = rates[:, None] * (exposures + 1e3 * p[2]) * (1.0 + light)
         return signal
@@ -131,28 +131,30 @@ def _fit(signals: Floats, u_signals: Floats, exposures: Floats, range_dn: float,
     def residuals(p: Floats) -> Floats:
         x = signals / range_dn
         made_linear = signals * (1.0 + x * (p[0] + x * p[1]))
-        scaled_residuals = (made_linear - expected(p)) / u_signals
+        scaled_residuals = (made_linear - expected_signals(p)) / u_signals
         return np.concatenate([scaled_residuals[is_known], p[-len(exposures) :] / scatter])
 
     fit = least_squares(residuals, np.zeros(3 + len(start) + len(exposures)), method="trf", x_scale="jac")
     degrees = max(1, len(fit.fun) - len(fit.x))
     factor = max(1.0, 2.0 * fit.cost / degrees)  # Birge ratio: never smaller than the scatter of the data shows
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * factor
-    deviations = signals / expected(fit.x) - 1.0
+    deviations = signals / expected_signals(fit.x) - 1.0
     return _Fit(fit.x[:2], 1e3 * fit.x[2], covariance[:3, :3], fit.fun[: is_known.sum()], deviations)
 
 
-def _grouped(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
+def _grouped_signals(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
     """[groups, exposures] mean signals of pixels of similar brightness, and their standard uncertainties; NaN
     where more than `_CLIPPED_SHARE` of a group is saturated."""
-    bright = max(pairs, key=lambda p: float(np.where(p.saturated.mean() < _CLIPPED_SHARE, p.first.mean(), -1.0)))
+    bright = max(
+        pairs, key=lambda p: float(np.where(p.saturation_mask.mean() < _CLIPPED_SHARE, p.first.mean(), -1.0))
+    )
     # Blocks of neighbours are sorted, not pixels: sorting by noisy values would bias the groups' means.
     blocks = np.arange(len(bright.first) // BLOCK * BLOCK).reshape(-1, BLOCK)
     order = blocks[np.argsort((bright.first + bright.second)[blocks].mean(axis=1), kind="stable")]
     signals, u = np.full((_GROUPS, len(pairs)), np.nan), np.ones((_GROUPS, len(pairs)))
     for g, members in enumerate(map(np.ravel, np.array_split(order, _GROUPS))):
         for i, pair in enumerate(pairs):
-            if pair.saturated[members].mean() > _CLIPPED_SHARE:
+            if pair.saturation_mask[members].mean() > _CLIPPED_SHARE:
                 continue
             mean = 0.5 * (pair.first[members] + pair.second[members])
             noise = np.std(pair.first[members] - pair.second[members]) / 2.0
@@ -165,7 +167,7 @@ def _flicker(pairs: Sequence[Pair]) -> float:
     """Relative standard deviation of the light from frame to frame, from the two frames of each pair."""
     differences = []
     for pair in pairs:
-        keep = ~pair.saturated
+        keep = ~pair.saturation_mask
         total = pair.first[keep].sum() + pair.second[keep].sum()
         if total > 0:
             differences.append(2.0 * (pair.first[keep].sum() - pair.second[keep].sum()) / total)
@@ -191,11 +193,11 @@ def _refuse_contradictions(pairs: Sequence[Pair], signals: Floats, flicker: floa
 
 
 def _refuse_other_scene(
-    pairs: Sequence[Pair], left: Floats, known: NDArray[np.bool_], signals: Floats, u_signals: Floats
+    pairs: Sequence[Pair], residuals: Floats, known_mask: NDArray[np.bool_], signals: Floats, u_signals: Floats
 ) -> None:
     """Raise InputError if the ratios between groups of pixels differ in one exposure."""
-    relative = np.full(known.shape, np.nan)
-    relative[known] = left * u_signals[known] / signals[known]
+    relative = np.full(known_mask.shape, np.nan)
+    relative[known_mask] = residuals * u_signals[known_mask] / signals[known_mask]
     rms = np.sqrt(np.nanmean((relative - np.nanmean(relative, axis=0)) ** 2, axis=0))
     noise = np.sqrt(np.nanmean((u_signals / signals) ** 2, axis=0))
     worst = int(np.nanargmax(rms - _SCENE_SIGMA * noise))

@@ -23,7 +23,7 @@ class Pair:
     exposure_us: float
     first: Floats
     second: Floats
-    saturated: NDArray[np.bool_]
+    saturation_mask: NDArray[np.bool_]
     """[pixels] True where either frame is saturated."""
 
 
@@ -36,14 +36,15 @@ class Estimate:
 
 
 def refuse_all_clipped(pairs: Sequence[Pair]) -> None:
-    bright = [pair for pair in pairs if pair.saturated.mean() > 0.5]
+    bright = [pair for pair in pairs if pair.saturation_mask.mean() > 0.5]
     if len(bright) > len(pairs) - 4:
         raise InputError(
-            f"response: more than half of the pixels are saturated in {named(bright)}; expected four exposures "
+            f"response: more than half of the pixels are saturated in {pair_names(bright)}; expected four "
+            f"exposures "
             "or more without. Add shorter ones"
         )
 
 
-def named(pairs: Sequence[Pair]) -> str:
+def pair_names(pairs: Sequence[Pair]) -> str:
     names = [pair.name for pair in pairs]
     return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")

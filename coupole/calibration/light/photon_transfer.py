@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.calibration.light.pairs import BLOCK, Estimate, Pair, named, refuse_all_clipped
+from coupole.calibration.light.pairs import BLOCK, Estimate, Pair, pair_names, refuse_all_clipped
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 
@@ -48,7 +48,7 @@ class PhotonTransfer:
     """[levels] and variance of each, with its standard uncertainty."""
     variance_dn2: Floats
     u_variance_dn2: Floats
-    used: NDArray[np.bool_]
+    used_levels: NDArray[np.bool_]
 
     @property
     def electrons_per_dn(self) -> Estimate:
@@ -79,7 +79,7 @@ def photon_transfer(pairs: Sequence[Pair]) -> PhotonTransfer:
     slopes = np.array([by_intercept, by_gain])
     u_read_e = float(np.sqrt(slopes @ fit.covariance @ slopes))
     peak = int(np.argmax(np.where(levels > 0, variances, 0.0)))
-    saturated_seen = any(pair.saturated.any() for pair in pairs)
+    saturated_seen = any(pair.saturation_mask.any() for pair in pairs)
     saturation_dn = float(levels[peak])
     saturation_e = saturation_dn / fit.slope
     return PhotonTransfer(
@@ -111,7 +111,7 @@ def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
     """Mean of the two frames and their squared difference over 2, at each unsaturated pixel of all pairs."""
     signal, squares = [], []
     for pair in pairs:
-        keep = ~pair.saturated
+        keep = ~pair.saturation_mask
         if keep.sum() < _LEAST_PIXELS:
             continue
         mean = 0.5 * (pair.first[keep] + pair.second[keep])
@@ -121,7 +121,7 @@ def _squared_differences(pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
         signal.append(mean)
         squares.append(difference**2 / 2.0)
     if not signal:
-        raise InputError(f"response: {named(pairs)}: nearly all pixels are saturated; add shorter exposures")
+        raise InputError(f"response: {pair_names(pairs)}: nearly all pixels are saturated; add shorter exposures")
     return np.concatenate(signal), np.concatenate(squares)
 
 
@@ -145,7 +145,7 @@ def _line_of_sound_levels(levels: Floats, variances: Floats, counts: Floats) -> 
     return fit, is_used
 
 
-def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
+def _levels(signal: Floats, squared_differences: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean signal, mean squared difference over 2 and number of pixels, in levels of similar signal."""
     order = np.argsort(signal, kind="stable")
     # Equal steps of signal, not of rank: bright pixels may be few, and they determine most of the gain.
@@ -158,13 +158,13 @@ def _levels(signal: Floats, squared: Floats) -> tuple[Floats, Floats, Floats]:
             f"response: expected four or more levels of signal, found {int(keep.sum())}; bracket the exposure"
         )
     mean = np.bincount(bins, signal, _LEVELS)[keep] / counts[keep]
-    variance = np.bincount(bins, squared, _LEVELS)[keep] / counts[keep]
+    variance = np.bincount(bins, squared_differences, _LEVELS)[keep] / counts[keep]
     return mean, variance, counts[keep]
 
 
-def _line(signal: Floats, variance: Floats, counts: Floats, used: NDArray[np.bool_]) -> _Line:
+def _line(signal: Floats, variance: Floats, counts: Floats, used_levels: NDArray[np.bool_]) -> _Line:
     """Weighted line; weights by the line itself, as weights by single variances would bias it downwards."""
-    x, y, n = signal[used], variance[used], counts[used]
+    x, y, n = signal[used_levels], variance[used_levels], counts[used_levels]
     expected_variance = np.maximum(y, 1e-6)
     design = np.column_stack([np.ones_like(x), x])
     coefficients, covariance = np.zeros(2), np.eye(2)
@@ -183,7 +183,7 @@ def _prnu(pairs: Sequence[Pair]) -> Estimate | None:
 
     In each block of neighbours the scene is modelled by a parabola; None if that is not sufficient.
     """
-    clean = [pair for pair in pairs if not pair.saturated.any()]
+    clean = [pair for pair in pairs if not pair.saturation_mask.any()]
     if not clean:
         return None
     pair = max(clean, key=lambda p: float(p.first.mean()))

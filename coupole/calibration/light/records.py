@@ -40,7 +40,7 @@ from coupole.calibration.record import (
     Parameter,
     Record,
     rows_of,
-    sealed,
+    seal_record,
 )
 from coupole.calibration.report import Outcome
 from coupole.calibration.request import Request
@@ -65,20 +65,20 @@ def sealed_outcome(
     limits: Sequence[Limit],
     files: Mapping[str, bytes] | None = None,
     noise: Sequence[Noise] = (),
-    fixed: Mapping[str, float] | None = None,
+    fixed_figures: Mapping[str, float] | None = None,
     remarks: Sequence[str] = (),
     more_inputs: Sequence[tuple[str, str]] = (),
 ) -> Outcome:
     """A record of a radiometric calibration, with its files; `draw` gets the record and an empty figure."""
     about, contents = frames.about, files or {}
-    record = sealed(
+    record = seal_record(
         kind=kind,
         **request.head(),
-        simulated=about.simulated,
+        simulated=about.is_simulated,
         validity=request.validity(about, size_px, temperatures_of(frames.frames)),
         transforms={},
         parameters=tuple(parameters),
-        fixed=dict(fixed or {}),
+        fixed=dict(fixed_figures or {}),
         covariance=rows_of(covariance),
         files=tuple(Input(name=n, sha256=hashlib.sha256(content).hexdigest()) for n, content in contents.items()),
         noise=tuple(noise),
@@ -137,7 +137,7 @@ def dark_outcome(frames: LightFrames, request: Request, progress: Progress) -> O
         partial(pictures.draw_dark, dark),
         limits=against_limits(DARK, request.limits, {"hot": len(dark.hot) / pixels}),
         files={f"{request.name}.h5": content},
-        fixed=fixed_figures,
+        fixed_figures=fixed_figures,
         remarks=(f"{len(dark.hot)} hot pixels of {pixels}; the list is in {request.name}.h5",),
     )
 
@@ -227,7 +227,7 @@ def response_outcome(
             unit="e",
             stated=0.0,
             found=transfer.read_noise_e.value,
-            redundancy=float(transfer.used.sum() - 2),
+            redundancy=float(transfer.used_levels.sum() - 2),
         )
         for channel, transfer in transfers.items()
     ]
@@ -241,7 +241,7 @@ def response_outcome(
         partial(pictures.draw_response, transfers, lines),
         limits=against_limits(RESPONSE, request.limits, {"linearity": worst, "flicker": flicker}),
         noise=noise,
-        fixed={"range_dn": range_dn, **_saturation_figures(transfers)},
+        fixed_figures={"range_dn": range_dn, **_saturation_figures(transfers)},
         remarks=remarks,
         more_inputs=record_input(dark_record),
     )
@@ -306,7 +306,7 @@ def _response_parameters(
         line = lines[channel]
         gain = transfer.gain_dn_per_e
         intercept = transfer.read_noise_dn.value**2 + 1.0 / 12.0
-        freedom = float(max(1, transfer.used.sum() - 2))
+        freedom = float(max(1, transfer.used_levels.sum() - 2))
         values = [
             ("dark_variance_dn2", intercept, float(np.sqrt(transfer.covariance[0, 0])), "read noise"),
             ("gain_dn_per_e", gain.value, gain.u, "shot noise"),
@@ -388,9 +388,9 @@ def block_diagonal(blocks: Sequence[Floats]) -> Floats:
     return np.asarray(block_diag(*blocks))
 
 
-def limit_of(what: str, found: float, limit: float, unit: str = "") -> Limit:
+def limit_of(description: str, figure: float, limit: float, unit: str = "") -> Limit:
     """A figure with its acceptance limit."""
-    return Limit(what=what, found=found, limit=limit, unit=unit)
+    return Limit(what=description, found=figure, limit=limit, unit=unit)
 
 
 def record_input(path: Path | None) -> tuple[tuple[str, str], ...]:

@@ -45,7 +45,7 @@ class TileView:
     """[n, m] DN/s over the flat field, of one channel; NaN where nothing was seen."""
     u_signal: Floats
     """[n, m] of each, from noise."""
-    saturated: NDArray[np.bool_]
+    saturation_mask: NDArray[np.bool_]
     """[n] True where pixels of the tile were saturated."""
 
 
@@ -136,7 +136,7 @@ def rows_of(
     usable = (cos_in.min(axis=1) > _LOWEST_COSINE) & (h > 0).all(axis=1) & np.isfinite(view.signal).all(axis=1)
     rows: list[Row] = []
     shaded_leds: list[int] = []
-    for n in np.flatnonzero(usable & ~view.saturated):
+    for n in np.flatnonzero(usable & ~view.saturation_mask):
         middle = float(np.median(ratio[n]))
         # A shadow's edge across a part raises that part's noise, so the median noise of all parts is used.
         limit = _SHADED * abs(middle) + _SHADED_SIGMA * float(np.median(u_ratio[n]))
@@ -148,7 +148,7 @@ def rows_of(
         rows.append(Row(number, int(view.leds[n]), float(view.signal[n].sum() / total), u, slopes[n]))
     if shaded_leds:
         remarks.append(f"view {view.name}: the tile is partly in shadow under {list_of(shaded_leds)}; not used")
-    if (full := view.leds[view.saturated & usable]).size:
+    if (full := view.leds[view.saturation_mask & usable]).size:
         remarks.append(f"view {view.name}: the tile is saturated under {list_of(full)}; not used, expose less")
     return rows, {*shaded_leds, *map(int, full)}
 

@@ -63,7 +63,7 @@ class Ellipse:
     covariance: Floats
     """[2, 2] of the centre."""
     rms: float
-    used: NDArray[np.bool_]
+    point_mask: NDArray[np.bool_]
 
 
 def find_stickers(
@@ -182,7 +182,7 @@ def _sticker(
     rays = unproject(rim, lens)
     flat = rays[:, :2] / rays[:, 2:]
     ellipse = fit_ellipse(flat, _LEAST_SIGMA_PX / lens.fx)
-    if ellipse is None or ellipse.used.sum() < _LEAST_RIM * _RAYS:
+    if ellipse is None or ellipse.point_mask.sum() < _LEAST_RIM * _RAYS:
         return None
     widths = 1 / np.linalg.eigvalsh(ellipse.shape)
     if ellipse.rms > _WORST_RIM * widths.min() or widths.min() < LEAST_AXES_RATIO * widths.max():

@@ -25,7 +25,7 @@ from coupole.calibration.multi_view import CameraView, SeenPoint, seen_points
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.point_sets import match_points
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.rotations import Floats, between, inverses, moved, skew
+from coupole.calibration.rotations import Floats, between, inverses, moved_transforms, skew
 
 STICKERS, SCANNER, POSITION, ORIENTATION, HAND_EYE = (
     "stickers",
@@ -54,7 +54,7 @@ class MeshPose:
 
     base_from_mesh: Floats
     covariance: Floats
-    matched: tuple[str, ...]
+    recognised_names: tuple[str, ...]
     """Names of the targets that were recognised."""
     missing: tuple[str, ...]
     false_points: int
@@ -98,7 +98,7 @@ def mesh_to_robot(
     targets_mm: Floats,
     names: Sequence[str],
     *,
-    stated: Stated = Stated(),
+    stated_noise: Stated = Stated(),
     prior: CameraPrior | None = None,
     depth_mm: tuple[float, float] = (200.0, 900.0),
 ) -> MeshPose:
@@ -107,23 +107,32 @@ def mesh_to_robot(
     Without `prior` the views' poses have no error in common. Raises InputError if too few stickers are seen in
     three views, or if their layout has no match or two.
     """
-    pose_px = intrinsics.fx * (stated.robot_mm / np.mean(depth_mm) + np.radians(stated.robot_deg))
-    tolerance_px = 4.0 * float(np.hypot(stated.sticker_px, pose_px))
+    pose_px = intrinsics.fx * (stated_noise.robot_mm / np.mean(depth_mm) + np.radians(stated_noise.robot_deg))
+    tolerance_px = 4.0 * float(np.hypot(stated_noise.sticker_px, pose_px))
     tolerance_mm = 4.0 * float(
-        np.sqrt(stated.scanner_mm**2 + stated.robot_mm**2 + (0.5 * depth_mm[0] * 1e-4) ** 2)
+        np.sqrt(stated_noise.scanner_mm**2 + stated_noise.robot_mm**2 + (0.5 * depth_mm[0] * 1e-4) ** 2)
     )
     points = seen_points(views, intrinsics, tolerance_px=tolerance_px, depth_mm=depth_mm)
     found_mm = np.array([point.base_mm for point in points]).reshape(-1, 3)
     match = match_points(found_mm, targets_mm, tolerance_mm)
-    matched_points = [points[row] for row in match.found]
+    matched_points = [points[row] for row in match.found_rows]
     adjustment = _adjust(
-        views, intrinsics, matched_points, targets_mm[match.known], match.found_from_known, stated, prior
+        views,
+        intrinsics,
+        matched_points,
+        targets_mm[match.known_rows],
+        match.found_from_known,
+        stated_noise,
+        prior,
     )
-    matched_names = [names[row] for row in match.known.tolist()]
+    matched_names = [names[row] for row in match.known_rows.tolist()]
     to_degrees = np.diag([1.0, 1.0, 1.0, *np.degrees([1.0, 1.0, 1.0])])
     sightings = sum(len(point.views) for point in matched_points)
     residuals = np.concatenate(
-        [r[k] for r, k in zip(adjustment.residuals[:sightings], adjustment.kept[:sightings], strict=True)]
+        [
+            r[k]
+            for r, k in zip(adjustment.residuals[:sightings], adjustment.accepted_masks[:sightings], strict=True)
+        ]
     )
     return MeshPose(
         adjustment.state.base_from_mesh,
@@ -132,8 +141,8 @@ def mesh_to_robot(
         tuple(name for name in names if name not in set(matched_names)),
         len(points) - len(matched_points),
         {name: len(point.views) for name, point in zip(matched_names, matched_points, strict=True)},
-        float(np.sqrt(np.mean(residuals**2)) * stated.sticker_px),
-        _by_view(adjustment, matched_points, len(views), stated.sticker_px),
+        float(np.sqrt(np.mean(residuals**2)) * stated_noise.sticker_px),
+        _by_view(adjustment, matched_points, len(views), stated_noise.sticker_px),
         match.rms_mm,
         {component.name: component.factor for component in adjustment.components},
         {component.name: component.redundancy for component in adjustment.components},
@@ -143,14 +152,14 @@ def mesh_to_robot(
 
 
 def _by_view(
-    adjusted: Adjusted[_State], seen: Sequence[SeenPoint], views: int, sticker_px: float
+    adjustment: Adjusted[_State], sticker_points: Sequence[SeenPoint], views: int, sticker_px: float
 ) -> tuple[tuple[int, int, float], ...]:
-    view_of = np.concatenate([point.views for point in seen])
+    view_of = np.concatenate([point.views for point in sticker_points])
     view_figures = []
     for view in range(views):
         rows = np.flatnonzero(view_of == view)
-        good = [row for row in rows if adjusted.kept[row].all()]
-        square = sum(float(np.sum(adjusted.residuals[row] ** 2)) for row in good)
+        good = [row for row in rows if adjustment.accepted_masks[row].all()]
+        square = sum(float(np.sum(adjustment.residuals[row] ** 2)) for row in good)
         view_figures.append(
             (len(good), len(rows) - len(good), sticker_px * float(np.sqrt(square / max(len(good), 1))))
         )
@@ -166,8 +175,8 @@ class _Problem:
     """
 
     intrinsics: Intrinsics
-    stated: Stated
-    reported: Floats
+    stated_noise: Stated
+    reported_poses: Floats
     """[v, 4, 4] base_from_camera."""
     targets_mm: Floats
     """[t, 3] the table's, of the recognised targets."""
@@ -179,14 +188,14 @@ class _Problem:
     """[n] and its view."""
     lens: NDArray[np.intp]
     """[f] rows of the free lens parameters in `optics.NAMES`."""
-    held: Floats
+    prior_whiten: Floats
     """W [f + 6 + k, f + 6 + k] with W'W the inverse covariance of what views share."""
     by_shared: Floats
     """[v, 6, f + 6 + k] step of each reported pose for what views share."""
 
     @property
     def first_target(self) -> int:
-        return 6 + 6 * len(self.reported)
+        return 6 + 6 * len(self.reported_poses)
 
     @property
     def first_shared(self) -> int:
@@ -197,8 +206,8 @@ class _Problem:
 
     def move(self, state: _State, step: Floats) -> _State:
         return _State(
-            moved(state.base_from_mesh, step[:6]),
-            moved(state.base_from_camera, step[6 : self.first_target].reshape(-1, 6)),
+            moved_transforms(state.base_from_mesh, step[:6]),
+            moved_transforms(state.base_from_camera, step[6 : self.first_target].reshape(-1, 6)),
             state.targets_mm + step[self.first_target : self.first_shared].reshape(-1, 3),
             state.shared_step + step[self.first_shared :],
         )
@@ -215,8 +224,8 @@ class _Problem:
         by_turn = by_base @ (-turn @ skew(places))
         by_view = projection.by_point @ skew(in_camera)
         by_all = [by_base, by_turn, by_base @ turn, -by_base, by_view, projection.by_intrinsics[:, :, self.lens]]
-        jacobian = np.concatenate(by_all, axis=2) / self.stated.sticker_px
-        residuals = (self.observed_px - projection.pixels) / self.stated.sticker_px
+        jacobian = np.concatenate(by_all, axis=2) / self.stated_noise.sticker_px
+        residuals = (self.observed_px - projection.pixels) / self.stated_noise.sticker_px
         columns = self._sticker_columns()
         return [Block(residuals[k], jacobian[k], columns[k], 0) for k in range(len(residuals))]
 
@@ -235,7 +244,7 @@ class _Problem:
 
     def _target_blocks(self, state: _State) -> list[Block]:
         """Each target lies where the table has it, within the scanner's accuracy."""
-        sigma_mm = self.stated.scanner_mm
+        sigma_mm = self.stated_noise.scanner_mm
         blocks = []
         for row, at_mm in enumerate(state.targets_mm):
             columns = np.arange(self.first_target + 3 * row, self.first_target + 3 * row + 3)
@@ -245,36 +254,36 @@ class _Problem:
     def _pose_blocks(self, state: _State) -> list[Block]:
         """Each view's pose is the reported one, moved by what views share, within the arm's noise. What views
         share is zero within its record's covariance."""
-        pose_sigma = np.array([self.stated.robot_mm] * 3 + [np.radians(self.stated.robot_deg)] * 3)
-        shared_columns = self.first_shared + np.arange(len(self.held))
-        off_by = between(state.base_from_camera, self.reported) + self.by_shared @ state.shared_step
+        pose_sigma = np.array([self.stated_noise.robot_mm] * 3 + [np.radians(self.stated_noise.robot_deg)] * 3)
+        shared_columns = self.first_shared + np.arange(len(self.prior_whiten))
+        off_by = between(state.base_from_camera, self.reported_poses) + self.by_shared @ state.shared_step
         blocks = []
-        for view in range(len(self.reported)):
+        for view in range(len(self.reported_poses)):
             for group, part in ((2, slice(0, 3)), (3, slice(3, 6))):
                 columns = np.concatenate([6 + 6 * view + np.arange(6)[part], shared_columns])
                 by_both = np.concatenate([np.eye(3), -self.by_shared[view, part]], axis=1)
                 jacobian = by_both / pose_sigma[part][:, None]
                 blocks.append(Block(off_by[view, part] / pose_sigma[part], jacobian, columns, group))
-        return [*blocks, Block(-self.held @ state.shared_step, self.held, shared_columns, 4)]
+        return [*blocks, Block(-self.prior_whiten @ state.shared_step, self.prior_whiten, shared_columns, 4)]
 
 
 def _adjust(
     views: Sequence[CameraView],
     intrinsics: Intrinsics,
-    seen: Sequence[SeenPoint],
+    sticker_points: Sequence[SeenPoint],
     targets_mm: Floats,
     start: Floats,
-    stated: Stated,
+    stated_noise: Stated,
     prior: CameraPrior | None,
 ) -> Adjusted[_State]:
     """Adjust the mesh's pose from `start` together with the views, the targets and what views share."""
     reported_poses = np.array([view.base_from_camera for view in views])
     groups = (
-        Group(STICKERS, estimated=True, rejects=2),
-        Group(SCANNER, estimated=False),
-        Group(POSITION, estimated=True),
-        Group(ORIENTATION, estimated=True),
-        Group(HAND_EYE, estimated=False),
+        Group(STICKERS, is_estimated=True, rejects=2),
+        Group(SCANNER, is_estimated=False),
+        Group(POSITION, is_estimated=True),
+        Group(ORIENTATION, is_estimated=True),
+        Group(HAND_EYE, is_estimated=False),
     )
     lens = np.array([], np.intp)
     if prior is None:
@@ -284,16 +293,25 @@ def _adjust(
         whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(prior.covariance)))
         by_shared = _by_shared(reported_poses, prior)
     observed_px = np.array(
-        [views[v].pixels[p] for point in seen for v, p in zip(point.views, point.places, strict=True)]
+        [views[v].pixels[p] for point in sticker_points for v, p in zip(point.views, point.places, strict=True)]
     )
-    target_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(seen)])
-    view_of = np.concatenate([point.views for point in seen])
+    target_of = np.concatenate([np.full(len(point.views), row) for row, point in enumerate(sticker_points)])
+    view_of = np.concatenate([point.views for point in sticker_points])
     problem = _Problem(
-        intrinsics, stated, reported_poses, targets_mm, observed_px, target_of, view_of, lens, whitening, by_shared
+        intrinsics,
+        stated_noise,
+        reported_poses,
+        targets_mm,
+        observed_px,
+        target_of,
+        view_of,
+        lens,
+        whitening,
+        by_shared,
     )
     begin = _State(start, reported_poses, targets_mm, np.zeros(len(whitening)))
     unknowns = problem.first_shared + len(whitening)
-    return adjust(begin, problem.evaluate, problem.move, groups, unknowns, what="mesh to robot")
+    return adjust(begin, problem.evaluate, problem.move, groups, unknowns, calibration_name="mesh to robot")
 
 
 def _by_shared(base_from_camera: Floats, prior: CameraPrior) -> Floats:

@@ -26,7 +26,7 @@ def views_of(
     ]
 
 
-def corrected(
+def corrected_views(
     views: Sequence[CameraView], stickers: Sequence[Sequence[Sticker]], points: Sequence[SeenPoint]
 ) -> list[CameraView]:
     """The views with all detections moved from the ellipses' middles to the images of the disks' centres."""
@@ -38,13 +38,13 @@ def corrected(
                 for v, p in zip(point.views, point.places, strict=True)
             ]
         )
-        normal_numbers = _agreed(normals)
+        normal_numbers = _agreeing_normals(normals)
         for v, p, w in zip(point.views, point.places, normal_numbers.tolist(), strict=True):
             pixels[v][p] = stickers[v][p].centres[w]
     return [replace(view, pixels=view_pixels) for view, view_pixels in zip(views, pixels, strict=True)]
 
 
-def _agreed(normals: Floats) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def _agreeing_normals(normals: Floats) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     """Choose which of two normals [views, 2, 3] each view sees, so that they agree best."""
     candidates = normals.reshape(-1, 3)
     cosines = np.einsum("ci,vki->cvk", candidates, normals)

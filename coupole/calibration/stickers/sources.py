@@ -39,7 +39,7 @@ class StickerImages:
     stickers: tuple[tuple[Sticker, ...], ...]
     names: tuple[str, ...]
     size_px: tuple[int, int]
-    shown: int
+    shown_number: int
     """Number of the image with most stickers."""
     picture: Floats
     """[H, W] that image."""
@@ -78,7 +78,7 @@ def find_all_stickers(
     size_px: tuple[int, int] | None = None
     shown_number, picture = 0, np.zeros((1, 1))
     for number, source in enumerate(sources.images):
-        image = source.read().plane()
+        image = source.read_picture().plane()
         size = (image.shape[1], image.shape[0])
         if size_px is not None and size != size_px:
             raise InputError(f"{source.name}: {size[0]} x {size[1]} pixels, the images before it {size_px}")

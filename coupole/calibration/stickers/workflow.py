@@ -21,7 +21,7 @@ from coupole.calibration.record import (
     Validity,
     pose_of,
     rows_of,
-    sealed,
+    seal_record,
     step_names,
 )
 from coupole.calibration.request import Request
@@ -36,11 +36,11 @@ from coupole.calibration.stickers.mesh_to_robot import (
     Stated,
     mesh_to_robot,
 )
-from coupole.calibration.stickers.points import corrected, views_of
+from coupole.calibration.stickers.points import corrected_views, views_of
 from coupole.calibration.stickers.sources import Scan, StickerImages
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
-from coupole.scan.simplify import simplified
+from coupole.scan.simplify import simplified_mesh
 
 _LEAST_SIGMA_PX = 0.02
 _MOST_FACES = 1_000_000
@@ -69,7 +69,7 @@ def mesh_from(
     prior: CameraPrior,
     request: Request,
     *,
-    stated: Stated,
+    stated_noise: Stated,
     depth_mm: tuple[float, float],
     base_from_support: Transform | None = None,
     arm: CalibratedArm | None = None,
@@ -83,28 +83,30 @@ def mesh_from(
         base_from_flange, prior = calibrated_poses(base_from_flange, joints_deg, arm, prior)
     base_from_camera = base_from_flange @ prior.flange_from_camera
     sigma_px = _sigma_px(images)
-    stated = replace(stated, sticker_px=sigma_px)
-    pose_px = prior.lens.fx * (stated.robot_mm / float(np.mean(depth_mm)) + np.radians(stated.robot_deg))
+    stated_noise = replace(stated_noise, sticker_px=sigma_px)
+    pose_px = prior.lens.fx * (
+        stated_noise.robot_mm / float(np.mean(depth_mm)) + np.radians(stated_noise.robot_deg)
+    )
     views = views_of(images.names, base_from_camera, images.stickers)
     points = seen_points(views, prior.lens, tolerance_px=4 * float(np.hypot(0.2, pose_px)), depth_mm=depth_mm)
-    views = corrected(views, images.stickers, points)
+    views = corrected_views(views, images.stickers, points)
     pose = mesh_to_robot(
-        views, prior.lens, scan.targets_mm, scan.names, stated=stated, prior=prior, depth_mm=depth_mm
+        views, prior.lens, scan.targets_mm, scan.names, stated_noise=stated_noise, prior=prior, depth_mm=depth_mm
     )
     u_mm = np.array([pose.uncertainty_at(target) for target in scan.targets_mm])
     transforms = {"base_from_mesh": pose_of(pose.base_from_mesh)}
     if base_from_support is not None:
         transforms["support_from_object"] = pose_of(inverse(base_from_support) @ pose.base_from_mesh)
-    record = sealed(
+    record = seal_record(
         kind="mesh",
         **request.head(),
-        simulated=sources.about.simulated,
+        simulated=sources.about.is_simulated,
         validity=Validity(expires=request.expires),
         transforms=transforms,
         parameters=_parameters(pose),
-        fixed={"stickers_found": float(len(pose.matched)), "stickers_known": float(len(scan.names))},
+        fixed={"stickers_found": float(len(pose.recognised_names)), "stickers_known": float(len(scan.names))},
         covariance=rows_of(pose.covariance),
-        noise=_noise(pose, stated),
+        noise=_noise(pose, stated_noise),
         images=tuple(
             ImageResidual(name=name, corners=used_count, rejected=rejected_count, rms_px=rms_px)
             for name, (used_count, rejected_count, rms_px) in zip(images.names, pose.residuals_of, strict=True)
@@ -113,7 +115,7 @@ def mesh_from(
         remarks=(*_remarks(pose), *(() if arm is None else (_of_the_arm(arm),))),
         inputs=tuple(Input(name=name, sha256=digest) for name, digest in (*sources.inputs, *scan.inputs)),
     )
-    camera_from_mesh = inverses(base_from_camera[images.shown]) @ pose.base_from_mesh
+    camera_from_mesh = inverses(base_from_camera[images.shown_number]) @ pose.base_from_mesh
     return MeshFound(record, pose, images, camera_from_mesh, prior.lens, scan, u_mm)
 
 
@@ -125,30 +127,30 @@ def _sigma_px(images: StickerImages) -> float:
     return max(float(np.sqrt(np.median(variances))), _LEAST_SIGMA_PX)
 
 
-def outline_px(found: MeshFound, mesh: Path) -> Floats:
+def outline_px(result: MeshFound, mesh: Path) -> Floats:
     """Ends [n, 2, 2] (px) of the mesh's edges between triangles that face the shown image's camera and triangles
     that do not: its contours."""
     import trimesh
 
     whole = trimesh.load_mesh(mesh, process=False)
-    coarse = simplified(np.asarray(whole.vertices), np.asarray(whole.faces), _MOST_FACES)
+    coarse = simplified_mesh(np.asarray(whole.vertices), np.asarray(whole.faces), _MOST_FACES)
     coarse_mesh = trimesh.Trimesh(*coarse, process=False)
-    eye_mm = inverse(found.camera_from_mesh)[:3, 3]
+    eye_mm = inverse(result.camera_from_mesh)[:3, 3]
     corners = np.asarray(coarse_mesh.triangles)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     faces_eye = np.einsum("ij,ij->i", normals, eye_mm - corners[:, 0]) > 0
     face, neighbour = np.asarray(coarse_mesh.face_adjacency).T
     edges = np.asarray(coarse_mesh.face_adjacency_edges)[faces_eye[face] != faces_eye[neighbour]]
     ends = np.asarray(coarse_mesh.vertices, dtype=np.float64)[edges.reshape(-1)]
-    return reprojected(found, ends).reshape(-1, 2, 2)
+    return projected_pixels(result, ends).reshape(-1, 2, 2)
 
 
-def reprojected(found: MeshFound, mesh_mm: Floats) -> Floats:
+def projected_pixels(result: MeshFound, mesh_mm: Floats) -> Floats:
     """Pixels [n, 2] of points [n, 3] of the mesh in the image that is shown; NaN for points behind the camera."""
-    in_camera = mesh_mm @ found.camera_from_mesh[:3, :3].T + found.camera_from_mesh[:3, 3]
+    in_camera = mesh_mm @ result.camera_from_mesh[:3, :3].T + result.camera_from_mesh[:3, 3]
     pixels = np.full((len(mesh_mm), 2), np.nan)
     before = in_camera[:, 2] > 1.0
-    pixels[before] = optics.project(in_camera[before], found.lens.vector()).pixels
+    pixels[before] = optics.project(in_camera[before], result.lens.vector()).pixels
     return pixels
 
 
@@ -166,11 +168,11 @@ def _parameters(pose: MeshPose) -> tuple[Parameter, ...]:
     )
 
 
-def _noise(pose: MeshPose, stated: Stated) -> tuple[Noise, ...]:
+def _noise(pose: MeshPose, stated_noise: Stated) -> tuple[Noise, ...]:
     stated_sigmas = {
-        STICKERS: (stated.sticker_px, "px"),
-        POSITION: (stated.robot_mm, "mm"),
-        ORIENTATION: (stated.robot_deg, "deg"),
+        STICKERS: (stated_noise.sticker_px, "px"),
+        POSITION: (stated_noise.robot_mm, "mm"),
+        ORIENTATION: (stated_noise.robot_deg, "deg"),
     }
     return tuple(
         Noise(
@@ -188,7 +190,7 @@ def _figures(pose: MeshPose, scan: Scan, u_mm: Floats) -> dict[str, float]:
     """The figures that `acceptance.MESH` limits."""
     return {
         "place_mm": float(u_mm.max()),
-        "missing": 1 - len(pose.matched) / len(scan.names),
+        "missing": 1 - len(pose.recognised_names) / len(scan.names),
         "residual_px": pose.residual_px,
         "robot_ratio": float(max(pose.noise[POSITION], pose.noise[ORIENTATION])),
     }

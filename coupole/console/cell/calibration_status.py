@@ -173,7 +173,7 @@ def _row(path: Path, cell: Cell) -> RecordRow:
         left_days=(record.validity.expires - now).total_seconds() / _DAY_S,
         tightest=_limit_words(worst[1].what, worst[1].found, worst[1].limit, worst[1].unit) if worst else "",
         margin=1 - worst[0] if worst else None,
-        against=tuple(_without(path, refusals([InForce(path, record)], situation_of(cell.rig), needed=()))),
+        against=tuple(_without(path, refusals([InForce(path, record)], situation_of(cell.rig), needed_kinds=()))),
     )
 
 
@@ -184,7 +184,7 @@ def _step(step: Step, folder: Path) -> StepNow:
         if not path.is_file():
             continue
         try:
-            wrong = [limit for limit in read_record(path).limits if not limit.passed]
+            wrong = [limit for limit in read_record(path).limits if not limit.is_met]
         except CoupoleError as error:
             problems.append(str(error))
             continue

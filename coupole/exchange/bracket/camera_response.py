@@ -75,7 +75,7 @@ def found_response(photographs: Photographs) -> Response:
     curves, uncertain, noise = [], [], []
     for channel in range(3):
         samples = _samples(photographs.values[..., channel])
-        curve, sigma, value_noise = _solved(samples, np.log(photographs.exposure_s))
+        curve, sigma, value_noise = _solve_curve(samples, np.log(photographs.exposure_s))
         curves.append(curve)
         uncertain.append(sigma)
         noise.append(value_noise)
@@ -117,11 +117,11 @@ def _samples(values: NDArray[np.float32]) -> Array:
     return np.asarray(pixels[order[np.linspace(0, len(order) - 1, min(_PIXELS, len(order))).astype(int)]])
 
 
-def _solved(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
+def _solve_curve(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
     """g [NODES], its uncertainty, and the noise of values. What moved between photographs counts for little."""
     weights = hat(samples)
     for _ in range(_ROUNDS):
-        g, inverse = _fitted(samples, weights, log_t)
+        g, inverse = _fit_curve(samples, weights, log_t)
         off, noise = _left_over(samples, weights, g, log_t)
         slope = np.maximum(_at(np.gradient(g, 1.0 / (NODES - 1)), samples), 1e-3)
         weights = hat(samples) / (1.0 + (off / (_OUTLIER * noise * slope)) ** 2) ** 2
@@ -133,7 +133,7 @@ def _solved(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
     return g, uncertain, noise
 
 
-def _fitted(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:
+def _fit_curve(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:
     """g [NODES], and the inverse of its normal equations."""
     matrix, target = _normal_equations(samples, weights, log_t)
     gauge = np.zeros((NODES, NODES))

@@ -27,7 +27,7 @@ class Merged:
     """[h, w, 3]."""
     uncertainty: NDArray[np.float32]
     """[h, w, 3], standard, relative, of noise and response."""
-    saturated: NDArray[np.bool_]
+    saturation_mask: NDArray[np.bool_]
     """[h, w, 3], in all photographs: the radiance is a lower bound."""
     dark: NDArray[np.bool_]
     """[h, w, 3], in all photographs: hardly more than noise."""
@@ -35,7 +35,7 @@ class Merged:
     """[photographs, h, w], left out there, because others say otherwise: something moved."""
 
 
-def merged(photographs: Photographs, response: Response) -> Merged:
+def merge_exposures(photographs: Photographs, response: Response) -> Merged:
     shape = photographs.values.shape[1:]
     radiance, uncertain = np.empty(shape, np.float32), np.empty(shape, np.float32)
     is_saturated, dark = np.empty(shape, bool), np.empty(shape, bool)
@@ -57,7 +57,7 @@ def merged(photographs: Photographs, response: Response) -> Merged:
 
 
 def _mean(
-    found: NDArray[np.float64],
+    radiances: NDArray[np.float64],
     usable: NDArray[np.bool_],
     exposure_s: NDArray[np.float64],
     response: Response,
@@ -66,10 +66,10 @@ def _mean(
     """Weighted mean and its relative uncertainty. Weights follow from the mean, not from the pixel's own values,
     whose noise would favour the darker of two."""
     noise = max(float(response.noise[channel]), 0.29 / 255.0)
-    mean = np.where(usable, found, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    mean = np.where(usable, radiances, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     for _ in range(_ROUNDS):
         total, sums, curve = np.zeros_like(mean), np.zeros_like(mean), np.zeros_like(mean)
-        for radiance, is_usable, time in zip(found, usable, exposure_s, strict=True):
+        for radiance, is_usable, time in zip(radiances, usable, exposure_s, strict=True):
             model = response.value(mean * time, channel)
             sigma = response.slope(model, channel) * noise  # relative
             weight = np.where(is_usable, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
@@ -84,14 +84,14 @@ def _mean(
 
 
 def _contradicting(
-    found: NDArray[np.float64],
+    radiances: NDArray[np.float64],
     values: NDArray[np.float32],
     usable: NDArray[np.bool_],
     response: Response,
     channel: int,
 ) -> NDArray[np.bool_]:
     """[photographs, h, w] of those that lie beyond `_CONTRADICTS` deviations of the best exposed ones' median."""
-    logs = np.where(usable, np.log(np.maximum(found, 1e-300)), np.nan)
+    logs = np.where(usable, np.log(np.maximum(radiances, 1e-300)), np.nan)
     lonely = usable.sum(axis=0) < 2
     weights = np.where(usable, hat(values.astype(float)), 0.0)
     best = np.take_along_axis(logs, np.argmax(weights, axis=0)[None], axis=0)[0]

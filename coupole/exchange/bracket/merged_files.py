@@ -16,17 +16,17 @@ from coupole.exchange.bracket.exposure_merging import Merged
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
 
 
-def write_exr(path: Path, merged: Merged, told: str) -> None:
+def write_exr(path: Path, merged_picture: Merged, comment: str) -> None:
     """Channels R, G, B; `u.R`, `u.G`, `u.B`, relative standard uncertainties, inf for bounds; `saturated`, `dark`
     and `contradicting`, 1 where a channel, or a photograph, is. Raises StorageError."""
     channels: dict[str, Any] = {}
     for number, name in enumerate("RGB"):
-        channels[name] = np.ascontiguousarray(merged.radiance[..., number])
-        channels[f"u.{name}"] = np.ascontiguousarray(merged.uncertainty[..., number])
-    channels["saturated"] = merged.saturated.any(axis=2).astype(np.float32)
-    channels["dark"] = merged.dark.any(axis=2).astype(np.float32)
-    channels["contradicting"] = merged.contradicting.any(axis=0).astype(np.float32)
-    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "comments": told}
+        channels[name] = np.ascontiguousarray(merged_picture.radiance[..., number])
+        channels[f"u.{name}"] = np.ascontiguousarray(merged_picture.uncertainty[..., number])
+    channels["saturated"] = merged_picture.saturation_mask.any(axis=2).astype(np.float32)
+    channels["dark"] = merged_picture.dark.any(axis=2).astype(np.float32)
+    channels["contradicting"] = merged_picture.contradicting.any(axis=0).astype(np.float32)
+    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "comments": comment}
     part = path.with_name(f".{path.name}.part")
     try:
         OpenEXR.File(head, channels).write(str(part))

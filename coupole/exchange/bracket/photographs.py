@@ -40,7 +40,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         raise InputError(
             f"--exposure-s: expected a time for each of {len(paths)} photographs, found {len(exposure_s)}"
         )
-    pictures = [_read(path) for path in paths]
+    pictures = [_read_photograph(path) for path in paths]
     exif_tags = [_exif(path) for path in paths] if exposure_s is None else [{_TIME: time} for time in exposure_s]
     for number, label in ((_APERTURE, "apertures"), (_ISO, "ISO numbers")):
         settings = {tags.get(number) for tags in exif_tags}
@@ -70,7 +70,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
     )
 
 
-def _read(path: Path) -> tuple[NDArray[np.float32], int]:
+def _read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
     """[h, w, 3], and how many levels."""
     if path.suffix.lower() not in _PLAIN:
         return _raw(path), 65536

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.appearance.matter.tabulated import SpecularTable, specular_coordinates, tabulated
+from coupole.appearance.matter.tabulated import SpecularTable, specular_coordinates, tabulated_brdf
 from coupole.errors import InputError
 
 Array = NDArray[np.float64]
@@ -134,13 +134,13 @@ def table_of(samples: Samples) -> SpecularTable:
     return SpecularTable(incidence, theta, np.einsum("kj,itjb->itkb", cosines, values.reshape(*shape, 3)))
 
 
-def evaluated(table: SpecularTable) -> Callable[[Array, Array], Array]:
+def table_function(table: SpecularTable) -> Callable[[Array, Array], Array]:
     """The table as a function of directions [n, 3], in parts that fit into memory."""
 
     def reflectance(ways_in: Array, ways_out: Array) -> Array:
         parts = range(0, len(ways_in), _AT_ONCE)
         blocks = [
-            tabulated(ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE], table=table) for at in parts
+            tabulated_brdf(ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE], table=table) for at in parts
         ]
         return np.concatenate(blocks)
 
@@ -149,7 +149,7 @@ def evaluated(table: SpecularTable) -> Callable[[Array, Array], Array]:
 
 def misses(samples: Samples, table: SpecularTable) -> tuple[float, float]:
     """Median and 95 % of the relative differences between table and samples."""
-    off = np.abs(evaluated(table)(samples.ways_in, samples.ways_out) / samples.f - 1.0)
+    off = np.abs(table_function(table)(samples.ways_in, samples.ways_out) / samples.f - 1.0)
     median, most = np.quantile(off, [0.5, 0.95])
     return float(median), float(most)
 

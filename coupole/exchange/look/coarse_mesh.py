@@ -32,14 +32,14 @@ def coarse_mesh(
     """Make a coarse mesh from places [m, 3] in steps of a grid and triangles [n, 3]: the finest trial of at most
     `most` triangles."""
     cells = 4.0
-    trial = _clustered(places, triangles, cells)
+    trial = _clustered_mesh(places, triangles, cells)
     while len(trial.triangles) <= most and cells < 1 << 16:
         last_fit, cells = trial, cells * _FINER
-        trial = _clustered(places, triangles, cells)
+        trial = _clustered_mesh(places, triangles, cells)
     return last_fit if len(trial.triangles) > most else trial
 
 
-def _clustered(places: NDArray[np.uint16], triangles: NDArray[np.uint32], cells: float) -> CoarseMesh:
+def _clustered_mesh(places: NDArray[np.uint16], triangles: NDArray[np.uint32], cells: float) -> CoarseMesh:
     x, y, z = (places / (65536.0 / cells)).astype(np.uint64).T
     _, cluster, members = np.unique(
         x << np.uint64(40) | y << np.uint64(20) | z, return_inverse=True, return_counts=True

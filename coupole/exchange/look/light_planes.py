@@ -119,10 +119,10 @@ def _missed_between(roots: Floats, ways: Floats, planes: int) -> tuple[float, fl
     components = _components(apart, min(planes, len(apart), apart.shape[1]))
     short = (apart @ components.T @ components).reshape(training.shape) + means
     between = np.einsum("wl,plc->pwc", weights(ways[~out], ways[out], KERNEL), short)
-    return missed(np.maximum(between, 0.0) ** 2, roots[:, out] ** 2)
+    return error_figures(np.maximum(between, 0.0) ** 2, roots[:, out] ** 2)
 
 
-def missed(found: Floats, measured: Floats) -> tuple[float, float]:
+def error_figures(computed_values: Floats, measured_values: Floats) -> tuple[float, float]:
     """Median and root of the mean square of what differs."""
-    off = np.abs(found - measured)
+    off = np.abs(computed_values - measured_values)
     return float(np.median(off)), float(np.sqrt(np.mean(off**2)))

@@ -48,8 +48,8 @@ def frames_of_view(
         row = int(np.flatnonzero(view.leds == led)[0])
         if not np.isfinite(share).any():
             continue
-        small = averaged(share, step)
-        picture, peak = _coded(small if small.shape[2] == 3 else np.repeat(small, 3, axis=2))
+        small = block_means(share, step)
+        picture, peak = _srgb_codes(small if small.shape[2] == 3 else np.repeat(small, 3, axis=2))
         blocks.append(block_of(f"frame-{view.path.stem}-{led}", picture))
         full_scale = np.broadcast_to(np.nan_to_num(view.full_scales[row]), 3) / math.pi
         frames.append(
@@ -77,7 +77,7 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
     """[3, 3] rows: axes of directions from the camera, the last forward; [21, 2] coefficients of x^i y^j (all j
     of an i, then the next) that give column and row, as shares of the picture, of a direction's x and y where z
     is 1."""
-    rows, columns = np.nonzero(surface.seen >= 0)
+    rows, columns = np.nonzero(surface.triangle_of_pixel >= 0)
     some = slice(None, None, max(1, len(rows) // _MOST_PLACES))
     rows, columns = rows[some], columns[some]
     ways = surface.places_mm[rows, columns].astype(np.float64) - surface.camera_mm
@@ -89,13 +89,13 @@ def _lens(surface: Surface) -> tuple[Floats, Floats]:
     x, y = (local[:, :2] / local[:, 2:]).T
     design = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
     scale = np.abs(design).max(axis=0)
-    height, width = surface.seen.shape
+    height, width = surface.triangle_of_pixel.shape
     shares = np.stack([(columns + 0.5) / width, (rows + 0.5) / height], axis=1)
     coefficients = np.linalg.lstsq(design / scale, shares, rcond=None)[0]
     return axes, coefficients / scale[:, None]
 
 
-def averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
+def block_means(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
     """Means of step x step pixels that have a value in all channels; NaN where none has. The last row and column
     are of what is left over."""
     height, width = share.shape[:2]
@@ -111,7 +111,7 @@ def averaged(share: NDArray[np.float32], step: int) -> NDArray[np.float64]:
     return np.where(counts > 0, sums / np.maximum(counts, 1.0), np.nan)
 
 
-def _coded(small: Floats) -> tuple[NDArray[np.uint8], float]:
+def _srgb_codes(small: Floats) -> tuple[NDArray[np.uint8], float]:
     """[h, w, 3] in sRGB's steps up to the peak that is returned, from 1; 0 where there is no value."""
     is_finite = np.asarray(np.isfinite(small).all(axis=2))
     peak = max(float(np.quantile(small[is_finite], _WHITE_QUANTILE)) if is_finite.any() else 1.0, 1e-9)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from coupole.calibration.light.frames import LightFrame, LightFrames, open_light_frames
 from coupole.calibration.light.records import dark_signal
 from coupole.errors import InputError
-from coupole.exchange.look.light_planes import LightPlanes, light_planes, missed
+from coupole.exchange.look.light_planes import LightPlanes, error_figures, light_planes
 from coupole.exchange.look.look_blocks import Block, Look, block_of, jpeg_of
-from coupole.exchange.look.look_frames import MOST_PX, averaged
+from coupole.exchange.look.look_frames import MOST_PX, block_means
 from coupole.exchange.look.look_tiles import TILE_PX, levels_of, tiles_of
 from coupole.exchange.srgb import srgb
 from coupole.geometry import apply, inverse
@@ -42,15 +42,15 @@ class Frames:
 
     of_run: LightFrames
     dark: Callable[[LightFrame], NDArray[np.float32]]
-    chosen: dict[int, LightFrame]
+    frame_of_led: dict[int, LightFrame]
 
     @property
     def shortest_us(self) -> float:
-        return min(frame.exposure_us for frame in self.chosen.values())
+        return min(frame.exposure_us for frame in self.frame_of_led.values())
 
     def share(self, led: int) -> NDArray[np.float32]:
         """[h, w, 3] as at the shortest exposure; colours between a Bayer filter's pixels are interpolated."""
-        frame, run = self.chosen[led], self.of_run
+        frame, run = self.frame_of_led[led], self.of_run
         steps = 65535.0 / (run.white_dn - run.black_dn)
         linear = np.clip((frame.read() - self.dark(frame)) * np.float32(steps), 0, 65535)
         codes = np.rint(linear).astype(np.uint16)
@@ -109,7 +109,8 @@ _ERRORS = {
 def _about(run: Run, frames: LightFrames, views: list[dict[str, Any]]) -> dict[str, Any]:
     wide, high = views[0]["picture_px"]
     off = "; ".join(
-        f"{view['name']}: {_told(view['missed'])} at the LEDs, {_told(view['missed_between'])} between them"
+        f"{view['name']}: {_error_text(view['missed'])} at the LEDs, {_error_text(view['missed_between'])} "
+        f"between them"
         for view in views
     )
     return {
@@ -140,37 +141,37 @@ def _about(run: Run, frames: LightFrames, views: list[dict[str, Any]]) -> dict[s
     }
 
 
-def _told(off: tuple[float, float] | None) -> str:
+def _error_text(off: tuple[float, float] | None) -> str:
     return "unknown (too few LEDs)" if off is None else f"{off[0]:.2%} and {off[1]:.2%}"
 
 
 def _target_mm(frames: Frames, focus_distance_mm: float) -> Floats:
-    pose = next(iter(frames.chosen.values())).base_from_camera
+    pose = next(iter(frames.frame_of_led.values())).base_from_camera
     return np.asarray(pose[:3, 3] + focus_distance_mm * pose[:3, 2])
 
 
 def _towards(frames: Frames, target_mm: Floats, places_mm: Floats) -> Floats:
     """[n, 3] unit vectors from the target to places: x right of the picture, y up, z to the camera."""
-    into_camera = inverse(next(iter(frames.chosen.values())).base_from_camera)
+    into_camera = inverse(next(iter(frames.frame_of_led.values())).base_from_camera)
     apart = (apply(into_camera, places_mm) - apply(into_camera, target_mm)) * (1.0, -1.0, -1.0)
     ways: Floats = apart / np.linalg.norm(apart, axis=1, keepdims=True)
     return ways
 
 
 def _ways(frames: Frames, leds: LedTable, target_mm: Floats) -> Floats:
-    return _towards(frames, target_mm, leds.positions_mm[leds.rows(sorted(frames.chosen))])
+    return _towards(frames, target_mm, leds.positions_mm[leds.rows(sorted(frames.frame_of_led))])
 
 
 def _view(
     frames: Frames, name: str, ways: Floats, say: Said
 ) -> tuple[dict[str, Any], Block, list[Block], list[Block]]:
     """Return what the page knows of a view; its block of lights; tiles; pictures of frames."""
-    leds = sorted(frames.chosen)
+    leds = sorted(frames.frame_of_led)
     frame_facts: list[dict[str, Any]] = []
     pictures: list[Block] = []
 
     def see(number: int, share: NDArray[np.float32]) -> None:
-        frame = frames.chosen[leds[number]]
+        frame = frames.frame_of_led[leds[number]]
         block, frame_about = _frame(f"frame-{name}-{leds[number]}", share)
         pictures.append(block)
         of_shot = {"shot": str(frame.shot), "exposure_us": frame.exposure_us, "way": ways[number].tolist()}
@@ -205,7 +206,7 @@ def _view(
 
 def _frame(name: str, share: NDArray[np.float32]) -> tuple[Block, dict[str, Any]]:
     """A picture of a frame, and what is said of it."""
-    small = averaged(share, math.ceil(max(share.shape) / MOST_PX))
+    small = block_means(share, math.ceil(max(share.shape) / MOST_PX))
     peak = max(float(small.max()), 1e-9)
     codes = np.rint(255.0 * srgb(small / peak)).astype(np.uint8)
     size_px = [codes.shape[1], codes.shape[0]]
@@ -227,7 +228,7 @@ def _plane_tiles(
 def _missed_as_written(
     frames: Frames,
     leds: list[int],
-    taken: LightPlanes,
+    view_planes: LightPlanes,
     tiles: list[Block],
     low: NDArray[np.float32],
     step: NDArray[np.float32],
@@ -242,10 +243,10 @@ def _missed_as_written(
     for number in range(0, len(leds), -(-len(leds) // _CHECKED)):
         share = frames.share(leds[number])[:TILE_PX, :TILE_PX]
         inside = planes[:, : share.shape[0], : share.shape[1]]
-        root = np.einsum("phw,pc->hwc", inside, taken.of_leds[:, number]) + taken.means[number]
+        root = np.einsum("phw,pc->hwc", inside, view_planes.of_leds[:, number]) + view_planes.means[number]
         models.append(np.maximum(root, 0.0).ravel() ** 2)
         shares.append(share.ravel().astype(np.float64))
-    return missed(np.concatenate(models), np.concatenate(shares))
+    return error_figures(np.concatenate(models), np.concatenate(shares))
 
 
 def _apart_deg(ways: Floats) -> float:
@@ -261,7 +262,7 @@ def _shots(run: Run, frames: Frames, view: str, leds: LedTable, target_mm: Float
     """LEDs of the view whose frame is not there: not proven, or hidden; and how many shots are proven."""
     proven = run.proven()
     plan_shots = [shot for shot in run.expected_shots() if shot.view == view and isinstance(shot.light, Led)]
-    missing = {shot.light.id for shot in plan_shots if isinstance(shot.light, Led)} - set(frames.chosen)
+    missing = {shot.light.id for shot in plan_shots if isinstance(shot.light, Led)} - set(frames.frame_of_led)
     hidden_ids = run.hidden_leds.get(view, [])
 
     def at(ids: Sequence[int]) -> list[list[float]]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, octahedral
 from coupole.exchange.look.look_tiles import TILE_PX, levels_of, tiles_of
-from coupole.reflectance.picture_result import MATERIALS, PictureResult, opened
+from coupole.reflectance.picture_result import MATERIALS, PictureResult, open_result_file
 
 
 def look_of_pictures(folder: Path) -> Look:
@@ -22,7 +22,7 @@ def look_of_pictures(folder: Path) -> Look:
     if not (folder / MATERIALS).exists():
         raise InputError(f"{folder / MATERIALS}: is not there; `coupole reflectance --pictures` makes it")
     fields = np.full((_FIELDS, height, width), np.nan, np.float32)
-    with opened(folder / MATERIALS) as file:
+    with open_result_file(folder / MATERIALS) as file:
         is_fitted = mask.copy()
         is_fitted[mask] = np.isfinite(file["alpha"][()])
         first = 0

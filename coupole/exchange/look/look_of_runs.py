@@ -53,7 +53,7 @@ def look_of_result(
         raise InputError(f"{folder}: has no fit {fit}; `coupole reflectance fit {folder}` makes it")
     support_from_base = inverse(result.base_from_support)
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
-    places, triangles, origin_mm, step_mm = welded(corners_mm)
+    places, triangles, origin_mm, step_mm = weld_corners(corners_mm)
     count = len(triangles)
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
     of_triangles, count_measured = _materials(result, fit, support_from_base)
@@ -122,7 +122,7 @@ def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[
         "gloss": halves(_pair(materials.alpha, materials.residual)[rows]),
         "uncertainty": _uncertainty(result.materials_path(fit))[rows],
     }
-    return {name: _spread(numbers, at, count) for name, numbers in values.items()}, len(at)
+    return {name: _spread_values(numbers, at, count) for name, numbers in values.items()}, len(at)
 
 
 def _first(
@@ -137,7 +137,7 @@ def _first(
     return tuple(block_of(f"first-{name}", values) for name, values in arrays.items())
 
 
-def welded(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
+def weld_corners(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
     """Weld corners [3 n, 3] of triangles. Returns places [m, 3] in steps from an origin, each once, in the order
     of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm."""
     origin_mm = corners_mm.min(axis=0)
@@ -157,11 +157,11 @@ def _uncertainty(path: Path) -> NDArray[np.uint8]:
     return log_coded(np.stack(list(standard_uncertainties(path).values()), axis=1))
 
 
-def _pair(one: Floats, other: Floats) -> Floats:
-    return np.stack([one, other], axis=1)
+def _pair(first: Floats, second: Floats) -> Floats:
+    return np.stack([first, second], axis=1)
 
 
-def _spread(values: NDArray[Any], at: NDArray[np.int64], count: int) -> NDArray[Any]:
+def _spread_values(values: NDArray[Any], at: NDArray[np.int64], count: int) -> NDArray[Any]:
     """[count, ...] 0 but where triangles have values."""
     all_of_them = np.zeros((count, *values.shape[1:]), values.dtype)
     all_of_them[at] = values

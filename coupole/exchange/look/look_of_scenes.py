@@ -24,7 +24,7 @@ from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import InputError
 from coupole.exchange.look.look_blocks import Look, block_of, octahedral
-from coupole.exchange.look.look_of_runs import welded
+from coupole.exchange.look.look_of_runs import weld_corners
 from coupole.exchange.look.scene_layers import (
     PATHS,
     SHOWN,
@@ -69,7 +69,7 @@ class _Materials:
     def number(self, material: Material) -> int:
         key = material.model_dump_json()
         if key not in self._numbers:
-            self._numbers[key] = self.add([layers_of(material, self.folder)], told(material))
+            self._numbers[key] = self.add([layers_of(material, self.folder)], describe_material(material))
         return self._numbers[key]
 
     def add(self, layers: Sequence[tuple[Layer, ...]], name: str, *, is_drawn: bool = False) -> int:
@@ -95,15 +95,15 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
             slab_parts, face = _nashiji(thing, materials)
             parts += slab_parts
         elif isinstance(thing, Makie):
-            parts.append(_sprinkled(thing, materials))
+            parts.append(_sprinkled_part(thing, materials))
         elif isinstance(thing, Nashiji):
-            parts.append(_lacquered(thing, materials))
+            parts.append(_lacquered_part(thing, materials))
         else:
             casts = thing.kind != "plane"
             parts += [_opaque(piece, materials, casts) for piece in objects.pieces(thing, folder)]
     powers = illuminants(scene, folder)
     corners_mm = np.concatenate([part.corners_mm for part in parts])
-    places, triangles, origin_mm, step_mm = welded(corners_mm.reshape(-1, 3))
+    places, triangles, origin_mm, step_mm = weld_corners(corners_mm.reshape(-1, 3))
     normals = flat_normals(corners_mm)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     colour_tables = tables(materials.layers, powers, scene.observer)
@@ -111,7 +111,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
         "places": places,
         "triangles": triangles,
         "normals": octahedral(normals),
-        "material": _numbered(parts),
+        "material": _material_codes(parts),
         "tables": colour_tables.reshape(-1, *colour_tables.shape[-2:]),
     }
     about = _about(scene, folder, powers, materials) | {
@@ -126,7 +126,7 @@ def look_of_scene(scene: Scene, folder: Path) -> Look:
     return Look(about, tuple(block_of(name, values) for name, values in blocks.items()), errors=errors)
 
 
-def told(material: Material) -> str:
+def describe_material(material: Material) -> str:
     """Describe a material in a few words, without values that are the defaults."""
     values = material.model_dump(mode="json", exclude_defaults=True)
     values.pop("kind", None)
@@ -139,7 +139,7 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Materials) -> dict[str, Any]:
+def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], materials: _Materials) -> dict[str, Any]:
     start = start_of(scene, folder)
     lamps = [light.kind for light in scene.lights if light.kind in {"area", "leds"}]
     return {
@@ -152,7 +152,7 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Ma
         "illuminants": {
             name: {"told": name, "xy": chromaticity(power, scene.observer)} for name, power in powers.items()
         },
-        "materials": found.names,
+        "materials": materials.names,
         "remarks": remarks(scene),
         "observer": scene.observer,
         "irradiance": float(np.pi),
@@ -168,7 +168,7 @@ def _about(scene: PlainScene, folder: Path, powers: dict[str, Array], found: _Ma
     }
 
 
-def _opaque(piece: Piece | Ball, found: _Materials, casts: bool) -> _Part:
+def _opaque(piece: Piece | Ball, materials: _Materials, casts: bool) -> _Part:
     if isinstance(piece.material, Pane):
         raise InputError("a page has no light through coloured glass; leave `stained_glass` and glazing out")
     corners_mm = (
@@ -176,43 +176,51 @@ def _opaque(piece: Piece | Ball, found: _Materials, casts: bool) -> _Part:
         if isinstance(piece, Ball)
         else piece.corners_mm
     )
-    return _Part(corners_mm, found.number(piece.material), casts)
+    return _Part(corners_mm, materials.number(piece.material), casts)
 
 
-def _makie(thing: MakieTile, found: _Materials) -> list[_Part]:
+def _makie(thing: MakieTile, materials: _Materials) -> list[_Part]:
     """The drawing as shares of metal over lacquer, in place of grains."""
     tile = samples.makie_tile(thing.side_mm, thing.triangles, thing.petals, thing.seed)
     metal = Metal(kind="metal", roughness=thing.roughness)
     black = Lacquer(kind="lacquer")
-    layers = (*layers_of(metal, found.folder), *layers_of(black, found.folder))
-    drawing = found.add([layers], f"{told(metal)}, by its share, over {told(black)}", is_drawn=True)
-    face = objects.placed(Piece(tile.face, black), thing).corners_mm
-    body = objects.placed(Piece(tile.body, black), thing).corners_mm
-    return [_Part(face, drawing, share=tile.share), _Part(body, found.number(black))]
+    layers = (*layers_of(metal, materials.folder), *layers_of(black, materials.folder))
+    drawing = materials.add(
+        [layers], f"{describe_material(metal)}, by its share, over {describe_material(black)}", is_drawn=True
+    )
+    face = objects.placed_piece(Piece(tile.face, black), thing).corners_mm
+    body = objects.placed_piece(Piece(tile.body, black), thing).corners_mm
+    return [_Part(face, drawing, share=tile.share), _Part(body, materials.number(black))]
 
 
-def _sprinkled(thing: Makie, found: _Materials) -> _Part:
-    grains = coarse_grains(thing, found.folder)
-    layers = (*layers_of(thing.metal, found.folder), *layers_of(thing.lacquer, found.folder))
-    drawing = found.add([layers], f"{told(thing.metal)}, by its share, over {told(thing.lacquer)}", is_drawn=True)
+def _sprinkled_part(thing: Makie, materials: _Materials) -> _Part:
+    grains = coarse_grains(thing, materials.folder)
+    layers = (*layers_of(thing.metal, materials.folder), *layers_of(thing.lacquer, materials.folder))
+    drawing = materials.add(
+        [layers],
+        f"{describe_material(thing.metal)}, by its share, over {describe_material(thing.lacquer)}",
+        is_drawn=True,
+    )
     return _Part(
-        objects.placed(Piece(grains.corners_mm, thing.metal), thing).corners_mm, drawing, share=grains.share
+        objects.placed_piece(Piece(grains.corners_mm, thing.metal), thing).corners_mm, drawing, share=grains.share
     )
 
 
-def _lacquered(thing: Nashiji, found: _Materials) -> _Part:
+def _lacquered_part(thing: Nashiji, materials: _Materials) -> _Part:
     """Flakes as the mean over many."""
-    number = found.add([nashiji_layers(thing, found.folder)], f"mean of flakes of {told(thing.metal)} in urushi")
-    corners_mm = lacquered_corners(thing, found.folder)
-    return _Part(objects.placed(Piece(corners_mm, thing.metal), thing).corners_mm, number)
+    number = materials.add(
+        [nashiji_layers(thing, materials.folder)], f"mean of flakes of {describe_material(thing.metal)} in urushi"
+    )
+    corners_mm = lacquered_corners(thing, materials.folder)
+    return _Part(objects.placed_piece(Piece(corners_mm, thing.metal), thing).corners_mm, number)
 
 
-def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[str, Any]]:
+def _nashiji(thing: NashijiSlab, materials: _Materials) -> tuple[list[_Part], dict[str, Any]]:
     """Flakes and what lies under the lacquer; the lacquer's face, which the page refracts at."""
     longest_mm = 2.0 * _PATH * thing.depth_mm
     rotation = thing.scene_from_thing()[:3, :3]
     parts, flakes = [], None
-    for piece in objects.pieces(thing, found.folder):
+    for piece in objects.pieces(thing, materials.folder):
         assert isinstance(piece, Piece)
         if isinstance(piece.material, Glass):
             top_mm = float((piece.corners_mm @ rotation[:, 2]).max())
@@ -220,10 +228,10 @@ def _nashiji(thing: NashijiSlab, found: _Materials) -> tuple[list[_Part], dict[s
             if flakes is None:
                 metal = piece.material
                 name = f"gold flake, roughness {metal.roughness:g}, in urushi"
-                flakes = found.add(flake_layers(metal.gold, metal.roughness, longest_mm), name)
+                flakes = materials.add(flake_layers(metal.gold, metal.roughness, longest_mm), name)
             parts.append(_Part(piece.corners_mm, flakes))
         elif not isinstance(piece.material, Pane):
-            parts.append(_Part(piece.corners_mm, found.number(piece.material)))
+            parts.append(_Part(piece.corners_mm, materials.number(piece.material)))
     face = {
         "normal": rotation[:, 2].tolist(),
         "height_mm": top_mm,
@@ -242,7 +250,7 @@ def _box(parts: Sequence[_Part]) -> list[list[float]]:
     return [corners_mm.min(axis=0).tolist(), corners_mm.max(axis=0).tolist()]
 
 
-def _numbered(parts: Sequence[_Part]) -> NDArray[np.uint16]:
+def _material_codes(parts: Sequence[_Part]) -> NDArray[np.uint16]:
     """[n, 2] of triangles: number of the material, code of the first layer's share."""
     blocks = []
     for part in parts:

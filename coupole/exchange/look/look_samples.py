@@ -80,9 +80,9 @@ def _codes(
     for first in range(0, len(view.leds), _LEDS):
         leds = np.arange(first, min(first + _LEDS, len(view.leds)))
         samples = channel_samples(result, view, rows, leds, None, scan_noise_um, beside)
-        finite_samples = samples.at(samples.known)
+        finite_samples = samples.at(samples.known_places)
         low, high = bounds(finite_samples.places, finite_samples.sources, _QUANTILE_95)
         ends = np.full((2, len(samples.f)), np.nan)
-        ends[:, samples.known] = 1.0 - low, np.minimum(high - 1.0, _FAR)
+        ends[:, samples.known_places] = 1.0 - low, np.minimum(high - 1.0, _FAR)
         codes[1:, :, leds] = log_coded(ends).reshape(2, len(rows), len(leds))
     return codes

@@ -42,7 +42,7 @@ def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
     height, width = values.shape[1:]
     for level, _ in enumerate(levels_of(width, height)):
         if level:
-            values = halved(values)
+            values = halve_pictures(values)
         for row in range(-(-values.shape[1] // TILE_PX)):
             for column in range(-(-values.shape[2] // TILE_PX)):
                 rows, columns = (slice(k * TILE_PX, (k + 1) * TILE_PX) for k in (row, column))
@@ -52,7 +52,7 @@ def tiles_of(values: NDArray[np.float32]) -> Iterator[Tile]:
                 yield Tile(level, column, row, part)
 
 
-def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def halve_pictures(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """[n, ceil(h / 2), ceil(w / 2)] means of those of 2 x 2 pixels that have a value."""
     count, height, width = values.shape
     means = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)

@@ -53,7 +53,7 @@ class ResidualPlanes:
     codes: NDArray[np.uint8]
     """[3 + planes, n] of shares by channel (1 to 255: 0 to 1; 0: no residual), and of numbers: 128 + 127 times the
     root of their share of the greatest one, with their sign."""
-    missed: float
+    missed_energy: float
     """Sum of the squares of what pages leave of the fit, over some triangles, directions and channels."""
     energy: float
     """The same of what GGX alone leaves of it: of the residual."""
@@ -80,7 +80,7 @@ def residual_blocks(
         blocks += [block_of(names[0], codes), block_of(names[1], planes_of_view.planes)]
         camera_mm = apply(support_from_base, view.camera_mm).tolist()
         views.append({"name": view.view, "blocks": names, "camera_mm": camera_mm})
-        missed_energy, energy = missed_energy + planes_of_view.missed, energy + planes_of_view.energy
+        missed_energy, energy = missed_energy + planes_of_view.missed_energy, energy + planes_of_view.energy
         say("residuals", number + 1, len(result.views))
     share = 1.0 - missed_energy / energy if energy > 0.0 else 1.0
     return {"planes": planes, "side": SIDE, "kept": round(share, 4), "views": views}, blocks
@@ -108,7 +108,7 @@ def residual_planes(result: RunResult, view: ViewSamples, count: int) -> Residua
     table = np.einsum("pck,kn->npc", basis, _functions(table_directions().reshape(-1, 3)))
     planes = red_green_blue(table.reshape(-1, channels)).reshape(SIDE, SIDE, count, 3).transpose(2, 0, 1, 3)
     check_rows = np.sort(some[:_JUDGED])
-    missed_energy, energy = _missed(
+    missed_energy, energy = _missed_energy(
         result, view, coefficients[check_rows], codes[:, check_rows], basis, check_rows
     )
     return ResidualPlanes(planes.astype(np.float16), codes, missed_energy, energy)
@@ -124,13 +124,13 @@ def table_directions() -> Floats:
     return np.stack([u * stretch, v * stretch, 1.0 - square], axis=-1)
 
 
-def _components(learnt: Floats, count: int) -> tuple[Floats, Floats]:
+def _components(learnt_coefficients: Floats, count: int) -> tuple[Floats, Floats]:
     """Find the components of coefficients [n, channels, COUNT]. Returns rows [count, channels * COUNT] that give
     numbers of components, and the way back: coefficients of each component. Where there are fewer, the rest is
     0."""
-    channels = learnt.shape[1]
+    channels = learnt_coefficients.shape[1]
     root = _metric()
-    apart = (learnt @ root).reshape(len(learnt), -1)
+    apart = (learnt_coefficients @ root).reshape(len(learnt_coefficients), -1)
     size = apart.shape[1]
     powers, axes = eigh(apart.T @ apart, subset_by_index=(max(0, size - count), size - 1))
     axes = np.where(powers > 1e-12 * max(powers.max(initial=0.0), 1e-300), axes, 0.0)[:, ::-1].T
@@ -168,12 +168,12 @@ def _half_sphere(count: int) -> Floats:
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
 
 
-def _missed(
+def _missed_energy(
     result: RunResult,
     view: ViewSamples,
     coefficients: NDArray[np.float32],
     codes: NDArray[np.uint8],
-    scaled: Floats,
+    scaled_planes: Floats,
     rows: NDArray[np.int64],
 ) -> tuple[float, float]:
     """`missed` and `energy` of `ResidualPlanes`, of some rows of the view's file, under distant lights."""
@@ -194,7 +194,7 @@ def _missed(
     model = np.nan_to_num(model_values(lights, result.materials(FIT.over.name, places)))
     fit = FIT.values(lights, coefficients, model)
     roots = (codes[3:].astype(np.float64) - 128.0) / _STEPS
-    short = np.einsum("pn,pck->nck", roots * np.abs(roots), scaled)
+    short = np.einsum("pn,pck->nck", roots * np.abs(roots), scaled_planes)
     shares = (codes[: coefficients.shape[1]].T - 1.0) / _SHARE_STEPS
     page_coefficients = np.concatenate([short, shares[:, :, None]], axis=2).astype(np.float32)
     page = FIT.values(lights, page_coefficients, model)

@@ -58,16 +58,16 @@ def layers_of(material: Material, folder: Path) -> tuple[Layer, ...]:
     """One or two layers, whose sum the material is; paths are relative to `folder`. Raises InputError."""
     match material:
         case Diffuse():
-            return (_bodied(np.zeros((ANGLES, BANDS)), matt(material.reflectance, folder).values, 1.0),)
+            return (_layer_with_body(np.zeros((ANGLES, BANDS)), matt(material.reflectance, folder).values, 1.0),)
         case Paint():
-            return (_coated(materials.paint_inside(material, folder), material, folder),)
+            return (_coated_layer(materials.paint_inside(material, folder), material, folder),)
         case Lacquer():
-            return (_coated(materials.lacquer_body(material, folder), material, folder),)
+            return (_coated_layer(materials.lacquer_body(material, folder), material, folder),)
         case Metal():
             return (_metal(material, folder),)
         case Films():
             films, base = materials.films_of(material, folder)
-            return (_bodied(_stack(films, base), np.zeros(BANDS), material.roughness),)
+            return (_layer_with_body(_stack(films, base), np.zeros(BANDS), material.roughness),)
         case Gilt():
             return _gilt(material, folder)
         case Glass():
@@ -82,11 +82,13 @@ def flake_layers(gold: float, roughness: float, longest_mm: float) -> list[tuple
     index = materials.metal_index(gold) / indices.URUSHI
     mirror, absorption = fresnel.reflectance(COSINES[:, None], index), lacquer.urushi_absorption()
     ways_mm = np.linspace(0.0, longest_mm, PATHS)
-    return [(_bodied(mirror * np.exp(-way * absorption), np.zeros(BANDS), roughness),) for way in ways_mm]
+    return [(_layer_with_body(mirror * np.exp(-way * absorption), np.zeros(BANDS), roughness),) for way in ways_mm]
 
 
 def tables(
-    found: Sequence[tuple[tuple[Layer, ...], bool]], powers: Mapping[str, Array], observer: light.Observer
+    layers_of_materials: Sequence[tuple[tuple[Layer, ...], bool]],
+    powers: Mapping[str, Array],
+    observer: light.Observer,
 ) -> NDArray[np.float32]:
     """[illuminants, materials, LAYERS, COLUMNS, 4] linear sRGB of white 1 under each illuminant.
 
@@ -94,11 +96,11 @@ def tables(
     triangle has its own share of the first layer and the second has the rest, else 0, and the colour of white.
     Colours outside the gamut have numbers below 0.
     """
-    numbers = np.zeros((len(powers), len(found), LAYERS, COLUMNS, 4), np.float32)
+    numbers = np.zeros((len(powers), len(layers_of_materials), LAYERS, COLUMNS, 4), np.float32)
     numbers[..., :ANGLES, 3] = 1.0
     numbers[..., ANGLES, 3] = 1.0
     for at, power in enumerate(powers.values()):
-        for number, (layers, is_drawn) in enumerate(found):
+        for number, (layers, is_drawn) in enumerate(layers_of_materials):
             for place, layer in enumerate(layers):
                 here = numbers[at, number, place]
                 here[:ANGLES, :3] = colours(layer.mirror, power, observer)
@@ -121,11 +123,11 @@ def chromaticity(power: Array, observer: light.Observer) -> list[float]:
     return [float(value) for value in xyz[:2] / xyz.sum()]
 
 
-def _bodied(mirror: Array, body: Array, roughness: float) -> Layer:
+def _layer_with_body(mirror: Array, body: Array, roughness: float) -> Layer:
     return Layer(mirror, np.ones(ANGLES), body, roughness)
 
 
-def _coated(body: InternalReflectance, material: Paint | Lacquer, folder: Path) -> Layer:
+def _coated_layer(body: InternalReflectance, material: Paint | Lacquer, folder: Path) -> Layer:
     return _under_face(body, real_index(material.index, folder), material.roughness)
 
 
@@ -142,7 +144,9 @@ def _metal(material: Metal, folder: Path) -> Layer:
         index = index / indices.URUSHI
         inward = 1.0 - float(fresnel.reflectance(1.0, indices.URUSHI)) if material.face else 1.0
         factor = (inward * lacquer.transmittance(material.depth_mm, 1.0, lacquer.urushi_absorption())) ** 2
-    return _bodied(fresnel.reflectance(COSINES[:, None], index) * factor, np.zeros(BANDS), material.roughness)
+    return _layer_with_body(
+        fresnel.reflectance(COSINES[:, None], index) * factor, np.zeros(BANDS), material.roughness
+    )
 
 
 def _stack(films: Sequence[Film], base: Complex) -> Array:
@@ -157,7 +161,7 @@ def _gilt(material: Gilt, folder: Path) -> tuple[Layer, ...]:
         return (bare,)
     through = gilding.leaf.transmittance[-1] * layered.emerging(gilding.leaf, gilding.bole)
     films = [Film(index, material.thickness_nm)]
-    leaf = _bodied(_stack(films, indices.constant(indices.EGG_WHITE)), through, material.roughness)
+    leaf = _layer_with_body(_stack(films, indices.constant(indices.EGG_WHITE)), through, material.roughness)
     if material.uncovered == 0.0:
         return (leaf,)
     return leaf.times(1.0 - material.uncovered), bare.times(material.uncovered)

@@ -39,14 +39,14 @@ class _Lamp:
 
 def illuminants(scene: PlainScene, folder: Path) -> dict[str, Array]:
     """Spectral power [81] by name: the scene's own first, then those that a page always offers."""
-    powers = {named(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
+    powers = {spectrum_name(light.spectrum): power(light.spectrum, folder) for light in scene.lights}
     offers = {name: known_light.illuminant(name) for name in ("D65", "A")}
     offers |= {"LED of the dome": spectral_power(LedSpectrum())}
     offers |= {name: known_light.led(name) for name in ("LED-B1", "LED-B3")}
     return powers | {name: curve for name, curve in offers.items() if name not in powers}
 
 
-def named(spectrum: Power) -> str:
+def spectrum_name(spectrum: Power) -> str:
     """Return the name that the page has for a spectrum."""
     match spectrum:
         case Illuminant() | Source() | Values():
@@ -72,13 +72,13 @@ def start_of(scene: PlainScene, folder: Path) -> dict[str, Any]:
     white_cd_m2 = scene.display.white_cd_m2 or max(
         [lamp.illuminance_lux / math.pi for lamp in lamps] + [light.luminance_cd_m2 for light in around]
     )
-    lights = [_shown(lamp, white_cd_m2) for lamp in lamps] or [_dark(named(around[0].spectrum))]
-    is_used_to_first = lights[0]["illuminant"] == named(scene.lights[0].spectrum)
+    lights = [_lamp_entry(lamp, white_cd_m2) for lamp in lamps] or [_dark(spectrum_name(around[0].spectrum))]
+    is_used_to_first = lights[0]["illuminant"] == spectrum_name(scene.lights[0].spectrum)
     sky = sum(light.luminance_cd_m2 for light in around) / white_cd_m2
     return {
         "lights": lights,
         "sky": min(sky, 100.0),
-        "skyIlluminant": named(next(iter(around or scene.lights)).spectrum),
+        "skyIlluminant": spectrum_name(next(iter(around or scene.lights)).spectrum),
         "white": 1.0 if scene.display.white_cd_m2 else 0.0,
         "camera": _camera(scene.cameras[0]),
         "adapted": scene.display.adaptation != "none" and is_used_to_first,
@@ -123,8 +123,8 @@ def _square(way: Array, facing: Array, area_mm2: float, intensity_cd_mm2_m2: flo
     return _Lamp(way, intensity_cd_mm2_m2 * cosine / apart_mm**2, radius_deg, spectrum)
 
 
-def _shown(lamp: _Lamp, white_cd_m2: float) -> dict[str, Any]:
-    return _dark(named(lamp.spectrum)) | {
+def _lamp_entry(lamp: _Lamp, white_cd_m2: float) -> dict[str, Any]:
+    return _dark(spectrum_name(lamp.spectrum)) | {
         "direction": (lamp.to_light / np.linalg.norm(lamp.to_light)).tolist(),
         "strength": min(lamp.illuminance_lux / (math.pi * white_cd_m2), 100.0),
         "softness": min(lamp.radius_deg, _WIDEST_DEG),

@@ -49,7 +49,7 @@ def nashiji_layers(thing: Nashiji, folder: Path) -> tuple[Layer, Layer]:
     """The lacquer's face over the ground, and the flakes' lobe. Raises InputError."""
     if not isinstance(thing.ground, Diffuse):
         raise InputError(f"nashiji on a ground of kind {thing.ground.kind}: a page shows grounds of kind diffuse")
-    cover, absorption_per_mm = _covered(thing), absorption.per_mm(thing.absorption, indices.URUSHI, folder)
+    cover, absorption_per_mm = _covered_share(thing), absorption.per_mm(thing.absorption, indices.URUSHI, folder)
     face = fresnel.reflectance(COSINES, indices.URUSHI)
     passing = 1.0 - face
     inside = np.sqrt(1.0 - (1.0 - COSINES**2) / indices.URUSHI**2)
@@ -69,7 +69,7 @@ def nashiji_layers(thing: Nashiji, folder: Path) -> tuple[Layer, Layer]:
     return coat, Layer(lobe, np.ones(ANGLES), np.zeros(BANDS), roughness)
 
 
-def _covered(thing: Nashiji) -> float:
+def _covered_share(thing: Nashiji) -> float:
     """Share of the surface that flakes cover, seen from above: discs at random places."""
     area_mm2 = np.pi * thing.flake_radius_mm**2 * np.exp(2.0 * _RADIUS_SPREAD**2)
     return float(-np.expm1(-thing.flakes_per_mm2 * area_mm2))

@@ -94,7 +94,7 @@ class AdaptiveTable:
         """Size of the file without its small fields."""
         return 4 * 4 * self.thetas * self.side**2
 
-    def read(self) -> RglTable:
+    def decoded_table(self) -> RglTable:
         """Return the table as readers of the file have it."""
         planes = np.ascontiguousarray(np.moveaxis(self.rgb, 2, -1))
         flat = np.ones((1, self.thetas, 2, 2))
@@ -117,23 +117,25 @@ class AdaptiveTable:
         return tensors({**fields, "ndf": self.ndf, "sigma": np.full((2, 2), 0.25, np.float32)})
 
 
-def encode_adaptive(material: Material, most_error: float, told: str = "") -> bytes:
+def encode_adaptive(material: Material, most_error: float, description: str = "") -> bytes:
     """The file; its description says what it misses. Raises InputError if no table is large enough."""
     pairs = tuple(_pairs(material))
     table, errors = _smallest(material, most_error, pairs)
     text = (
         f"{material.name}; misses the fit by {errors[0]:.1e} in the median and {errors[1]:.1e} at 95 % of all "
-        f"directions, by {errors[2]:.1e} and {errors[3]:.1e} of those in its lobe; {told}"
+        f"directions, by {errors[2]:.1e} and {errors[3]:.1e} of those in its lobe; {description}"
     )
     return table.encode(text)
 
 
-def _smallest(material: Material, most_error: float, checked: tuple[Checked, ...]) -> tuple[AdaptiveTable, Floats]:
+def _smallest(
+    material: Material, most_error: float, check_pairs: tuple[Checked, ...]
+) -> tuple[AdaptiveTable, Floats]:
     """A table that misses no more; from the smallest on it grows by what helps more for its bytes."""
     table = AdaptiveTable(material, THETAS[0], SIDES[0], CROWDINGS[0])
-    errors = _missed(table, checked)
+    errors = _relative_errors(table, check_pairs)
     while errors[1::2].max() > most_error:
-        trials = [(larger, _missed(larger, checked)) for larger in _larger(table)]
+        trials = [(larger, _relative_errors(larger, check_pairs)) for larger in _larger(table)]
         if not trials:
             raise InputError(
                 f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB misses "
@@ -161,10 +163,10 @@ def _larger(table: AdaptiveTable) -> Iterator[AdaptiveTable]:
             yield replace(table, thetas=more, side=side, crowding=crowding)
 
 
-def _missed(table: AdaptiveTable, checked: tuple[Checked, ...]) -> Floats:
+def _relative_errors(table: AdaptiveTable, check_pairs: tuple[Checked, ...]) -> Floats:
     """Median and `SHARE` of the relative errors, of each set of pairs."""
-    reflectance = table.read()
-    return np.concatenate([np.quantile(pairs.misses(reflectance), [0.5, SHARE]) for pairs in checked])
+    reflectance = table.decoded_table()
+    return np.concatenate([np.quantile(pairs.misses(reflectance), [0.5, SHARE]) for pairs in check_pairs])
 
 
 def _pairs(material: Material) -> Iterator[Checked]:

@@ -37,10 +37,10 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     return paths
 
 
-def encode(material: Material, told: str = "") -> bytes:
+def encode(material: Material, description: str = "") -> bytes:
     """f cos(theta_o) for isotropic incidence at `THETAS` angles; half vectors at azimuth (2 u - 1) pi by rows, and
     elevation pi/2 v^2 by columns."""
     theta_i = np.linspace(0.0, 0.5 * np.pi, THETAS, dtype=np.float32)
     values = cosine_weighted(material.reflectance, theta_i, half_vectors(SIDE))
     rgb = nodes_for_linear_reading(values, theta_i)
-    return tensors(fields_of(theta_i, rgb, drawn_by(values, theta_i), f"{material.name}; {told}"))
+    return tensors(fields_of(theta_i, rgb, drawn_by(values, theta_i), f"{material.name}; {description}"))

@@ -21,7 +21,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     paths = []
     for view in surface.result.views:
         view_surface = surface_of_view(surface.result, view)
-        number = np.where(view_surface.seen >= 0, view.triangles[view_surface.seen], -1)
+        number = np.where(view_surface.triangle_of_pixel >= 0, view.triangles[view_surface.triangle_of_pixel], -1)
 
         def picture(values: NDArray[np.float64], number: NDArray[np.int64] = number) -> NDArray[np.float32]:
             pixels = values[number].astype(np.float32)

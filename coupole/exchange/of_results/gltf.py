@@ -30,7 +30,7 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.glb`: metres, y up. Triangles without a material are left out."""
-    rows = np.flatnonzero(surface.known)
+    rows = np.flatnonzero(surface.has_material)
     corners = (surface.vertices_mm[surface.triangles[rows]].reshape(-1, 3) @ Y_UP_FROM_SUPPORT.T) * 1e-3
     normals = np.repeat(surface.normals[rows] @ Y_UP_FROM_SUPPORT.T, 3, axis=0)
     places = np.repeat(middles(len(rows)), 3, axis=0)
@@ -55,7 +55,7 @@ def _document(
     views, at = [], 0
     for block in (*(values.tobytes() for values in arrays), *pictures):
         views.append({"buffer": 0, "byteOffset": at, "byteLength": len(block)})
-        at += _padded(len(block))
+        at += _padded_size(len(block))
     for view in views[: len(arrays)]:
         view["target"] = _ARRAY_BUFFER
     accessors = [
@@ -99,8 +99,8 @@ def _png(values: Floats) -> bytes:
 
 def _glb(document: dict[str, Any], blocks: list[bytes]) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (_padded(len(text)) - len(text))
-    binary = b"".join(block + bytes(_padded(len(block)) - len(block)) for block in blocks)
+    text += b" " * (_padded_size(len(text)) - len(text))
+    binary = b"".join(block + bytes(_padded_size(len(block)) - len(block)) for block in blocks)
     total = 12 + 8 + len(text) + 8 + len(binary)
 
     def words(*numbers: int) -> bytes:
@@ -110,5 +110,5 @@ def _glb(document: dict[str, Any], blocks: list[bytes]) -> bytes:
     return head + words(len(text), _JSON) + text + words(len(binary), _BIN) + binary
 
 
-def _padded(size: int) -> int:
+def _padded_size(size: int) -> int:
     return -(-size // 4) * 4

@@ -28,7 +28,7 @@ _SURFACE = "measured_surface"
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.mtlx`, its textures (OpenEXR, float32, linear) and `surface.obj` (metres, y up, one texture
     coordinate and one normal for each triangle). Triangles without a material are left out."""
-    rows = np.flatnonzero(surface.known)
+    rows = np.flatnonzero(surface.has_material)
     ks = surface.ks[rows]
     most = ks.max(axis=1, keepdims=True)
     textures = {
@@ -72,12 +72,12 @@ def _document(surface: MeasuredSurface) -> bytes:
     return text + b"\n"
 
 
-def _mesh(surface: MeasuredSurface, known: np.ndarray[tuple[int], np.dtype[np.int64]]) -> str:
-    vertices, corner = np.unique(surface.triangles[known], return_inverse=True)
+def _mesh(surface: MeasuredSurface, known_triangles: np.ndarray[tuple[int], np.dtype[np.int64]]) -> str:
+    vertices, corner = np.unique(surface.triangles[known_triangles], return_inverse=True)
     places = (surface.vertices_mm[vertices] @ Y_UP_FROM_SUPPORT.T) * 1e-3
-    normals = surface.normals[known] @ Y_UP_FROM_SUPPORT.T
-    texels = middles(len(known))
-    number = np.arange(1, len(known) + 1)
+    normals = surface.normals[known_triangles] @ Y_UP_FROM_SUPPORT.T
+    texels = middles(len(known_triangles))
+    number = np.arange(1, len(known_triangles) + 1)
     lines = [f"# {surface.remark}", "# metres, y up; the material is in surface.mtlx"]
     lines += [f"v {x:.8g} {y:.8g} {z:.8g}" for x, y, z in places.tolist()]
     lines += [f"vt {u:.8f} {1.0 - v:.8f}" for u, v in texels.tolist()]

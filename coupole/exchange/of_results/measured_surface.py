@@ -47,21 +47,21 @@ class MeasuredSurface:
     uncertain: dict[str, Floats]
     """[n] standard uncertainties, all parts together: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
     `u_normal` rad."""
-    chosen: tuple[int, ...] = ()
+    chosen_triangles: tuple[int, ...] = ()
     """Triangles that are asked for by name."""
     most_error: float | None = None
     """Relative, of tables that adapt to their material; None: plain ones."""
 
     @cached_property
-    def known(self) -> NDArray[np.bool_]:
+    def has_material(self) -> NDArray[np.bool_]:
         """[n] triangles that have a material."""
         return np.isfinite(self.alpha) & np.isfinite(self.kd).all(axis=1)
 
-    def under_a_layer(self, picked: NDArray[np.int64]) -> Floats:
+    def under_a_layer(self, triangle_numbers: NDArray[np.int64]) -> Floats:
         """[n, 3] colour, 0 to 1, of the diffuse part of triangles where a model's specular layer keeps light from
         it: pi kd, and more by what a layer of the brightest ks reflects at normal incidence."""
-        passes = np.maximum(1.0 - self.ks[picked].max(axis=1, keepdims=True), _LEAST_PASSED)
-        return np.asarray(np.clip(np.pi * self.kd[picked] / passes, 0.0, 1.0))
+        passes = np.maximum(1.0 - self.ks[triangle_numbers].max(axis=1, keepdims=True), _LEAST_PASSED)
+        return np.asarray(np.clip(np.pi * self.kd[triangle_numbers] / passes, 0.0, 1.0))
 
     @property
     def remark(self) -> str:
@@ -71,7 +71,7 @@ class MeasuredSurface:
         return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
 
 
-def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] = ()) -> MeasuredSurface:
+def read_surface(folder: Path, fit: str | None = None, chosen_triangles: tuple[int, ...] = ()) -> MeasuredSurface:
     """Read the surface of a whole result, with the material fit that missed least unless a fit is named. Raises
     InputError if there is no such fit."""
     about = read_about(folder)
@@ -109,5 +109,5 @@ def read_surface(folder: Path, fit: str | None = None, chosen: tuple[int, ...] =
         everywhere(red_green_blue(materials.ks)),
         everywhere(materials.alpha),
         {key: everywhere(values) for key, values in standard_uncertainties(path).items()},
-        chosen,
+        chosen_triangles,
     )

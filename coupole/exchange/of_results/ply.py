@@ -30,7 +30,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     and grey 128, where no material is known."""
     faces = np.zeros(len(surface.triangles), _FACE)
     faces["count"], faces["vertex_indices"] = 3, surface.triangles
-    colours = np.where(surface.known[:, None], np.rint(255 * srgb(np.pi * np.nan_to_num(surface.kd))), 128)
+    colours = np.where(surface.has_material[:, None], np.rint(255 * srgb(np.pi * np.nan_to_num(surface.kd))), 128)
     columns = {"alpha": surface.alpha, **surface.uncertain}
     columns |= dict(zip(_COLOURS, colours.T, strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))

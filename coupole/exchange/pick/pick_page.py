@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError, StorageError, reason
 from coupole.exchange.look.look_blocks import in_script
-from coupole.scan.simplify import simplified
+from coupole.scan.simplify import simplified_mesh
 
 MOST_TRIANGLES = 100_000
 """Greatest number of triangles of a page. A finer mesh is simplified, and takes its parts from the nearest
@@ -36,7 +36,7 @@ def write_pick_page(
     """
     if path.suffix.lower() != ".html":
         raise InputError(f"--out {path}: expected a name that ends in .html")
-    points, faces = simplified(vertices_mm, triangles, most_triangles)
+    points, faces = simplified_mesh(vertices_mm, triangles, most_triangles)
     if len(faces) == 0:
         raise InputError(
             f"{title}: nothing is left of the mesh at {most_triangles} triangles; see to its triangles"

@@ -115,13 +115,13 @@ def _pictures(view: LitView, say: Said) -> Iterator[tuple[str, str, NDArray[np.u
         number = int(np.argmax(view.directions @ direction))
         elevation_deg = np.degrees(np.arcsin(view.directions[number, 2]))
         label = f"Light from the {side}, {elevation_deg:.0f} degrees above the picture's plane"
-        yield side, label, _codes(view.encoded(number))
+        yield side, label, _codes(view.encoded_picture(number))
     if view.normals is not None:
         yield "normals", "Normals: (n + 1) / 2 as red, green, blue", _codes((view.normals + 1.0) / 2.0)
 
 
-def _codes(encoded: Picture) -> NDArray[np.uint8]:
-    codes: NDArray[np.uint8] = np.rint(255.0 * np.nan_to_num(encoded)).clip(0, 255).astype(np.uint8)
+def _codes(encoded_picture: Picture) -> NDArray[np.uint8]:
+    codes: NDArray[np.uint8] = np.rint(255.0 * np.nan_to_num(encoded_picture)).clip(0, 255).astype(np.uint8)
     return codes
 
 

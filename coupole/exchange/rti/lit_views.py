@@ -53,7 +53,7 @@ class LitView:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def encoded(self, number: int) -> Picture:
+    def encoded_picture(self, number: int) -> Picture:
         """[h, w, 3] as displays take it: sRGB, 0 to 1."""
         picture: Picture = srgb(self.linear(number))
         return picture
@@ -70,7 +70,7 @@ class LitView:
             say(f"{self.name}: reading", number + 1, len(self))
         return np.stack(values)
 
-    def projected(self, weights: Floats, say: Said) -> Picture:
+    def weighted_sums(self, weights: Floats, say: Said) -> Picture:
         """[h, w, planes]: sums of encoded values by `weights` [lights, 3, planes]."""
         width, height = self.size_px
         weights = weights.astype(np.float32)
@@ -79,7 +79,7 @@ class LitView:
         for first in range(0, len(self), _BATCH):
             batch = range(first, min(first + _BATCH, len(self)))
             for place, number in enumerate(batch):
-                values[:, 3 * place : 3 * place + 3] = self.encoded(number).reshape(-1, 3)
+                values[:, 3 * place : 3 * place + 3] = self.encoded_picture(number).reshape(-1, 3)
             by = weights[first : batch.stop].reshape(-1, weights.shape[2])
             for pixel in range(0, len(planes), _BLOCK):
                 planes[pixel : pixel + _BLOCK] += values[pixel : pixel + _BLOCK, : len(by)] @ by
@@ -123,9 +123,9 @@ def view_of_run(run: Run, name: str, folder: Path, say: Said) -> LitView:
         values: Picture = read_picture(pictures.files[number]) * factors
         return values
 
-    return _seen(
+    return _lit_view(
         name=name,
-        origin=f"Coupole, {'simulated' if pictures.simulated else 'measured'}: {run.folder.name}, view {name}",
+        origin=f"Coupole, {'simulated' if pictures.is_simulated else 'measured'}: {run.folder.name}, view {name}",
         size_px=(width, height),
         pixel_mm=pictures.width_mm / width,
         directions=directions,
@@ -140,7 +140,7 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
     kinds: dict[Any, str] = {True: "simulated", False: "measured"}
     kind = kinds.get(about.get("simulated"), "not known whether measured or simulated")
     of = about.get("uncalibrated_run") or result.folder.name
-    return _seen(
+    return _lit_view(
         name=result.folder.name,
         origin=f"Coupole, pictures under known lights, {kind}: {of}",
         size_px=(width, height),
@@ -152,7 +152,9 @@ def view_of_result(result: PictureResult, say: Said) -> LitView:
     )
 
 
-def _seen(*, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any) -> LitView:
+def _lit_view(
+    *, linear: Callable[[int], Picture], directions: Floats, name: str, say: Said, **about: Any
+) -> LitView:
     """Return the view with the lights that viewers can have, those above the picture's plane, and white 1."""
     above = np.flatnonzero(directions[:, 2] > 0.0)
     if len(above) < FEWEST_LIGHTS:

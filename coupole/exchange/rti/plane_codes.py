@@ -45,7 +45,7 @@ class PlaneCode:
 
     def planes_of(self, view: LitView, say: Said) -> Picture:
         """[h, w, planes] of a view."""
-        planes = view.projected(self.weights, say)
+        planes = view.weighted_sums(self.weights, say)
         planes -= self.offset.astype(np.float32)
         return planes
 

@@ -66,17 +66,18 @@ def write_hsh(view: LitView, path: Path, say: Said) -> float:
     return code.misses_dn(view.samples(some, say), decoding.reshape(len(decoding), -1))
 
 
-def _one_colour(each: Picture, triangular: Floats) -> tuple[Floats, Floats]:
-    """Luminance [pixels, 6] and colour [pixels, 3], the largest channel 1, whose product is nearest to `each`
-    [pixels, 6, 3] over the lights; `triangular` is R of the terms' QR: the first singular vectors of R `each`."""
-    projections = np.einsum("ij,pjc->pic", triangular.astype(np.float32), each)
+def _one_colour(term_planes: Picture, triangular: Floats) -> tuple[Floats, Floats]:
+    """Luminance [pixels, 6] and colour [pixels, 3], the largest channel 1, whose product is nearest to
+    `term_planes` [pixels, 6, 3] over the lights; `triangular` is R of the terms' QR: the first singular vectors of
+    R `term_planes`."""
+    projections = np.einsum("ij,pjc->pic", triangular.astype(np.float32), term_planes)
     products = np.einsum("pic,pid->pcd", projections, projections)
     vectors = np.linalg.eigh(products)[1][..., -1].astype(np.float64)
     vectors *= np.where(vectors.sum(axis=1, keepdims=True) < 0.0, -1.0, 1.0)
     vectors = np.maximum(vectors, 0.0)
     largest = vectors.max(axis=1, keepdims=True)
     colour = np.where(largest > 0.0, vectors / np.maximum(largest, 1e-12), 1.0)
-    luminance = np.einsum("pjc,pc->pj", each, colour) / np.sum(colour * colour, axis=1, keepdims=True)
+    luminance = np.einsum("pjc,pc->pj", term_planes, colour) / np.sum(colour * colour, axis=1, keepdims=True)
     return luminance, colour
 
 

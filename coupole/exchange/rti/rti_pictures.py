@@ -47,14 +47,14 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
     pictures = write_pictures(
         run.folder, view, out / LINEAR, lambda step, done, of: say(f"{view}: {step}", done, of)
     )
-    brightest = _read(pictures.files[0])
+    brightest = _read_picture(pictures.files[0])
     for source in pictures.files:
-        brightest = np.maximum(brightest, _read(source))
+        brightest = np.maximum(brightest, _read_picture(source))
     codes = _srgb_codes(float(np.quantile(brightest.max(axis=2), WHITE_QUANTILE)))
     paths = []
     for number, source in enumerate(pictures.files):
         paths.append(out / f"{source.stem}.jpg")
-        write_synced(paths[-1], cv2.imencode(".jpg", codes[_read(source)], _JPEG)[1].tobytes())
+        write_synced(paths[-1], cv2.imencode(".jpg", codes[_read_picture(source)], _JPEG)[1].tobytes())
         say(f"{view}: jpeg", number + 1, len(pictures.files))
     directions = pictures.lights_mm / np.linalg.norm(pictures.lights_mm, axis=1, keepdims=True)
     lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
@@ -69,18 +69,19 @@ def write_dome(run: Run, view: str, path: Path) -> Path:
     return _write_dome(run, view, lights_of_view(run.folder, view), path)
 
 
-def _write_dome(run: Run, view: str, taken: PicturedView, path: Path) -> Path:
-    distances_mm = np.linalg.norm(taken.lights_mm, axis=1, keepdims=True)
+def _write_dome(run: Run, view: str, pictured_view: PicturedView, path: Path) -> Path:
+    distances_mm = np.linalg.norm(pictured_view.lights_mm, axis=1, keepdims=True)
     dome = {
         "label": f"{run.folder.name} {view}",
-        "notes": f"Coupole, {'simulated' if taken.simulated else 'measured'}; nominal places of the LEDs",
-        "imageWidth": taken.width_mm,
+        "notes": f"Coupole, {'simulated' if pictured_view.is_simulated else 'measured'}; nominal places of the "
+        "LEDs",
+        "imageWidth": pictured_view.width_mm,
         "domeDiameter": 2.0 * float(distances_mm.mean()),
         "verticalOffset": 0.0,
         "lightConfiguration": "lights3d",
-        "directions": _points(taken.lights_mm / distances_mm),
+        "directions": _points(pictured_view.lights_mm / distances_mm),
         "positionsSphere": [],
-        "positions3d": _points(taken.lights_mm),
+        "positions3d": _points(pictured_view.lights_mm),
         "ledAdjust": [],
     }
     write_synced(path, json.dumps(dome, indent=1) + "\n")
@@ -91,7 +92,7 @@ def _points(places: NDArray[np.float64]) -> list[dict[str, float]]:
     return [dict(zip("xyz", place, strict=True)) for place in places.tolist()]
 
 
-def _read(path: Path) -> NDArray[np.uint16]:
+def _read_picture(path: Path) -> NDArray[np.uint16]:
     """[h, w, 3] or [h, w, 1], blue first."""
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert picture is not None

@@ -15,7 +15,7 @@ from coupole.appearance.matter import kubelka_munk
 from coupole.appearance.spectra.channels import channel_values, channel_weights
 from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.measured import Measured
-from coupole.appearance.spectra.resampling import resampled
+from coupole.appearance.spectra.resampling import resample
 from coupole.errors import InputError
 from coupole.heritage.analysis.identification import Candidate
 from coupole.heritage.analysis.references import References
@@ -52,7 +52,7 @@ def classes_of_channels(
     covered_bands = np.isfinite(references.reflectance).mean(axis=0) >= _COVERED
     rows = np.isfinite(references.reflectance[:, covered_bands]).all(axis=1)
     power, *channel_sensitivities = (
-        np.nan_to_num(resampled(spectrum, BANDS_NM, STEP_NM)[0]) for spectrum in (light, *sensitivities)
+        np.nan_to_num(resample(spectrum, BANDS_NM, STEP_NM)[0]) for spectrum in (light, *sensitivities)
     )
     weights = channel_weights(np.maximum(power, 0.0), np.maximum(np.stack(channel_sensitivities), 0.0))
     share = weights[:, covered_bands].sum(axis=1)

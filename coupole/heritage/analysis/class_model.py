@@ -125,7 +125,7 @@ class ClassModel:
         weight = sizes**-0.5
         several = sizes > 1
 
-        def missed(scale: Array) -> float:
+        def loss(scale: Array) -> float:
             none = np.log(_probabilities(all_of_class, scale)[:, -1] + 1e-12)
             total = -float(weight @ none / weight.sum()) + 1e-3 * float(scale @ scale)
             if several.any():
@@ -134,19 +134,19 @@ class ClassModel:
             return total
 
         minimum = minimize(
-            missed, _START, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-4}
+            loss, _START, method="Nelder-Mead", options={"maxiter": 300, "xatol": 1e-3, "fatol": 1e-4}
         )
         return np.asarray(minimum.x)
 
-    def _kernel(self, squared: Array) -> Array:
-        distance = np.sqrt(3.0 * squared / self._length2)
+    def _kernel(self, squared_distances: Array) -> Array:
+        distance = np.sqrt(3.0 * squared_distances / self._length2)
         kernel: Array = (1.0 + distance) * np.exp(-distance)
         return kernel
 
 
-def _probabilities(found: Array, scale: Array) -> Array:
+def _probabilities(class_scores: Array, scale: Array) -> Array:
     sharpness = np.exp(scale[0])
-    exponents = sharpness * np.column_stack([found[:, :-1], scale[1] + scale[2] * found[:, -1]])
+    exponents = sharpness * np.column_stack([class_scores[:, :-1], scale[1] + scale[2] * class_scores[:, -1]])
     exponents -= exponents.max(axis=1, keepdims=True)
     powers = np.exp(exponents)
     probabilities: Array = powers / powers.sum(axis=1, keepdims=True)

@@ -34,7 +34,7 @@ def matches(
     target under the first light. CIEDE2000 is colour-science's. Raises InputError for an unknown light.
     """
     functions = light.observer(observer)
-    a, b = (_held(values) for values in (target, recipe))
+    a, b = (_fill_missing(values) for values in (target, recipe))
     light_matches: list[Match] = []
     ratio = np.ones(3)
     for number, name in enumerate(lights):
@@ -54,7 +54,7 @@ def difference(xyz_a: Array, xyz_b: Array, white: Array) -> float:
     return float(colour.difference.delta_E_CIE2000(light.lab(xyz_a, white), light.lab(xyz_b, white)))
 
 
-def _held(values: Array) -> Array:
+def _fill_missing(values: Array) -> Array:
     is_known = np.isfinite(values)
     return np.interp(np.arange(len(values)), np.flatnonzero(is_known), values[is_known])
 

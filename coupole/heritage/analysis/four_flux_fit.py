@@ -56,25 +56,31 @@ def fit(black: Film, white: Film, directional: Directional, face: Face, noise: f
     """Fit the four fluxes of one film over two grounds. Thickness, grounds and their uncertainties are those of
     the diffuse `Film`s."""
     rng = np.random.default_rng(seed)
-    n = len(black.seen)
+    n = len(black.reflectance)
 
-    def drawn(values: Array, u: Array | float) -> Array:
+    def with_draws(values: Array, u: Array | float) -> Array:
         """[(1 + DRAWS) n]: as measured, then as it might have been."""
         std = np.broadcast_to(np.asarray(u, dtype=float), n)
         noisy = values + std * rng.standard_normal((DRAWS, n))
         return np.concatenate([values[None], noisy]).ravel()
 
     films = [
-        Film(drawn(film.seen, noise), drawn(_ground(film), film.u_ground), film.ground_name, 0.0, 1.0)
+        Film(
+            with_draws(film.reflectance, noise),
+            with_draws(_ground(film), film.u_ground),
+            film.ground_name,
+            0.0,
+            1.0,
+        )
         for film in (black, white)
     ]
-    coefficients = layer_fit.fit(films, _repeated(face, DRAWS + 1), noise)
+    coefficients = layer_fit.fit(films, _repeat_face(face, DRAWS + 1), noise)
     light = Directional(
-        drawn(directional.over_black, noise),
-        drawn(directional.over_white, noise),
-        np.clip(drawn(directional.transmittance, noise), 1e-4, 1.0),
+        with_draws(directional.over_black, noise),
+        with_draws(directional.over_white, noise),
+        np.clip(with_draws(directional.transmittance, noise), 1e-4, 1.0),
     )
-    solutions = _solved(coefficients, films, light, _repeated(face, DRAWS + 1)).reshape(3, DRAWS + 1, n)
+    solutions = _solve_layer(coefficients, films, light, _repeat_face(face, DRAWS + 1)).reshape(3, DRAWS + 1, n)
     # Coefficients of the whole layer: those per mm follow from the thickness, the same in all bands of a draw.
     h = black.thickness_mm * np.ones(DRAWS + 1)
     h[1:] += black.u_thickness_mm * rng.standard_normal(DRAWS)
@@ -88,14 +94,14 @@ def _ground(film: Film) -> Array:
     return film.ground
 
 
-def _repeated(face: Face, times: int) -> Face:
+def _repeat_face(face: Face, times: int) -> Face:
     parts = (face.passing, face.inner, face.gloss)
     return Face(*(np.tile(part, times) if part.ndim else part for part in parts))
 
 
-def _solved(found: Coefficients, films: list[Film], light: Directional, face: Face) -> Array:
+def _solve_layer(coefficients: Coefficients, films: list[Film], light: Directional, face: Face) -> Array:
     """k, s_i, s_j [3, n] of the whole layer."""
-    k, s = np.maximum(found.absorption, 0.0), found.scattering
+    k, s = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
     rho, tau = kubelka_munk.layer(k, s, 1.0)
     inside = []
     for film, value in zip(films, (light.over_black, light.over_white), strict=True):

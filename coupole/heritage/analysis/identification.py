@@ -110,7 +110,7 @@ def identify(spectrum: Measured, references: References) -> Finding:
         for number in order
     )
     mixture = unmix(reflectance, of_bands.reflectance, of_bands.classes)
-    verdict, reason = _judged(of_bands, probabilities, candidates, mixture, reflectance)
+    verdict, reason = _judge(of_bands, probabilities, candidates, mixture, reflectance)
     parts = _parts(references, of_bands, mixture) if verdict == "mixture" and mixture is not None else ()
     return Finding(
         spectrum.name,
@@ -127,19 +127,20 @@ def identify(spectrum: Measured, references: References) -> Finding:
     )
 
 
-def _judged(
+def _judge(
     of_bands: OfBands,
     probabilities: Array,
     candidates: tuple[Candidate, ...],
-    mixed: Unmixed | None,
-    seen: Array,
+    mixture: Unmixed | None,
+    reflectance: Array,
 ) -> tuple[Verdict, str]:
     model, best = of_bands.model, candidates[0]
-    flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(seen).std() < _FLAT else ""
-    if mixed is not None and mixed.is_settled:
+    flat = "; the spectrum has no bands, so its level decides" if log_k_over_s(reflectance).std() < _FLAT else ""
+    if mixture is not None and mixture.is_settled:
         return "mixture", (
-            f"two references leave {mixed.residual:.1%} of K/S; one alone is worse by {mixed.gain:.0f} and two of "
-            f"other classes by {mixed.lead:.0f} in Schwarz's criterion"
+            f"two references leave {mixture.residual:.1%} of K/S; one alone is worse by {mixture.gain:.0f} and "
+            f"two of "
+            f"other classes by {mixture.lead:.0f} in Schwarz's criterion"
         )
     if not model.is_known(probabilities)[0]:
         return "unknown", (
@@ -159,23 +160,26 @@ def _judged(
     return "ambiguous", f"{choices}{flat}"
 
 
-def _parts(references: References, of_bands: OfBands, mixed: Unmixed) -> tuple[Part, ...]:
+def _parts(references: References, of_bands: OfBands, mixture: Unmixed) -> tuple[Part, ...]:
     return tuple(
         Part(references.names[row], references.class_of[row], share)
-        for row, share in zip(of_bands.rows[list(mixed.references)], mixed.shares, strict=True)
+        for row, share in zip(of_bands.rows[list(mixture.references)], mixture.shares, strict=True)
     )
 
 
-def _evidence(of_bands: OfBands, seen: Array, best: int, runner_up: int) -> Evidence:
+def _evidence(of_bands: OfBands, reflectance: Array, best: int, runner_up: int) -> Evidence:
     from coupole.appearance.matter import kubelka_munk
 
-    log_ratio = log_k_over_s(seen)
+    log_ratio = log_k_over_s(reflectance)
 
-    def scaled(row: int) -> tuple[Array, Array]:
+    def scaled_reference(row: int) -> tuple[Array, Array]:
         of_row = log_k_over_s(of_bands.reflectance[row])
         log_fit = of_row + (log_ratio - of_row).mean()
-        return kubelka_munk.opaque(np.exp(log_fit)), (log_fit - log_ratio) / of_bands.spread
+        return kubelka_munk.opaque(np.exp(log_fit)), (log_fit - log_ratio) / of_bands.reference_spread
 
-    (best_shape, missed_by_one), (second_shape, missed_by_two) = scaled(best), scaled(runner_up)
+    (best_shape, missed_by_one), (second_shape, missed_by_two) = (
+        scaled_reference(best),
+        scaled_reference(runner_up),
+    )
     log_odds = 0.5 * (missed_by_two**2 - missed_by_one**2)
-    return Evidence(BANDS_NM[of_bands.bands], seen, best_shape, second_shape, log_odds)
+    return Evidence(BANDS_NM[of_bands.bands], reflectance, best_shape, second_shape, log_odds)

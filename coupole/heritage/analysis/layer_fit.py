@@ -39,7 +39,7 @@ _LEAST_S = 1e-6
 class Film:
     """One spectrum of a film."""
 
-    seen: Array
+    reflectance: Array
     """[n], in air."""
     ground: Array | None
     """[n], inside the binder; None of an opaque film."""
@@ -79,7 +79,7 @@ class Coefficients:
         return np.sqrt(self.covariance[:, 1, 1])
 
     @property
-    def determined(self) -> NDArray[np.bool_]:
+    def determined_bands(self) -> NDArray[np.bool_]:
         """[n] of bool: whether the films show their grounds enough to tell S."""
         is_determined = self.u_scattering < LEAST_DETERMINED * self.scattering
         return np.asarray(is_determined & (self.unlike > _LEAST_UNLIKE))
@@ -119,16 +119,16 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
     """
     _check(films)
     k, s = _start(films, face)
-    y = np.stack([film.seen for film in films], axis=1)
+    y = np.stack([film.reflectance for film in films], axis=1)
     damping = np.full(len(k), 1e-3)
     weight = 1.0 / _variances(k, s, films, face, noise)
-    cost = np.sum(weight * (y - _seen(k, s, films, face)) ** 2, axis=1)
+    cost = np.sum(weight * (y - _film_reflectances(k, s, films, face)) ** 2, axis=1)
     for step in range(_STEPS):
         if step % 10 == 5:  # grounds and thicknesses count as much as K and S let them
             weight = 1.0 / _variances(k, s, films, face, noise)
-            cost = np.sum(weight * (y - _seen(k, s, films, face)) ** 2, axis=1)
+            cost = np.sum(weight * (y - _film_reflectances(k, s, films, face)) ** 2, axis=1)
         jacobian = _jacobian(k, s, films, face)
-        residuals = y - _seen(k, s, films, face)
+        residuals = y - _film_reflectances(k, s, films, face)
         normal = np.einsum("nfi,nf,nfj->nij", jacobian, weight, jacobian)
         slope = np.einsum("nfi,nf,nf->ni", jacobian, weight, residuals)
         scale = np.einsum("nii->ni", normal) + 1e-6 * np.einsum("nii->n", normal)[:, None] + 1e-12
@@ -136,7 +136,7 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
         step_k, step_s = np.einsum("nij,nj->in", inverse_normal, slope)
         new_k, new_s = k + step_k, np.maximum(s + step_s, _LEAST_S)
         new_k = np.maximum(new_k, -0.3 * new_s)
-        trial = np.sum(weight * (y - _seen(new_k, new_s, films, face)) ** 2, axis=1)
+        trial = np.sum(weight * (y - _film_reflectances(new_k, new_s, films, face)) ** 2, axis=1)
         better = trial <= cost
         k, s = np.where(better, new_k, k), np.where(better, new_s, s)
         cost = np.where(better, trial, cost)
@@ -144,13 +144,16 @@ def fit(films: Sequence[Film], face: Face, noise: float) -> Coefficients:
     return _with_uncertainty(k, s, y, films, face, noise)
 
 
-def predict(found: Coefficients, face: Face, thickness_mm: float, ground: Array | float | None) -> Predicted:
+def predict(
+    coefficients: Coefficients, face: Face, thickness_mm: float, ground: Array | float | None
+) -> Predicted:
     """Predict what a film of a thickness over a ground (inside the binder, known exactly) would show."""
-    k, s = found.absorption, found.scattering
+    k, s = coefficients.absorption, coefficients.scattering
     films = [Film(k, None if ground is None else np.broadcast_to(ground, k.shape), thickness_mm=thickness_mm)]
     slope = _jacobian(k, s, films, face)[:, 0]
     return Predicted(
-        _seen(k, s, films, face)[:, 0], np.sqrt(np.einsum("ni,nij,nj->n", slope, found.covariance, slope))
+        _film_reflectances(k, s, films, face)[:, 0],
+        np.sqrt(np.einsum("ni,nij,nj->n", slope, coefficients.covariance, slope)),
     )
 
 
@@ -168,20 +171,20 @@ def _check(films: Sequence[Film]) -> None:
 def _start(films: Sequence[Film], face: Face) -> tuple[Array, Array]:
     """The best of a grid over K/S and S: far enough down the right valley for what follows."""
     thickest = max((film.thickness_mm for film in films if film.ground is not None), default=1.0)
-    y = np.stack([film.seen for film in films], axis=1)
+    y = np.stack([film.reflectance for film in films], axis=1)
     best = np.full(len(y), np.inf)
     k, s = np.zeros(len(y)), np.ones(len(y))
     for sigma in np.geomspace(0.02, 20.0, 13):
         for ratio in np.geomspace(1e-3, 30.0, 13):
             here = np.full(len(y), sigma / thickest)
-            cost = np.sum((y - _seen(ratio * here, here, films, face)) ** 2, axis=1)
+            cost = np.sum((y - _film_reflectances(ratio * here, here, films, face)) ** 2, axis=1)
             nearer = cost < best
             best = np.where(nearer, cost, best)
             k, s = np.where(nearer, ratio * here, k), np.where(nearer, here, s)
     return k, s
 
 
-def _seen(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
+def _film_reflectances(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
     """[n, films], as instruments see them."""
     return np.stack([_one_seen(k, s, film, face, film.thickness_mm, film.ground) for film in films], axis=1)
 
@@ -196,8 +199,10 @@ def _jacobian(k: Array, s: Array, films: Sequence[Film], face: Face) -> Array:
     step = 1e-5 * (np.abs(k) + s)
     return np.stack(
         [
-            (_seen(k + step, s, films, face) - _seen(k - step, s, films, face)) / (2.0 * step)[:, None],
-            (_seen(k, s + step, films, face) - _seen(k, s - step, films, face)) / (2.0 * step)[:, None],
+            (_film_reflectances(k + step, s, films, face) - _film_reflectances(k - step, s, films, face))
+            / (2.0 * step)[:, None],
+            (_film_reflectances(k, s + step, films, face) - _film_reflectances(k, s - step, films, face))
+            / (2.0 * step)[:, None],
         ],
         axis=2,
     )
@@ -235,7 +240,7 @@ def _unlike(y: Array, films: Sequence[Film], face: Face) -> Array:
     for film in films:
         if film.ground is not None:
             bare = face.passing * film.ground / (1.0 - face.inner * film.ground) + face.gloss
-            change += 0.5 * (film.seen - bare) ** 2
+            change += 0.5 * (film.reflectance - bare) ** 2
     return np.asarray(np.minimum(variation, change))
 
 
@@ -262,7 +267,7 @@ def _with_uncertainty(
     for effect in (*grounds.values(), *thicknesses.values()):
         shift = np.einsum("nif,nf->ni", gain, effect)
         covariance += shift[:, :, None] * shift[:, None, :]
-    residuals = y - _seen(k, s, films, face)
+    residuals = y - _film_reflectances(k, s, films, face)
     return Coefficients(
         k,
         s,

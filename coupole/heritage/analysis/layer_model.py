@@ -32,7 +32,7 @@ class Deserved:
     because: str
     difference: float
     """Largest difference over bands and grounds between what the two models show under directional light."""
-    unscattered: float
+    unscattered_share: float
     """Largest share over the bands of directional light that reaches the ground unscattered."""
 
 
@@ -45,14 +45,14 @@ class GrainRatio:
     bands: int
 
 
-def deserved(found: Coefficients, films: list[Film], face: Face, noise: float) -> Deserved:
+def deserved_model(coefficients: Coefficients, films: list[Film], face: Face, noise: float) -> Deserved:
     """Choose the model from K and S alone."""
-    sure = found.determined
+    sure = coefficients.determined_bands
     if not sure.any():
         return Deserved(
             "K/S only", "the films hide their grounds in every band: they tell K/S, not K and S", 0.0, 0.0
         )
-    k, s = np.maximum(found.absorption, 0.0), found.scattering
+    k, s = np.maximum(coefficients.absorption, 0.0), coefficients.scattering
     total = 4.0 / 3.0 * s
     difference, direct_share, through = 0.0, 0.0, 0.0
     for film in films:

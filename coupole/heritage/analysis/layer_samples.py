@@ -75,18 +75,18 @@ class Samples:
     is_per_mm: bool
 
 
-def read_samples(given: LayerGiven, folder: Path) -> Samples:
+def read_samples(layer_file: LayerGiven, folder: Path) -> Samples:
     """The spectra, their paths relative to `folder`. Raises InputError with the file for what contradicts
     itself."""
-    films = given.films
+    films = layer_file.films
     has_thickness = [film.thickness_um is not None for film in films if film.over is not None]
     if any(has_thickness) != all(has_thickness):
         raise InputError(
             "thickness: expected one for each film over a ground, or for none; some have one, some not"
         )
-    binder_face = face(given.binder_index, given.geometry)
+    binder_face = face(layer_file.binder_index, layer_file.geometry)
     paths = {film.spectrum for film in films} | {film.over for film in films if film.over is not None}
-    more = given.directional
+    more = layer_file.directional
     if more is not None:
         paths |= {more.over_black, more.over_white, more.transmittance}
     spectra = {path: spectrum_on_grid(folder / path) for path in sorted(paths)}
@@ -98,44 +98,53 @@ def read_samples(given: LayerGiven, folder: Path) -> Samples:
     spectra = {path: values[bands] for path, values in spectra.items()}
     nm = WAVELENGTHS_NM[bands]
     for film in films:
-        _check_level(spectra[film.spectrum], film.spectrum, nm, binder_face, given.noise)
-    film_samples = [_film(film, spectra, binder_face, given) for film in films]
-    _check_order(film_samples, films, nm, given.noise)
+        _check_level(spectra[film.spectrum], film.spectrum, nm, binder_face, layer_file.noise)
+    film_samples = [_film(film, spectra, binder_face, layer_file) for film in films]
+    _check_order(film_samples, films, nm, layer_file.noise)
     return Samples(
         nm,
         film_samples,
-        _directional(given, spectra, nm, binder_face),
+        _directional(layer_file, spectra, nm, binder_face),
         binder_face,
         bool(has_thickness) and all(has_thickness),
     )
 
 
-def paint_file(given: LayerGiven, samples: Samples, found: Coefficients, four: FourFlux | None) -> PaintFile:
+def paint_file(
+    layer_file: LayerGiven, samples: Samples, coefficients: Coefficients, four: FourFlux | None
+) -> PaintFile:
     """The result to keep. Where the films hide their grounds S is drawn straight between bands that tell it, with
     an uncertainty of 100 %; if they do so in all bands, K and S are relative to a scattering of 1. K below 0 is
     kept as 0. The head says where."""
-    nm, sure = samples.wavelengths_nm, found.determined
-    ratio = np.maximum(found.absorption, 0.0) / found.scattering
+    nm, sure = samples.wavelengths_nm, coefficients.determined_bands
+    ratio = np.maximum(coefficients.absorption, 0.0) / coefficients.scattering
     unit: Literal["per mm", "per layer", "relative"] = "per mm" if samples.is_per_mm else "per layer"
     if sure.any():
-        s = np.interp(nm, nm[sure], found.scattering[sure])
-        u_k, u_s = np.where(sure, found.u_absorption, ratio * s), np.where(sure, found.u_scattering, s)
+        s = np.interp(nm, nm[sure], coefficients.scattering[sure])
+        u_k, u_s = (
+            np.where(sure, coefficients.u_absorption, ratio * s),
+            np.where(sure, coefficients.u_scattering, s),
+        )
     else:
         unit, s, u_k, u_s = "relative", np.ones(len(nm)), np.zeros(len(nm)), np.zeros(len(nm))
-    provenance: dict[str, Any] = {"noise": given.noise, "geometry": given.geometry, "grounds": given.grounds}
-    provenance["spectra"] = [film.spectrum.name for film in given.films]
-    if len(thicknesses := sorted({film.thickness_um for film in given.films if film.thickness_um})):
+    provenance: dict[str, Any] = {
+        "noise": layer_file.noise,
+        "geometry": layer_file.geometry,
+        "grounds": layer_file.grounds,
+    }
+    provenance["spectra"] = [film.spectrum.name for film in layer_file.films]
+    if len(thicknesses := sorted({film.thickness_um for film in layer_file.films if film.thickness_um})):
         provenance["thickness_um"] = thicknesses
     if sure.any() and not sure.all():
         provenance["assumed_scattering_at_nm"] = [float(value) for value in nm[~sure]]
-    if (below := found.absorption < 0.0).any():
+    if (below := coefficients.absorption < 0.0).any():
         provenance["absorption_set_to_0_at_nm"] = [float(value) for value in nm[below]]
     directional_columns = {}
     if four is not None:
         directional_columns = {"k": four.direct_absorption, "s_i": four.forward, "s_j": four.backward}
         directional_columns |= {"u_k": four.u_direct_absorption, "u_s_i": four.u_forward, "u_s_j": four.u_backward}
     return PaintFile(
-        given.name, unit, given.binder_index, nm, ratio * s, s, u_k, u_s, provenance, directional_columns
+        layer_file.name, unit, layer_file.binder_index, nm, ratio * s, s, u_k, u_s, provenance, directional_columns
     )
 
 
@@ -152,17 +161,17 @@ def spectrum_on_grid(path: Path) -> Array:
     return np.asarray(values)
 
 
-def _film(film: FilmGiven, spectra: dict[Path, Array], one: Face, given: LayerGiven) -> Film:
+def _film(film: FilmGiven, spectra: dict[Path, Array], binder_face: Face, layer_file: LayerGiven) -> Film:
     reflectance = spectra[film.spectrum]
     if film.over is None:
         return Film(reflectance, None)
     ground = spectra[film.over]
-    u_ground: Array | float = given.noise
-    if given.grounds == "coated":
-        below = ground - one.gloss
-        u_ground = given.noise * one.passing / (one.passing + one.inner * below) ** 2
-        ground = below / (one.passing + one.inner * below)
-    if ground.min() < -_BEYOND * given.noise or ground.max() > 1.0 + _BEYOND * np.max(u_ground):
+    u_ground: Array | float = layer_file.noise
+    if layer_file.grounds == "coated":
+        below = ground - binder_face.gloss
+        u_ground = layer_file.noise * binder_face.passing / (binder_face.passing + binder_face.inner * below) ** 2
+        ground = below / (binder_face.passing + binder_face.inner * below)
+    if ground.min() < -_BEYOND * layer_file.noise or ground.max() > 1.0 + _BEYOND * np.max(u_ground):
         raise InputError(
             f"{film.over}: as a ground under a glossy face it would reflect {ground.min():.3g} to "
             f"{ground.max():.3g} inside; expected 0 to 1: see `grounds` (bare), and whether gloss is included"
@@ -173,25 +182,30 @@ def _film(film: FilmGiven, spectra: dict[Path, Array], one: Face, given: LayerGi
     return Film(reflectance, np.clip(ground, 0.0, 1.0), str(film.over), u_ground, h, u_h)
 
 
-def _check_level(seen: Array, path: Path, nm: Array, one: Face, noise: float) -> None:
-    low, high = np.broadcast_to(one.gloss, seen.shape), np.broadcast_to(one.brightest, seen.shape)
-    wrong = np.flatnonzero((seen < low - _BEYOND * noise) | (seen > high + _BEYOND * noise))
+def _check_level(reflectance: Array, path: Path, nm: Array, binder_face: Face, noise: float) -> None:
+    low, high = (
+        np.broadcast_to(binder_face.gloss, reflectance.shape),
+        np.broadcast_to(binder_face.brightest, reflectance.shape),
+    )
+    wrong = np.flatnonzero((reflectance < low - _BEYOND * noise) | (reflectance > high + _BEYOND * noise))
     if len(wrong):
         at = wrong[0]
         raise InputError(
-            f"{path}: is {seen[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as {low[at]:.3g} to "
+            f"{path}: is {reflectance[at]:.3g} at {nm[at]:g} nm; a paint under this face is seen as "
+            f"{low[at]:.3g} to "
             f"{high[at]:.3g}: see whether gloss is included, the binder's index, and percent or fractions"
         )
 
 
-def _check_order(films: Sequence[Film], given: Sequence[FilmGiven], nm: Array, noise: float) -> None:
+def _check_order(films: Sequence[Film], film_entries: Sequence[FilmGiven], nm: Array, noise: float) -> None:
     """Raises InputError for a film that is darker over the lighter of two grounds."""
-    for (a, told_a), (b, told_b) in combinations(zip(films, given, strict=True), 2):
+    for (a, told_a), (b, told_b) in combinations(zip(films, film_entries, strict=True), 2):
         if a.ground is None or b.ground is None or a.thickness_mm != b.thickness_mm:
             continue
         lighter = np.sign(b.ground - a.ground)
         wrong = np.flatnonzero(
-            (lighter * (b.seen - a.seen) < -_BEYOND * np.sqrt(2.0) * noise) & (np.abs(b.ground - a.ground) > 0.05)
+            (lighter * (b.reflectance - a.reflectance) < -_BEYOND * np.sqrt(2.0) * noise)
+            & (np.abs(b.ground - a.ground) > 0.05)
         )
         if len(wrong):
             at = wrong[0]
@@ -202,13 +216,15 @@ def _check_order(films: Sequence[Film], given: Sequence[FilmGiven], nm: Array, n
             )
 
 
-def _directional(given: LayerGiven, spectra: dict[Path, Array], nm: Array, one: Face) -> Directional | None:
-    directional = given.directional
+def _directional(
+    layer_file: LayerGiven, spectra: dict[Path, Array], nm: Array, binder_face: Face
+) -> Directional | None:
+    directional = layer_file.directional
     if directional is None:
         return None
-    grounds = [film.over for film in given.films]
-    thicknesses = {film.thickness_um for film in given.films}
-    if len(given.films) != 2 or None in grounds or len(thicknesses) != 1:
+    grounds = [film.over for film in layer_file.films]
+    thicknesses = {film.thickness_um for film in layer_file.films}
+    if len(layer_file.films) != 2 or None in grounds or len(thicknesses) != 1:
         raise InputError(
             "directional: expected `films` to be one film over black, then over white, by diffuse light"
         )
@@ -218,9 +234,9 @@ def _directional(given: LayerGiven, spectra: dict[Path, Array], nm: Array, one: 
             "directional: expected `films` to be over black first, then over white; found white first"
         )
     for path in (directional.over_black, directional.over_white):
-        _check_level(spectra[path], path, nm, one, given.noise)
+        _check_level(spectra[path], path, nm, binder_face, layer_file.noise)
     through = spectra[directional.transmittance]
-    if through.min() < -_BEYOND * given.noise or through.max() > 1.0 + _BEYOND * given.noise:
+    if through.min() < -_BEYOND * layer_file.noise or through.max() > 1.0 + _BEYOND * layer_file.noise:
         raise InputError(
             f"{directional.transmittance}: expected a transmittance of 0 to 1, found up to {through.max():.3g}"
         )

@@ -80,7 +80,7 @@ def _of_file(path: Path) -> Paint:
     paint = read_paint(path)
     pigment = paint.on_grid()
     u_k, u_s = paint.uncertainties_on_grid()
-    is_covered = paint.covered()
+    is_covered = paint.covered_bands()
     k, s = (np.where(is_covered, values, np.nan) for values in (pigment.absorption, pigment.scattering))
     return Paint(paint.name, str(path), paint.unit, k, s, u_k, u_s)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
-from coupole.appearance.spectra.measured import decoded
+from coupole.appearance.spectra.measured import decode_text
 from coupole.appearance.spectra.spectra_library import LibrarySpectrum
 from coupole.errors import InputError, Problem, reason
 
@@ -37,10 +37,10 @@ def read_classes(path: Path) -> dict[str, PigmentClass]:
     """A table of name, class and, if known, Colour Index name, separated by commas, semicolons or tabs; a first
     line with these words is not needed. Raises InputError with file and line."""
     try:
-        text = decoded(path.read_bytes())
+        text = decode_text(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: {reason(error)}") from error
-    return _parsed(text, str(path))
+    return _parse_classes(text, str(path))
 
 
 def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClass]:
@@ -50,18 +50,22 @@ def shipped_classes(spectra: Sequence[LibrarySpectrum]) -> dict[str, PigmentClas
     for stem in {Path(spectrum.file).stem for spectrum in spectra}:
         table = folder.joinpath(f"{stem}.csv")
         if table.is_file():
-            classes |= _parsed(table.read_text(encoding="utf-8"), f"{stem}.csv")
+            classes |= _parse_classes(table.read_text(encoding="utf-8"), f"{stem}.csv")
     return classes
 
 
-def lacking(class_name: str, known: Collection[str]) -> list[str]:
-    """Classes of the same family that `known` lacks."""
+def lacking(class_name: str, known_classes: Collection[str]) -> list[str]:
+    """Classes of the same family that `known_classes` lacks."""
     return sorted(
-        sibling for family in FAMILIES if class_name in family for sibling in family if sibling not in set(known)
+        sibling
+        for family in FAMILIES
+        if class_name in family
+        for sibling in family
+        if sibling not in set(known_classes)
     )
 
 
-def _parsed(text: str, file: str) -> dict[str, PigmentClass]:
+def _parse_classes(text: str, file: str) -> dict[str, PigmentClass]:
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{file}: expected lines of name and class, found none")

@@ -45,7 +45,7 @@ class Recipe:
     """Shares of the paints used; they sum to 1."""
     half_widths: dict[str, float]
     """Half widths of the 95 % intervals of the shares."""
-    seen: Array
+    reflectance: Array
     """[81], what the mixture shows, NaN in bands that were not compared."""
     rms: float
     """Root mean square of what it misses."""
@@ -61,7 +61,7 @@ class Found:
     """Recipes of 1, 2, ... paints, and which of them is worth its paints."""
 
     recipes: tuple[Recipe, ...]
-    chosen: int
+    chosen_index: int
     """Index in `recipes`."""
     target: Array
     """[81], seen."""
@@ -81,7 +81,7 @@ class Found:
     @property
     def best(self) -> Recipe:
         """The one to mix."""
-        return self.recipes[self.chosen]
+        return self.recipes[self.chosen_index]
 
     @property
     def is_explained(self) -> bool:
@@ -122,22 +122,25 @@ def find(target: Array, palette: Sequence[Paint], face: Face, noise: float, at_m
     for size in range(1, min(at_most, len(palette)) + 1):
         candidates = _subsets(len(palette), size, before)
         likely_subsets = sorted(candidates, key=problem.roughly)[:_REFINED]
-        fits = sorted((problem.refined(subset) for subset in likely_subsets), key=lambda found: found[0])
+        fits = sorted((problem.refined_shares(subset) for subset in likely_subsets), key=lambda found: found[0])
         before = [subset for _, subset, _ in fits[:3]]
         all_fits += fits
         recipes.append(problem.recipe(fits[0][1], fits[0][2]))
-    choice = _chosen(recipes, int(bands.sum()))
+    choice = _choose_recipe(recipes, int(bands.sum()))
     rivals = _rivals(all_fits, choice + 1, max(1.0, recipes[choice].misfit) ** 2, palette)
     return Found(tuple(recipes), choice, target, bands, noise, rivals)
 
 
 def _rivals(
-    tried: Sequence[tuple[float, tuple[int, ...], Array]], size: int, scale: float, palette: Sequence[Paint]
+    tried_recipes: Sequence[tuple[float, tuple[int, ...], Array]],
+    size: int,
+    scale: float,
+    palette: Sequence[Paint],
 ) -> tuple[dict[str, float], ...]:
     """Shares of the recipes tried that are not told from the best one of a size, the nearest first."""
-    best = min(cost for cost, subset, _ in tried if len(subset) == size)
+    best = min(cost for cost, subset, _ in tried_recipes if len(subset) == size)
     rivals = []
-    for cost, subset, shares in sorted(tried, key=lambda one: one[0]):
+    for cost, subset, shares in sorted(tried_recipes, key=lambda one: one[0]):
         worse = (cost - best) / scale
         near = worse < _UNTOLD if len(subset) <= size else len(subset) == size + 1 and worse < -_UNTOLD
         if near and not (len(subset) == size and cost == best):
@@ -161,7 +164,7 @@ def _subsets(count: int, size: int, before: Sequence[tuple[int, ...]]) -> Iterab
     }
 
 
-def _chosen(recipes: Sequence[Recipe], bands: int) -> int:
+def _choose_recipe(recipes: Sequence[Recipe], bands: int) -> int:
     """The fewest to which one more paint adds nothing beyond noise, or what no palette explains."""
     scale = max(1.0, recipes[-1].misfit)
     for number, (recipe, more) in enumerate(pairwise(recipes)):
@@ -199,9 +202,9 @@ class _Problem:
     def roughly(self, subset: tuple[int, ...]) -> float:
         """Root mean square residual of the linear problem's mixture."""
         shares = self._linear(subset)
-        return float(np.mean((self._seen(subset, shares) - self.target) ** 2))
+        return float(np.mean((self._mixture_reflectance(subset, shares) - self.target) ** 2))
 
-    def refined(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
+    def refined_shares(self, subset: tuple[int, ...]) -> tuple[float, tuple[int, ...], Array]:
         """Squared residuals over their variances, and shares that are not negative."""
         from scipy.optimize import least_squares
 
@@ -210,7 +213,7 @@ class _Problem:
         start = np.maximum(self._linear(subset), 1e-6)
         u = np.sqrt(self.noise**2 + self._of_palette(subset, start / start.sum()))
         solution = least_squares(
-            lambda c: np.append((self._seen(subset, c) - self.target) / u, c.sum() - 1.0),
+            lambda c: np.append((self._mixture_reflectance(subset, c) - self.target) / u, c.sum() - 1.0),
             start / start.sum(),
             bounds=(0.0, 2.0),
             x_scale=np.maximum(start / start.sum(), 1e-3),
@@ -220,10 +223,10 @@ class _Problem:
 
     def _cost(self, subset: tuple[int, ...], shares: Array) -> float:
         u2 = self.noise**2 + self._of_palette(subset, shares)
-        return float(np.sum((self._seen(subset, shares) - self.target) ** 2 / u2))
+        return float(np.sum((self._mixture_reflectance(subset, shares) - self.target) ** 2 / u2))
 
     def recipe(self, subset: tuple[int, ...], shares: Array) -> Recipe:
-        reflectance = self._seen(subset, shares)
+        reflectance = self._mixture_reflectance(subset, shares)
         residuals = reflectance - self.target
         smooth = np.convolve(residuals, np.ones(5) / 5.0, mode="same")
         at = int(np.argmax(np.abs(smooth)))
@@ -257,10 +260,10 @@ class _Problem:
         )
         return np.asarray(amounts / size / (amounts / size).sum())
 
-    def _seen(self, subset: tuple[int, ...], shares: Array) -> Array:
+    def _mixture_reflectance(self, subset: tuple[int, ...], shares: Array) -> Array:
         columns = list(subset)
         k, s = self.k[:, columns] @ shares, self.s[:, columns] @ shares
-        return self.face.seen(InternalReflectance(kubelka_munk.opaque(k / s))).values
+        return self.face.reflectance_in_air(InternalReflectance(kubelka_munk.opaque(k / s))).values
 
     def _uncertainty(self, subset: tuple[int, ...], shares: Array, variance: Array) -> Array:
         """Standard uncertainty of the shares, from the variance [bands] of recipe less target."""
@@ -269,7 +272,11 @@ class _Problem:
             return np.zeros(1)
         step = 1e-6
         slopes = np.stack(
-            [(self._seen(subset, shares + step * e) - self._seen(subset, shares)) / step for e in np.eye(count)],
+            [
+                (self._mixture_reflectance(subset, shares + step * e) - self._mixture_reflectance(subset, shares))
+                / step
+                for e in np.eye(count)
+            ],
             axis=1,
         )
         # Shares sum to 1: only changes within that plane count.
@@ -289,6 +296,8 @@ class _Problem:
             for u, at in ((paint.u_absorption, (1.0, 0.0)), (paint.u_scattering, (0.0, 1.0))):
                 step = 1e-6 * (k + s)
                 reflectance = kubelka_munk.opaque((k + at[0] * step) / (s + at[1] * step))
-                change = self.face.seen(InternalReflectance(reflectance)).values - self._seen(subset, shares)
+                change = self.face.reflectance_in_air(
+                    InternalReflectance(reflectance)
+                ).values - self._mixture_reflectance(subset, shares)
                 variance += (change / step * share * u[self.bands]) ** 2
         return variance

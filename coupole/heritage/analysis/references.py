@@ -102,7 +102,7 @@ class OfBands:
         )
 
     @cached_property
-    def spread(self) -> Array:
+    def reference_spread(self) -> Array:
         """[bands] rms difference of log(K/S), less its mean, between references of a class that are most alike."""
         log_ratio = log_k_over_s(self.reflectance)
         shape = log_ratio - log_ratio.mean(axis=1, keepdims=True)
@@ -129,7 +129,7 @@ class References:
     """[n, 221] at `BANDS_NM`; NaN where it was not measured."""
     remarks: tuple[str, ...]
     """Remarks on what was left out, and why."""
-    _prepared: dict[bytes, OfBands] = field(default_factory=dict)
+    _of_bands_cache: dict[bytes, OfBands] = field(default_factory=dict)
 
     def of_bands(self, spectrum_name: str, reflectance: Array) -> OfBands:
         """The references in the bands in which a spectrum [221] and nine of ten references were measured.
@@ -147,7 +147,7 @@ class References:
                 f"{_range(library_nm)}"
             )
         key = shared_bands.tobytes()
-        if key not in self._prepared:
+        if key not in self._of_bands_cache:
             bands, rows = np.flatnonzero(shared_bands), np.flatnonzero(is_known[:, shared_bands].all(axis=1))
             names = tuple(sorted({self.class_of[row] for row in rows}))
             if len(names) < _LEAST_CLASSES:
@@ -157,8 +157,8 @@ class References:
                 )
             classes = np.array([names.index(self.class_of[row]) for row in rows])
             values = self.reflectance[np.ix_(rows, bands)]
-            self._prepared[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
-        return self._prepared[key]
+            self._of_bands_cache[key] = OfBands(bands, rows, values, classes, ClassModel(values, classes, names))
+        return self._of_bands_cache[key]
 
     def without_stray_light(self, reflectance: Array) -> tuple[Array, str]:
         """A spectrum [221] without a violet end that rises as no reference does, and what was left out, if
@@ -191,7 +191,7 @@ class References:
         )
 
 
-def measured(spectrum: LibrarySpectrum) -> Measured:
+def trimmed_spectrum(spectrum: LibrarySpectrum) -> Measured:
     """A spectrum of a file for identification, without the bands that it lacks at its ends.
 
     Raises InputError, with file and line, for gaps wider than 20 nm, which resampling leaves open.
@@ -238,8 +238,8 @@ def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, Pi
     remarks = []
     if len(members) < len(spectra):
         without = [s.name for s in spectra if s.name not in {c.name for c, _ in members}]
-        remarks.append(f"{len(without)} spectra have no class and are left out: {_listed(without)}")
-    values = np.stack([on_bands(measured(spectrum)) for spectrum, _ in members])
+        remarks.append(f"{len(without)} spectra have no class and are left out: {_list_of_names(without)}")
+    values = np.stack([on_bands(trimmed_spectrum(spectrum)) for spectrum, _ in members])
     rows, doublets = _without_doublets(values, members)
     return References(
         tuple(members[row][0].name for row in rows),
@@ -249,7 +249,9 @@ def make_references(spectra: Sequence[LibrarySpectrum], classes: Mapping[str, Pi
     )
 
 
-def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]]) -> tuple[list[int], list[str]]:
+def _without_doublets(
+    values: Array, classed_spectra: list[tuple[LibrarySpectrum, str]]
+) -> tuple[list[int], list[str]]:
     dropped_rows: set[int] = set()
     remarks = []
     for row in range(len(values)):
@@ -257,7 +259,7 @@ def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]])
         in_both = np.isfinite(apart)
         same = np.where(in_both, apart, 0.0).max(axis=1, initial=0.0) < _SAME
         for before in np.flatnonzero(same & in_both.any(axis=1)):
-            (first, first_class), (second, second_class) = classed[before], classed[row]
+            (first, first_class), (second, second_class) = classed_spectra[before], classed_spectra[row]
             agree = first_class == second_class
             dropped_rows |= {row} if agree else {int(before), row}
             effect = "counts once" if agree else f"is left out: {first_class}, {second_class}"
@@ -268,7 +270,7 @@ def _without_doublets(values: Array, classed: list[tuple[LibrarySpectrum, str]])
     return [row for row in range(len(values)) if row not in dropped_rows], remarks
 
 
-def _listed(names: list[str]) -> str:
+def _list_of_names(names: list[str]) -> str:
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 

@@ -11,7 +11,7 @@ from coupole.appearance.matter import kubelka_munk
 from coupole.appearance.matter.glossy_face import Face, InternalReflectance
 from coupole.appearance.spectra.grid import Array
 from coupole.appearance.spectra.measured import Measured
-from coupole.appearance.spectra.resampling import resampled
+from coupole.appearance.spectra.resampling import resample
 
 STEP_NM = 10.0
 BANDS_NM: Array = np.arange(300.0, 2500.0 + STEP_NM / 2, STEP_NM)
@@ -36,7 +36,7 @@ _SURFACE = 0.04
 
 def on_bands(spectrum: Measured) -> Array:
     """[221] reflectance at `BANDS_NM`."""
-    return resampled(spectrum, BANDS_NM, STEP_NM)[0]
+    return resample(spectrum, BANDS_NM, STEP_NM)[0]
 
 
 def log_k_over_s(reflectance: Array) -> Array:
@@ -56,7 +56,7 @@ def appearances(reflectance: Array) -> Array:
         look = kubelka_munk.opaque(ratio * factor)
         if internal:
             face = Face(np.array((1.0 - _SURFACE) * (1.0 - internal)), np.array(internal), np.zeros(()))
-            look = face.seen(InternalReflectance(look)).values
+            look = face.reflectance_in_air(InternalReflectance(look)).values
         looks.append(gloss + (1.0 - gloss) * look)
     looks[0] = reflectance
     return np.stack(looks)

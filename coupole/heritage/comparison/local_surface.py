@@ -75,7 +75,7 @@ def _fit_batch(
     normals: Floats,
     reach_mm: float,
     part: slice,
-    found: LocalFits,
+    local_fits: LocalFits,
 ) -> None:
     away, near = tree.query(places, NEIGHBOURS)
     offsets = np.asarray(tree.data)[near] - places[:, None]
@@ -93,20 +93,20 @@ def _fit_batch(
     if values is not None:
         fits.append(_least_squares(design[:, :, :_PLANE_TERMS], values[near]))
     there_values, residuals = (np.concatenate([fit[k] for fit in fits], axis=-1) for k in (0, 1))
-    found.values[part] = np.where(there[:, None], there_values, np.nan)
+    local_fits.values[part] = np.where(there[:, None], there_values, np.nan)
     scatter = np.einsum("nkc,nkd->ncd", residuals, residuals) / _FREEDOM_ALONE
-    found.scatter[part] = np.where(there[:, None, None], scatter, np.nan)
-    found.leverage[part, 0] = np.where(there, fits[0][2], np.nan)
-    found.leverage[part, 1:] = np.where(there, fits[-1][2], np.nan)[:, None]
+    local_fits.scatter[part] = np.where(there[:, None, None], scatter, np.nan)
+    local_fits.leverage[part, 0] = np.where(there, fits[0][2], np.nan)
+    local_fits.leverage[part, 1:] = np.where(there, fits[-1][2], np.nan)[:, None]
 
 
-def _least_squares(design: Floats, seen: Floats) -> tuple[Floats, Floats, Floats]:
+def _least_squares(design: Floats, observations: Floats) -> tuple[Floats, Floats, Floats]:
     """Values [n, c] at the middle, what is left [n, k, c], and leverage [n], of designs [n, k, t] and values
     [n, k, c]."""
     normal = np.einsum("nki,nkj->nij", design, design) + _RIDGE * NEIGHBOURS * np.eye(design.shape[2])
     inverse = np.linalg.inv(normal)
-    terms = inverse @ np.einsum("nki,nkc->nic", design, seen)
-    return terms[:, 0], seen - design @ terms, inverse[:, 0, 0]
+    terms = inverse @ np.einsum("nki,nkc->nic", design, observations)
+    return terms[:, 0], observations - design @ terms, inverse[:, 0, 0]
 
 
 def _tangents(normals: Floats) -> tuple[Floats, Floats]:

@@ -31,9 +31,9 @@ def read_result_state(folder: Path) -> State:
     corners = surface.vertices_mm[surface.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(across, axis=1, keepdims=True)
-    kept_triangles = np.flatnonzero((lengths[:, 0] > 0) | surface.known)
+    kept_triangles = np.flatnonzero((lengths[:, 0] > 0) | surface.has_material)
     middles = corners.mean(axis=1)[kept_triangles]
-    kd, is_known = surface.kd[kept_triangles], surface.known[kept_triangles]
+    kd, is_known = surface.kd[kept_triangles], surface.has_material[kept_triangles]
     if not is_known.any():
         raise InputError(f"{folder}: no triangle has a fitted material")
     lab = np.full((len(kept_triangles), 3), np.nan)

@@ -19,8 +19,8 @@ from coupole.heritage.comparison.result_state import read_result_state
 from coupole.heritage.comparison.significance import discoveries, of_lengths, of_vectors
 from coupole.heritage.comparison.state_files import Colours, Floats, State, colour_library, read_state
 from coupole.heritage.comparison.unchanged_alignment import Alignment, align
-from coupole.scan.registration.prepared_scan import thinned
-from coupole.scan.registration.small_motions import applied, inverse_of
+from coupole.scan.registration.prepared_scan import thinned_cloud
+from coupole.scan.registration.small_motions import inverse_of, moved_points
 from coupole.scan.registration.viewpoint import Viewpoint
 
 Say = Callable[[str, int, int], None]
@@ -57,26 +57,26 @@ class Comparison:
     """[n] along the normals, outwards positive; NaN where the other state has no surface."""
     u_mm: Floats
     """[n] standard uncertainty."""
-    moved: NDArray[np.bool_]
+    moved_points: NDArray[np.bool_]
     """[n] significantly."""
     noise_factor: float
     de00: Floats | None
     """[n] CIEDE2000 under D65."""
-    recoloured: NDArray[np.bool_] | None
+    recoloured_points: NDArray[np.bool_] | None
     colour_factor: float
     shape_regions: tuple[Region, ...]
     colour_regions: tuple[Region, ...]
 
 
 def compare(
-    before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, aligned: bool, say: Say
+    before_path: Path, after_path: Path, unit: str, noise_mm: float | None, *, is_aligned: bool, say: Say
 ) -> Comparison:
     """Compare two files, or folders of `coupole reflectance`. `noise_mm` is the standard deviation of a point,
-    else found by the scatter; `aligned` takes the files' frame as common. Raises InputError, ExtraMissing."""
+    else found by the scatter; `is_aligned` takes the files' frame as common. Raises InputError, ExtraMissing."""
     say("reading", 0, 2)
-    before = _read(before_path, unit)
+    before = _load_state(before_path, unit)
     say("reading", 1, 2)
-    after = _read(after_path, unit)
+    after = _load_state(after_path, unit)
     say("reading", 2, 2)
     if not 0.2 < before.size_mm / after.size_mm < 5:
         raise InputError(
@@ -85,21 +85,23 @@ def compare(
         )
     say("aligning", 0, 1)
     alignment = align(before, after)
-    if aligned:
+    if is_aligned:
         alignment = Alignment(np.eye(4), np.zeros((6, 6)), np.zeros(3), alignment.noise_mm, True)
     say("aligning", 1, 1)
-    return _compared(before, after, alignment, noise_mm, say)
+    return _compare_states(before, after, alignment, noise_mm, say)
 
 
-def _read(path: Path, unit: str) -> State:
+def _load_state(path: Path, unit: str) -> State:
     return read_result_state(path) if path.is_dir() else read_state(path, unit)
 
 
-def _compared(before: State, after: State, alignment: Alignment, noise_mm: float | None, say: Say) -> Comparison:
+def _compare_states(
+    before: State, after: State, alignment: Alignment, noise_mm: float | None, say: Say
+) -> Comparison:
     spacing_mm = max(before.spacing_mm, after.spacing_mm)
     reach_mm = max(_REACH_SHARE * before.size_mm, _REACH_SPACINGS * spacing_mm)
     normals = _normals(before)
-    after_mm = applied(alignment.before_from_after, after.points_mm)
+    after_mm = moved_points(alignment.before_from_after, after.points_mm)
     colours = None
     if before.colours is not None and after.colours is not None:
         colours = before.colours, after.colours
@@ -167,23 +169,23 @@ def _normals(state: State) -> Floats:
     """[n, 3]: by triangles, else by neighbours, and then which side is out is not known."""
     if state.outward is not None and np.linalg.norm(state.outward, axis=1).min() > 0:
         return state.outward
-    cloud = thinned(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)
+    cloud = thinned_cloud(state.points_mm, state.spacing_mm, Viewpoint("none"), state.outward)
     return np.asarray(cloud.normals[cloud.tree.query(state.points_mm)[1]])
 
 
-def de00_of(lab: Floats, other: Floats) -> Floats:
+def de00_of(lab: Floats, other_lab: Floats) -> Floats:
     """[n] CIEDE2000 between CIELAB values [n, 3] (Luo, Cui, Rigg, Color Res. Appl. 26(5), 2001). Raises
     ExtraMissing."""
-    return np.asarray(colour_library().deltaE_ciede2000(lab, other), np.float64)
+    return np.asarray(colour_library().deltaE_ciede2000(lab, other_lab), np.float64)
 
 
-def _regions(found: Comparison, marked: NDArray[np.bool_]) -> tuple[Region, ...]:
+def _regions(comparison: Comparison, point_mask: NDArray[np.bool_]) -> tuple[Region, ...]:
     """The largest first; a few single points are left out."""
-    numbers = np.flatnonzero(marked)
+    numbers = np.flatnonzero(point_mask)
     if not len(numbers):
         return ()
-    points = found.before.points_mm[numbers]
-    pairs = cKDTree(points).query_pairs(3 * found.before.spacing_mm, output_type="ndarray")
+    points = comparison.before.points_mm[numbers]
+    pairs = cKDTree(points).query_pairs(3 * comparison.before.spacing_mm, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), tuple(pairs.T)), (len(numbers), len(numbers)))
     count, of_point = connected_components(graph, directed=False)
     regions = []
@@ -197,17 +199,17 @@ def _regions(found: Comparison, marked: NDArray[np.bool_]) -> tuple[Region, ...]
                 len(region_rows),
                 points[in_region].mean(axis=0),
                 float(np.ptp(points[in_region], axis=0).max()),
-                float(np.nanmean(found.distance_mm[region_rows])),
-                float("nan") if found.de00 is None else float(np.nanmean(found.de00[region_rows])),
+                float(np.nanmean(comparison.distance_mm[region_rows])),
+                float("nan") if comparison.de00 is None else float(np.nanmean(comparison.de00[region_rows])),
             )
         )
     return tuple(sorted(regions, key=lambda region: -region.points))
 
 
-def about(found: Comparison) -> dict[str, Any]:
+def about(comparison: Comparison) -> dict[str, Any]:
     """The content of `comparison.json`."""
 
-    def told(regions: tuple[Region, ...]) -> list[dict[str, Any]]:
+    def region_entries(regions: tuple[Region, ...]) -> list[dict[str, Any]]:
         return [
             {
                 "points": region.points,
@@ -219,30 +221,30 @@ def about(found: Comparison) -> dict[str, Any]:
             for region in regions
         ]
 
-    is_known = np.isfinite(found.distance_mm)
+    is_known = np.isfinite(comparison.distance_mm)
     colours = None
-    if found.de00 is not None and found.recoloured is not None:
+    if comparison.de00 is not None and comparison.recoloured_points is not None:
         colours = {
-            "changed": int(found.recoloured.sum()),
-            "median_de00": float(np.nanmedian(found.de00)),
-            "largest_de00": float(np.nanmax(found.de00)),
-            "factor_by_scatter": found.colour_factor,
-            "regions": told(found.colour_regions),
+            "changed": int(comparison.recoloured_points.sum()),
+            "median_de00": float(np.nanmedian(comparison.de00)),
+            "largest_de00": float(np.nanmax(comparison.de00)),
+            "factor_by_scatter": comparison.colour_factor,
+            "regions": region_entries(comparison.colour_regions),
         }
     return {
-        "before": found.before.name,
-        "after": found.after.name,
-        "before_from_after": found.alignment.before_from_after.tolist(),
-        "after_from_before": inverse_of(found.alignment.before_from_after).tolist(),
+        "before": comparison.before.name,
+        "after": comparison.after.name,
+        "before_from_after": comparison.alignment.before_from_after.tolist(),
+        "after_from_before": inverse_of(comparison.alignment.before_from_after).tolist(),
         "points": len(is_known),
         "not_comparable": int((~is_known).sum()),
         "shape": {
-            "changed": int(found.moved.sum()),
-            "median_mm": float(np.median(np.abs(found.distance_mm[is_known]))),
-            "largest_mm": float(np.abs(found.distance_mm[is_known]).max()),
-            "median_u_mm": float(np.nanmedian(found.u_mm)),
-            "factor_by_scatter": found.noise_factor,
-            "regions": told(found.shape_regions),
+            "changed": int(comparison.moved_points.sum()),
+            "median_mm": float(np.median(np.abs(comparison.distance_mm[is_known]))),
+            "largest_mm": float(np.abs(comparison.distance_mm[is_known]).max()),
+            "median_u_mm": float(np.nanmedian(comparison.u_mm)),
+            "factor_by_scatter": comparison.noise_factor,
+            "regions": region_entries(comparison.shape_regions),
         },
         "colour": colours,
     }

@@ -13,9 +13,9 @@ import numpy as np
 
 from coupole.errors import InputError
 from coupole.heritage.comparison.state_files import Floats, State
-from coupole.scan.registration.pair_matching import match_by_features, refined
-from coupole.scan.registration.prepared_scan import PLACE_SPACINGS, Cloud, thinned
-from coupole.scan.registration.small_motions import applied, stepped
+from coupole.scan.registration.pair_matching import match_by_features, refined_motion
+from coupole.scan.registration.prepared_scan import PLACE_SPACINGS, Cloud, thinned_cloud
+from coupole.scan.registration.small_motions import moved_points, stepped_motion
 from coupole.scan.registration.viewpoint import Viewpoint
 
 _COARSE_POINTS, _FINE_POINTS = 4_000, 60_000
@@ -37,7 +37,7 @@ class Alignment:
     pivot_mm: Floats
     noise_mm: float
     """Robust standard deviation of distances along normals."""
-    given: bool
+    is_given: bool
     """True if the states lay on each other in their files already."""
 
     def uncertainty_mm(self, points_mm: Floats, normals: Floats) -> Floats:
@@ -49,35 +49,35 @@ class Alignment:
 def align(before: State, after: State) -> Alignment:
     """Find the motion between two states. Raises InputError if they do not look like the same object."""
     spacing_mm = max(before.spacing_mm, after.spacing_mm)
-    fine = [_thinned(state, spacing_mm, _FINE_POINTS) for state in (before, after)]
-    coarse = [_thinned(state, 2 * fine[0].pitch_mm, _COARSE_POINTS) for state in (before, after)]
+    fine = [_thin_state(state, spacing_mm, _FINE_POINTS) for state in (before, after)]
+    coarse = [_thin_state(state, 2 * fine[0].pitch_mm, _COARSE_POINTS) for state in (before, after)]
     pitch_mm = max(cloud.pitch_mm for cloud in coarse)
     motion, is_given = np.eye(4), True
     if _share(coarse[0], coarse[1], motion, pitch_mm) < _ALIGNED_SHARE:
         is_given = False
         motion, agreement = match_by_features(*coarse)
         if agreement >= _FEATURES_AGREED:
-            motion = refined(coarse[0], coarse[1], motion, 2.5 * pitch_mm, 40)
+            motion = refined_motion(coarse[0], coarse[1], motion, 2.5 * pitch_mm, 40)
         if agreement < _FEATURES_AGREED or _share(coarse[0], coarse[1], motion, pitch_mm) < _LEAST_SHARE:
             raise InputError(
                 f"{before.name} and {after.name}: no motion brings {100 * _LEAST_SHARE:.0f} % or more of one onto "
                 "the other. Another object, another unit, or a part of it only?"
             )
-    return _robust(fine[0], fine[1], motion, pitch_mm, given=is_given)
+    return _robust(fine[0], fine[1], motion, pitch_mm, is_given=is_given)
 
 
-def _thinned(state: State, pitch_mm: float, most: int) -> Cloud:
+def _thin_state(state: State, pitch_mm: float, most: int) -> Cloud:
     pitch_mm = max(pitch_mm, PLACE_SPACINGS / 2 * state.spacing_mm)
-    cloud = thinned(state.points_mm, pitch_mm, Viewpoint("none"), state.outward)
+    cloud = thinned_cloud(state.points_mm, pitch_mm, Viewpoint("none"), state.outward)
     while len(cloud.points_mm) > most:
         pitch_mm *= max(1.05, (len(cloud.points_mm) / most) ** 0.5)
-        cloud = thinned(state.points_mm, pitch_mm, Viewpoint("none"), state.outward)
+        cloud = thinned_cloud(state.points_mm, pitch_mm, Viewpoint("none"), state.outward)
     return cloud
 
 
 def _share(before: Cloud, after: Cloud, motion: Floats, pitch_mm: float) -> float:
     """Return the share of the after's points that lie on the other state, within half a cell along its normals."""
-    moved_mm = applied(motion, after.points_mm)
+    moved_mm = moved_points(motion, after.points_mm)
     away, nearest = before.tree.query(moved_mm, distance_upper_bound=1.5 * pitch_mm)
     hit = np.isfinite(away)
     off = np.sum((moved_mm[hit] - before.points_mm[nearest[hit]]) * before.normals[nearest[hit]], axis=1)
@@ -86,10 +86,10 @@ def _share(before: Cloud, after: Cloud, motion: Floats, pitch_mm: float) -> floa
     return float(np.sum((np.abs(off) < 0.5 * pitch_mm) & (facing > 0.8)) / len(moved_mm))
 
 
-def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, given: bool) -> Alignment:
+def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, is_given: bool) -> Alignment:
     pivot = before.points_mm.mean(axis=0)
     for _ in range(_MOST_ROUNDS):
-        moved_mm = applied(motion, after.points_mm)
+        moved_mm = moved_points(motion, after.points_mm)
         away, nearest = before.tree.query(moved_mm, distance_upper_bound=max(reach_mm, 1.5 * before.pitch_mm))
         hit = np.flatnonzero(np.isfinite(away))
         normals = before.normals[nearest[hit]]
@@ -100,7 +100,7 @@ def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, giv
         normal = (rows * weights[:, None]).T @ rows
         normal += np.diag(np.full(6, 1e-12 * np.trace(normal)))
         step = -np.linalg.solve(normal, rows.T @ (weights * off))
-        motion = stepped(motion, step, pivot)
+        motion = stepped_motion(motion, step, pivot)
         reach_mm = 0.7 * reach_mm
         if reach_mm < before.pitch_mm and np.abs(step[:3]).max() < _SETTLED * before.pitch_mm:
             break
@@ -110,4 +110,4 @@ def _robust(before: Cloud, after: Cloud, motion: Floats, reach_mm: float, *, giv
     )
     pulls = np.stack([np.bincount(cells, column) for column in (rows * (weights * off)[:, None]).T], axis=1)
     bread = np.linalg.inv(normal)
-    return Alignment(motion, bread @ (pulls.T @ pulls) @ bread, pivot, noise_mm, given)
+    return Alignment(motion, bread @ (pulls.T @ pulls) @ bread, pivot, noise_mm, is_given)

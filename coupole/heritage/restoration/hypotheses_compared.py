@@ -28,10 +28,10 @@ class Difference:
     difference of the mean colours."""
 
 
-def compared(
+def compare_pictures(
     xyz: NDArray[np.float32],
-    other: NDArray[np.float32],
-    seen: NDArray[np.int16],
+    other_xyz: NDArray[np.float32],
+    part_of_pixel: NDArray[np.int16],
     names: tuple[str, ...],
     eye: Eye,
     white_cd_m2: float,
@@ -39,19 +39,19 @@ def compared(
     """Compare two pictures [h, w, 3] in cd/m^2 for an eye that is used to `white_cd_m2` of the first light's
     colour.
 
-    `seen` [h, w] are rows of `names`, negative where the object is not seen. CIEDE2000 (Luo, Cui, Rigg, Color Res.
-    Appl. 26(5), 2001) is colour-science's.
+    `part_of_pixel` [h, w] are rows of `names`, negative where the object is not seen. CIEDE2000 (Luo, Cui, Rigg,
+    Color Res. Appl. 26(5), 2001) is colour-science's.
     """
-    de00 = np.full(seen.shape, np.nan)
-    on = seen >= 0
-    pair = [light.lab(picture[on].astype(float) / white_cd_m2, eye.white) for picture in (xyz, other)]
+    de00 = np.full(part_of_pixel.shape, np.nan)
+    on = part_of_pixel >= 0
+    pair = [light.lab(picture[on].astype(float) / white_cd_m2, eye.white) for picture in (xyz, other_xyz)]
     de00[on] = _ciede2000(*pair)
-    rows = seen[on]
+    rows = part_of_pixel[on]
     figures: dict[str, dict[str, Any]] = {}
     for row, name in enumerate(names):
         of_part = rows == row
         if of_part.any():
-            means = [picture[on][of_part].mean(axis=0, dtype=float) / white_cd_m2 for picture in (xyz, other)]
+            means = [picture[on][of_part].mean(axis=0, dtype=float) / white_cd_m2 for picture in (xyz, other_xyz)]
             labs = [light.lab(mean[None], eye.white) for mean in means]
             figures[name] = {
                 "pixels": int(of_part.sum()),
@@ -61,14 +61,14 @@ def compared(
     return Difference(de00, figures)
 
 
-def drawn(de00: NDArray[np.float64]) -> NDArray[np.uint8]:
+def difference_picture(de00: NDArray[np.float64]) -> NDArray[np.uint8]:
     """[h, w, 3]: light where nothing differs, violet at `FULL_DE00`, dark where the object is not seen."""
     share = np.clip(np.nan_to_num(de00) / FULL_DE00, 0.0, 1.0)[..., None]
     colours = np.where(np.isnan(de00)[..., None], _AROUND, _LIGHT + share * (_STRONG - _LIGHT))
     return np.rint(255.0 * colours).astype(np.uint8)
 
 
-def _ciede2000(lab: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ciede2000(lab: NDArray[np.float64], other_lab: NDArray[np.float64]) -> NDArray[np.float64]:
     import colour
 
-    return np.asarray(colour.difference.delta_E_CIE2000(lab, other), float)
+    return np.asarray(colour.difference.delta_E_CIE2000(lab, other_lab), float)

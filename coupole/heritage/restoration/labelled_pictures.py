@@ -25,7 +25,7 @@ _LANGUAGE = "{http://www.w3.org/XML/1998/namespace}lang"
 _XMP_KEYWORD = "XML:com.adobe.xmp"
 
 
-def told(hypotheses: Sequence[Hypothesis]) -> dict[str, str]:
+def metadata_texts(hypotheses: Sequence[Hypothesis]) -> dict[str, str]:
     """Texts for metadata by their keywords, of a picture of one or more hypotheses."""
     names = "; ".join(f"{hypothesis.name}: {hypothesis.title}" for hypothesis in hypotheses)
     several = len(hypotheses) > 1
@@ -47,7 +47,7 @@ def for_exr(texts: Mapping[str, str]) -> dict[str, str]:
     return {keyword.lower(): words for keyword, words in texts.items()}
 
 
-def restamped(path: Path, attributes: Mapping[str, str]) -> None:
+def restamp_exr(path: Path, attributes: Mapping[str, str]) -> None:
     """Give an EXR these attributes, unless it has them. Raises OSError, RuntimeError."""
     import OpenEXR
 
@@ -61,7 +61,7 @@ def restamped(path: Path, attributes: Mapping[str, str]) -> None:
     part.replace(path)
 
 
-def captioned(picture: Picture, hypothesis: Hypothesis, lines: int | None = None) -> Picture:
+def captioned_picture(picture: Picture, hypothesis: Hypothesis, lines: int | None = None) -> Picture:
     """The picture [h, w, 3] with a strip below it: the word, title and references; of some number of lines."""
     caption = caption_lines(picture.shape[1], hypothesis)
     return with_strip(picture, caption, lines or len(caption))
@@ -71,7 +71,7 @@ def caption_lines(width_px: int, hypothesis: Hypothesis) -> list[str]:
     """The words of the strip, broken for a picture of this width; what is left out, the last line says."""
     references = "; ".join(dict.fromkeys(source.reference for source in hypothesis.sources))
     words = [f"Hypothesis: {hypothesis.title} (simulated)", f"Sources: {references}"]
-    lines = [line for paragraph in words for line in broken(paragraph, width_px)]
+    lines = [line for paragraph in words for line in break_lines(paragraph, width_px)]
     if len(lines) > _MOST_LINES:
         lines = [*lines[: _MOST_LINES - 1], "... (all of them in the file's metadata)"]
     return lines
@@ -107,7 +107,7 @@ def _font(size: int) -> Any:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
 
 
-def broken(words: str, width_px: int) -> list[str]:
+def break_lines(words: str, width_px: int) -> list[str]:
     """Lines that a strip has room for; a word that is longer than a line is broken."""
     size = _size(width_px)
     font, room = _font(size), max(width_px - 2 * size, 4 * size)

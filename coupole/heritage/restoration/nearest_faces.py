@@ -39,15 +39,17 @@ def nearest_faces(mesh: PaintedMesh, vertices_mm: Floats, triangles: NDArray[np.
     return nearest
 
 
-def _nearest(tree: Any, corners: Floats, others: Floats, points: Floats, turned: Floats) -> NDArray[np.int64]:
+def _nearest(
+    tree: Any, corners: Floats, scaled_normals: Floats, points: Floats, normals_of_points: Floats
+) -> NDArray[np.int64]:
     """Choose among the candidates with the nearest middles, by the distances to their surfaces."""
     from trimesh.triangles import closest_point
 
     count = min(_CANDIDATES, len(corners))
-    near = tree.query(np.concatenate([points, turned], axis=1), k=count)[1].reshape(len(points), count)
+    near = tree.query(np.concatenate([points, normals_of_points], axis=1), k=count)[1].reshape(len(points), count)
     squares = [
         ((closest_point(corners[column], points) - points) ** 2).sum(axis=1)
-        + ((others[column] - turned) ** 2).sum(axis=1)
+        + ((scaled_normals[column] - normals_of_points) ** 2).sum(axis=1)
         for column in near.T
     ]
     return np.asarray(near[np.arange(len(points)), np.stack(squares, axis=1).argmin(axis=1)])

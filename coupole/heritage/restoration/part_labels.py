@@ -45,7 +45,7 @@ class Parts:
         return {name: int(count) for name, count in zip(self.names, label_counts, strict=True)}
 
 
-def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
+def parts_of(mesh: PaintedMesh, document: Document, parts_file: PartsFile) -> Parts:
     """Raises InputError with all problems: what the mesh does not have, parts without a triangle,
     triangles without a part."""
     names: list[str] = []
@@ -53,7 +53,7 @@ def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
     places: dict[str, int] = {}
     remarks: list[str] = []
     problems: list[Problem] = []
-    for number, rule in enumerate(given.rules):
+    for number, rule in enumerate(parts_file.rules):
         try:
             rule_names, rule_labels, unknown = _by_rule(mesh, rule, document)
         except InputError as error:
@@ -68,13 +68,14 @@ def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
         remarks += _overlaps(names, labels, new, number)
         remarks += [f"rule {number + 1} ({rule.kind}): {unknown}"] if unknown else []
         labels = np.where(is_labelled, new, labels)
-    labels = _with_rest(given, names, labels, document, problems)
+    labels = _with_rest(parts_file, names, labels, document, problems)
     counts = np.bincount(labels[labels >= 0], minlength=len(names))
     for name, count in zip(names, counts, strict=True):
         if count == 0 and not problems:
             at = ("rules", places[name]) if name in places else ("rest",)
             message = (
-                f"the part {name!r} has no triangle: none is there, or later rules took it; {_heard(remarks)}"
+                f"the part {name!r} has no triangle: none is there, or later rules took it; "
+                f"{_remark_text(remarks)}"
             )
             problems.append(document.problem(at, message))
     if problems:
@@ -85,18 +86,18 @@ def parts_of(mesh: PaintedMesh, document: Document, given: PartsFile) -> Parts:
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _heard(remarks: Sequence[str]) -> str:
+def _remark_text(remarks: Sequence[str]) -> str:
     return "; ".join(remarks) or "see to its rule, or leave it out"
 
 
 def _with_rest(
-    given: PartsFile, names: list[str], labels: Labels, document: Document, problems: list[Problem]
+    parts_file: PartsFile, names: list[str], labels: Labels, document: Document, problems: list[Problem]
 ) -> Labels:
     none = labels == NONE
-    if given.rest is not None:
-        if given.rest not in names:
-            names.append(given.rest)
-        return np.where(none, names.index(given.rest), labels).astype(np.int16)
+    if parts_file.rest is not None:
+        if parts_file.rest not in names:
+            names.append(parts_file.rest)
+        return np.where(none, names.index(parts_file.rest), labels).astype(np.int16)
     if none.any() and not problems:
         message = f"{int(none.sum())} of {len(labels)} triangles have no part; name the part of them as `rest`"
         problems.append(document.problem(("rules",), message))
@@ -122,7 +123,7 @@ def _by_rule(mesh: PaintedMesh, rule: Rule, document: Document) -> tuple[list[st
             labels, unknown = _by_colour(mesh.srgb, rule.colours, rule.tolerance)
             return list(rule.colours), _majority(labels[mesh.triangles]), unknown
         case Texture():
-            labels, unknown = _by_colour(_seen(mesh, rule, document), rule.colours, rule.tolerance)
+            labels, unknown = _by_colour(_texture_colours(mesh, rule, document), rule.colours, rule.tolerance)
             return list(rule.colours), labels, unknown
         case Box():
             middles = mesh.middles_mm
@@ -170,7 +171,7 @@ def _majority(corners: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(np.where((a == b) | (a == c), a, np.where(b == c, b, first)), np.int64)
 
 
-def _seen(mesh: PaintedMesh, rule: Texture, document: Document) -> NDArray[np.uint8]:
+def _texture_colours(mesh: PaintedMesh, rule: Texture, document: Document) -> NDArray[np.uint8]:
     """[m, 3] the picture's colour at the middle of each triangle, of the nearest pixel."""
     picture = mesh.texture if rule.image is None else _picture(document.resolve(rule.image))
     if mesh.uv is None:

@@ -149,8 +149,8 @@ def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
     return document, restoration
 
 
-def reduced(
-    found: RestorationFile, samples: int | None, width_px: int | None, step_nm: int | None
+def reduced_file(
+    restoration_file: RestorationFile, samples: int | None, width_px: int | None, step_nm: int | None
 ) -> RestorationFile:
     """Return the file with fewer samples, narrower pictures or coarser bands, for a quick look. Raises InputError
     for a step other than 5, 10, 20 or 40 nm."""
@@ -162,28 +162,30 @@ def reduced(
     if step_nm:
         changes["bands"] = Bands.model_validate({"step_nm": step_nm})
     if width_px:
-        changes["views"] = _narrowed(_in_full(found.views), width_px)
-    return found.model_copy(update=changes)
+        changes["views"] = _narrowed_views(_in_full(restoration_file.views), width_px)
+    return restoration_file.model_copy(update=changes)
 
 
-def named_files(found: RestorationFile, document: Document) -> tuple[Path, ...]:
+def named_files(restoration_file: RestorationFile, document: Document) -> tuple[Path, ...]:
     """All that it names, each once."""
-    return tuple(dict.fromkeys(document.resolve(named_path) for _, named_path in _files(found)))
+    return tuple(dict.fromkeys(document.resolve(named_path) for _, named_path in _files(restoration_file)))
 
 
-def chosen(document: Document, found: RestorationFile, names: Sequence[str]) -> tuple[Hypothesis, ...]:
+def chosen_hypotheses(
+    document: Document, restoration_file: RestorationFile, names: Sequence[str]
+) -> tuple[Hypothesis, ...]:
     """Return the hypotheses with these names, in the file's order; all without names. Raises InputError for an
     unknown name."""
-    known_names = [hypothesis.name for hypothesis in found.hypotheses]
+    known_names = [hypothesis.name for hypothesis in restoration_file.hypotheses]
     if unknown := [name for name in names if name not in known_names]:
         raise InputError(f"--hypothesis {unknown[0]}: expected one of {', '.join(known_names)} of {document.path}")
-    return tuple(candidate for candidate in found.hypotheses if not names or candidate.name in names)
+    return tuple(candidate for candidate in restoration_file.hypotheses if not names or candidate.name in names)
 
 
-def expect_parts(document: Document, found: RestorationFile, names: Sequence[str], parts: Path) -> None:
+def expect_parts(document: Document, restoration_file: RestorationFile, names: Sequence[str], parts: Path) -> None:
     """Raise InputError unless every hypothesis has a material for each part, and for no other."""
     problems: list[Problem] = []
-    for number, hypothesis in enumerate(found.hypotheses):
+    for number, hypothesis in enumerate(restoration_file.hypotheses):
         at = ("hypotheses", number, "materials")
         for name in hypothesis.materials:
             if name not in names:
@@ -199,9 +201,9 @@ def expect_parts(document: Document, found: RestorationFile, names: Sequence[str
         raise InputError(problems)
 
 
-def cameras_of(found: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple[Camera, ...]:
+def cameras_of(restoration_file: RestorationFile, low_mm: Floats, high_mm: Floats) -> tuple[Camera, ...]:
     """The cameras for an object with this box in the scene's frame."""
-    match _in_full(found.views):
+    match _in_full(restoration_file.views):
         case Cameras() as given:
             return given.cameras
         case Turntable() as table:
@@ -221,9 +223,11 @@ def _in_full(views: Views) -> Turntable | Cameras | Auto:
     return Auto(kind="auto") if views == "auto" else views
 
 
-def _narrowed(views: Turntable | Cameras | Auto, width_px: int) -> Turntable | Cameras | Auto:
+def _narrowed_views(views: Turntable | Cameras | Auto, width_px: int) -> Turntable | Cameras | Auto:
     if isinstance(views, Cameras):
-        return views.model_copy(update={"cameras": tuple(camera.narrowed(width_px) for camera in views.cameras)})
+        return views.model_copy(
+            update={"cameras": tuple(camera.narrowed_to(width_px) for camera in views.cameras)}
+        )
     if width_px >= views.width_px:
         return views
     height_px = max(4, round(views.height_px * width_px / views.width_px))
@@ -252,8 +256,8 @@ def _about(name: str, turn_deg: float, table: Turntable, corners: Floats) -> Cam
     )
 
 
-def _files(found: RestorationFile) -> Iterator[tuple[tuple[str | int, ...], Path]]:
-    yield from files(found)
-    for number, hypothesis in enumerate(found.hypotheses):
+def _files(restoration_file: RestorationFile) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+    yield from files(restoration_file)
+    for number, hypothesis in enumerate(restoration_file.hypotheses):
         for part, material in hypothesis.materials.items():
             yield from files(material, ("hypotheses", number, "materials", part))

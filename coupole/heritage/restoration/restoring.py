@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from coupole.appearance.render import pictures, variant
 from coupole.appearance.render.colour import Eye
-from coupole.appearance.render.objects import pieces, placed
+from coupole.appearance.render.objects import pieces, placed_piece
 from coupole.appearance.render.pieces import Ball, Piece
-from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.rendering import Spectral, open_renderer
 from coupole.appearance.render.scene_file import Camera, PlainScene, with_plain_lights
-from coupole.appearance.shapes.triangles import flat_normals, welded
+from coupole.appearance.shapes.triangles import flat_normals, weld_corners
 from coupole.errors import InputError, StorageError, reason
 from coupole.heritage.restoration import labelled_pictures
 from coupole.heritage.restoration.painted_mesh import Floats, PaintedMesh
@@ -45,7 +45,7 @@ class Restoration:
     mesh: PaintedMesh
     parts: Parts
     document: Document
-    given: RestorationFile
+    restoration_file: RestorationFile
     hypotheses: tuple[Hypothesis, ...]
 
     @property
@@ -56,18 +56,18 @@ class Restoration:
     @cached_property
     def corners_mm(self) -> Floats:
         """[triangles, 3, 3] in the scene's frame."""
-        pose = self.given.object.scene_from_thing()
+        pose = self.restoration_file.object.scene_from_thing()
         return np.asarray(self.mesh.corners_mm @ pose[:3, :3].T + pose[:3, 3])
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         points = self.corners_mm.reshape(-1, 3)
-        return cameras_of(self.given, points.min(axis=0), points.max(axis=0))
+        return cameras_of(self.restoration_file, points.min(axis=0), points.max(axis=0))
 
     @cached_property
     def stage(self) -> Stage:
         """The scene without the object."""
-        restoration_file = self.given
+        restoration_file = self.restoration_file
         return Stage(
             schema_version=1,
             name=restoration_file.name,
@@ -95,22 +95,24 @@ class Restoration:
 
     @cached_property
     def seen_parts(self) -> SeenParts:
-        other_pieces = [piece for thing in self.given.surroundings for piece in pieces(thing, self.folder)]
+        other_pieces = [
+            piece for thing in self.restoration_file.surroundings for piece in pieces(thing, self.folder)
+        ]
         around: list[Piece | Ball] = list(other_pieces)
         return SeenParts(self.corners_mm, self.parts.labels, around)
 
     @cached_property
     def _normals(self) -> Floats | None:
-        return smooth_normals(self.mesh.corners_mm) if self.given.smooth else None
+        return smooth_normals(self.mesh.corners_mm) if self.restoration_file.smooth else None
 
-    def painted(self, hypothesis: Hypothesis) -> list[Piece]:
+    def painted_parts(self, hypothesis: Hypothesis) -> list[Piece]:
         """The object's parts in the scene's frame."""
         corners, painted_pieces = self.mesh.corners_mm, []
         for row, name in enumerate(self.parts.names):
             of_part = self.parts.labels == row
             normals = None if self._normals is None else self._normals[of_part]
-            piece = Piece(corners[of_part], hypothesis.materials[name], self.given.smooth, normals)
-            painted_pieces.append(placed(piece, self.given.object))
+            piece = Piece(corners[of_part], hypothesis.materials[name], self.restoration_file.smooth, normals)
+            painted_pieces.append(placed_piece(piece, self.restoration_file.object))
         return painted_pieces
 
     @cached_property
@@ -118,12 +120,14 @@ class Restoration:
         """Digest of what all pictures share: shape, parts, the scene but for display and cameras, files,
         renderer."""
         hasher = hashlib.sha256(
-            f"{self.mesh.digest()} {self.parts.names} {variant.spectral(polarised=False)}".encode()
+            f"{self.mesh.digest()} {self.parts.names} {variant.spectral(is_polarised=False)}".encode()
         )
         hasher.update(self.parts.labels.tobytes())
-        hasher.update(self.given.object.model_dump_json().encode() + str(self.given.smooth).encode())
+        hasher.update(
+            self.restoration_file.object.model_dump_json().encode() + str(self.restoration_file.smooth).encode()
+        )
         hasher.update(self.stage.model_dump_json(exclude={"display", "cameras"}).encode())
-        for path in named_files(self.given, self.document):
+        for path in named_files(self.restoration_file, self.document):
             hasher.update(path.read_bytes())
         return hasher.hexdigest()
 
@@ -173,7 +177,7 @@ def render_all(restoration: Restoration, out: Path, say: Say) -> list[Made]:
 
 def smooth_normals(corners_mm: Floats) -> Floats:
     """[triangles, 3, 3] unit normals at the corners: means over all triangles at a place, by their areas."""
-    points, faces = welded(corners_mm)
+    points, faces = weld_corners(corners_mm)
     cross = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
     sums = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(points)) for column in cross.T], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
@@ -188,20 +192,22 @@ def smooth_normals(corners_mm: Floats) -> Floats:
 
 def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say: Say) -> list[Made]:
     folder.mkdir(parents=True, exist_ok=True)
-    texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
+    texts = labelled_pictures.for_exr(labelled_pictures.metadata_texts([hypothesis]))
     about_of_camera = {
-        camera.name: _known(restoration, hypothesis, camera, folder) for camera in restoration.cameras
+        camera.name: _noted_summary(restoration, hypothesis, camera, folder) for camera in restoration.cameras
     }
     new_cameras = [camera for camera in restoration.cameras if about_of_camera[camera.name] is None]
     step = f"rendering {hypothesis.name}"
     if new_cameras:
         say(step, 0, len(new_cameras))
-        with opened(restoration.stage, restoration.folder, restoration.painted(hypothesis)) as renderer:
+        with open_renderer(
+            restoration.stage, restoration.folder, restoration.painted_parts(hypothesis)
+        ) as renderer:
             written_by = f"Mitsuba {renderer.version}, {renderer.variant_name}"
             for number, camera in enumerate(new_cameras):
 
-                def passes(done: int, total: int, number: int = number) -> None:
-                    say(step, number * total + done, len(new_cameras) * total)
+                def passes(done_count: int, total: int, number: int = number) -> None:
+                    say(step, number * total + done_count, len(new_cameras) * total)
 
                 picture = renderer.render(camera, passes)
                 about_of_camera[camera.name] = _write(
@@ -210,14 +216,14 @@ def _of_one(restoration: Restoration, hypothesis: Hypothesis, folder: Path, say:
     renderings = []
     for camera in restoration.cameras:
         path = folder / f"{camera.name}.exr"
-        labelled_pictures.restamped(path, texts)
+        labelled_pictures.restamp_exr(path, texts)
         renderings.append(
             Made(hypothesis, camera, path, about_of_camera[camera.name] or {}, camera in new_cameras)
         )
     return renderings
 
 
-def _known(
+def _noted_summary(
     restoration: Restoration, hypothesis: Hypothesis, camera: Camera, folder: Path
 ) -> dict[str, Any] | None:
     """Return what is noted of the same picture, if it is there."""
@@ -232,32 +238,38 @@ def _known(
 
 
 def _write(
-    restoration: Restoration, of: tuple[Hypothesis, Camera], found: Spectral, folder: Path, written_by: str
+    restoration: Restoration,
+    of: tuple[Hypothesis, Camera],
+    spectral_picture: Spectral,
+    folder: Path,
+    written_by: str,
 ) -> dict[str, Any]:
     hypothesis, camera = of
     beside = folder / f"{camera.name}.json"
     beside.unlink(missing_ok=True)
-    xyz = restoration.eye.tristimulus(found.radiance)
-    about = f"{restoration.given.name}, hypothesis {hypothesis.name}: {pictures.SYNTHETIC}; {written_by}"
-    texts = labelled_pictures.for_exr(labelled_pictures.told([hypothesis]))
-    pictures.write_exr(folder / f"{camera.name}.exr", restoration.lit, found, xyz, about, texts)
+    xyz = restoration.eye.tristimulus(spectral_picture.radiance)
+    about = (
+        f"{restoration.restoration_file.name}, hypothesis {hypothesis.name}: {pictures.SYNTHETIC}; {written_by}"
+    )
+    texts = labelled_pictures.for_exr(labelled_pictures.metadata_texts([hypothesis]))
+    pictures.write_exr(folder / f"{camera.name}.exr", restoration.lit, spectral_picture, xyz, about, texts)
     record = {
         "of": restoration.digest(hypothesis, camera),
         "renderer": written_by,
-        "samples": found.samples,
-        "noise": None if found.noise is None else round(found.noise, 5),
-        "mean_cd_m2": round(float(restoration.eye.luminance(found.radiance).mean()), 6),
+        "samples": spectral_picture.samples,
+        "noise": None if spectral_picture.noise is None else round(spectral_picture.noise, 5),
+        "mean_cd_m2": round(float(restoration.eye.luminance(spectral_picture.radiance).mean()), 6),
     }
     beside.write_text(json.dumps(record) + "\n", encoding="utf-8")
     return record
 
 
-def common_white(restoration: Restoration, made: Sequence[Made]) -> float:
+def common_white(restoration: Restoration, made_pictures: Sequence[Made]) -> float:
     """The luminance in cd/m^2 that all pictures show as white. Raises InputError if they are black."""
-    display = restoration.given.display
+    display = restoration.restoration_file.display
     if display.white_cd_m2 is not None:
         return display.white_cd_m2
-    some = [rendering.xyz()[::2, ::2, 1].ravel() for rendering in made]
+    some = [rendering.xyz()[::2, ::2, 1].ravel() for rendering in made_pictures]
     white = float(np.quantile(np.concatenate(some), 1.0 - display.clipped))
     if white <= 0.0:
         raise InputError(

@@ -21,13 +21,15 @@ _BALL = 12
 class SeenParts:
     """Parts of an object among other things of a scene."""
 
-    def __init__(self, corners_mm: Floats, labels: NDArray[np.int16], others: Sequence[Piece | Ball]) -> None:
+    def __init__(
+        self, corners_mm: Floats, labels: NDArray[np.int16], other_pieces: Sequence[Piece | Ball]
+    ) -> None:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
         around = [
             body.centre_mm + body.radius_mm * unit_sphere(_BALL) if isinstance(body, Ball) else body.corners_mm
-            for body in others
+            for body in other_pieces
         ]
         corners = np.concatenate([corners_mm, *around])
         self._labels = np.full(len(corners) + 1, NOTHING, np.int16)
@@ -35,7 +37,7 @@ class SeenParts:
         self._tree: Any = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._tree, corners.astype(np.float32))
 
-    def seen(self, camera: Camera) -> NDArray[np.int16]:
+    def part_of_pixel(self, camera: Camera) -> NDArray[np.int16]:
         """[h, w] rows of parts, `NOTHING` where the object is not seen."""
         ways = rays(camera).reshape(-1, 3)
         starts = np.broadcast_to(np.asarray(camera.position_mm, float), ways.shape)

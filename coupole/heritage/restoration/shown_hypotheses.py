@@ -14,10 +14,16 @@ from numpy.typing import NDArray
 
 import coupole
 from coupole.appearance.render import colour, pictures
-from coupole.appearance.render.denoising import DENOISED, denoised
+from coupole.appearance.render.denoising import DENOISED, denoised_xyz
 from coupole.errors import StorageError, reason
 from coupole.heritage.restoration import hypotheses_compared, labelled_pictures
-from coupole.heritage.restoration.labelled_pictures import Picture, caption_lines, for_png, told, with_strip
+from coupole.heritage.restoration.labelled_pictures import (
+    Picture,
+    caption_lines,
+    for_png,
+    metadata_texts,
+    with_strip,
+)
 from coupole.heritage.restoration.restoring import Made, Restoration, Say, common_white
 
 RESULT = "result.json"
@@ -37,20 +43,20 @@ class Shown:
     """Figures of the parts, as `hypotheses_compared.Difference.of_parts`."""
 
 
-def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say) -> dict[str, Any]:
+def show_all(restoration: Restoration, made_pictures: Sequence[Made], out: Path, say: Say) -> dict[str, Any]:
     """Write PNG pictures, side by side, differences and `result.json`; what that holds.
 
     Raises InputError if all is black or the denoiser is missing, StorageError.
     """
-    white_cd_m2 = common_white(restoration, made)
+    white_cd_m2 = common_white(restoration, made_pictures)
     views = []
     try:
         for number, camera in enumerate(restoration.cameras):
             say("showing", number, len(restoration.cameras))
-            renderings = [rendering for rendering in made if rendering.camera.name == camera.name]
+            renderings = [rendering for rendering in made_pictures if rendering.camera.name == camera.name]
             views.append(_of_view(restoration, renderings, white_cd_m2, out))
         say("showing", len(views), len(views))
-        result = _result(restoration, made, views, white_cd_m2, out)
+        result = _result(restoration, made_pictures, views, white_cd_m2, out)
         (out / RESULT).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{out}: {reason(error)}. Choose another folder, or free space.") from error
@@ -60,31 +66,33 @@ def show_all(restoration: Restoration, made: Sequence[Made], out: Path, say: Say
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _of_view(restoration: Restoration, made: Sequence[Made], white_cd_m2: float, out: Path) -> Shown:
-    camera = made[0].camera
-    colours = [rendering.xyz() for rendering in made]
-    if restoration.given.display.denoised:
-        displays = [_displayed(restoration, denoised(xyz.astype(float)), white_cd_m2) for xyz in colours]
+def _of_view(restoration: Restoration, made_pictures: Sequence[Made], white_cd_m2: float, out: Path) -> Shown:
+    camera = made_pictures[0].camera
+    colours = [rendering.xyz() for rendering in made_pictures]
+    if restoration.restoration_file.display.denoised:
+        displays = [
+            _displayed_picture(restoration, denoised_xyz(xyz.astype(float)), white_cd_m2) for xyz in colours
+        ]
     else:
-        displays = [_displayed(restoration, xyz, white_cd_m2) for xyz in colours]
-    room = max(len(caption_lines(camera.width_px, rendering.hypothesis)) for rendering in made)
+        displays = [_displayed_picture(restoration, xyz, white_cd_m2) for xyz in colours]
+    room = max(len(caption_lines(camera.width_px, rendering.hypothesis)) for rendering in made_pictures)
     strips = [
-        labelled_pictures.captioned(picture, of.hypothesis, room)
-        for picture, of in zip(displays, made, strict=True)
+        labelled_pictures.captioned_picture(picture, of.hypothesis, room)
+        for picture, of in zip(displays, made_pictures, strict=True)
     ]
     files = {}
-    for picture, rendering in zip(strips, made, strict=True):
+    for picture, rendering in zip(strips, made_pictures, strict=True):
         files[rendering.hypothesis.name] = rendering.exr.with_suffix(".png")
         about = _about(restoration, rendering, white_cd_m2)
         pictures.write_png(
-            rendering.exr.with_suffix(".png"), picture, about, for_png(told([rendering.hypothesis]))
+            rendering.exr.with_suffix(".png"), picture, about, for_png(metadata_texts([rendering.hypothesis]))
         )
-    beside = _side_by_side(strips, made, out) if len(made) > 1 else None
-    parts = restoration.seen_parts.seen(camera)
+    beside = _side_by_side(strips, made_pictures, out) if len(made_pictures) > 1 else None
+    parts = restoration.seen_parts.part_of_pixel(camera)
     differences, of_parts = {}, {}
-    for (first, rendering), (second, other_rendering) in combinations(enumerate(made), 2):
+    for (first, rendering), (second, other_rendering) in combinations(enumerate(made_pictures), 2):
         pair = rendering.hypothesis.name, other_rendering.hypothesis.name
-        difference = hypotheses_compared.compared(
+        difference = hypotheses_compared.compare_pictures(
             colours[first], colours[second], parts, restoration.parts.names, restoration.eye, white_cd_m2
         )
         differences[pair] = out / f"difference-{pair[0]}-{pair[1]}-{camera.name}.png"
@@ -93,29 +101,29 @@ def _of_view(restoration: Restoration, made: Sequence[Made], white_cd_m2: float,
     return Shown(camera.name, files, beside, differences, of_parts)
 
 
-def _displayed(restoration: Restoration, xyz: NDArray[Any], white_cd_m2: float) -> Picture:
-    adaptation = restoration.given.display.adaptation
-    return colour.displayed(colour.adapted(xyz / white_cd_m2, restoration.eye.white, adaptation))[0]
+def _displayed_picture(restoration: Restoration, xyz: NDArray[Any], white_cd_m2: float) -> Picture:
+    adaptation = restoration.restoration_file.display.adaptation
+    return colour.displayed_srgb(colour.adapted_xyz(xyz / white_cd_m2, restoration.eye.white, adaptation))[0]
 
 
-def _about(restoration: Restoration, made: Made, white_cd_m2: float) -> str:
-    denoising = f"; {DENOISED}" if restoration.given.display.denoised else ""
+def _about(restoration: Restoration, made_picture: Made, white_cd_m2: float) -> str:
+    denoising = f"; {DENOISED}" if restoration.restoration_file.display.denoised else ""
     return (
-        f"{restoration.given.name}, hypothesis {made.hypothesis.name}: {pictures.SYNTHETIC}; "
-        f"{made.about['renderer']}; white {white_cd_m2:.4g} cd/m2{denoising}"
+        f"{restoration.restoration_file.name}, hypothesis {made_picture.hypothesis.name}: {pictures.SYNTHETIC}; "
+        f"{made_picture.about['renderer']}; white {white_cd_m2:.4g} cd/m2{denoising}"
     )
 
 
-def _side_by_side(strips: Sequence[Picture], made: Sequence[Made], out: Path) -> Path:
+def _side_by_side(strips: Sequence[Picture], made_pictures: Sequence[Made], out: Path) -> Path:
     height, width = strips[0].shape[:2]
     sheet = np.zeros((height, len(strips) * (width + _GAP_PX) - _GAP_PX, 3), np.uint8)
     for number, strip in enumerate(strips):
         first = number * (width + _GAP_PX)
         sheet[:, first : first + width] = strip
-    path = out / f"side-by-side-{made[0].camera.name}.png"
-    hypotheses = [rendering.hypothesis for rendering in made]
+    path = out / f"side-by-side-{made_pictures[0].camera.name}.png"
+    hypotheses = [rendering.hypothesis for rendering in made_pictures]
     names = "; ".join(f"hypothesis {hypothesis.name}" for hypothesis in hypotheses)
-    pictures.write_png(path, sheet, f"{names}: {pictures.SYNTHETIC}", for_png(told(hypotheses)))
+    pictures.write_png(path, sheet, f"{names}: {pictures.SYNTHETIC}", for_png(metadata_texts(hypotheses)))
     return path
 
 
@@ -123,20 +131,24 @@ def _write_difference(de00: NDArray[np.float64], pair: tuple[Made, Made], path: 
     names = " and ".join(f"hypothesis {rendering.hypothesis.name}" for rendering in pair)
     words = f"Between {names}: colour difference, CIEDE2000; 0 light, {hypotheses_compared.FULL_DE00:g} violet"
     width = de00.shape[1]
-    lines = labelled_pictures.broken(words, width)
-    picture = with_strip(hypotheses_compared.drawn(de00), lines, len(lines))
-    pictures.write_png(path, picture, words, for_png(told([rendering.hypothesis for rendering in pair])))
+    lines = labelled_pictures.break_lines(words, width)
+    picture = with_strip(hypotheses_compared.difference_picture(de00), lines, len(lines))
+    pictures.write_png(path, picture, words, for_png(metadata_texts([rendering.hypothesis for rendering in pair])))
 
 
 def _result(
-    restoration: Restoration, made: Sequence[Made], shown: Sequence[Shown], white_cd_m2: float, out: Path
+    restoration: Restoration,
+    made_pictures: Sequence[Made],
+    shown_views: Sequence[Shown],
+    white_cd_m2: float,
+    out: Path,
 ) -> dict[str, Any]:
     def name(path: Path | None) -> str | None:
         return None if path is None else path.relative_to(out).as_posix()
 
-    by_view = {(rendering.hypothesis.name, rendering.camera.name): rendering for rendering in made}
+    by_view = {(rendering.hypothesis.name, rendering.camera.name): rendering for rendering in made_pictures}
     views = []
-    for view in shown:
+    for view in shown_views:
         view_pictures = {}
         for hypothesis, path in view.pictures.items():
             rendering = by_view[hypothesis, view.camera]
@@ -157,16 +169,16 @@ def _result(
     return {
         "schema_version": 1,
         "software": f"coupole {coupole.__version__}",
-        "restoration": restoration.given.name,
+        "restoration": restoration.restoration_file.name,
         "synthetic": True,
         "mesh": {"name": restoration.mesh.path.name, "sha256_of_shape": restoration.mesh.digest()},
         "parts": restoration.parts.counts(),
         "remarks": list(restoration.parts.remarks),
         "hypotheses": [hypothesis.model_dump(mode="json") for hypothesis in restoration.hypotheses],
-        "observer": f"CIE {restoration.given.observer}",
-        "bands": len(range(380, 781, restoration.given.bands.step_nm)),
+        "observer": f"CIE {restoration.restoration_file.observer}",
+        "bands": len(range(380, 781, restoration.restoration_file.bands.step_nm)),
         "white_cd_m2": round(white_cd_m2, 6),
-        "made_anew": sum(rendering.is_new for rendering in made),
-        "taken_as_they_were": sum(not rendering.is_new for rendering in made),
+        "made_anew": sum(rendering.is_new for rendering in made_pictures),
+        "taken_as_they_were": sum(not rendering.is_new for rendering in made_pictures),
         "views": views,
     }

@@ -139,8 +139,8 @@ def _text_images(path: Path) -> Iterator[ColmapImage]:
         next(lines, None)  # its points, an empty line if it has none
 
 
-def _refuse(path: Path, number: int, expected: str, line: str) -> NoReturn:
-    raise InputError(f"{path}:{number}:1: expected {expected}; found {line[:60]!r}")
+def _refuse(path: Path, number: int, expectation: str, line: str) -> NoReturn:
+    raise InputError(f"{path}:{number}:1: expected {expectation}; found {line[:60]!r}")
 
 
 # -- binary ---------------------------------------------------------------------------------------------------
@@ -149,35 +149,35 @@ def _refuse(path: Path, number: int, expected: str, line: str) -> NoReturn:
 Record = TypeVar("Record")
 
 
-def _records(path: Path, read: Callable[[bytes, int], tuple[Record, int]]) -> Iterator[Record]:
-    """Yield each record that `read` makes of the data from a place on; `read` also returns where the next one
-    begins."""
+def _records(path: Path, read_record: Callable[[bytes, int], tuple[Record, int]]) -> Iterator[Record]:
+    """Yield each record that `read_record` makes of the data from a place on; `read_record` also returns where the
+    next one begins."""
     try:
         data = path.read_bytes()
         (count,), at = struct.unpack_from("<Q", data), 8
         for _ in range(count):
-            record, at = read(data, at)
+            record, at = read_record(data, at)
             yield record
     except (OSError, OverflowError, struct.error, ValueError) as error:
         raise InputError(f"{path}: expected COLMAP's binary; it is damaged or cut short: {error}") from error
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    def read(data: bytes, at: int) -> tuple[tuple[int, ColmapCamera], int]:
+    def read_camera(data: bytes, at: int) -> tuple[tuple[int, ColmapCamera], int]:
         camera, number, width, height = struct.unpack_from("<IiQQ", data, at)
         model = _NUMBERS.get(number, f"number {number}")
         parameters = struct.unpack_from(f"<{len(MODELS.get(model, ()))}d", data, at + 24)
         return (camera, _camera(path, model, (width, height), list(parameters))), at + 24 + 8 * len(parameters)
 
-    yield from _records(path, read)
+    yield from _records(path, read_camera)
 
 
 def _binary_images(path: Path) -> Iterator[ColmapImage]:
-    def read(data: bytes, at: int) -> tuple[ColmapImage, int]:
+    def read_image(data: bytes, at: int) -> tuple[ColmapImage, int]:
         *pose, camera = struct.unpack_from("<7dI", data, at + 4)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode()
         (points,) = struct.unpack_from("<Q", data, end + 1)
         return _image(path, name, camera, pose), end + 9 + 24 * points
 
-    yield from _records(path, read)
+    yield from _records(path, read_image)

@@ -42,26 +42,26 @@ class ColmapPoses:
     """[v, 4, 4] mm, in the order of the run's views."""
     scale: float
     """mm for a unit of the model."""
-    moved: Floats
+    steps_from_records: Floats
     """[v, 6] from the records' poses: mm, and rad in the camera's frame."""
     over_u: Floats
     """[v, 2] shift and turn over the records' standard uncertainty."""
 
-    def of(self, measured: MeasuredRun) -> MeasuredRun:
+    def of(self, measured_run: MeasuredRun) -> MeasuredRun:
         """Return the run with these poses."""
-        views = zip(measured.views, self.base_from_camera, strict=True)
+        views = zip(measured_run.views, self.base_from_camera, strict=True)
         return replace(
-            measured,
+            measured_run,
             views=tuple(replace(view, base_from_camera=base_from_camera) for view, base_from_camera in views),
         )
 
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return what a result says of these poses."""
-        shift_mm = np.linalg.norm(self.moved[:, :3], axis=1)
-        turn_deg = np.degrees(np.linalg.norm(self.moved[:, 3:], axis=1))
+        shift_mm = np.linalg.norm(self.steps_from_records[:, :3], axis=1)
+        turn_deg = np.degrees(np.linalg.norm(self.steps_from_records[:, 3:], axis=1))
         return {
             "sha256": sha256(self.path),
-            "fitted": len(self.moved) >= LEAST_FITTED,
+            "fitted": len(self.steps_from_records) >= LEAST_FITTED,
             "mm_per_unit": float(f"{self.scale:.9g}"),
             "median_moved_mm": round(float(np.median(shift_mm)), 6),
             "median_turned_deg": round(float(np.median(turn_deg)), 7),
@@ -69,25 +69,25 @@ class ColmapPoses:
         }
 
 
-def read_poses(folder: Path, measured: MeasuredRun) -> ColmapPoses:
+def read_poses(folder: Path, measured_run: MeasuredRun) -> ColmapPoses:
     """Read the poses of a run, given by its records, from a folder of COLMAP's. Raises InputError: no model, a
     view that it lacks or has twice, another lens, centres on a line, poses that the records do not allow."""
     model = read_model(folder)
-    camera_from_world = _of_views(model, measured)
-    recorded_poses = np.stack([view.base_from_camera for view in measured.views])
+    camera_from_world = _of_views(model, measured_run)
+    recorded_poses = np.stack([view.base_from_camera for view in measured_run.views])
     world_from_camera = inverses(camera_from_world)
     if len(recorded_poses) >= LEAST_FITTED:
-        _refuse_a_line(model.path, recorded_poses[:, :3, 3], _uncertainties(measured)[:, 0])
+        _refuse_a_line(model.path, recorded_poses[:, :3, 3], _uncertainties(measured_run)[:, 0])
         scale, base_from_world = similarity(world_from_camera[:, :3, 3], recorded_poses[:, :3, 3])
     else:
-        scale, base_from_world = 1.0, measured.base_from_support
+        scale, base_from_world = 1.0, measured_run.base_from_support
     scaled_poses = world_from_camera.copy()
     scaled_poses[:, :3, 3] *= scale
     base_from_camera = base_from_world @ scaled_poses
     steps = between(recorded_poses, base_from_camera)
     lengths = np.stack([np.linalg.norm(steps[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))], axis=1)
-    poses = ColmapPoses(model.path, base_from_camera, scale, steps, lengths / _uncertainties(measured))
-    _refuse_far(poses, measured)
+    poses = ColmapPoses(model.path, base_from_camera, scale, steps, lengths / _uncertainties(measured_run))
+    _refuse_far(poses, measured_run)
     return poses
 
 
@@ -104,38 +104,38 @@ def similarity(of_points: Floats, to_points: Floats) -> tuple[float, Floats]:
     return scale, motion
 
 
-def _of_views(model: ColmapModel, measured: MeasuredRun) -> Floats:
+def _of_views(model: ColmapModel, measured_run: MeasuredRun) -> Floats:
     """[v, 4, 4] camera_from_world of the run's views. Raises InputError for one without, or of another lens."""
     stems = [Path(image.name).stem for image in model.images]
     by_name = dict(zip(stems, model.images, strict=True))
     camera_from_world = []
-    for view in measured.views:
+    for view in measured_run.views:
         if (count := stems.count(view.name)) != 1:
             names = ", ".join(sorted(image.name for image in model.images)[:5]) or "none"
             raise InputError(
                 f"{model.path}: has {count} images of the view {view.name}; expected {view.name}.png, as `coupole "
-                f"export {measured.run.folder} --to colmap` names it; found {names}"
+                f"export {measured_run.run.folder} --to colmap` names it; found {names}"
             )
         image = by_name[view.name]
         if image.camera not in model.cameras:
             raise InputError(f"{model.path}: image {image.name}: its camera {image.camera} is not in the model")
-        _refuse_other_lens(model.path, image.camera, model.cameras[image.camera], measured)
+        _refuse_other_lens(model.path, image.camera, model.cameras[image.camera], measured_run)
         camera_from_world.append(image.camera_from_world)
     return np.stack(camera_from_world)
 
 
-def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured: MeasuredRun) -> None:
+def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured_run: MeasuredRun) -> None:
     """Poses hold for the lens with which they were found."""
     where = f"{path.with_stem('cameras')}: camera {number}"
-    if camera.size_px != measured.frames.size_px:
-        raise InputError(f"{where}: expected pictures of {measured.frames.size_px} px; found {camera.size_px}")
+    if camera.size_px != measured_run.frames.size_px:
+        raise InputError(f"{where}: expected pictures of {measured_run.frames.size_px} px; found {camera.size_px}")
     parameters = dict(camera.parameters)
     if "f" in parameters:
         parameters["fx"] = parameters["fy"] = parameters.pop("f")
-    prior = measured.camera
+    prior = measured_run.camera
     u = dict(zip(prior.free, np.sqrt(np.diag(prior.covariance)), strict=False))
     for name in (*NAMES, *(name for name in parameters if name not in NAMES)):
-        lens_parameter = getattr(measured.lens, name, 0.0) + (_TO_CENTRE_PX if name in ("cx", "cy") else 0.0)
+        lens_parameter = getattr(measured_run.lens, name, 0.0) + (_TO_CENTRE_PX if name in ("cx", "cy") else 0.0)
         apart, most_apart = (
             abs(parameters.get(name, 0.0) - lens_parameter),
             max(MOST_APART * u.get(name, 0.0), _SAME * max(1.0, abs(lens_parameter))),
@@ -149,10 +149,10 @@ def _refuse_other_lens(path: Path, number: int, camera: ColmapCamera, measured: 
             )
 
 
-def _uncertainties(measured: MeasuredRun) -> Floats:
+def _uncertainties(measured_run: MeasuredRun) -> Floats:
     """[v, 2] standard uncertainty of the records' poses in their worst direction: mm, rad."""
     u_poses = []
-    for view in measured.views:
+    for view in measured_run.views:
         first = len(view.pointing.free)
         pose_covariance = view.pointing.covariance[first : first + 6, first : first + 6]
         u_poses.append(
@@ -170,19 +170,20 @@ def _refuse_a_line(path: Path, centres_mm: Floats, u_mm: Floats) -> None:
         )
 
 
-def _refuse_far(poses: ColmapPoses, measured: MeasuredRun) -> None:
+def _refuse_far(poses: ColmapPoses, measured_run: MeasuredRun) -> None:
     view, kind = np.unravel_index(np.argmax(poses.over_u), poses.over_u.shape)
     if poses.over_u[view, kind] <= MOST_APART:
         return
-    length = float(np.linalg.norm(poses.moved[view, 3 * kind : 3 * kind + 3]))
+    length = float(np.linalg.norm(poses.steps_from_records[view, 3 * kind : 3 * kind + 3]))
     how_far = f"{np.degrees(length):.3g} degrees" if kind else f"{length:.3g} mm"
     conditions = (
-        f"after a similarity to the {len(poses.moved)} cameras of the records"
-        if len(poses.moved) >= LEAST_FITTED
+        f"after a similarity to the {len(poses.steps_from_records)} cameras of the records"
+        if len(poses.steps_from_records) >= LEAST_FITTED
         else "in the support's frame, in mm, as with one or two views the model must be"
     )
     raise InputError(
-        f"{poses.path}: the camera of {measured.views[view].name} is {how_far} from where the records have it, "
+        f"{poses.path}: the camera of {measured_run.views[view].name} is {how_far} from where the records have "
+        f"it, "
         f"{conditions}: {poses.over_u[view, kind]:.1f} times their standard uncertainty; expected {MOST_APART:g} "
         "at most. Is it another run's model, or a reconstruction that failed? Else calibrate hand-eye anew"
     )

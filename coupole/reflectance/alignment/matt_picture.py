@@ -42,12 +42,12 @@ def common_leds(views: Sequence[MeasuredView]) -> list[int]:
 
 
 def matt_picture(
-    measured: MeasuredRun, radiometry: Radiometry, view: MeasuredView, leds: Sequence[int], say: Said
+    measured_run: MeasuredRun, radiometry: Radiometry, view: MeasuredView, leds: Sequence[int], say: Said
 ) -> NDArray[np.float32]:
     """[h / 2, w / 2] mean of green DN per microsecond over the flat field, of blocks of 2 x 2 pixels, each by the
     longest exposure that does not clip it. A block that all exposures of an LED clip counts as brighter than
     under the others; NaN where that reaches the ranks that are used. Raises StorageError for a damaged frame."""
-    green = radiometry.channel == measured.channels.index(GREEN)
+    green = radiometry.channel == measured_run.channels.index(GREEN)
     height, width = green.shape
     stack = np.full((len(leds), height // 2, width // 2), np.inf, np.float32)
     top_dn = radiometry.white_dn - RANGE_LEFT_OUT * (radiometry.white_dn - radiometry.black_dn)

@@ -23,7 +23,7 @@ from coupole.preflight.object_shape import MM_PER_UNIT
 from coupole.reflectance.alignment.matt_picture import Said, common_leds, matt_picture
 from coupole.reflectance.alignment.refined_geometry import ABOUT, REFINED, SCHEMA, write_refined
 from coupole.reflectance.alignment.refinement import Refined, refine
-from coupole.reflectance.alignment.unknowns import Given, renumbered, welded
+from coupole.reflectance.alignment.unknowns import Given, renumbered_triangles, welded_vertices
 from coupole.reflectance.alignment.view_matches import Matches
 from coupole.reflectance.extraction.measured_run import MeasuredRun, read_measured_run, refuse_different
 from coupole.reflectance.extraction.pointing import STATED, Doubts, camera_covariance
@@ -83,7 +83,7 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
         complete(out / MESH, partial(_write_mesh, refinement, runs[0]))
         complete(
             out / REFINED,
-            lambda path: write_refined(path, refinement, names, pictures, digest, simulated=any_simulated),
+            lambda path: write_refined(path, refinement, names, pictures, digest, is_simulated=any_simulated),
         )
         write_synced(out / ABOUT, json.dumps(about, indent=1) + "\n")
     except OSError as error:
@@ -104,8 +104,10 @@ def given_by(runs: Sequence[MeasuredRun], doubts: Doubts) -> Given:
         )
     cameras = np.stack([view.base_from_camera for measured_run in runs for view in measured_run.views])
     covariance = camera_covariance(prior, cameras, doubts)
-    triangles = renumbered(first.triangles)
-    return Given(first.lens, prior.free, cameras, covariance, welded(first.corners_mm, triangles), triangles)
+    triangles = renumbered_triangles(first.triangles)
+    return Given(
+        first.lens, prior.free, cameras, covariance, welded_vertices(first.corners_mm, triangles), triangles
+    )
 
 
 def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
@@ -119,33 +121,33 @@ def _refuse_other_cameras(measured_runs: Sequence[MeasuredRun]) -> None:
             )
 
 
-def _write_mesh(refined: Refined, measured: MeasuredRun, path: Path) -> None:
+def _write_mesh(refinement: Refined, measured_run: MeasuredRun, path: Path) -> None:
     """Write the refined mesh in the unit and frame of the mesh that was given, without the vertices that no
     triangle uses."""
-    plan = read_plan(measured.run.plan_path, measured.run.rig_path).plan
+    plan = read_plan(measured_run.run.plan_path, measured_run.run.rig_path).plan
     assert plan.object is not None  # read_measured_run refuses runs without
-    base_from_object = measured.base_from_support @ plan.object.support_from_object.matrix()
-    vertices_mm = apply(inverse(base_from_object), refined.unknowns.vertices_at(refined.steps))
+    base_from_object = measured_run.base_from_support @ plan.object.support_from_object.matrix()
+    vertices_mm = apply(inverse(base_from_object), refinement.unknowns.vertices_at(refinement.steps))
     vertices = vertices_mm / MM_PER_UNIT[plan.object.mesh_unit]
-    mesh = trimesh.Trimesh(vertices, refined.unknowns.given.triangles, process=False)
+    mesh = trimesh.Trimesh(vertices, refinement.unknowns.prior_geometry.triangles, process=False)
     path.write_bytes(trimesh.exchange.ply.export_ply(mesh))
 
 
 def _about(
-    refined: Refined,
+    refinement: Refined,
     runs: Sequence[MeasuredRun],
     names: Sequence[tuple[str, str]],
     leds: Sequence[int],
     request: RefineRequest,
 ) -> dict[str, Any]:
-    unknowns, u = refined.unknowns, refined.uncertainties
+    unknowns, u = refinement.unknowns, refinement.uncertainties
     stated_u = np.sqrt(np.diag(unknowns.covariance))
-    edge_mm = _mean_edge_mm(unknowns.given)
-    shape = refined.steps[unknowns.shape]
+    edge_mm = _mean_edge_mm(unknowns.prior_geometry)
+    shape = refinement.steps[unknowns.shape]
     cameras = []
     for number, name in enumerate(names):
         columns = unknowns.camera(number)
-        camera_steps = {"moved": refined.steps[columns], "u": u[columns], "stated_u": stated_u[columns]}
+        camera_steps = {"moved": refinement.steps[columns], "u": u[columns], "stated_u": stated_u[columns]}
         cameras.append(
             {"run": name[0], "view": name[1]} | {key: _mm_deg(six) for key, six in camera_steps.items()}
         )
@@ -158,16 +160,16 @@ def _about(
         "leds": list(leds),
         "search_mm": request.search_mm,
         "disagreement": {
-            "before": _disagreement(refined.before, edge_mm),
-            "after": _disagreement(refined.after, edge_mm),
+            "before": _disagreement(refinement.before, edge_mm),
+            "after": _disagreement(refinement.after, edge_mm),
         },
         "lens": {
-            name: {"moved": float(refined.steps[i]), "u": float(u[i]), "stated_u": float(stated_u[i])}
+            name: {"moved": float(refinement.steps[i]), "u": float(u[i]), "stated_u": float(stated_u[i])}
             for i, name in enumerate(unknowns.names[unknowns.lens])
         },
         "cameras": cameras,
         "mesh": {
-            "moved": _mm_deg(refined.steps[unknowns.mesh]),
+            "moved": _mm_deg(refinement.steps[unknowns.mesh]),
             "u": _mm_deg(u[unknowns.mesh]),
             "stated_u": _mm_deg(stated_u[unknowns.mesh]),
             "shape_rms_mm": float(np.sqrt(np.mean(shape**2))),
@@ -175,17 +177,17 @@ def _about(
             "shape_stated_u_mm": request.doubts.shape_mm,
             "scale_mm": request.doubts.scale_mm,
         },
-        "noise_factor": refined.noise_factor,
-        "rejected": refined.rejected,
+        "noise_factor": refinement.noise_factor,
+        "rejected": refinement.rejected_count,
         "unknowns": unknowns.count,
-        "determined": refined.determined,
-        "chi2_of_steps": refined.chi2_of_steps,
+        "determined": refinement.determined_count,
+        "chi2_of_steps": refinement.chi2_of_steps,
     }
 
 
 def _disagreement(matches: Matches, edge_mm: float) -> dict[str, float | int]:
     apart_mm = matches.apart_mm
-    apart_px = 2 * np.linalg.norm(matches.found - matches.computed, axis=1)
+    apart_px = 2 * np.linalg.norm(matches.matched_blocks - matches.expected_blocks, axis=1)
     return {
         "matches": len(apart_mm),
         "median_mm": float(np.median(apart_mm)),
@@ -195,8 +197,8 @@ def _disagreement(matches: Matches, edge_mm: float) -> dict[str, float | int]:
     }
 
 
-def _mean_edge_mm(given: Given) -> float:
-    corners = given.vertices_mm[given.triangles]
+def _mean_edge_mm(prior_geometry: Given) -> float:
+    corners = prior_geometry.vertices_mm[prior_geometry.triangles]
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
 
 

@@ -15,7 +15,7 @@ from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import read_json
 from coupole.reflectance.alignment.refinement import Refined
-from coupole.reflectance.alignment.unknowns import renumbered
+from coupole.reflectance.alignment.unknowns import renumbered_triangles
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.pointing import Pointing
 from coupole.storage.durable import sha256
@@ -62,20 +62,20 @@ class RefinedGeometry:
     pointings: dict[tuple[str, str], Pointing]
     """Uncertainty of where the cameras look, by run and view."""
 
-    def of(self, measured: MeasuredRun) -> MeasuredRun:
+    def of(self, measured_run: MeasuredRun) -> MeasuredRun:
         """Return a run with this geometry. Raises InputError for a run, view or mesh that was not refined, and for
         a run that has changed since."""
-        if sha256(measured.mesh_path) != self.mesh_sha256:
+        if sha256(measured_run.mesh_path) != self.mesh_sha256:
             raise InputError(
-                f"{self.path}: another mesh than {measured.mesh_path} was refined; name that with --mesh"
+                f"{self.path}: another mesh than {measured_run.mesh_path} was refined; name that with --mesh"
             )
-        run = measured.run.folder.name
-        if absent := [view.name for view in measured.views if (run, view.name) not in self.base_from_camera]:
+        run = measured_run.run.folder.name
+        if absent := [view.name for view in measured_run.views if (run, view.name) not in self.base_from_camera]:
             raise InputError(
                 f"{self.path}: holds no pose of the view {absent[0]} of {run}; `coupole reflectance refine` "
                 "with all runs that you name makes them"
             )
-        if self.inputs.get(run) != dict(measured.frames.inputs):
+        if self.inputs.get(run) != dict(measured_run.frames.inputs):
             raise InputError(
                 f"{self.path}: {run} has other frames than when it was refined; `coupole reflectance refine` it "
                 "anew, with another --out"
@@ -86,10 +86,10 @@ class RefinedGeometry:
                 base_from_camera=self.base_from_camera[run, view.name],
                 pointing=self.pointings[run, view.name],
             )
-            for view in measured.views
+            for view in measured_run.views
         )
-        corners_mm = self.vertices_mm[renumbered(measured.triangles)]
-        return replace(measured, lens=self.lens, views=views, corners_mm=corners_mm)
+        corners_mm = self.vertices_mm[renumbered_triangles(measured_run.triangles)]
+        return replace(measured_run, lens=self.lens, views=views, corners_mm=corners_mm)
 
 
 def read_refined(folder: Path) -> RefinedGeometry:
@@ -111,37 +111,37 @@ def read_refined(folder: Path) -> RefinedGeometry:
         raise InputError(
             f"{path}: expected the result of `coupole reflectance refine`: {reason(error)}"
         ) from error
-    return RefinedGeometry(path, lens, poses, vertices_mm, digest, _told(folder, "inputs"), pointings)
+    return RefinedGeometry(path, lens, poses, vertices_mm, digest, _stored_entry(folder, "inputs"), pointings)
 
 
 def what_was_refined(folder: Path) -> dict[str, Any]:
     """Return what a result says of the refinement it was made with. Raises InputError if there is none."""
-    return {"sha256": sha256(folder / REFINED), "disagreement": _told(folder, "disagreement")}
+    return {"sha256": sha256(folder / REFINED), "disagreement": _stored_entry(folder, "disagreement")}
 
 
 def write_refined(
     path: Path,
-    refined: Refined,
+    refinement: Refined,
     views: Sequence[tuple[str, str]],
     pictures: Sequence[NDArray[np.float32]],
     mesh_sha256: str,
-    simulated: bool,
+    is_simulated: bool,
 ) -> None:
     """`views` are names of run and view."""
-    unknowns, steps = refined.unknowns, refined.steps
+    unknowns, steps = refinement.unknowns, refinement.steps
     values = {
         "lens": unknowns.lens_at(steps).vector(),
         "base_from_camera": unknowns.cameras_at(steps),
         "vertices_mm": unknowns.vertices_at(steps),
-        "vertex_u_mm": refined.vertex_u_mm(),
+        "vertex_u_mm": refinement.vertex_u_mm(),
         "steps": steps,
-        "covariance": refined.covariance,
+        "covariance": refinement.covariance,
         "stated_covariance": unknowns.covariance,
         "controls_mm": unknowns.controls_mm,
         "middle_mm": unknowns.middle_mm,
     }
     with h5py.File(path, "w") as file:
-        file.attrs.update(schema=SCHEMA, mesh_sha256=mesh_sha256, simulated=simulated)
+        file.attrs.update(schema=SCHEMA, mesh_sha256=mesh_sha256, simulated=is_simulated)
         for name, data in values.items():
             file.create_dataset(name, data=data, track_times=False).attrs["told"] = TOLD[name]
         text = h5py.string_dtype()
@@ -149,7 +149,7 @@ def write_refined(
         file.create_dataset("names", data=np.array(unknowns.names, object), dtype=text, track_times=False)
         for name in ("views", "names"):
             file[name].attrs["told"] = TOLD[name]
-        for when, matches in (("before", refined.before), ("after", refined.after)):
+        for when, matches in (("before", refinement.before), ("after", refinement.after)):
             for name, description in MATCH_FIELDS.items():
                 data = file.create_dataset(f"{when}/{name}", data=getattr(matches, name), track_times=False)
                 data.attrs["told"] = description
@@ -174,7 +174,7 @@ def _pointings(
     return pointings
 
 
-def _told(folder: Path, name: str) -> Any:
+def _stored_entry(folder: Path, name: str) -> Any:
     """Return what `refined.json` says under a name."""
     path = folder / ABOUT
     try:

@@ -39,7 +39,7 @@ LEAST_SEARCH_MM = 0.3
 """Below which a search is not narrowed."""
 FEWEST_MATCHES = 30
 MATCHES, STATED = "matches", "records and scan"
-_GROUPS = (Group(MATCHES, estimated=True, rejects=2), Group(STATED, estimated=False))
+_GROUPS = (Group(MATCHES, is_estimated=True, rejects=2), Group(STATED, is_estimated=False))
 _TOGETHER = 1 << 16
 """Vertices."""
 
@@ -57,7 +57,7 @@ class Refined:
     after: Matches
     noise_factor: float
     """Noise of the matches, as a multiple of what noise and texture alone would leave."""
-    rejected: int
+    rejected_count: int
     """Matches that did not count, in the last adjustment."""
 
     @cached_property
@@ -71,11 +71,11 @@ class Refined:
         uncertainties well."""
         return float(self.steps @ np.linalg.solve(self.unknowns.covariance, self.steps))
 
-    def vertex_u_mm(self, chosen: NDArray[np.int64] | slice = slice(None)) -> Floats:
+    def vertex_u_mm(self, vertex_numbers: NDArray[np.int64] | slice = slice(None)) -> Floats:
         """[n] standard uncertainty of vertices along their normals."""
         unknowns, surface = self.unknowns, slice(self.unknowns.mesh.start, self.unknowns.count)
-        vertices = unknowns.given.vertices_mm[chosen]
-        normals, covariance = unknowns.normals[chosen], self.covariance[surface, surface]
+        vertices = unknowns.prior_geometry.vertices_mm[vertex_numbers]
+        normals, covariance = unknowns.normals[vertex_numbers], self.covariance[surface, surface]
         u_mm = np.empty(len(vertices))
         for first in range(0, len(vertices), _TOGETHER):
             rows = slice(first, first + _TOGETHER)
@@ -84,14 +84,14 @@ class Refined:
         return u_mm
 
     @property
-    def determined(self) -> float:
+    def determined_count(self) -> float:
         """Number of unknowns that the pictures determine: each counts by the share of its information that they
         gave."""
         return self.unknowns.count - float(np.trace(np.linalg.solve(self.unknowns.covariance, self.covariance)))
 
 
 def refine(
-    given: Given,
+    prior_geometry: Given,
     pictures: list[NDArray[np.float32]],
     doubts: Doubts,
     search_mm: float,
@@ -102,28 +102,30 @@ def refine(
 
     Raises InputError if the views have too little in common, or the object is too large for the field's scale.
     """
-    unknowns = Unknowns(given, doubts, control_points(given.vertices_mm, doubts.scale_mm))
+    unknowns = Unknowns(prior_geometry, doubts, control_points(prior_geometry.vertices_mm, doubts.scale_mm))
     steps = np.zeros(unknowns.count)
-    matches = before = _matched(unknowns, steps, pictures, search_mm, threads, say)
+    matches = before = _find_matches(unknowns, steps, pictures, search_mm, threads, say)
     for number in range(ROUNDS):
-        adjustment = _adjusted(unknowns, steps, matches)
+        adjustment = _adjust(unknowns, steps, matches)
         say("rounds of refinement", number + 1, ROUNDS)
         apart_before_mm = float(np.median(matches.apart_mm))
         search_mm = min(search_mm, max(search_mm / SEARCH_SHRINKS, LEAST_SEARCH_MM))
         steps = adjustment.state
-        matches = _matched(unknowns, steps, pictures, search_mm, threads, say)
+        matches = _find_matches(unknowns, steps, pictures, search_mm, threads, say)
         if number and apart_before_mm - float(np.median(matches.apart_mm)) < SETTLED_MM:
             break
     say("rounds of refinement", ROUNDS, ROUNDS)
     component = adjustment.components[0]
-    return Refined(unknowns, steps, adjustment.covariance, before, matches, component.factor, component.rejected)
+    return Refined(
+        unknowns, steps, adjustment.covariance, before, matches, component.factor, component.rejected_count
+    )
 
 
 def surfaces_of(
     unknowns: Unknowns, steps: Floats, pictures: list[NDArray[np.float32]], threads: int
 ) -> list[ViewSurface]:
     """Return what all views show of the mesh, by the geometry after some steps."""
-    corners = unknowns.vertices_at(steps)[unknowns.given.triangles]
+    corners = unknowns.vertices_at(steps)[unknowns.prior_geometry.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
     mesh, lens = PacketMesh(corners), unknowns.lens_at(steps)
@@ -134,7 +136,7 @@ def surfaces_of(
     ]
 
 
-def _matched(
+def _find_matches(
     unknowns: Unknowns,
     steps: Floats,
     pictures: list[NDArray[np.float32]],
@@ -152,7 +154,7 @@ def _matched(
     return matches
 
 
-def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
+def _adjust(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[Floats]:
     """All steps from what the records say, by matches that were made after `steps`."""
     lines = match_lines(unknowns, steps, matches)
     lower = np.linalg.cholesky(unknowns.covariance)
@@ -172,13 +174,13 @@ def _adjusted(unknowns: Unknowns, steps: Floats, matches: Matches) -> Adjusted[F
         lambda state, change: state + change,
         _GROUPS,
         unknowns.count,
-        what="the refinement of views",
+        calibration_name="the refinement of views",
     )
 
 
 def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Block]:
     """Residuals and derivatives of the matches of each pair of views, whitened by their covariances."""
-    views = range(len(unknowns.given.base_from_camera))
+    views = range(len(unknowns.prior_geometry.base_from_camera))
     lens, cameras = unknowns.lens_at(steps), unknowns.cameras_at(steps)
     surface = np.arange(unknowns.mesh.start, unknowns.count)
     blocks = []
@@ -186,8 +188,8 @@ def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Blo
         pair_matches = matches.some((matches.reference == a) & (matches.other == b))
         if not len(pair_matches.blocks):
             continue
-        first = _seen(cameras[a], lens, unknowns, pair_matches.points_mm)
-        second = _seen(cameras[b], lens, unknowns, pair_matches.points_mm)
+        first = _sight_of_points(cameras[a], lens, unknowns, pair_matches.points_mm)
+        second = _sight_of_points(cameras[b], lens, unknowns, pair_matches.points_mm)
         # [n, 3, 3]: rows of the first view's derivatives by the place, and the normal
         across = np.linalg.inv(np.concatenate([first.by_place, pair_matches.normals[:, None]], axis=1))
         along = across[:, :, 2:] @ unknowns.by_surface(pair_matches.points_mm, pair_matches.normals)[:, None]
@@ -206,7 +208,7 @@ def match_lines(unknowns: Unknowns, steps: Floats, matches: Matches) -> list[Blo
             [np.r_[unknowns.lens], np.r_[unknowns.camera(a)], np.r_[unknowns.camera(b)], surface]
         )
         whitening = np.linalg.inv(np.linalg.cholesky(pair_matches.covariance))
-        residuals = whitening @ (pair_matches.found - pair_matches.computed)[..., None]
+        residuals = whitening @ (pair_matches.matched_blocks - pair_matches.expected_blocks)[..., None]
         blocks.append(
             Block(residuals.reshape(-1), (whitening @ derivatives).reshape(-1, len(columns)), columns, 0)
         )
@@ -225,13 +227,13 @@ class _Seen:
     """[n, 2, 6]"""
 
 
-def _seen(camera: Floats, lens: optics.Intrinsics, unknowns: Unknowns, points_mm: Floats) -> _Seen:
+def _sight_of_points(camera: Floats, lens: optics.Intrinsics, unknowns: Unknowns, points_mm: Floats) -> _Seen:
     """`lens` is of pixels; a block is two of them."""
     turn, place = camera[:3, :3], camera[:3, 3]
     inside = (points_mm - place) @ turn
     projection = optics.project(inside, lens.vector())
     by_point = projection.by_point / 2
     by_place = by_point @ turn.T
-    free = [optics.NAMES.index(name) for name in unknowns.given.free]
+    free = [optics.NAMES.index(name) for name in unknowns.prior_geometry.free]
     by_camera = np.concatenate([-by_place, by_point @ skew(inside)], axis=2)
     return _Seen(by_place, projection.by_intrinsics[:, :, free] / 2, by_camera)

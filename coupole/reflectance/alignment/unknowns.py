@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from coupole.calibration.optics import NAMES, Intrinsics
-from coupole.calibration.rotations import moved, rotation
+from coupole.calibration.rotations import moved_transforms, rotation
 from coupole.errors import InputError
 from coupole.reflectance.extraction.pointing import Doubts
 
@@ -53,14 +53,14 @@ class Given:
 class Unknowns:
     """The vector of steps: its parts, its covariance before the pictures, and the geometry that it gives."""
 
-    given: Given
+    prior_geometry: Given
     doubts: Doubts
     controls_mm: Floats
     """[controls, 3]"""
 
     @property
     def lens(self) -> slice:
-        return slice(0, len(self.given.free))
+        return slice(0, len(self.prior_geometry.free))
 
     def camera(self, view: int) -> slice:
         first = self.lens.stop + 6 * view
@@ -68,7 +68,7 @@ class Unknowns:
 
     @property
     def mesh(self) -> slice:
-        first = self.lens.stop + 6 * len(self.given.base_from_camera)
+        first = self.lens.stop + 6 * len(self.prior_geometry.base_from_camera)
         return slice(first, first + 6)
 
     @property
@@ -83,9 +83,9 @@ class Unknowns:
     def names(self) -> tuple[str, ...]:
         """Names of the unknowns with their units, in the vector's order."""
         steps = ("x_mm", "y_mm", "z_mm", "rx_rad", "ry_rad", "rz_rad")
-        views = range(len(self.given.base_from_camera))
+        views = range(len(self.prior_geometry.base_from_camera))
         return (
-            *(name + "_px" * (name in NAMES[:4]) for name in self.given.free),
+            *(name + "_px" * (name in NAMES[:4]) for name in self.prior_geometry.free),
             *(f"camera{view}.{step}" for view in views for step in steps),
             *(f"mesh.{step}" for step in steps),
             *(f"shape{control}_mm" for control in range(len(self.controls_mm))),
@@ -95,24 +95,26 @@ class Unknowns:
     def covariance(self) -> Floats:
         """[count, count] by records and doubts."""
         mesh = self.doubts.mesh_covariance
-        return np.asarray(block_diag(self.given.camera_covariance, mesh, self._shape_covariance))
+        return np.asarray(block_diag(self.prior_geometry.camera_covariance, mesh, self._shape_covariance))
 
     @cached_property
     def middle_mm(self) -> Floats:
         """[3] about which the mesh turns."""
-        return np.asarray(self.given.vertices_mm.mean(axis=0))
+        return np.asarray(self.prior_geometry.vertices_mm.mean(axis=0))
 
     def lens_at(self, steps: Floats) -> Intrinsics:
-        values = {name: getattr(self.given.lens, name) for name in self.given.free}
-        return replace(self.given.lens, **{n: values[n] + float(steps[i]) for i, n in enumerate(values)})
+        values = {name: getattr(self.prior_geometry.lens, name) for name in self.prior_geometry.free}
+        return replace(self.prior_geometry.lens, **{n: values[n] + float(steps[i]) for i, n in enumerate(values)})
 
     def cameras_at(self, steps: Floats) -> Floats:
         """[views, 4, 4] base_from_camera."""
-        return moved(self.given.base_from_camera, steps[self.lens.stop : self.mesh.start].reshape(-1, 6))
+        return moved_transforms(
+            self.prior_geometry.base_from_camera, steps[self.lens.stop : self.mesh.start].reshape(-1, 6)
+        )
 
     def vertices_at(self, steps: Floats) -> Floats:
         """[n, 3] base frame."""
-        geometry, mesh = self.given, steps[self.mesh]
+        geometry, mesh = self.prior_geometry, steps[self.mesh]
         along = cho_solve(cho_factor(self._shape_covariance), steps[self.shape])
         vertices_mm = geometry.vertices_mm.copy()
         for first in range(0, len(vertices_mm), _TOGETHER):
@@ -136,7 +138,7 @@ class Unknowns:
     @cached_property
     def normals(self) -> Floats:
         """[n, 3] of the given vertices, by the areas of their triangles."""
-        return vertex_normals(self.given.vertices_mm, self.given.triangles)
+        return vertex_normals(self.prior_geometry.vertices_mm, self.prior_geometry.triangles)
 
     @cached_property
     def _shape_covariance(self) -> Floats:
@@ -180,14 +182,14 @@ def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
     return points_mm[indices]
 
 
-def renumbered(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
+def renumbered_triangles(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """[m, 3] places of triangles' corners among the vertices that triangles use, which keep their order."""
     in_use = np.zeros(int(triangles.max()) + 1, np.bool_)
     in_use[triangles] = True
     return (np.cumsum(in_use) - 1)[triangles].astype(np.uint32)
 
 
-def welded(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
+def welded_vertices(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
     """[n, 3] vertices of triangles that are `renumbered`, whose corners [m, 3, 3] are known."""
     vertices = np.zeros((int(triangles.max()) + 1, 3))
     vertices[triangles] = corners_mm

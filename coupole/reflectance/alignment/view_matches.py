@@ -54,9 +54,9 @@ class Matches:
     """[n, 3] where the reference puts it: on a plane through the mesh around it, base frame."""
     normals: Floats
     """[n, 3] of these planes."""
-    found: Floats
+    matched_blocks: Floats
     """[n, 2] block of the other view that shows the spot."""
-    computed: Floats
+    expected_blocks: Floats
     """[n, 2] block of the other view at which it should."""
     covariance: Floats
     """[n, 2, 2] of `found`, blocks squared, from noise and texture."""
@@ -69,8 +69,8 @@ class Matches:
         lengths_mm: Floats = np.linalg.norm(self.shifts_mm, axis=1)
         return lengths_mm
 
-    def some(self, chosen: NDArray[np.bool_]) -> Matches:
-        return Matches(*(getattr(self, attribute.name)[chosen] for attribute in fields(self)))
+    def some(self, match_mask: NDArray[np.bool_]) -> Matches:
+        return Matches(*(getattr(self, attribute.name)[match_mask] for attribute in fields(self)))
 
 
 def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, say: Said) -> Matches:
@@ -80,7 +80,7 @@ def match_views(views: Sequence[ViewSurface], search_mm: float, threads: int, sa
     places = [_places(number, views, half) for number in range(len(views))]
     total = sum(len(part.blocks) for part in places)
     every = max(1, -(-total // MOST_PLACES))
-    some = [part.thinned(every) for part in places]
+    some = [part.every_nth(every) for part in places]
     jobs = [(a, b) for a, b in product(range(len(views)), repeat=2) if a != b]
     pair_matches: list[Matches] = []
     with ThreadPoolExecutor(threads) as pool:
@@ -101,7 +101,7 @@ class _Places:
     detail: Floats
     """[n, views] blocks per square millimetre; 0 for views that do not see the place."""
 
-    def thinned(self, every: int) -> _Places:
+    def every_nth(self, every: int) -> _Places:
         return _Places(self.blocks[::every], self.points_mm[::every], self.normals[::every], self.detail[::every])
 
 
@@ -171,7 +171,7 @@ def _shift(
     window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
     template, points_mm = first.picture[window], first.points_mm[(*window, 0)]
     lens = second.lens.vector()
-    second_picture = _warped(
+    second_picture = _warped_picture(
         first.points_mm, row, column, half + reach + _MARGIN, second.picture, second.points_mm,
         second.base_from_camera, lens,
     )  # fmt: skip
@@ -186,7 +186,7 @@ def _shift(
 
 
 @numba.njit(cache=True, nogil=True)
-def _warped(points, row, column, half, other, other_points, pose, lens):  # type: ignore[no-untyped-def]
+def _warped_picture(points, row, column, half, other_picture, other_points, pose, lens):  # type: ignore[no-untyped-def]
     """[side, side] what the other view shows at the places of the first one's blocks; NaN where it does not."""
     side = 2 * half + 1
     values, inside = np.full((side, side), np.nan), np.empty(3)
@@ -208,12 +208,12 @@ def _warped(points, row, column, half, other, other_points, pose, lens):  # type
             across = fx * (u * g + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + cx
             down = fy * (v * g + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + cy
             near_x, near_y = int(np.round(across)), int(np.round(down))
-            if 2 <= near_x < other.shape[1] - 2 and 2 <= near_y < other.shape[0] - 2:
+            if 2 <= near_x < other_picture.shape[1] - 2 and 2 <= near_y < other_picture.shape[0] - 2:
                 off = 0.0
                 for k in range(3):
                     off += (other_points[near_y, near_x, k] - points[y, x, k]) ** 2
                 if off < (_HIDDEN_BEYOND * inside[2] / fx) ** 2:  # not if it is NaN
-                    values[j, i] = _cubic(other, across, down)
+                    values[j, i] = _cubic(other_picture, across, down)
     return values
 
 
@@ -239,7 +239,7 @@ def _keys(far):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _best_shift(template, shown, warped, reach):  # type: ignore[no-untyped-def]
+def _best_shift(template, reference_points_mm, warped_picture, reach):  # type: ignore[no-untyped-def]
     """Greatest correlation over whole shifts, and the shift."""
     side = len(template)
     best, right, down = -1.0, 0, 0
@@ -248,8 +248,8 @@ def _best_shift(template, shown, warped, reach):  # type: ignore[no-untyped-def]
             n, a, b, aa, bb, ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
             for j in range(side):
                 for i in range(side):
-                    p, q = template[j, i], warped[_MARGIN + reach + dy + j, _MARGIN + reach + dx + i]
-                    if np.isfinite(q) and np.isfinite(shown[j, i]):
+                    p, q = template[j, i], warped_picture[_MARGIN + reach + dy + j, _MARGIN + reach + dx + i]
+                    if np.isfinite(q) and np.isfinite(reference_points_mm[j, i]):
                         n += 1
                         a += p
                         b += q
@@ -265,7 +265,7 @@ def _best_shift(template, shown, warped, reach):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-untyped-def]
+def _finer(template, reference_points_mm, warped_picture, reach, right, down):  # type: ignore[no-untyped-def]
     """Refine a whole shift; return whether the steps converged, the shift, and its covariance [2, 2]."""
     side, first = len(template), _MARGIN + reach
     x, y, gain, offset = float(right), float(down), 1.0, 0.0
@@ -275,10 +275,10 @@ def _finer(template, shown, warped, reach, right, down):  # type: ignore[no-unty
         for j in range(side):
             for i in range(side):
                 at_x, at_y = first + x + i, first + y + j
-                q = _cubic(warped, at_x, at_y)
-                slope_x = _cubic(warped, at_x + 0.5, at_y) - _cubic(warped, at_x - 0.5, at_y)
-                slope_y = _cubic(warped, at_x, at_y + 0.5) - _cubic(warped, at_x, at_y - 0.5)
-                if not np.isfinite(q + slope_x + slope_y + shown[j, i]):
+                q = _cubic(warped_picture, at_x, at_y)
+                slope_x = _cubic(warped_picture, at_x + 0.5, at_y) - _cubic(warped_picture, at_x - 0.5, at_y)
+                slope_y = _cubic(warped_picture, at_x, at_y + 0.5) - _cubic(warped_picture, at_x, at_y - 0.5)
+                if not np.isfinite(q + slope_x + slope_y + reference_points_mm[j, i]):
                     continue
                 off = template[j, i] - gain * q - offset
                 row = (gain * slope_x, gain * slope_y, q, 1.0)

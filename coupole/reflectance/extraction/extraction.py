@@ -52,15 +52,17 @@ class Geometry:
         return Facets(self.facets.centres_mm[triangles], self.facets.normals[triangles], sides)
 
 
-def geometry_of(measured: MeasuredRun) -> Geometry:
-    corners = measured.corners_mm
+def geometry_of(measured_run: MeasuredRun) -> Geometry:
+    corners = measured_run.corners_mm
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return Geometry(PacketMesh(corners), Facets(corners.mean(axis=1), normals, neighbours_of(measured.triangles)))
+    return Geometry(
+        PacketMesh(corners), Facets(corners.mean(axis=1), normals, neighbours_of(measured_run.triangles))
+    )
 
 
 def extract_view(
-    measured: MeasuredRun,
+    measured_run: MeasuredRun,
     geometry: Geometry,
     radiometry: Radiometry,
     view: MeasuredView,
@@ -71,7 +73,7 @@ def extract_view(
 ) -> dict[str, Any]:
     """Write a view's samples to an HDF5 file, whole or not at all; what the report says of them."""
     threads = threads or len(os.sched_getaffinity(0))
-    work, surface = view_pass(measured, geometry, radiometry, view, threads)
+    work, surface = view_pass(measured_run, geometry, radiometry, view, threads)
     codes_of = shadows_of(work, geometry)
     sample_count, of_code = 0, np.zeros(len(CODES), np.int64)
 
@@ -103,27 +105,27 @@ def extract_view(
 
 
 def view_pass(
-    measured: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
+    measured_run: MeasuredRun, geometry: Geometry, radiometry: Radiometry, view: MeasuredView, threads: int
 ) -> tuple[ViewPass, SeenSurface]:
     """Return the pass of a view, ready for its frames, and what the view sees. Raises InputError if it sees
     nothing of the mesh."""
-    focal_mm, focus_mm, f_number = measured.optics
+    focal_mm, focus_mm, f_number = measured_run.optics
     surface = seen_surface(
         geometry.mesh,
         geometry.facets.normals,
-        measured.lens,
+        measured_run.lens,
         view.base_from_camera,
-        measured.frames.size_px,
+        measured_run.frames.size_px,
         blur=(focal_mm, focus_mm, f_number, MOST_BLUR_PX),
         threads=threads,
     )
     if not len(surface.triangles):
         raise InputError(
-            f"{measured.run.folder}: no pixel of the view {view.name} shows the mesh: do mesh and hand-eye "
+            f"{measured_run.run.folder}: no pixel of the view {view.name} shows the mesh: do mesh and hand-eye "
             "belong to this run, and is the object in focus?"
         )
     reader = SignalReader(radiometry, surface)
-    return ViewPass(measured, view, geometry.of(surface.triangles), reader), surface
+    return ViewPass(measured_run, view, geometry.of(surface.triangles), reader), surface
 
 
 def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor], NDArray[np.uint8]]:
@@ -132,7 +134,7 @@ def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor]
 
     def codes_of(part: slice, pool: Executor) -> NDArray[np.uint8]:
         leds = work.leds[part]
-        codes = lamp_codes(geometry.mesh, work.facets, Positions(leds, *work.measured.leds.of(leds)), pool)
+        codes = lamp_codes(geometry.mesh, work.facets, Positions(leds, *work.measured_run.leds.of(leds)), pool)
         if hidden_by_cell is not None:
             codes[(codes == REACHED) & hidden_by_cell(leds)] = BY_CELL
         return codes
@@ -143,7 +145,7 @@ def shadows_of(work: ViewPass, geometry: Geometry) -> Callable[[slice, Executor]
 def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None:
     """A function of some LEDs, [leds, triangles] what the run says that arm or tool hide from the nearest patch of
     the object or one beside it, since edges of their shadows lie between patches; None if it says nothing."""
-    measured_run = work.measured
+    measured_run = work.measured_run
     with h5py.File(measured_run.run.view_path(work.view.name), "r") as file:
         if "entry/shadow/codes" not in file:
             return None
@@ -156,15 +158,15 @@ def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.
     beside = patches.query(points_mm, k=min(_PATCHES_BESIDE, len(points_mm)))[1].reshape(len(points_mm), -1)
     by_cell = by_cell[beside].any(axis=1)
 
-    def hidden(leds: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def hidden_from_leds(leds: NDArray[np.int64]) -> NDArray[np.bool_]:
         is_hidden: NDArray[np.bool_] = by_cell.T[[column[int(led)] for led in leds]][:, patch]
         return is_hidden
 
-    return hidden
+    return hidden_from_leds
 
 
 def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
-    measured_run, view, leds = work.measured, work.view, work.leds
+    measured_run, view, leds = work.measured_run, work.view, work.leds
     file.attrs["channels"] = "".join(measured_run.channels)
     file.attrs["simulated"] = measured_run.run.simulated
     file.attrs["frame"] = "base of the robot"
@@ -194,16 +196,16 @@ def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     _dataset(file, "full_scales", scales, "of the camera that f cos_i E/Phi of 1 gives in the longest exposure")
 
 
-def _dn_share(measured: MeasuredRun, view: MeasuredView, led: int) -> Floats:
+def _dn_share(measured_run: MeasuredRun, view: MeasuredView, led: int) -> Floats:
     """[channels] share of the camera's range that f cos_i E/Phi of 1 gives."""
     frame = max(view.by_led[led], key=lambda frame: frame.exposure_us)
-    range_dn = measured.frames.white_dn - measured.frames.black_dn
-    share: Floats = measured.power_of(frame) * frame.exposure_us * 1e-6 / range_dn
+    range_dn = measured_run.frames.white_dn - measured_run.frames.black_dn
+    share: Floats = measured_run.power_of(frame) * frame.exposure_us * 1e-6 / range_dn
     return share
 
 
-def _dataset(file: h5py.File, name: str, values: NDArray[Any], told: str) -> None:
-    file.create_dataset(name, data=values, track_times=False).attrs["told"] = told
+def _dataset(file: h5py.File, name: str, values: NDArray[Any], description: str) -> None:
+    file.create_dataset(name, data=values, track_times=False).attrs["told"] = description
 
 
 def _begin_samples(file: h5py.File, work: ViewPass) -> dict[str, h5py.Dataset]:

@@ -52,9 +52,9 @@ class FrameRing:
     def give_back(self, slots: Iterable[int]) -> None:
         """Slots whose frames are done with: the next frames are read into them."""
         for slot, frame in zip(slots, self._wanted, strict=False):
-            self._ahead.append(self._readers.submit(self._read, frame, slot))
+            self._ahead.append(self._readers.submit(self._read_frame, frame, slot))
 
-    def _read(self, frame: LightFrame, slot: int) -> int:
+    def _read_frame(self, frame: LightFrame, slot: int) -> int:
         pixels = self.pixels[slot, : self._shape[0] * self._shape[1]].reshape(self._shape)
         if frame.read_into is None:
             pixels[:] = frame.read()

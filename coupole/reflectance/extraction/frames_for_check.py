@@ -71,20 +71,21 @@ def block_offsets(channel: NDArray[np.int8], channels: int) -> NDArray[np.int64]
 
 
 def _picture(
-    known: Radiometry,
+    radiometry: Radiometry,
     frame: LightFrame,
-    seen: NDArray[np.int32],
-    reached: NDArray[np.bool_],
+    place_of_pixel: NDArray[np.int32],
+    is_lit: NDArray[np.bool_],
     offsets: NDArray[np.int64],
 ) -> tuple[NDArray[np.float16], float]:
     """One LED's picture, and its mean absolute error by noise."""
-    height, width = seen.shape
-    range_dn = known.white_dn - known.black_dn
-    top_dn = known.white_dn - RANGE_LEFT_OUT * range_dn
+    height, width = place_of_pixel.shape
+    range_dn = radiometry.white_dn - radiometry.black_dn
+    top_dn = radiometry.white_dn - RANGE_LEFT_OUT * range_dn
     share = np.full((height // 2, width // 2, len(offsets)), np.nan, np.float32)
     noise = np.full(share.shape, np.nan, np.float32)
     _blocks(
-        frame.read(), known.dark(frame), seen, reached, offsets, known.flat, known.curve, known.noise, top_dn,
+        frame.read(), radiometry.dark(frame), place_of_pixel, is_lit, offsets, radiometry.flat,
+        radiometry.curve, radiometry.noise, top_dn,
         float(range_dn), share, noise,
     )  # fmt: skip
     some = noise[np.isfinite(noise)]
@@ -92,13 +93,13 @@ def _picture(
 
 
 @numba.njit(cache=True, nogil=True)
-def _blocks(raw, dark, seen, reached, offsets, flat, curve, noise, top_dn, range_dn, share, deviation):  # type: ignore[no-untyped-def]
+def _blocks(raw, dark, place_of_pixel, is_lit, offsets, flat, curve, noise, top_dn, range_dn, share, deviation):  # type: ignore[no-untyped-def]
     for row in range(share.shape[0]):
         for column in range(share.shape[1]):
             good = True
             for pixel in range(4):
                 y, x = 2 * row + pixel // 2, 2 * column + pixel % 2
-                good &= reached[seen[y, x]] and raw[y, x] < top_dn
+                good &= is_lit[place_of_pixel[y, x]] and raw[y, x] < top_dn
             if not good:
                 continue
             for c in range(share.shape[2]):

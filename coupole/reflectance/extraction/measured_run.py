@@ -95,12 +95,12 @@ class Powers:
         """Return the powers of some LEDs; NaN for those that the record does not have."""
         rows = np.array([self._row.get(int(led), -1) for led in leds])
 
-        def picked(values: Floats) -> Floats:
+        def values_of_leds(values: Floats) -> Floats:
             led_values: Floats = values[rows]
             led_values[rows < 0] = np.nan
             return led_values
 
-        return Powers(leds, *map(picked, (self.power, self.board_c, self.u_own, self.u_shared)))
+        return Powers(leds, *map(values_of_leds, (self.power, self.board_c, self.u_own, self.u_shared)))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from coupole.calibration import optics
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.posed_camera import CameraPrior
-from coupole.calibration.rotations import moved, rotation, skew
+from coupole.calibration.rotations import moved_transforms, rotation, skew
 
 Floats = NDArray[np.float64]
 
@@ -81,11 +81,11 @@ class Pointing:
         look: root of the mean square over some of `points_mm` [n, 3], which the view sees."""
         points_mm = points_mm[:: max(1, len(points_mm) // _POINTS)]
 
-        def seen(steps: Floats) -> Floats:
+        def pixels_after(steps: Floats) -> Floats:
             shift = steps[len(self.free) :]
             steps_of_lens = zip(self.free, steps, strict=False)
             bent_lens = replace(lens, **{name: getattr(lens, name) + float(step) for name, step in steps_of_lens})
-            camera = moved(base_from_camera[None], shift[None, :6])[0]
+            camera = moved_transforms(base_from_camera[None], shift[None, :6])[0]
             there = (points_mm - self.middle_mm) @ rotation(shift[9:]).T + self.middle_mm + shift[6:9]
             inside = (there - camera[:3, 3]) @ camera[:3, :3]
             pixels: Floats = optics.project(inside, bent_lens.vector()).pixels
@@ -94,7 +94,11 @@ class Pointing:
         sizes = np.sqrt(np.diag(self.covariance))
         steps = _SMALL * np.diag(np.where(sizes > 0.0, sizes, 1.0))
         by_step = np.stack(
-            [(seen(deviation) - seen(-deviation)) / (2.0 * deviation.max()) for deviation in steps], axis=-1
+            [
+                (pixels_after(deviation) - pixels_after(-deviation)) / (2.0 * deviation.max())
+                for deviation in steps
+            ],
+            axis=-1,
         )
         in_pixels = np.einsum("nki,ij,nkj->n", by_step, self.covariance, by_step) / 2.0
         depth_mm = (points_mm - base_from_camera[:3, 3]) @ base_from_camera[:3, 2]

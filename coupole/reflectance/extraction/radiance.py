@@ -22,20 +22,20 @@ RANGE_LEFT_OUT = 0.02
 class Radiometry:
     """Data that turn the DN of a run's frames into linear signal, read once for all its views."""
 
-    def __init__(self, measured: MeasuredRun) -> None:
-        frames, records = measured.frames, measured.records
+    def __init__(self, measured_run: MeasuredRun) -> None:
+        frames, records = measured_run.frames, measured_run.records
         width, height = frames.size_px
         self.white_dn, self.black_dn = frames.white_dn, frames.black_dn
         self.dark: Callable[[LightFrame], NDArray[np.float32]] = dark_signal(frames, records.get("dark"))
         self.channel = np.zeros((height, width), np.int8)
         """[h, w] number of a pixel's channel."""
-        for number, channel in enumerate(measured.channels):
+        for number, channel in enumerate(measured_run.channels):
             self.channel[channel_mask((height, width), frames.pattern, channel)] = number
-        self.channels = len(measured.channels)
+        self.channels = len(measured_run.channels)
         self.flat = np.ones((height, width), np.float32)
-        self.curve, self.noise, self.u_pixel = _response(measured)
+        self.curve, self.noise, self.u_pixel = _response(measured_run)
         if "flat-field" in records:
-            self.flat, u_pixel = _flat_field(measured)
+            self.flat, u_pixel = _flat_field(measured_run)
             self.u_pixel = np.full(self.channels, u_pixel)
 
 
@@ -102,28 +102,28 @@ class SignalReader:
             np.take(self._radiometry.dark(frame).ravel(), self.lists.places, out=self.darks[number], mode="clip")
 
 
-def _response(measured: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _response(measured_run: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """[channels, 3] c2, c3 and range of the response, [channels, 2] variance in the dark (DN^2) and gain (DN/e),
     [channels] relative spread of pixels' own responses (0 where the scene did not let it be measured); without a
     record a straight line, and NaN."""
-    path, channels = measured.records.get("response"), measured.channels
+    path, channels = measured_run.records.get("response"), measured_run.channels
     curve, noise = np.zeros((len(channels), 3)), np.full((len(channels), 2), np.nan)
     u_pixel = np.full(len(channels), np.nan)
     curve[:, 2] = 1.0
     if path is not None:
-        record = read_earlier(path, "response", measured.frames.about, measured.frames.size_px)
+        record = read_earlier(path, "response", measured_run.frames.about, measured_run.frames.size_px)
         for number, channel in enumerate(channels):
-            linearise(path, channel, measured.frames)  # refuses a record of another camera
+            linearise(path, channel, measured_run.frames)  # refuses a record of another camera
             curve[number] = [record.value(name) for name in (f"c2.{channel}", f"c3.{channel}", "range_dn")]
             noise[number] = [record.value(f"{name}.{channel}") for name in ("dark_variance_dn2", "gain_dn_per_e")]
             u_pixel[number] = record.fixed.get(f"prnu.{channel}", 0.0)
     return curve, noise, u_pixel
 
 
-def _flat_field(measured: MeasuredRun) -> tuple[NDArray[np.float32], float]:
+def _flat_field(measured_run: MeasuredRun) -> tuple[NDArray[np.float32], float]:
     """[h, w] fall-off and response of each pixel, and the latter's relative standard uncertainty: their spread,
     where a record does not say how well they were measured."""
-    path, frames = measured.records["flat-field"], measured.frames
+    path, frames = measured_run.records["flat-field"], measured_run.frames
     fall_off, response = (map_beside(path, "flat-field", name, frames) for name in ("g", "pixel_response"))
     record = read_earlier(path, "flat-field", frames.about, frames.size_px)
     return fall_off * response, float(record.fixed.get("u_pixel_response", np.std(response)))

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from coupole.reflectance.extraction.sample_codes import REACHED
 from coupole.reflectance.lanes import (
     absolute,
-    gathered,
+    gather_lanes,
     if_less,
     lanes,
     larger,
-    loaded,
+    load_row,
     root,
     store_halves,
 )
@@ -72,13 +72,13 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
         if REACHED not in codes[row]:
             continue
         per_irradiance = _per_irradiance(centres_mm[row], normals[row], lamps)
-        off = absolute(loaded(codes, row) - np.float32(REACHED))
+        off = absolute(load_row(codes, row) - np.float32(REACHED))
         per_irradiance = if_less(off, np.float32(0.5), per_irradiance, _NAN)
         for channel in range(f.shape[2]):
             list_number = (first + row) * f.shape[2] + channel
             begin, end = lists.starts[list_number], lists.starts[list_number + 1]
             signal, u_signal = _signal(begin, end, channel, lists, response, darks, shots)
-            value = signal * per_irradiance / loaded(lamps.powers, channel)
+            value = signal * per_irradiance / load_row(lamps.powers, channel)
             size = absolute(value)
             store_halves(if_less(size, np.float32(MOST_F), value, _NAN), bits[0])
             store_halves(if_less(size, np.float32(MOST_F), u_signal, _NAN), bits[1])
@@ -91,9 +91,9 @@ def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
     """1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
     square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))
     for k in range(3):
-        way = loaded(lamps.centres_mm, k) - np.float32(centre_mm[k])
+        way = load_row(lamps.centres_mm, k) - np.float32(centre_mm[k])
         square = square + way * way
-        leaving = leaving - way * loaded(lamps.axes, k)
+        leaving = leaving - way * load_row(lamps.axes, k)
         arriving = arriving + way * np.float32(normal[k])
     leaving = larger(leaving, np.float32(0.0))
     lit = _SQUARE_MM * leaving * arriving / (square * square)
@@ -130,7 +130,7 @@ def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: 
     slots, dark = shots.slots[number], darks[shots.exposures[number]]
     total, above, variance, highest = lanes(none), lanes(none), lanes(none), lanes(none)
     for pixel in range(begin, end):
-        dn, even = gathered(shots.frames, slots, np.int64(lists.places[pixel])), lists.even[pixel]
+        dn, even = gather_lanes(shots.frames, slots, np.int64(lists.places[pixel])), lists.even[pixel]
         highest = larger(highest, dn)
         signal = dn - dark[pixel]
         above = above + signal
@@ -140,6 +140,6 @@ def _mean(begin, end, channel, lists, response, darks, shots, number):  # type: 
     mean = total * (unity / (count * shots.times_s[number]))
     mean = if_less(highest, response.top_dn, mean, _NAN)
     mean = if_less(response.least_dn * count, above, mean, _NAN)
-    mean = if_less(np.float32(0.5), loaded(shots.there, number), mean, _NAN)
+    mean = if_less(np.float32(0.5), load_row(shots.there, number), mean, _NAN)
     scale = unity / (count * shots.times_s[number])
     return mean, variance * (scale * scale)

@@ -68,7 +68,7 @@ def seen_surface(
 
     def trace(first: int) -> None:
         rows = slice(first, min(first + _ROWS, height))
-        _turned(directions_of_rows(lens, width, rows.start, rows.stop), base_from_camera, ways[rows])
+        _turn_directions(directions_of_rows(lens, width, rows.start, rows.stop), base_from_camera, ways[rows])
         triangle, distance = mesh.first_met(eye_mm, ways[rows].reshape(-1, 3))
         hit[rows], far[rows] = triangle.reshape(-1, width), distance.reshape(-1, width)
 
@@ -98,7 +98,7 @@ def _circle(
 
 
 @numba.njit(cache=True, nogil=True)
-def _turned(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
+def _turn_directions(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
     """Fill `ways` [rows, width, 3] with the directions as unit vectors of the base frame."""
     for row in range(ways.shape[0]):
         for column in range(ways.shape[1]):
@@ -110,7 +110,7 @@ def _turned(directions, base_from_camera, ways):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, first, used):  # type: ignore[no-untyped-def]
+def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, first, pixel_in_use):  # type: ignore[no-untyped-def]
     """Mark the pixels of a band of rows that are not at a silhouette, not seen at a grazing angle, and sharp."""
     for row in range(first, min(first + _ROWS, hit.shape[0] - 1)):
         for column in range(1, hit.shape[1] - 1):
@@ -130,7 +130,7 @@ def _judge(hit, far, ways, normals, axis, fx, infinite_mm, focus_mm, most_mm, fi
                 for k in range(3):
                     square += (distance * way[k] - away * beside[k]) ** 2
                 alone |= not square <= most_step_mm * most_step_mm  # also if the ray beside it met nothing
-            used[row, column] = not alone
+            pixel_in_use[row, column] = not alone
 
 
 def directions_of_rows(lens: Intrinsics, width: int, first: int, end: int) -> Floats:

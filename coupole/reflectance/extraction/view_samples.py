@@ -52,7 +52,7 @@ class Samples:
 class ViewPass:
     """A view's frames and triangles, and what is known of both."""
 
-    measured: MeasuredRun
+    measured_run: MeasuredRun
     view: MeasuredView
     facets: Facets
     reader: SignalReader
@@ -75,7 +75,7 @@ class ViewPass:
         blocks = [slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
         self.reader.prepare(self.view.frames)
         in_order, most = list(chain.from_iterable(frames)), max(map(len, frames))
-        ring = FrameRing(in_order, self.measured.frames.size_px, most)
+        ring = FrameRing(in_order, self.measured_run.frames.size_px, most)
         with ThreadPoolExecutor(threads) as pool, ring:
             for part, part_frames in zip(parts, frames, strict=True):
                 codes = codes_of(part, pool)
@@ -104,15 +104,15 @@ class ViewPass:
 
     def _lamps(self, part: slice) -> Lamps:
         leds = self.leds[part]
-        centres_mm, normals = self.measured.leds.of(leds)
-        powers = np.stack([self.measured.power_of(self.view.by_led[int(led)][0]) for led in leds])
+        centres_mm, normals = self.measured_run.leds.of(leds)
+        powers = np.stack([self.measured_run.power_of(self.view.by_led[int(led)][0]) for led in leds])
         powers = np.where(powers > 0.0, powers, np.nan)
 
         def across(values: NDArray[np.float64]) -> NDArray[np.float32]:
             """[..., 8]: one lane for each LED, the last for those that lack."""
             return np.pad(values.T, ((0, 0), (0, LANES - len(leds))), mode="edge").astype(np.float32, order="C")
 
-        return Lamps(across(centres_mm), across(normals), across(powers), self.measured.emission == "paper")
+        return Lamps(across(centres_mm), across(normals), across(powers), self.measured_run.emission == "paper")
 
     def _block(self, part: slice, rows: slice, shots: Shots, lamps: Lamps, codes: NDArray[np.uint8]) -> Samples:
         leds = part.stop - part.start

@@ -36,7 +36,7 @@ class Environment:
     axes: Floats
     """[3, 3] rows: middle, left, up."""
 
-    def turned(self, angle_deg: float) -> Environment:
+    def turned_about_up(self, angle_deg: float) -> Environment:
         """Return the environment turned about up, from the middle to the left."""
         cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
         turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
@@ -65,11 +65,11 @@ class Environment:
         by_row = np.append(0.0, np.cumsum(light.sum(axis=1)))
         number = np.arange(count)
         across = (number * _GOLDEN + 0.5) % 1.0
-        row, down = _placed(by_row, (number + 0.5) / count)
+        row, down = _parts_at(by_row, (number + 0.5) / count)
         column, right = np.empty(count, np.int64), np.empty(count)
         for row_number in np.unique(row):
             here = row == row_number
-            column[here], right[here] = _placed(np.append(0.0, np.cumsum(light[row_number])), across[here])
+            column[here], right[here] = _parts_at(np.append(0.0, np.cumsum(light[row_number])), across[here])
         height, width = mean.shape
         edges = np.cos(np.linspace(0.0, math.pi, height + 1))
         up = edges[row] + down * (edges[row + 1] - edges[row])
@@ -80,27 +80,27 @@ class Environment:
         return local @ self.axes, self.radiance[row, column].astype(np.float64), density
 
 
-def _placed(cumulated: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
+def _parts_at(cumulative_sum: Floats, shares: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Return the parts of a growing sum into which shares of it fall, and how far into the part."""
-    at = shares * cumulated[-1]
-    part = np.clip(np.searchsorted(cumulated, at, side="right") - 1, 0, len(cumulated) - 2)
-    within = (at - cumulated[part]) / np.maximum(cumulated[part + 1] - cumulated[part], 1e-300)
+    at = shares * cumulative_sum[-1]
+    part = np.clip(np.searchsorted(cumulative_sum, at, side="right") - 1, 0, len(cumulative_sum) - 2)
+    within = (at - cumulative_sum[part]) / np.maximum(cumulative_sum[part + 1] - cumulative_sum[part], 1e-300)
     return part.astype(np.int64), np.clip(within, 0.0, 1.0)
 
 
 def read_environment(path: Path, axes: Floats, strength: Floats, turn_deg: float = 0.0) -> Environment:
     """A file in OpenEXR or Radiance format, times a strength [3]. Raises InputError if it cannot be read, is not
     twice as wide as high, or holds what no light is."""
-    radiance = _read(path)
+    radiance = _read_radiance(path)
     if radiance.ndim != 3 or radiance.shape[2] < 3 or radiance.shape[1] != 2 * radiance.shape[0]:
         raise InputError(f"{path}: expected three colours, twice as wide as high; got {radiance.shape}")
     radiance = radiance[..., :3]
     if not np.all(np.isfinite(radiance)) or radiance.min() < 0.0 or not radiance.any():
         raise InputError(f"{path}: expected finite values, none below 0 and some above; repair it or name another")
-    return Environment(radiance * strength.astype(np.float32), axes).turned(turn_deg)
+    return Environment(radiance * strength.astype(np.float32), axes).turned_about_up(turn_deg)
 
 
-def _read(path: Path) -> NDArray[np.float32]:
+def _read_radiance(path: Path) -> NDArray[np.float32]:
     """[h, w, channels] red first."""
     if path.suffix.lower() not in {".exr", ".hdr"}:
         raise InputError(f"{path}: expected an environment in a file .exr or .hdr")

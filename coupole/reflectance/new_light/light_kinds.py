@@ -160,7 +160,7 @@ def area_of(text: str) -> AreaLight:
     return AreaLight(at_mm=at_mm, normal=(x, y, z), width_mm=numbers[6], height_mm=numbers[-1])
 
 
-def turned(light: AnyLight, angle_deg: float) -> AnyLight:
+def turn_light(light: AnyLight, angle_deg: float) -> AnyLight:
     """A light turned about the z axis, from x to y; an environment about its own up. Raises InputError for an LED,
     which has its place."""
     cosine, sine = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))

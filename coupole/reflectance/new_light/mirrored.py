@@ -9,7 +9,7 @@ import numpy as np
 
 from coupole.motion.occlusion import RAY_START_MM
 from coupole.motion.packet_rays import PacketMesh
-from coupole.reflectance.ggx import drawn, reflected, shine
+from coupole.reflectance.ggx import lobe_density, sample_reflection, shine
 from coupole.reflectance.new_light.beams import Emitter
 from coupole.reflectance.new_light.pictured_surface import Surface, in_strips
 from coupole.reflectance.new_light.shading import KD, KS, MIRROR_SHARE, Coats, Picture, shines
@@ -33,7 +33,7 @@ def add_mirrored(
     )  # fmt: skip
 
     def add(rows: slice) -> None:
-        triangles, places_mm, part = surface.seen[rows], surface.places_mm[rows], picture[rows]
+        triangles, places_mm, part = surface.triangle_of_pixel[rows], surface.places_mm[rows], picture[rows]
         asking = np.zeros(triangles.shape, np.bool_)
         _asking(
             triangles, places_mm, surface.camera_mm, coats, *of_emitter[:3], emitter.density, lobe_rays, asking
@@ -61,16 +61,16 @@ def add_mirrored(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mirror(  # type: ignore[no-untyped-def]
-    pixels, first_row, seen, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
-    halves_mm, radiance, density, ray, lobe_rays, met, gains, ways_mm
+    pixels, first_row, triangle_of_pixel, places_mm, camera_mm, faces, coats, near, axes, centre_mm,
+    halves_mm, radiance, density, ray, lobe_rays, hit_pixels, gains, ways_mm
 ):  # fmt: skip
     """Return how many of the rays of number `ray` from pixels [n, 2] point at a bright part of an emitter. Fill
-    `met` with their pixels, `gains` with what they bring if nothing is in their way, `ways_mm` with how they get
-    there."""
+    `hit_pixels` with their pixels, `gains` with what they bring if nothing is in their way, `ways_mm` with how
+    they get there."""
     way, channels, count = np.empty(3), gains.shape[1], 0
     for pixel in range(len(pixels)):
         row, column = pixels[pixel]
-        triangle = seen[row, column]
+        triangle = triangle_of_pixel[row, column]
         coat = coats[triangle]
         normal, place = coat[:3], places_mm[row, column]
         v0, v1, v2 = camera_mm[0] - place[0], camera_mm[1] - place[1], camera_mm[2] - place[2]
@@ -78,7 +78,7 @@ def _mirror(  # type: ignore[no-untyped-def]
         v0, v1, v2 = v0 / length, v1 / length, v2 / length
         nv = normal[0] * v0 + normal[1] * v1 + normal[2] * v2
         first, second = _two_numbers(first_row + row, column, ray)
-        nh = reflected(normal, v0, v1, v2, nv, coat[3], first, second, way)
+        nh = sample_reflection(normal, v0, v1, v2, nv, coat[3], first, second, way)
         nl = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
         face = faces[triangle]
         if not nl > 0.0 or not way[0] * face[0] + way[1] * face[1] + way[2] * face[2] > 0.0:
@@ -90,25 +90,25 @@ def _mirror(  # type: ignore[no-untyped-def]
         if not among > 0.0:
             continue
         lobe = shine(nl, nv, nh, coat[3])
-        share = nl / (among + lobe_rays * drawn(nv, nh, coat[3]))
+        share = nl / (among + lobe_rays * lobe_density(nv, nh, coat[3]))
         for channel in range(channels):
             value = coat[KD + channel] + coat[KS + channel] * lobe
             gains[count, channel] = radiance[x, y, channel] * value * share
         for k in range(3):
             ways_mm[count, k] = far_mm * way[k]
-        met[count] = pixel
+        hit_pixels[count] = pixel
         count += 1
     return count
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _asking(seen, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
+def _asking(triangle_of_pixel, places_mm, camera_mm, coats, near, axes, centre_mm, density, lobe_rays, asking):  # type: ignore[no-untyped-def]
     """Mark the pixels for which rays are drawn. Not for an area that is at most as large as their lobe: the solid
     angle that it could have at its distance, times how dense the lobe's rays can be, is at most 1."""
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            coat, place = coats[max(seen[row, column], 0)], places_mm[row, column]
-            if seen[row, column] < 0 or coat[3] == 0.0 or not shines(coat):
+    for row in range(triangle_of_pixel.shape[0]):
+        for column in range(triangle_of_pixel.shape[1]):
+            coat, place = coats[max(triangle_of_pixel[row, column], 0)], places_mm[row, column]
+            if triangle_of_pixel[row, column] < 0 or coat[3] == 0.0 or not shines(coat):
                 continue
             square, nv, above = 0.0, 0.0, 0.0
             for k in range(3):
@@ -117,7 +117,7 @@ def _asking(seen, places_mm, camera_mm, coats, near, axes, centre_mm, density, l
                 nv += coat[k] * view
                 above += (centre_mm[k] - place[k]) * axes[2, k]
             nv /= math.sqrt(square)
-            peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, coat[3])
+            peak = MIRROR_SHARE * lobe_rays * lobe_density(nv, 1.0, coat[3])
             asking[row, column] = nv > 0.0 and not (near and density * above * above * 1e-6 >= peak)
 
 

@@ -39,7 +39,7 @@ _MARGIN = 1.05
 class Surface:
     """Surface that the pixels of a picture [h, w] see."""
 
-    seen: NDArray[np.int32]
+    triangle_of_pixel: NDArray[np.int32]
     """[h, w] place in `triangles`; -1 for none."""
     places_mm: NDArray[np.float32]
     """[h, w, 3] base frame."""
@@ -99,7 +99,7 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     places = np.full(len(result.corners_mm), -1, np.int32)
     places[triangles] = np.arange(len(triangles))
-    base_from_camera, focal_px = _aimed(result, camera)
+    base_from_camera, focal_px = _aim_camera(result, camera)
     width, height = camera.size_px
     camera_mm = base_from_camera[:3, 3]
     triangle_of_pixel = np.full((height, width), -1, np.int32)
@@ -131,7 +131,7 @@ def in_strips(height: int, work: Callable[[slice], None]) -> None:
         list(pool.map(work, [slice(first, min(first + step, height)) for first in range(0, height, step)]))
 
 
-def _aimed(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
+def _aim_camera(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
     """base_from_camera [4, 4] (z forward, x right, y down), and the focal length in px."""
     points_mm = result.corners_mm[result.triangles].reshape(-1, 3).astype(np.float64)
     at_mm = apply(result.base_from_support, camera.at_mm)
@@ -162,13 +162,13 @@ def _aimed(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
 
 
 def _directions(
-    seen: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
+    triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
 ) -> tuple[Floats, Floats, Floats] | None:
     """Return what turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
     coefficients of column^i row^j, [3, 3] rows: axes of the directions' frame, the last forward. None for too few
     triangles."""
-    row, column = np.nonzero(seen >= 0)
-    triangle = seen[row, column]
+    row, column = np.nonzero(triangle_of_pixel >= 0)
+    triangle = triangle_of_pixel[row, column]
     count = np.bincount(triangle, minlength=len(centres_mm)).astype(np.float64)
     if np.count_nonzero(count) < _LEAST_TRIANGLES:
         return None
@@ -200,13 +200,15 @@ def _directions(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _meet(first_row, seen, pixel_scale, coefficients, frame, camera_mm, centres_mm, normals, places_mm):  # type: ignore[no-untyped-def]
+def _meet(  # type: ignore[no-untyped-def]
+    first_row, triangle_of_pixel, pixel_scale, coefficients, frame, camera_mm, centres_mm, normals, places_mm
+):
     """Fill `places_mm` with the places where the rays of rows of pixels meet the planes of the triangles that they
     see."""
     order = len(coefficients)
     along = np.empty((order, 2))
     way = np.empty(3)
-    for row in range(seen.shape[0]):
+    for row in range(triangle_of_pixel.shape[0]):
         y = (first_row + row - pixel_scale[1]) / pixel_scale[2]
         for i in range(order):
             for k in range(2):
@@ -214,8 +216,8 @@ def _meet(first_row, seen, pixel_scale, coefficients, frame, camera_mm, centres_
                 for j in range(order - 1 - i, -1, -1):
                     total = total * y + coefficients[i, j, k]
                 along[i, k] = total
-        for column in range(seen.shape[1]):
-            triangle = seen[row, column]
+        for column in range(triangle_of_pixel.shape[1]):
+            triangle = triangle_of_pixel[row, column]
             if triangle < 0:
                 continue
             x = (column - pixel_scale[0]) / pixel_scale[2]

@@ -18,18 +18,18 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.ggx import drawn
+from coupole.reflectance.ggx import lobe_density
 from coupole.reflectance.lanes import (
     LANES,
     absolute,
     add_in_turns,
     four_gathered,
-    gathered,
+    gather_lanes,
     if_less,
     in_turns,
     lanes,
     larger,
-    loaded,
+    load_row,
     root,
     store,
     total,
@@ -87,7 +87,8 @@ def add_beams(
     in_strips(
         len(picture),
         lambda rows: _add_beams(
-            rows.start, surface.seen[rows], surface.places_mm[rows], flat, surface.camera_mm, coats, *of_beams,
+            rows.start, surface.triangle_of_pixel[rows], surface.places_mm[rows], flat, surface.camera_mm,
+            coats, *of_beams,
             picture[rows],
         ),
     )  # fmt: skip
@@ -100,7 +101,8 @@ def add_beam(picture: Picture, surface: Surface, coats: Coats, codes: Codes, bea
     single = (values.astype(np.float32) for values in (surface.camera_mm, beam.place, beam.axis, three))
     camera_mm, place, axis, strength = single
     flat = [
-        pixel_array.reshape(codes.size, -1) for pixel_array in (surface.seen, surface.places_mm, codes, picture)
+        pixel_array.reshape(codes.size, -1)
+        for pixel_array in (surface.triangle_of_pixel, surface.places_mm, codes, picture)
     ]
 
     def add(pixels: list[NDArray[Any]]) -> None:
@@ -127,7 +129,7 @@ def add_values(picture: Picture, surface: Surface, values: NDArray[np.float32], 
     in_strips(
         len(picture),
         lambda rows: _add_values(
-            surface.seen[rows], surface.places_mm[rows], codes[rows], values, *of_beam, picture[rows]
+            surface.triangle_of_pixel[rows], surface.places_mm[rows], codes[rows], values, *of_beam, picture[rows]
         ),
     )
 
@@ -153,30 +155,34 @@ def _towards(near, place, axis, exponent, x, y, z, way):  # type: ignore[no-unty
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _reach(near, exponent, places, axes, x, y, z):  # type: ignore[no-untyped-def]
     """Return the same as `_towards` for eight beams: three coordinates of their directions, and cos^k / d^2."""
-    dx, dy, dz = loaded(places, 0), loaded(places, 1), loaded(places, 2)
+    dx, dy, dz = load_row(places, 0), load_row(places, 1), load_row(places, 2)
     if not near:
         return dx, dy, dz, lanes(np.float32(1.0))
     dx, dy, dz = dx - x, dy - y, dz - z
     inverse = np.float32(1.0) / root(dx * dx + dy * dy + dz * dz)
     dx, dy, dz, reach = dx * inverse, dy * inverse, dz * inverse, np.float32(1e6) * inverse * inverse
     for _ in range(exponent):
-        cosine = dx * loaded(axes, 0) + dy * loaded(axes, 1) + dz * loaded(axes, 2)
+        cosine = dx * load_row(axes, 0) + dy * load_row(axes, 1) + dz * load_row(axes, 2)
         reach = reach * larger(np.float32(-1.0) * cosine, np.float32(0.0))
     return dx, dy, dz, reach
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_beams(  # type: ignore[no-untyped-def]
-    first_row, seen, places_mm, codes, camera_mm, coats, near, exponent, places, axes, strengths, densities,
+    first_row, triangle_of_pixel, places_mm, codes, camera_mm, coats, near, exponent, places, axes, strengths,
+    densities,
     lobe_rays, picture
 ):  # fmt: skip
     every, channels, half, none = np.arange(LANES), picture.shape[2], np.float32(0.5), np.float32(0.0)
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            triangle = seen[row, column]
+    for row in range(triangle_of_pixel.shape[0]):
+        for column in range(triangle_of_pixel.shape[1]):
+            triangle = triangle_of_pixel[row, column]
             if triangle < 0 or coats[triangle, 3] == none:
                 continue
-            lit = absolute(gathered(codes, every, (first_row + row) * seen.shape[1] + column) - np.float32(LIT))
+            lit = absolute(
+                gather_lanes(codes, every, (first_row + row) * triangle_of_pixel.shape[1] + column)
+                - np.float32(LIT)
+            )
             if total(if_less(lit, half, np.float32(1.0), lit * none)) == none:
                 continue
             coat, place = coats[triangle], places_mm[row, column]
@@ -192,30 +198,32 @@ def _add_beams(  # type: ignore[no-untyped-def]
                 alpha2 = alpha * alpha
                 lobe = d / (nl * b + nv * root(alpha2 + (np.float32(1.0) - alpha2) * nl * nl))
                 if lobe_rays > 0 and shines(coat):
-                    ray_densities = loaded(densities, 0)
+                    ray_densities = load_row(densities, 0)
                     shared_reach = reach * ray_densities / (ray_densities + reach * d * (lobe_rays / (nv + b)))
                     if near:
                         least = ray_densities * _across(places, axes, place)
-                        peak = MIRROR_SHARE * lobe_rays * drawn(nv, 1.0, alpha)
+                        peak = MIRROR_SHARE * lobe_rays * lobe_density(nv, 1.0, alpha)
                         shared_reach = if_less(least, lanes(np.float32(peak)), shared_reach, reach)
                     reach = shared_reach
             reach = if_less(lit, half, reach * nl, none)
             for channel in range(channels):
-                light = reach * loaded(strengths, channel)
+                light = reach * load_row(strengths, channel)
                 shining = coat[KS + channel] * total(light * lobe)
                 picture[row, column, channel] += coat[KD + channel] * total(light) + shining
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
+def _add_beam(  # type: ignore[no-untyped-def]
+    triangle_of_pixel, places_mm, codes, coats, camera_mm, near, place, axis, exponent, strength, picture
+):
     """Eight neighbouring pixels in the lanes: arrays [n, 8], [n, 8 coordinates], [n, 8 channels]."""
     triangle, unity, none, half = np.zeros(LANES, np.int64), np.float32(1.0), np.float32(0.0), np.float32(0.5)
-    for eight in range(len(seen)):
-        lit = if_less(absolute(loaded(codes, eight) - np.float32(LIT)), half, unity, none)
+    for eight in range(len(triangle_of_pixel)):
+        lit = if_less(absolute(load_row(codes, eight) - np.float32(LIT)), half, unity, none)
         if total(lit) == none:
             continue
         for k in range(LANES):
-            triangle[k] = max(seen[eight, k], 0)
+            triangle[k] = max(triangle_of_pixel[eight, k], 0)
         n0, n1, n2, alpha = four_gathered(coats, triangle, 0)
         lit = if_less(none, alpha, lit, none)
         x, y, z = in_turns(places_mm, eight)
@@ -230,7 +238,7 @@ def _add_beam(seen, places_mm, codes, coats, camera_mm, near, place, axis, expon
         s0, s1, s2, _ = four_gathered(coats, triangle, KS)
         first = if_less(half, lit, reach * strength[0] * (d0 + s0 * lobe), none)
         if picture.shape[1] == LANES:
-            store(loaded(picture, eight) + first, picture, eight)
+            store(load_row(picture, eight) + first, picture, eight)
         else:
             second = if_less(half, lit, reach * strength[1] * (d1 + s1 * lobe), none)
             third = if_less(half, lit, reach * strength[2] * (d2 + s2 * lobe), none)
@@ -267,8 +275,10 @@ def _lobe(n0, n1, n2, h0, h1, h2, nl, nv, alpha):  # type: ignore[no-untyped-def
 @numba.njit(cache=True, nogil=True)
 def _across(places, axes, place):  # type: ignore[no-untyped-def]
     """Squares of the distances, m^2, of a pixel's place from the planes of eight emitters."""
-    above = (loaded(places, 0) - place[0]) * loaded(axes, 0) + (loaded(places, 1) - place[1]) * loaded(axes, 1)
-    above = above + (loaded(places, 2) - place[2]) * loaded(axes, 2)
+    above = (load_row(places, 0) - place[0]) * load_row(axes, 0) + (load_row(places, 1) - place[1]) * load_row(
+        axes, 1
+    )
+    above = above + (load_row(places, 2) - place[2]) * load_row(axes, 2)
     return np.float32(1e-6) * above * above
 
 
@@ -284,16 +294,18 @@ def _facets(n0, n1, n2, h0, h1, h2, nv, alpha):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_values(seen, places_mm, codes, values, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
+def _add_values(triangle_of_pixel, places_mm, codes, values, near, place, axis, exponent, strength, picture):  # type: ignore[no-untyped-def]
     way = np.empty(3)
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
+    for row in range(triangle_of_pixel.shape[0]):
+        for column in range(triangle_of_pixel.shape[1]):
             if codes[row, column] != LIT:
                 continue
             x, y, z = places_mm[row, column, 0], places_mm[row, column, 1], places_mm[row, column, 2]
             reach = _towards(near, place, axis, exponent, x, y, z, way)
             for channel in range(picture.shape[2]):
-                picture[row, column, channel] += strength[channel] * reach * values[seen[row, column], channel]
+                picture[row, column, channel] += (
+                    strength[channel] * reach * values[triangle_of_pixel[row, column], channel]
+                )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -31,22 +31,24 @@ _PACKET = 4
 """Rays of the grid down and across that go together."""
 
 
-def reached(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
+def trace_beam(mesh: PacketMesh, surface: Surface, beam: Beam, codes: Codes) -> None:
     """Fill `codes` [h, w] with whether the beam reaches each pixel; `mesh` is what throws shadows."""
     by = _facing(surface, beam), beam.place, beam.axis, beam.exponent
-    in_strips(len(codes), lambda rows: _begin(surface.seen[rows], surface.places_mm[rows], *by, codes[rows]))
+    in_strips(
+        len(codes), lambda rows: _begin(surface.triangle_of_pixel[rows], surface.places_mm[rows], *by, codes[rows])
+    )
     _trace(mesh, surface, beam, _asked_on_grid(codes), codes)
     open_cells = np.ones(codes[::CELL_PX, ::CELL_PX].shape, np.bool_)
     in_strips(len(open_cells) - 1, lambda cells: _close_cells(codes, cells.start, open_cells[cells]))
     fresh = np.ascontiguousarray(np.argwhere(open_cells))  # functions are compiled for each layout
     while len(fresh):
         _trace(mesh, surface, beam, _asked_in(codes, fresh), codes)
-        fresh = _spread(codes, open_cells, fresh)
+        fresh = _open_neighbours(codes, open_cells, fresh)
     in_strips(len(codes), lambda rows: _fill(codes, rows.start, rows.stop))
 
 
 def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.int64], codes: Codes) -> None:
-    on = surface.seen.reshape(-1), surface.places_mm.reshape(-1, 3), surface.normals
+    on = surface.triangle_of_pixel.reshape(-1), surface.places_mm.reshape(-1, 3), surface.normals
     how, flat = (blocked16(), mesh.scene, ARGUMENTS), codes.reshape(-1)
 
     def some(first: int) -> None:
@@ -58,7 +60,7 @@ def _trace(mesh: PacketMesh, surface: Surface, beam: Beam, pixels: NDArray[np.in
 
 @numba.njit(cache=True, nogil=True)
 def _trace_rays(  # type: ignore[no-untyped-def]
-    function, scene, arguments, pixels, seen, places_mm, normals, near, place, codes
+    function, scene, arguments, pixels, triangle_of_pixel, places_mm, normals, near, place, codes
 ):
     """Codes of some pixels, by a ray from each; neighbours in the list go together."""
     rays, words, valid = packet()
@@ -66,7 +68,7 @@ def _trace_rays(  # type: ignore[no-untyped-def]
         lanes = min(LANES, len(pixels) - first)
         for lane in range(lanes):
             pixel = pixels[first + lane]
-            triangle = seen[pixel]
+            triangle = triangle_of_pixel[pixel]
             for k in range(3):
                 start_mm = places_mm[pixel, k] + RAY_START_MM * normals[triangle, k]
                 rays[k, lane] = start_mm
@@ -100,15 +102,15 @@ def _facing(surface: Surface, beam: Beam) -> NDArray[np.bool_]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _begin(seen, places_mm, facing, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
+def _begin(triangle_of_pixel, places_mm, facing, place, axis, exponent, codes):  # type: ignore[no-untyped-def]
     """Codes by the normals of triangles and emitter alone."""
-    for row in range(seen.shape[0]):
-        for column in range(seen.shape[1]):
-            triangle = seen[row, column]
+    for row in range(triangle_of_pixel.shape[0]):
+        for column in range(triangle_of_pixel.shape[1]):
+            triangle = triangle_of_pixel[row, column]
             codes[row, column] = NONE if triangle < 0 else ASKED if facing[triangle] else AWAY
         if exponent == 0:
             continue
-        for column in range(seen.shape[1]):
+        for column in range(triangle_of_pixel.shape[1]):
             leaving = 0.0
             for k in range(3):
                 leaving += (places_mm[row, column, k] - place[k]) * axis[k]
@@ -153,7 +155,7 @@ def _asked_in(codes, cells):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _spread(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
+def _open_neighbours(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
     """Open the closed neighbours of cells [n, 2] with a pixel at the common side that differs from them; which."""
     down, across = open_cells.shape
     opened_cells = np.empty((4 * len(fresh), 2), np.int64)
@@ -172,10 +174,10 @@ def _spread(codes, open_cells, fresh):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _differs(codes, row, column, down, across, one):  # type: ignore[no-untyped-def]
-    """Tell whether one of a cell's pixels at its side was found to be other than `one`."""
+def _differs(codes, row, column, down, across, expected_code):  # type: ignore[no-untyped-def]
+    """Tell whether one of a cell's pixels at its side was found to be other than `expected_code`."""
     height, width = codes.shape
-    opposite = SHADED if one == LIT else LIT
+    opposite = SHADED if expected_code == LIT else LIT
     for step in range(CELL_PX):
         y = row + (step if down == 0 else (CELL_PX - 1 if down > 0 else 0))
         x = column + (step if across == 0 else (CELL_PX - 1 if across > 0 else 0))

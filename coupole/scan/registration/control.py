@@ -18,7 +18,7 @@ import numpy as np
 
 from coupole.errors import InputError, reason
 from coupole.scan.registration.pair_matching import Fit, PairMotion
-from coupole.scan.registration.small_motions import applied, motion_of_points
+from coupole.scan.registration.small_motions import motion_of_points, moved_points
 from coupole.scan.registration.viewpoint import Floats
 from coupole.scan.scanner_export import MM_PER_UNIT
 
@@ -57,11 +57,11 @@ class ControlPoint:
 class Sightings:
     """All targets in all scans, and the control points among them."""
 
-    seen: tuple[Sighting, ...] = ()
+    sightings: tuple[Sighting, ...] = ()
     control: dict[str, ControlPoint] | None = None
 
     @property
-    def anchored(self) -> bool:
+    def is_anchored(self) -> bool:
         """True if control points determine where the scans are."""
         return self.control is not None
 
@@ -69,7 +69,7 @@ class Sightings:
         """Return the sightings of some scans, which are numbered anew in this order."""
         place = {scan: k for k, scan in enumerate(scans)}
         sightings = tuple(
-            replace(sighting, scan=place[sighting.scan]) for sighting in self.seen if sighting.scan in place
+            replace(sighting, scan=place[sighting.scan]) for sighting in self.sightings if sighting.scan in place
         )
         names = {sighting.name for sighting in sightings} & set(self.control or {})
         enough = names and not _on_a_line(np.array([(self.control or {})[name].point_mm for name in names]))
@@ -77,17 +77,17 @@ class Sightings:
 
     def by_name(self) -> dict[str, list[Sighting]]:
         sightings_of = defaultdict(list)
-        for sighting in self.seen:
+        for sighting in self.sightings:
             sightings_of[sighting.name].append(sighting)
         return sightings_of
 
     def site_from_common(self, poses: Sequence[Floats]) -> Floats:
         """4x4 that brings sightings of control points onto these, by least squares."""
         assert self.control is not None
-        control_sightings = [sighting for sighting in self.seen if sighting.name in self.control]
+        control_sightings = [sighting for sighting in self.sightings if sighting.name in self.control]
         return motion_of_points(
             np.array(
-                [applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in control_sightings]
+                [moved_points(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in control_sightings]
             ),
             np.array([self.control[sighting.name].point_mm for sighting in control_sightings]),
         )
@@ -101,7 +101,9 @@ class Sightings:
             if control is None and len(several) < 2:
                 continue
             weights = np.array([sighting.u_mm**-2 for sighting in several])
-            places = np.array([applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several])
+            places = np.array(
+                [moved_points(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several]
+            )
             total = float(weights.sum() + (0 if control is None else control.u_mm**-2))
             middle = weights @ places + (0 if control is None else control.u_mm**-2 * control.point_mm)
             middle = middle / total
@@ -115,13 +117,13 @@ class Sightings:
             normal -= summed_rows.T @ summed_rows / total
         return normal, gradient
 
-    def left(self, poses: Sequence[Floats]) -> tuple[Sighting, ...]:
+    def with_distances(self, poses: Sequence[Floats]) -> tuple[Sighting, ...]:
         """All sightings with their distances from the targets' adjusted places."""
         sightings = []
         for name, several in self.by_name().items():
             control = (self.control or {}).get(name)
             weights = [sighting.u_mm**-2 for sighting in several] + ([] if control is None else [control.u_mm**-2])
-            places = [applied(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several]
+            places = [moved_points(poses[sighting.scan], sighting.point_mm[None])[0] for sighting in several]
             middle = np.average(places + ([] if control is None else [control.point_mm]), axis=0, weights=weights)
             for sighting, place in zip(several, places, strict=True):
                 sightings.append(replace(sighting, left_mm=float(np.linalg.norm(place - middle))))
@@ -138,7 +140,7 @@ def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
     """Motions between scans that share three targets or more that are not on a line. Raises InputError if names
     that two scans share cannot be of the same targets."""
     of_scan: dict[int, dict[str, Sighting]] = defaultdict(dict)
-    for sighting in sightings.seen:
+    for sighting in sightings.sightings:
         of_scan[sighting.scan][sighting.name] = sighting
     motions = []
     for first, second in combinations(sorted(of_scan), 2):
@@ -150,7 +152,7 @@ def motions_by_targets(sightings: Sightings) -> list[PairMotion]:
         if _on_a_line(first_mm):
             continue
         motion = motion_of_points(second_mm, first_mm)
-        off_mm = np.linalg.norm(applied(motion, second_mm) - first_mm, axis=1)
+        off_mm = np.linalg.norm(moved_points(motion, second_mm) - first_mm, axis=1)
         u_mm = np.array([np.hypot(of_scan[first][n].u_mm, of_scan[second][n].u_mm) for n in shared_names])
         worst = int(np.argmax(off_mm / u_mm))
         if off_mm[worst] > _SIGMAS * u_mm[worst] * np.sqrt(3):

@@ -25,7 +25,7 @@ _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 def e57_sources(path: Path) -> list[ScanSource]:
     """The scans of a file. Raises InputError, ExtraMissing."""
-    with _opened(path) as file:
+    with _open_e57(path) as file:
         count = file.scan_count
     if count == 0:
         raise InputError(f"{path}: expected scans; the file holds none (only pictures?)")
@@ -34,7 +34,7 @@ def e57_sources(path: Path) -> list[ScanSource]:
 
 def read_e57(source: ScanSource, *, colours: bool) -> ScanContent:
     """One scan, without the points that it marks as invalid. Raises InputError, ExtraMissing."""
-    with _opened(source.path) as file:
+    with _open_e57(source.path) as file:
         header = file.get_header(source.number)
         fields = header.point_fields
         kind = next((names for names in (_CARTESIAN, _SPHERICAL) if set(names) <= set(fields)), None)
@@ -55,7 +55,7 @@ def read_e57(source: ScanSource, *, colours: bool) -> ScanContent:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_e57(path: Path) -> Iterator[Any]:
     try:
         import pye57
     except ImportError as error:
@@ -78,7 +78,7 @@ def _columns(file: Any, header: Any, names: list[str]) -> dict[str, NDArray[np.f
     return {name: values[:record_count] for name, values in columns.items()}
 
 
-def _srgba(header: Any, read: dict[str, NDArray[np.float64]]) -> NDArray[np.uint8]:
+def _srgba(header: Any, columns: dict[str, NDArray[np.float64]]) -> NDArray[np.uint8]:
     """[n, 4] by the limits that the file states, else of 0 to 255."""
     levels = []
     for name in _COLOURS:
@@ -86,8 +86,8 @@ def _srgba(header: Any, read: dict[str, NDArray[np.float64]]) -> NDArray[np.uint
         if header.node.isDefined("colorLimits"):
             limits = header.node["colorLimits"]
             low, high = (float(limits[f"{name}{end}"].value()) for end in ("Minimum", "Maximum"))
-        levels.append(np.clip(np.round(255 * (read[name] - low) / max(high - low, 1e-12)), 0, 255))
-    there = read["isColorInvalid"] == 0 if "isColorInvalid" in read else np.ones(len(levels[0]), bool)
+        levels.append(np.clip(np.round(255 * (columns[name] - low) / max(high - low, 1e-12)), 0, 255))
+    there = columns["isColorInvalid"] == 0 if "isColorInvalid" in columns else np.ones(len(levels[0]), bool)
     return np.column_stack([*levels, 255 * there]).astype(np.uint8)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from coupole.scan.registration.pair_matching import MOST_CONTRADICTED, PairMotion, contradiction
 from coupole.scan.registration.prepared_scan import PreparedScan
-from coupole.scan.registration.small_motions import applied, displacement_mm, inverse_of
+from coupole.scan.registration.small_motions import displacement_mm, inverse_of, moved_points
 from coupole.scan.registration.viewpoint import Floats
 
 AGREEMENT_PITCHES = 3.0
@@ -31,10 +31,10 @@ class Groups:
     """Transform of each scan, 4x4 mm, into the frame of its group's first scan."""
     members: dict[int, list[int]]
     group_of: list[int]
-    accepted: list[PairMotion] = field(default_factory=list)
-    rejected: list[PairMotion] = field(default_factory=list)
+    accepted_motions: list[PairMotion] = field(default_factory=list)
+    rejected_motions: list[PairMotion] = field(default_factory=list)
 
-    def predicted(self, first: int, second: int) -> Floats | None:
+    def predicted_motion(self, first: int, second: int) -> Floats | None:
         """`first_from_second` of two scans of the same group."""
         if self.group_of[first] != self.group_of[second]:
             return None
@@ -42,7 +42,7 @@ class Groups:
 
     def agrees(self, scans: Sequence[PreparedScan], motion: PairMotion) -> bool:
         """Tell whether a motion between two scans of one group agrees with the places that they have already."""
-        predicted_motion = self.predicted(motion.first, motion.second)
+        predicted_motion = self.predicted_motion(motion.first, motion.second)
         return predicted_motion is not None and _agree(scans, motion, predicted_motion)
 
 
@@ -66,61 +66,61 @@ def join(scans: Sequence[PreparedScan], motions: Sequence[PairMotion]) -> Groups
 
 def _sort_within(scans: Sequence[PreparedScan], groups: Groups, motions: Sequence[PairMotion]) -> None:
     for motion in motions:
-        (groups.accepted if groups.agrees(scans, motion) else groups.rejected).append(motion)
+        (groups.accepted_motions if groups.agrees(scans, motion) else groups.rejected_motions).append(motion)
 
 
-def _agree(scans: Sequence[PreparedScan], motion: PairMotion, predicted: Floats) -> bool:
+def _agree(scans: Sequence[PreparedScan], motion: PairMotion, predicted_motion: Floats) -> bool:
     coarse = scans[motion.second].coarse
-    apart_mm = displacement_mm(motion.first_from_second, predicted, coarse.points_mm)
+    apart_mm = displacement_mm(motion.first_from_second, predicted_motion, coarse.points_mm)
     return apart_mm <= AGREEMENT_PITCHES * coarse.pitch_mm
 
 
 def _merge(
-    scans: Sequence[PreparedScan], groups: Groups, one: int, other: int, motions: Sequence[PairMotion]
+    scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, motions: Sequence[PairMotion]
 ) -> None:
     """Place a group in another as most of the motions between them say, or reject these."""
-    places = [_place(groups, one, motion) for motion in motions]
+    places = [_place(groups, group, motion) for motion in motions]
     supporters = [
-        [m for m in motions if _agree(scans, m, _between(groups, one, m, one_from_other))]
+        [m for m in motions if _agree(scans, m, _between(groups, group, m, one_from_other))]
         for one_from_other in places
     ]
     order = sorted(range(len(motions)), key=lambda k: -sum(m.fit.places for m in supporters[k]))
     for best in order:
-        if not _contradict(scans, groups, one, other, places[best]):
+        if not _contradict(scans, groups, group, other_group, places[best]):
             break
     else:
-        groups.rejected += motions
+        groups.rejected_motions += motions
         return
     agreeing = {id(m) for m in supporters[best]}
-    groups.accepted += [m for m in motions if id(m) in agreeing]
-    groups.rejected += [m for m in motions if id(m) not in agreeing]
-    for scan in groups.members.pop(other):
+    groups.accepted_motions += [m for m in motions if id(m) in agreeing]
+    groups.rejected_motions += [m for m in motions if id(m) not in agreeing]
+    for scan in groups.members.pop(other_group):
         groups.group_from_scan[scan] = places[best] @ groups.group_from_scan[scan]
-        groups.group_of[scan] = one
-        groups.members[one].append(scan)
+        groups.group_of[scan] = group
+        groups.members[group].append(scan)
 
 
-def _place(groups: Groups, one: int, motion: PairMotion) -> Floats:
-    """The place of the other group in group `one` by a motion between scans of both."""
+def _place(groups: Groups, group: int, motion: PairMotion) -> Floats:
+    """The place of the other group in group `group` by a motion between scans of both."""
     first, second, first_from_second = motion.first, motion.second, motion.first_from_second
-    if groups.group_of[first] != one:
+    if groups.group_of[first] != group:
         first, second, first_from_second = second, first, inverse_of(first_from_second)
     place = groups.group_from_scan[first] @ first_from_second @ inverse_of(groups.group_from_scan[second])
     return np.asarray(place)
 
 
-def _between(groups: Groups, one: int, motion: PairMotion, one_from_other: Floats) -> Floats:
-    """`first_from_second` of a motion's scans, if the other group is placed so in group `one`."""
-    whole = one_from_other if groups.group_of[motion.first] == one else inverse_of(one_from_other)
+def _between(groups: Groups, group: int, motion: PairMotion, one_from_other: Floats) -> Floats:
+    """`first_from_second` of a motion's scans, if the other group is placed so in group `group`."""
+    whole = one_from_other if groups.group_of[motion.first] == group else inverse_of(one_from_other)
     first, second = groups.group_from_scan[motion.first], groups.group_from_scan[motion.second]
     return np.asarray(inverse_of(first) @ whole @ second)
 
 
 def _contradict(
-    scans: Sequence[PreparedScan], groups: Groups, one: int, other: int, one_from_other: Floats
+    scans: Sequence[PreparedScan], groups: Groups, group: int, other_group: int, one_from_other: Floats
 ) -> bool:
     """True if a scan of one group lies in the space that a scan of the other saw through."""
-    pairs = [(a, b) for a in groups.members[one] for b in groups.members[other]]
+    pairs = [(a, b) for a in groups.members[group] for b in groups.members[other_group]]
     if len(pairs) > _MOST_CROSS_CHECKS:
         picks = np.random.default_rng(0).choice(len(pairs), _MOST_CROSS_CHECKS, replace=False)
         pairs = [pairs[k] for k in picks]
@@ -136,8 +136,8 @@ def _contradict(
     return False
 
 
-def spheres_meet(one: PreparedScan, other: PreparedScan, one_from_other: Floats) -> bool:
+def spheres_meet(first_scan: PreparedScan, second_scan: PreparedScan, one_from_other: Floats) -> bool:
     """Tell whether two scans' bounding spheres meet: only then they may overlap."""
-    (middle_one, radius_one), (middle_other, radius_other) = one.coarse.sphere, other.coarse.sphere
-    apart = np.linalg.norm(applied(one_from_other, middle_other[None])[0] - middle_one)
+    (middle_one, radius_one), (middle_other, radius_other) = first_scan.coarse.sphere, second_scan.coarse.sphere
+    apart = np.linalg.norm(moved_points(one_from_other, middle_other[None])[0] - middle_one)
     return bool(apart < radius_one + radius_other)

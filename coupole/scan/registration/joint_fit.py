@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from coupole.errors import InputError
 from coupole.scan.registration.control import Sighting, Sightings
 from coupole.scan.registration.prepared_scan import Cloud, PreparedScan
-from coupole.scan.registration.small_motions import applied, inverse_of, stepped
+from coupole.scan.registration.small_motions import inverse_of, moved_points, stepped_motion
 from coupole.scan.registration.viewpoint import Floats
 
 Say = Callable[[str, int, int], None]
@@ -81,21 +81,21 @@ def adjust(
     scans: Sequence[PreparedScan],
     pairs: Sequence[tuple[int, int]],
     common_from_scan: Sequence[Floats],
-    fixed: int,
+    fixed_scan: int,
     sightings: Sightings,
     say: Say,
 ) -> JointFit:
-    """Poses of scans from poses that are about right; `pairs` are numbers of scans that overlap. The scan `fixed`
-    stays where it is, unless there are control points. Raises InputError if nothing overlaps."""
+    """Poses of scans from poses that are about right; `pairs` are numbers of scans that overlap. The scan
+    `fixed_scan` stays where it is, unless there are control points. Raises InputError if nothing overlaps."""
     poses = [np.array(pose) for pose in common_from_scan]
-    if sightings.anchored:
+    if sightings.is_anchored:
         onto = sightings.site_from_common(poses)
         poses = [onto @ pose for pose in poses]
     inflation = 1.0
-    poses, state = _settled(scans, pairs, poses, fixed, sightings, inflation, say)
-    if sightings.seen and state.overlaps:  # what a point weighs against a target is known only now
+    poses, state = _settled_poses(scans, pairs, poses, fixed_scan, sightings, inflation, say)
+    if sightings.sightings and state.overlaps:  # what a point weighs against a target is known only now
         inflation = state.inflation()
-        poses, state = _settled(scans, pairs, poses, fixed, sightings, inflation, say)
+        poses, state = _settled_poses(scans, pairs, poses, fixed_scan, sightings, inflation, say)
     every = np.concatenate([o.off_mm for o in state.overlaps] or [np.zeros(1)])
     nearest = np.concatenate([o.nearest_mm for o in state.overlaps] or [np.zeros(1)])
     return JointFit(
@@ -106,7 +106,7 @@ def adjust(
         float(np.sqrt(np.mean(every**2))),
         float(np.median(nearest)),
         state.inflation(),
-        sightings.left(poses),
+        sightings.with_distances(poses),
     )
 
 
@@ -179,11 +179,11 @@ class _State:
         return np.asarray((pull.T @ pull).toarray() * few / inflation**4)
 
 
-def _settled(
+def _settled_poses(
     scans: Sequence[PreparedScan],
     pairs: Sequence[tuple[int, int]],
     poses: list[Floats],
-    fixed: int,
+    fixed_scan: int,
     sightings: Sightings,
     inflation: float,
     say: Say,
@@ -192,10 +192,10 @@ def _settled(
     reach_mm = 3.0 * pitch_mm
     for turn in range(_MOST_ROUNDS):
         say("adjusting all scans together", turn, _MOST_ROUNDS)
-        state = _state(scans, pairs, poses, fixed, sightings, inflation, reach_mm)
+        state = _state(scans, pairs, poses, fixed_scan, sightings, inflation, reach_mm)
         reach_mm = max(1.5 * pitch_mm, 5.0 * state.noise_mm)
         step = state.step().reshape(-1, 6)
-        poses = [stepped(pose, step[k], state.pivots[k]) for k, pose in enumerate(poses)]
+        poses = [stepped_motion(pose, step[k], state.pivots[k]) for k, pose in enumerate(poses)]
         if turn >= _LEAST_ROUNDS and np.abs(step[:, :3]).max() < _SETTLED_PITCHES * pitch_mm:
             break
     say("adjusting all scans together", _MOST_ROUNDS, _MOST_ROUNDS)
@@ -206,15 +206,17 @@ def _state(
     scans: Sequence[PreparedScan],
     pairs: Sequence[tuple[int, int]],
     poses: Sequence[Floats],
-    fixed: int,
+    fixed_scan: int,
     sightings: Sightings,
     inflation: float,
     reach_mm: float,
 ) -> _State:
     count = len(scans)
-    pivots = np.array([applied(p, s.coarse.points_mm).mean(axis=0) for s, p in zip(scans, poses, strict=True)])
+    pivots = np.array(
+        [moved_points(p, s.coarse.points_mm).mean(axis=0) for s, p in zip(scans, poses, strict=True)]
+    )
     overlaps = [o for pair in pairs for o in _overlaps(scans, poses, pivots, *pair, reach_mm)]
-    if not overlaps and not sightings.seen:
+    if not overlaps and not sightings.sightings:
         raise InputError("the scans do not overlap: there is nothing to adjust")
     pitch_mm = scans[0].fine.pitch_mm
     noise_mm = pitch_mm
@@ -230,8 +232,8 @@ def _state(
     targets_normal, targets_gradient = sightings.normal_equations(poses, pivots)
     prior = np.concatenate([np.r_[np.full(3, scan.survey.size_mm**-2.0), np.ones(3)] for scan in scans])
     free = np.ones(6 * count, bool)
-    if not sightings.anchored:
-        free[6 * fixed : 6 * fixed + 6] = False
+    if not sightings.is_anchored:
+        free[6 * fixed_scan : 6 * fixed_scan + 6] = False
     return _State(
         scans,
         overlaps,
@@ -254,20 +256,20 @@ def _overlaps(
     scans: Sequence[PreparedScan],
     poses: Sequence[Floats],
     pivots: Floats,
-    one: int,
-    other: int,
+    scan_number: int,
+    other_number: int,
     reach_mm: float,
 ) -> list[Overlap]:
     """The points of each of two scans on the surface of the other."""
-    signless = "none" in (scans[one].viewpoint.stand, scans[other].viewpoint.stand)
+    signless = "none" in (scans[scan_number].viewpoint.stand, scans[other_number].viewpoint.stand)
     overlaps = []
-    for first, second in ((one, other), (other, one)):
+    for first, second in ((scan_number, other_number), (other_number, scan_number)):
         first_from_second = inverse_of(poses[first]) @ poses[second]
         normals, off_mm, points, nearest_mm = distances(
             scans[first].fine, scans[second].fine, first_from_second, reach_mm, signless=signless
         )
         if len(off_mm) >= _LEAST_PAIRS:
-            normals, points = normals @ poses[first][:3, :3].T, applied(poses[first], points)
+            normals, points = normals @ poses[first][:3, :3].T, moved_points(poses[first], points)
             derivatives = np.concatenate(
                 [
                     -normals,
@@ -286,7 +288,7 @@ def distances(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return for points of the second scan near the first one: normals [n, 3] there, distances along these [n],
     points [n, 3] in the first scan's frame, and distances to its points [n]."""
-    moved_mm = applied(first_from_second, second.points_mm)
+    moved_mm = moved_points(first_from_second, second.points_mm)
     away_mm, nearest = first.tree.query(moved_mm, distance_upper_bound=reach_mm)
     hit = np.flatnonzero(np.isfinite(away_mm))
     facing = np.sum((second.normals[hit] @ first_from_second[:3, :3].T) * first.normals[nearest[hit]], axis=1)

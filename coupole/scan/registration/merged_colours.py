@@ -22,10 +22,10 @@ def linear_light(srgba: NDArray[np.uint8]) -> Floats:
     return np.hstack([linear * weight, weight])
 
 
-def encoded(weighted: Floats) -> NDArray[np.uint8]:
+def encode_srgb(weighted_sums: Floats) -> NDArray[np.uint8]:
     """[n, 3] sRGB, 8 bit, of sums of weighted linear light [n, 4]."""
-    weight = weighted[:, 3:]
-    linear = np.clip(weighted[:, :3] / np.where(weight > 0, weight, 1.0), 0.0, 1.0)
+    weight = weighted_sums[:, 3:]
+    linear = np.clip(weighted_sums[:, :3] / np.where(weight > 0, weight, 1.0), 0.0, 1.0)
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.where(weight > 0, np.round(255 * srgb), NO_COLOUR).astype(np.uint8)
 

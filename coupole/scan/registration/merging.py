@@ -22,10 +22,10 @@ from scipy.spatial import cKDTree
 
 from coupole.errors import InputError
 from coupole.scan.registration.extra import ExtraMissing, registration_libraries
-from coupole.scan.registration.merged_colours import around, encoded, linear_light
+from coupole.scan.registration.merged_colours import around, encode_srgb, linear_light
 from coupole.scan.registration.prepared_scan import NEIGHBOURS, PreparedScan, vertex_normals
 from coupole.scan.registration.scan_files import read_scan
-from coupole.scan.registration.small_motions import applied
+from coupole.scan.registration.small_motions import moved_points
 from coupole.scan.registration.viewpoint import Floats
 
 Say = Callable[[str, int, int], None]
@@ -54,7 +54,7 @@ class Merged:
     points: int = 0
     """Points that were read, of all scans."""
     cell_mm: float = 0.0
-    coloured: bool = False
+    has_colours: bool = False
     """True if a scan had colours, and mesh and clouds have them."""
     levels: dict[str, int] = field(default_factory=dict)
     """Points of each thinner cloud, by the name of its file."""
@@ -83,16 +83,16 @@ def merge(
         say("distributing points", number, len(scans))
         summary.points += scan.survey.count
         records = _records(scan, pose, unit, cell_mm)
-        summary.coloured |= bool(records["light"][:, 3].any())
+        summary.has_colours |= bool(records["light"][:, 3].any())
         _distribute(records, cell_mm, blocks)
     say("distributing points", len(scans), len(scans))
     clouds = {
-        f"points-{level:g}mm.ply": _Level(level, coloured=summary.coloured)
+        f"points-{level:g}mm.ply": _Level(level, has_colours=summary.has_colours)
         for level in levels_mm
         if level > cell_mm
     }
     files = sorted(blocks.iterdir())
-    with _MeshFile(folder, coloured=summary.coloured) as mesh:
+    with _MeshFile(folder, has_colours=summary.has_colours) as mesh:
         for number, path in enumerate(files):
             say("merging blocks", number, len(files))
             block = np.array([int(word) for word in path.stem.split("_")])
@@ -138,7 +138,7 @@ def _records(scan: PreparedScan, pose: Floats, unit: str, cell_mm: float) -> NDA
     normals *= np.where(incidence < 0, -1.0, 1.0)[:, None]
     keep = np.abs(incidence) > _STEEPEST
     records = np.empty(int(keep.sum()), _RECORD)
-    records["point"] = applied(pose, points[keep])
+    records["point"] = moved_points(pose, points[keep])
     records["normal"] = normals[keep] @ pose[:3, :3].T
     records["weight"] = np.abs(incidence[keep])
     records["light"] = 0.0
@@ -224,7 +224,7 @@ def _shades(
     lit = records[records["light"][:, 3] > 0]
     points = lit["point"].astype(np.float64) / cell_mm - block * BLOCK_CELLS
     light = lit["light"] * lit["weight"][:, None].astype(np.float64)
-    return encoded(around(points, light, vertices.astype(np.float64), _REACH_CELLS, _KERNEL_CELLS))
+    return encode_srgb(around(points, light, vertices.astype(np.float64), _REACH_CELLS, _KERNEL_CELLS))
 
 
 def _corners_near(points: Floats) -> NDArray[np.bool_]:
@@ -242,8 +242,8 @@ def _corners_near(points: Floats) -> NDArray[np.bool_]:
 class _MeshFile:
     """A mesh that grows on the disk; vertices on the borders of blocks are welded at the end."""
 
-    def __init__(self, folder: Path, *, coloured: bool) -> None:
-        self._coloured = coloured
+    def __init__(self, folder: Path, *, has_colours: bool) -> None:
+        self._coloured = has_colours
         self._shades: list[NDArray[np.uint8]] = []
         self._vertices_path, self._faces_path = folder / "vertices.part", folder / "faces.part"
         self._keys: list[NDArray[np.int64]] = []
@@ -340,8 +340,8 @@ def _edge_keys(vertices: NDArray[np.float32], block: NDArray[np.int64]) -> NDArr
 class _Level:
     """A cloud with one point, the mean, for each cell of a grid."""
 
-    def __init__(self, pitch_mm: float, *, coloured: bool) -> None:
-        self._coloured = coloured
+    def __init__(self, pitch_mm: float, *, has_colours: bool) -> None:
+        self._coloured = has_colours
         self._pitch_mm = pitch_mm
         self._keys: list[NDArray[np.int64]] = []
         self._sums: list[Floats] = []
@@ -368,5 +368,5 @@ class _Level:
                     f"{_COLOURS_HEAD if self._coloured else ''}end_header\n"
                 ).encode()
             )
-            _write_points(file, points, encoded(whole[:, 4:]) if self._coloured else None)
+            _write_points(file, points, encode_srgb(whole[:, 4:]) if self._coloured else None)
         return len(points)

@@ -37,7 +37,7 @@ class Fit:
 
     overlap: float
     """Share of the smaller scan's places that lie on the other scan."""
-    contradicted: float
+    contradicted_share: float
     """Share of points, seen by the other scanner, that lie where it saw nothing; 0 where neither viewpoint is
     known."""
     rms_mm: float
@@ -47,7 +47,7 @@ class Fit:
 
     @property
     def holds(self) -> bool:
-        return self.overlap >= LEAST_OVERLAP and self.contradicted <= MOST_CONTRADICTED
+        return self.overlap >= LEAST_OVERLAP and self.contradicted_share <= MOST_CONTRADICTED
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,14 @@ def match_by_features(first: Cloud, second: Cloud) -> tuple[Floats, int]:
     return motion, int(matcher.get_num_final_inliers())
 
 
-def refined(first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, iterations: int) -> Floats:
+def refined_motion(
+    first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: float, iterations: int
+) -> Floats:
     """The motion by generalized ICP, with points as far apart as `reach_mm` at first."""
     small_gicp, _ = registration_libraries()
     alignment = small_gicp.align(
-        _shared(first),
-        _shared(second),
+        _gicp_cloud(first),
+        _gicp_cloud(second),
         _tree(first),
         first_from_second,
         max_correspondence_distance=reach_mm,
@@ -91,7 +93,7 @@ def refined(first: Cloud, second: Cloud, first_from_second: Floats, reach_mm: fl
     return np.asarray(alignment.T_target_source)
 
 
-def _shared(cloud: Cloud) -> Any:
+def _gicp_cloud(cloud: Cloud) -> Any:
     """The cloud as the library's own, kept beside it."""
     small_gicp, _ = registration_libraries()
     if "_library_cloud" not in cloud.__dict__:
@@ -103,7 +105,7 @@ def _shared(cloud: Cloud) -> Any:
 
 
 def _tree(cloud: Cloud) -> Any:
-    _shared(cloud)
+    _gicp_cloud(cloud)
     return cloud.__dict__["_library_tree"]
 
 
@@ -134,10 +136,10 @@ def contradiction(
     the larger of both scans'. Only each `every`-th point is looked at."""
     there = second.coarse.points_mm[::every] @ first_from_second[:3, :3].T + first_from_second[:3, 3]
     back = (first.coarse.points_mm[::every] - first_from_second[:3, 3]) @ first_from_second[:3, :3]
-    return max(_contradicted(first, there, near_mm), _contradicted(second, back, near_mm))
+    return max(_contradicted_share(first, there, near_mm), _contradicted_share(second, back, near_mm))
 
 
-def _contradicted(seer: PreparedScan, points_mm: Floats, near_mm: float) -> float:
+def _contradicted_share(seer: PreparedScan, points_mm: Floats, near_mm: float) -> float:
     if seer.picture is None:
         return 0.0
     in_view, before = seer.picture.in_front(points_mm, 2.0 * near_mm)
@@ -162,10 +164,12 @@ def improve(
 ) -> PairMotion | None:
     """The motion between two scans from one that is about right, if it holds."""
     pitch_mm = first.coarse.pitch_mm
-    motion = refined(first.coarse, second.coarse, guess, 2.5 * pitch_mm, _COARSE_ITERATIONS)
+    motion = refined_motion(first.coarse, second.coarse, guess, 2.5 * pitch_mm, _COARSE_ITERATIONS)
     fit = fit_of(first, second, motion, 0.7 * pitch_mm)
-    if fit.overlap < _ROUGH_OVERLAP or fit.contradicted > _ROUGH_CONTRADICTED:
+    if fit.overlap < _ROUGH_OVERLAP or fit.contradicted_share > _ROUGH_CONTRADICTED:
         return None
-    motion = refined(first.fine, second.fine, motion, 1.5 * first.fine.pitch_mm + fit.rms_mm, _FINE_ITERATIONS)
+    motion = refined_motion(
+        first.fine, second.fine, motion, 1.5 * first.fine.pitch_mm + fit.rms_mm, _FINE_ITERATIONS
+    )
     fit = fit_of(first, second, motion, 0.7 * pitch_mm)
     return PairMotion(number_first, number_second, motion, fit, found_by) if fit.holds else None

@@ -30,18 +30,18 @@ class Search:
         self._scans, self._processes = scans, processes
         self._pool: ProcessPoolExecutor | None = None
 
-    def run(self, what: str, tasks: Sequence[Task], say: Say) -> list[PairMotion]:
+    def run(self, task_name: str, tasks: Sequence[Task], say: Say) -> list[PairMotion]:
         """The motions that hold, in the order of the tasks."""
         motions = []
-        for number, motion in enumerate(self._each(tasks)):
-            say(what, number + 1, len(tasks))
+        for number, motion in enumerate(self._motions(tasks)):
+            say(task_name, number + 1, len(tasks))
             if motion is not None:
                 motions.append(motion)
         return motions
 
-    def _each(self, tasks: Sequence[Task]) -> Iterable[PairMotion | None]:
+    def _motions(self, tasks: Sequence[Task]) -> Iterable[PairMotion | None]:
         if self._processes < 2 or (self._pool is None and len(tasks) < _WORTH_PROCESSES):
-            return (_matched(self._scans, task) for task in tasks)
+            return (_match_task(self._scans, task) for task in tasks)
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(self._processes, context, _begin, (self._scans,))
@@ -67,10 +67,10 @@ def _begin(scans: Sequence[PreparedScan]) -> None:
 
 
 def _matched_there(task: Task) -> PairMotion | None:
-    return _matched(_scans_there, task)
+    return _match_task(_scans_there, task)
 
 
-def _matched(scans: Sequence[PreparedScan], task: Task) -> PairMotion | None:
+def _match_task(scans: Sequence[PreparedScan], task: Task) -> PairMotion | None:
     first, second, guess = task
     if guess is None:
         return match(first, second, scans[first], scans[second])

@@ -63,7 +63,7 @@ class Survey:
     """Diagonal of the bounding box."""
     places: int
     """Cells of a grid of `PLACE_SPACINGS` spacings that hold points."""
-    folded: dict[Stand, float]
+    folded_shares: dict[Stand, float]
     """Share of rays along which two surfaces lie, for each viewpoint that the scan could have."""
 
 
@@ -121,25 +121,25 @@ def _sample(count: int) -> NDArray[np.intp]:
 
 
 def prepare(
-    source: ScanSource, unit: str, known: Survey, viewpoint: Viewpoint, fine_mm: float, coarse_mm: float
+    source: ScanSource, unit: str, scan_survey: Survey, viewpoint: Viewpoint, fine_mm: float, coarse_mm: float
 ) -> PreparedScan:
     """Read a scan and thin it to two pitches. Raises InputError."""
     content = read_scan(source, unit)
     mesh = content.mesh
-    fine = thinned(mesh.vertices.astype(np.float64), fine_mm, viewpoint, vertex_normals(mesh))
-    coarse = thinned(fine.points_mm, coarse_mm, viewpoint, fine.normals)
+    fine = thinned_cloud(mesh.vertices.astype(np.float64), fine_mm, viewpoint, vertex_normals(mesh))
+    coarse = thinned_cloud(fine.points_mm, coarse_mm, viewpoint, fine.normals)
     if len(coarse.points_mm) < 3 * NEIGHBOURS:
         raise InputError(f"{source}: its points lie in {len(coarse.points_mm)} places; expected a surface")
     picture = None
     if viewpoint.stand != "none":
-        some = _sample(known.count)
-        thinned_mm = known.spacing_mm * (known.count / len(some)) ** 0.5
+        some = _sample(scan_survey.count)
+        thinned_mm = scan_survey.spacing_mm * (scan_survey.count / len(some)) ** 0.5
         picture = DepthPicture(viewpoint, mesh.vertices[some].astype(np.float64), thinned_mm)
-    return PreparedScan(source, content.stated_pose, known, viewpoint, fine, coarse, picture)
+    return PreparedScan(source, content.stated_pose, scan_survey, viewpoint, fine, coarse, picture)
 
 
-def thinned(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known: Floats | None) -> Cloud:
-    """The mean point of each cell, with normals that face the scanner, or the side of the `known` ones."""
+def thinned_cloud(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known_normals: Floats | None) -> Cloud:
+    """The mean point of each cell, with normals that face the scanner, or the side of the `known_normals` ones."""
     small_gicp, _ = registration_libraries()
     middle = points_mm.mean(axis=0)
     thin = small_gicp.voxelgrid_sampling(points_mm - middle, pitch_mm)
@@ -148,8 +148,8 @@ def thinned(points_mm: Floats, pitch_mm: float, viewpoint: Viewpoint, known: Flo
     normals = np.ascontiguousarray(thin.normals()[:, :3])
     if viewpoint.stand != "none":
         outward = viewpoint.towards(points)
-    elif known is not None:
-        outward = known[cKDTree(points_mm).query(points)[1]]
+    elif known_normals is not None:
+        outward = known_normals[cKDTree(points_mm).query(points)[1]]
     else:
         return Cloud(points, normals, np.ones(len(points)), pitch_mm)
     incidence = np.sum(normals * outward, axis=1)

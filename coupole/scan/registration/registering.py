@@ -42,7 +42,7 @@ class Registered:
 
     names: tuple[str, ...]
     scans: tuple[PreparedScan, ...]
-    placed: tuple[int, ...]
+    placed_numbers: tuple[int, ...]
     """Numbers of the scans that hang together; the first is the one whose frame is the common one."""
     first_from_scan: dict[int, Floats]
     """4x4 mm, to the first placed scan's frame."""
@@ -51,9 +51,9 @@ class Registered:
     frame if there are any."""
     site_from_first: Floats | None
     """Transform of the first placed scan's frame into the control points' frame."""
-    unplaced: tuple[int, ...]
+    unplaced_numbers: tuple[int, ...]
     motions: tuple[PairMotion, ...]
-    rejected: tuple[PairMotion, ...]
+    rejected_motions: tuple[PairMotion, ...]
     pairs: int
     """Number of pairs that overlap."""
     loops: tuple[Loop, ...]
@@ -83,14 +83,14 @@ def register(
         raise InputError(f"expected two scans or more, found {len(sources)}")
     names = [source.name for source in sources]
     sightings = read_sightings(targets, control, names, unit)
-    scans = _prepared(sources, unit, stand, say)
+    scans = _prepared_scans(sources, unit, stand, say)
     if trust_poses and not any(scan.stated_pose is not None for scan in scans):
         raise InputError("--trust-poses: no scan states a pose; only PTX and E57 can")
     with search_of(scans, processes) as search:
         motions = motions_by_targets(sightings)
         if trust_poses:
-            motions += search.run("testing stated poses", list(_stated(scans)), say)
-        groups = _found(scans, search, motions, say, every=not trust_poses)
+            motions += search.run("testing stated poses", list(_stated_tasks(scans)), say)
+        groups = _groups_by_search(scans, search, motions, say, every=not trust_poses)
         main = max(groups.members.values(), key=lambda members: (len(members), -min(members)))
         if len(main) < 2:
             raise InputError(
@@ -100,10 +100,10 @@ def register(
             )
         scan_numbers = sorted(main)
         _grow(scans, search, groups, scan_numbers, say)
-    return _adjusted(names, scans, groups, scan_numbers, sightings, say)
+    return _adjusted_registration(names, scans, groups, scan_numbers, sightings, say)
 
 
-def _prepared(sources: Sequence[ScanSource], unit: str, stand: Stand | None, say: Say) -> list[PreparedScan]:
+def _prepared_scans(sources: Sequence[ScanSource], unit: str, stand: Stand | None, say: Say) -> list[PreparedScan]:
     surveys = []
     for number, source in enumerate(sources):
         say("reading", number, len(sources))
@@ -111,7 +111,7 @@ def _prepared(sources: Sequence[ScanSource], unit: str, stand: Stand | None, say
     say("reading", len(sources), len(sources))
     _expect_one_unit(sources, surveys)
     if stand is None:
-        viewpoints = choose_viewpoints([each_survey.folded for each_survey in surveys])
+        viewpoints = choose_viewpoints([each_survey.folded_shares for each_survey in surveys])
     else:
         viewpoints = [Viewpoint(stand)] * len(sources)
     fine_mm, coarse_mm = pitches(surveys)
@@ -150,7 +150,7 @@ def pitches(surveys: Sequence[Survey]) -> tuple[float, float]:
     return fine_mm, coarse_mm
 
 
-def _stated(scans: Sequence[PreparedScan]) -> Iterator[Task]:
+def _stated_tasks(scans: Sequence[PreparedScan]) -> Iterator[Task]:
     """Pairs that overlap by the poses of their files, with their motions."""
     for first, second in combinations(range(len(scans)), 2):
         first_pose, second_pose = scans[first].stated_pose, scans[second].stated_pose
@@ -160,7 +160,7 @@ def _stated(scans: Sequence[PreparedScan]) -> Iterator[Task]:
                 yield first, second, motion
 
 
-def _found(
+def _groups_by_search(
     scans: Sequence[PreparedScan], search: Search, by_targets: Sequence[PairMotion], say: Say, *, every: bool
 ) -> Groups:
     """Groups by features, and by motions that are known; `every` pair is tried, else those of different groups."""
@@ -185,51 +185,53 @@ def _found(
 
 
 def _some(
-    untried: Sequence[tuple[int, int]], groups: Groups, round_number: int
+    untried_pairs: Sequence[tuple[int, int]], groups: Groups, round_number: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Pairs for a round, a few of each scan, drawn from those of different groups; and the others."""
-    order = np.random.default_rng(round_number).permutation(len(untried))
+    order = np.random.default_rng(round_number).permutation(len(untried_pairs))
     partner_counts: dict[int, int] = {}
     batch, later = [], []
     for k in order:
-        first, second = untried[k]
+        first, second = untried_pairs[k]
         smaller = min((first, second), key=lambda scan: len(groups.members[groups.group_of[scan]]))
         if partner_counts.get(smaller, 0) < _PARTNERS:
             partner_counts[smaller] = partner_counts.get(smaller, 0) + 1
-            batch.append(untried[k])
+            batch.append(untried_pairs[k])
         else:
-            later.append(untried[k])
+            later.append(untried_pairs[k])
     return sorted(batch), later
 
 
-def _grow(scans: Sequence[PreparedScan], search: Search, groups: Groups, placed: Sequence[int], say: Say) -> None:
+def _grow(
+    scans: Sequence[PreparedScan], search: Search, groups: Groups, placed_numbers: Sequence[int], say: Say
+) -> None:
     """Motions of the pairs that overlap by the poses found, and were not matched yet."""
-    matched_pairs = {(m.first, m.second) for m in groups.accepted}
+    matched_pairs = {(m.first, m.second) for m in groups.accepted_motions}
     tasks = []
-    every = list(combinations(placed, 2))
+    every = list(combinations(placed_numbers, 2))
     for number, pair in enumerate(every):
         say("looking for neighbours", number + 1, len(every))
-        motion = groups.predicted(*pair)
+        motion = groups.predicted_motion(*pair)
         if motion is not None and pair not in matched_pairs and _may_overlap(scans, pair, motion):
             tasks.append((*pair, motion))
     motions = search.run("matching neighbours", tasks, say)
-    groups.accepted += [m for m in motions if groups.agrees(scans, m)]
-    groups.rejected += [m for m in motions if not groups.agrees(scans, m)]
+    groups.accepted_motions += [m for m in motions if groups.agrees(scans, m)]
+    groups.rejected_motions += [m for m in motions if not groups.agrees(scans, m)]
 
 
-def _may_overlap(scans: Sequence[PreparedScan], pair: tuple[int, int], predicted: Floats) -> bool:
+def _may_overlap(scans: Sequence[PreparedScan], pair: tuple[int, int], predicted_motion: Floats) -> bool:
     first, second = scans[pair[0]], scans[pair[1]]
-    if not spheres_meet(first, second, predicted):
+    if not spheres_meet(first, second, predicted_motion):
         return False
-    return fit_of(first, second, predicted, 1.5 * first.coarse.pitch_mm).overlap >= LEAST_OVERLAP
+    return fit_of(first, second, predicted_motion, 1.5 * first.coarse.pitch_mm).overlap >= LEAST_OVERLAP
 
 
 def _overlapping(
-    scans: Sequence[PreparedScan], placed: Sequence[int], poses: Sequence[Floats]
+    scans: Sequence[PreparedScan], placed_numbers: Sequence[int], poses: Sequence[Floats]
 ) -> Iterator[tuple[int, int, float]]:
-    """Pairs of the placed scans, by their places in `placed`, with the share that overlaps."""
-    for first_place, second_place in combinations(range(len(placed)), 2):
-        first, second = scans[placed[first_place]], scans[placed[second_place]]
+    """Pairs of the placed scans, by their places in `placed_numbers`, with the share that overlaps."""
+    for first_place, second_place in combinations(range(len(placed_numbers)), 2):
+        first, second = scans[placed_numbers[first_place]], scans[placed_numbers[second_place]]
         first_from_second = inverse_of(poses[first_place]) @ poses[second_place]
         if spheres_meet(first, second, first_from_second):
             overlap = fit_of(first, second, first_from_second, 0.7 * first.coarse.pitch_mm).overlap
@@ -237,38 +239,38 @@ def _overlapping(
                 yield first_place, second_place, overlap
 
 
-def _adjusted(
+def _adjusted_registration(
     names: Sequence[str],
     scans: Sequence[PreparedScan],
     groups: Groups,
-    placed: Sequence[int],
+    placed_numbers: Sequence[int],
     sightings: Sightings,
     say: Say,
 ) -> Registered:
-    placed_scans = [scans[k] for k in placed]
-    into_first = inverse_of(groups.group_from_scan[placed[0]])
-    poses = [into_first @ groups.group_from_scan[k] for k in placed]
-    overlapping = list(_overlapping(scans, placed, poses))
-    placed_sightings = sightings.of_scans(placed)
+    placed_scans = [scans[k] for k in placed_numbers]
+    into_first = inverse_of(groups.group_from_scan[placed_numbers[0]])
+    poses = [into_first @ groups.group_from_scan[k] for k in placed_numbers]
+    overlapping = list(_overlapping(scans, placed_numbers, poses))
+    placed_sightings = sightings.of_scans(placed_numbers)
     fit = adjust(placed_scans, [pair[:2] for pair in overlapping], poses, 0, placed_sightings, say)
     strong = [(first, second) for first, second, overlap in overlapping if overlap >= LEAST_OVERLAP]
     alone = pairs_alone(placed_scans, strong, fit, say)
-    fit, factor = with_loops(fit, alone, len(placed))
+    fit, factor = with_loops(fit, alone, len(placed_numbers))
     loops = [
-        Loop(tuple(placed[k] for k in loop.scans), loop.error_mm, loop.error_deg)
+        Loop(tuple(placed_numbers[k] for k in loop.scans), loop.error_mm, loop.error_deg)
         for loop in find_loops(placed_scans, alone)
     ]
     to_first = inverse_of(fit.common_from_scan[0])
     return Registered(
         tuple(names),
         tuple(scans),
-        tuple(placed),
-        {number: to_first @ fit.common_from_scan[k] for k, number in enumerate(placed)},
-        {number: fit.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k, number in enumerate(placed)},
-        fit.common_from_scan[0] if placed_sightings.anchored else None,
-        tuple(k for k in range(len(scans)) if k not in placed),
-        tuple(groups.accepted),
-        tuple(groups.rejected),
+        tuple(placed_numbers),
+        {number: to_first @ fit.common_from_scan[k] for k, number in enumerate(placed_numbers)},
+        {number: fit.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k, number in enumerate(placed_numbers)},
+        fit.common_from_scan[0] if placed_sightings.is_anchored else None,
+        tuple(k for k in range(len(scans)) if k not in placed_numbers),
+        tuple(groups.accepted_motions),
+        tuple(groups.rejected_motions),
         len(overlapping),
         tuple(loops),
         factor,

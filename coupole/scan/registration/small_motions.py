@@ -17,12 +17,12 @@ def inverse_of(motion: Floats) -> Floats:
     return back
 
 
-def applied(motion: Floats, points_mm: Floats) -> Floats:
+def moved_points(motion: Floats, points_mm: Floats) -> Floats:
     """Points [n, 3] after a motion."""
     return np.asarray(points_mm @ motion[:3, :3].T + motion[:3, 3])
 
 
-def stepped(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
+def stepped_motion(motion: Floats, step: Floats, pivot_mm: Floats) -> Floats:
     """A motion [4, 4] after a step [6] that turns about a point of the frame it leads to."""
     turn = Rotation.from_rotvec(step[3:]).as_matrix()
     new_motion = np.eye(4)
@@ -38,9 +38,9 @@ def step_between(before: Floats, after: Floats, pivot_mm: Floats) -> Floats:
     return np.concatenate([rest, Rotation.from_matrix(turn).as_rotvec()])
 
 
-def displacement_mm(one: Floats, other: Floats, points_mm: Floats) -> float:
+def displacement_mm(first_motion: Floats, second_motion: Floats, points_mm: Floats) -> float:
     """Root mean square distance between places of points [n, 3] by two motions."""
-    apart = points_mm @ (one - other)[:3, :3].T + (one - other)[:3, 3]
+    apart = points_mm @ (first_motion - second_motion)[:3, :3].T + (first_motion - second_motion)[:3, 3]
     return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 

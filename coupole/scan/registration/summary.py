@@ -15,133 +15,150 @@ _CONSPICUOUS = 3.0
 """Times their uncertainty that targets may be off before a sentence says so."""
 
 
-def about(found: Registered, merged: Merged | None) -> dict[str, Any]:
+def about(registration: Registered, merged_mesh: Merged | None) -> dict[str, Any]:
     """The content of `registration.json`; lengths in mm, angles in degrees."""
     summary: dict[str, Any] = {
-        "frame": found.names[found.placed[0]],
-        "poses": {found.names[k]: found.first_from_scan[k].tolist() for k in found.placed},
-        "uncertainties": {found.names[k]: _uncertainty(found, k) for k in found.placed},
-        "rms_mm": found.fit.rms_mm,
-        "median_overlap_mm": found.fit.median_nearest_mm,
-        "noise_mm": found.fit.noise_mm,
-        "overlapping_pairs": found.pairs,
-        "matched_pairs": len(found.motions),
+        "frame": registration.names[registration.placed_numbers[0]],
+        "poses": {
+            registration.names[k]: registration.first_from_scan[k].tolist() for k in registration.placed_numbers
+        },
+        "uncertainties": {
+            registration.names[k]: _uncertainty(registration, k) for k in registration.placed_numbers
+        },
+        "rms_mm": registration.fit.rms_mm,
+        "median_overlap_mm": registration.fit.median_nearest_mm,
+        "noise_mm": registration.fit.noise_mm,
+        "overlapping_pairs": registration.pairs,
+        "matched_pairs": len(registration.motions),
         "loops": [
-            {"scans": [found.names[k] for k in loop.scans], "error_mm": loop.error_mm, "error_deg": loop.error_deg}
-            for loop in found.loops
+            {
+                "scans": [registration.names[k] for k in loop.scans],
+                "error_mm": loop.error_mm,
+                "error_deg": loop.error_deg,
+            }
+            for loop in registration.loops
         ],
-        "loop_factor": found.loop_factor,
-        "rejected": [[found.names[m.first], found.names[m.second]] for m in found.rejected],
-        "unplaced": [found.names[k] for k in found.unplaced],
-        "viewpoints": {scan.name: scan.viewpoint.stand for scan in found.scans},
+        "loop_factor": registration.loop_factor,
+        "rejected": [
+            [registration.names[m.first], registration.names[m.second]] for m in registration.rejected_motions
+        ],
+        "unplaced": [registration.names[k] for k in registration.unplaced_numbers],
+        "viewpoints": {scan.name: scan.viewpoint.stand for scan in registration.scans},
     }
-    if found.fit.sightings:
+    if registration.fit.sightings:
         summary["targets"] = [
             {
-                "scan": found.names[found.placed[sighting.scan]],
+                "scan": registration.names[registration.placed_numbers[sighting.scan]],
                 "name": sighting.name,
                 "u_mm": sighting.u_mm,
                 "off_mm": sighting.left_mm,
             }
-            for sighting in found.fit.sightings
+            for sighting in registration.fit.sightings
         ]
-    if found.site_from_first is not None:
-        summary["site_from_first"] = found.site_from_first.tolist()
-    off_mm = stated_poses_off_mm(found)
+    if registration.site_from_first is not None:
+        summary["site_from_first"] = registration.site_from_first.tolist()
+    off_mm = stated_poses_off_mm(registration)
     if off_mm:
         summary["stated_poses_off_mm"] = off_mm
-    if merged is not None:
+    if merged_mesh is not None:
         summary["mesh"] = {
-            "vertices": merged.vertices,
-            "triangles": merged.triangles,
-            "points": merged.points,
-            "cell_mm": merged.cell_mm,
-            "colours": merged.coloured,
+            "vertices": merged_mesh.vertices,
+            "triangles": merged_mesh.triangles,
+            "points": merged_mesh.points,
+            "cell_mm": merged_mesh.cell_mm,
+            "colours": merged_mesh.has_colours,
         }
-        summary["levels"] = merged.levels
+        summary["levels"] = merged_mesh.levels
     return summary
 
 
-def _uncertainty(found: Registered, number: int) -> dict[str, Any]:
-    covariance = found.covariance[number]
+def _uncertainty(registration: Registered, number: int) -> dict[str, Any]:
+    covariance = registration.covariance[number]
     return {
         "position_mm": np.sqrt(np.diag(covariance)[:3]).tolist(),
         "orientation_deg": np.degrees(np.sqrt(np.diag(covariance)[3:])).tolist(),
-        "of_a_point_mm": point_uncertainty_mm(found, number),
+        "of_a_point_mm": point_uncertainty_mm(registration, number),
         "covariance": covariance.tolist(),
-        "about_mm": found.fit.pivots_mm[found.placed.index(number)].tolist(),
+        "about_mm": registration.fit.pivots_mm[registration.placed_numbers.index(number)].tolist(),
     }
 
 
-def point_uncertainty_mm(found: Registered, number: int) -> float:
+def point_uncertainty_mm(registration: Registered, number: int) -> float:
     """Root mean square displacement of a scan's points by the uncertainty of its pose (68 %)."""
-    covariance, points = found.covariance[number], found.scans[number].coarse.points_mm
+    covariance, points = registration.covariance[number], registration.scans[number].coarse.points_mm
     arms = points - points.mean(axis=0)
-    turn = found.fit.common_from_scan[found.placed.index(number)][:3, :3]
+    turn = registration.fit.common_from_scan[registration.placed_numbers.index(number)][:3, :3]
     arm_moments = (arms @ turn.T).T @ (arms @ turn.T) / len(arms)
     turning = np.trace(arm_moments) * np.eye(3) - arm_moments
     return float(np.sqrt(np.trace(covariance[:3, :3]) + np.sum(turning * covariance[3:, 3:])))
 
 
-def stated_poses_off_mm(found: Registered) -> dict[str, float]:
+def stated_poses_off_mm(registration: Registered) -> dict[str, float]:
     """Root mean square displacement of each scan's points from where the pose that its file states puts them, seen
     from the first placed scan that states one."""
-    stated_poses = {k: pose for k in found.placed if (pose := found.scans[k].stated_pose) is not None}
+    stated_poses = {
+        k: pose for k in registration.placed_numbers if (pose := registration.scans[k].stated_pose) is not None
+    }
     if len(stated_poses) < 2:
         return {}
     first = min(stated_poses)
     off = {}
     for k, pose in stated_poses.items():
         by_file = inverse_of(stated_poses[first]) @ pose
-        by_us = inverse_of(found.first_from_scan[first]) @ found.first_from_scan[k]
-        off[found.names[k]] = displacement_mm(by_file, by_us, found.scans[k].coarse.points_mm)
+        by_us = inverse_of(registration.first_from_scan[first]) @ registration.first_from_scan[k]
+        off[registration.names[k]] = displacement_mm(by_file, by_us, registration.scans[k].coarse.points_mm)
     return off
 
 
-def worst_loop_mm(found: Registered) -> float:
+def worst_loop_mm(registration: Registered) -> float:
     """0 where there is no loop."""
-    return found.loops[0].error_mm if found.loops else 0.0
+    return registration.loops[0].error_mm if registration.loops else 0.0
 
 
-def remarks(found: Registered) -> Iterator[str]:
+def remarks(registration: Registered) -> Iterator[str]:
     """Yield remarks that the reader must know, one sentence each."""
-    names = found.names
+    names = registration.names
     yield (
-        f"{len(found.placed)} of {len(names)} scans placed by {found.pairs} overlapping pairs; surfaces lie on "
-        f"each other within {found.fit.rms_mm:.3g} mm (root mean square along their normals)"
+        f"{len(registration.placed_numbers)} of {len(names)} scans placed by {registration.pairs} overlapping "
+        f"pairs; surfaces lie on "
+        f"each other within {registration.fit.rms_mm:.3g} mm (root mean square along their normals)"
     )
-    if found.loops:
-        middle = float(np.median([loop.error_mm for loop in found.loops]))
+    if registration.loops:
+        middle = float(np.median([loop.error_mm for loop in registration.loops]))
         yield (
-            f"{len(found.loops)} loops of pairs close within {middle:.3g} mm in the median, "
-            f"{worst_loop_mm(found):.3g} mm at worst"
+            f"{len(registration.loops)} loops of pairs close within {middle:.3g} mm in the median, "
+            f"{worst_loop_mm(registration):.3g} mm at worst"
         )
     else:
         yield "no loop closes: a wrong pair would not be noticed, and uncertainties are those of noise alone"
-    if found.loop_factor > 1.05:
+    if registration.loop_factor > 1.05:
         yield (
-            f"loops close {found.loop_factor:.1f} times worse than noise explains; all uncertainties are enlarged "
+            f"loops close {registration.loop_factor:.1f} times worse than noise explains; all uncertainties are "
+            f"enlarged "
             "by that"
         )
-    if found.unplaced:
-        yield "not placed, as they overlap no other enough: " + ", ".join(names[k] for k in found.unplaced)
-    if found.rejected:
-        yield f"{len(found.rejected)} pairs were rejected, as others contradict them"
-    if off_mm := stated_poses_off_mm(found):
+    if registration.unplaced_numbers:
+        yield "not placed, as they overlap no other enough: " + ", ".join(
+            names[k] for k in registration.unplaced_numbers
+        )
+    if registration.rejected_motions:
+        yield f"{len(registration.rejected_motions)} pairs were rejected, as others contradict them"
+    if off_mm := stated_poses_off_mm(registration):
         worst = max(off_mm, key=lambda name: off_mm[name])
         yield (
             f"poses stated by the files put points {np.median(list(off_mm.values())):.3g} mm in the median from "
             f"where they are found, {off_mm[worst]:.3g} mm at worst ({worst})"
         )
-    blind = [scan.name for scan in found.scans if scan.viewpoint.stand == "none"]
+    blind = [scan.name for scan in registration.scans if scan.viewpoint.stand == "none"]
     if blind:
         yield (
             "seen from nowhere that is known, so that empty space before them proves nothing (see --seen-from): "
             + ", ".join(blind)
         )
-    for sighting in found.fit.sightings:
+    for sighting in registration.fit.sightings:
         if sighting.left_mm > _CONSPICUOUS * np.sqrt(3) * sighting.u_mm:
             yield (
-                f"target {sighting.name} of {names[found.placed[sighting.scan]]} is {sighting.left_mm:.3g} mm "
+                f"target {sighting.name} of {names[registration.placed_numbers[sighting.scan]]} is "
+                f"{sighting.left_mm:.3g} mm "
                 f"off, stated are {sighting.u_mm:.2g} mm"
             )

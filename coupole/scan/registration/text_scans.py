@@ -105,15 +105,16 @@ def _header(file: BinaryIO, source: ScanSource) -> tuple[int, int, Floats | None
     return count, lines, _pose(source, np.array(rows[6:])) if lines > 1 else None
 
 
-def _numbers(source: ScanSource, line: int, text: str, wanted: int) -> list[float]:
+def _numbers(source: ScanSource, line: int, text: str, wanted_count: int) -> list[float]:
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    if len(numbers) != wanted or not np.all(np.isfinite(numbers)):
+    if len(numbers) != wanted_count or not np.all(np.isfinite(numbers)):
         excerpt = text.strip()[:60] or "nothing"
         raise InputError(
-            f"{source.path}:{line}: expected {wanted} number{'s' if wanted > 1 else ''} of the header of scan "
+            f"{source.path}:{line}: expected {wanted_count} number{'s' if wanted_count > 1 else ''} of the "
+            f"header of scan "
             f"{source.number + 1}, found `{excerpt}`"
         )
     return numbers

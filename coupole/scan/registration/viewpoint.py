@@ -40,7 +40,7 @@ class Viewpoint:
             return np.asarray(-points_mm / np.maximum(away, 1e-12))
         return np.broadcast_to(_axis(self.stand), points_mm.shape)
 
-    def seen(self, points_mm: Floats) -> tuple[Floats, Floats]:
+    def places_and_depths(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Places [n, 2] in the scanner's picture and depths [n] along its rays: radians and mm, or mm and mm."""
         if self.stand == "origin":
             depth = np.linalg.norm(points_mm, axis=1)
@@ -63,9 +63,9 @@ class DepthPicture:
     def __init__(self, viewpoint: Viewpoint, points_mm: Floats, spacing_mm: float) -> None:
         self._viewpoint = viewpoint
         self._level = _level(points_mm) if viewpoint.stand == "origin" else np.eye(3)
-        places, depths = viewpoint.seen(points_mm @ self._level)
+        places, depths = viewpoint.places_and_depths(points_mm @ self._level)
         self._turn = _gap(places[:, 0]) if viewpoint.stand == "origin" else 0.0
-        places = self._turned(places)
+        places = self._turned_places(places)
         self._low = places.min(axis=0)
         extent = places.max(axis=0) - self._low
         cell = 1.5 * (spacing_mm / np.median(depths) if viewpoint.stand == "origin" else spacing_mm)
@@ -82,7 +82,7 @@ class DepthPicture:
         nearest = ndimage.minimum_filter(near, 3, mode="nearest")
         self._nearest = np.where(around, nearest, -np.inf).reshape(-1)
 
-    def folded(self, step_mm: float) -> float:
+    def folded_share(self, step_mm: float) -> float:
         """Share of the cells that hold surfaces farther apart than a step along the ray."""
         near, far = self._own
         is_filled = np.isfinite(near)
@@ -91,13 +91,13 @@ class DepthPicture:
     def in_front(self, points_mm: Floats, least_mm: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Tell which points [n, 3] in this scan's frame lie in rays that ended at a surface, and which of these
         lie by `least_mm` or more before it, in space that the scanner saw through."""
-        places, depths = self._viewpoint.seen(points_mm @ self._level)
-        flat, inside = self._cells(self._turned(places))
+        places, depths = self._viewpoint.places_and_depths(points_mm @ self._level)
+        flat, inside = self._cells(self._turned_places(places))
         nearest = np.where(inside, self._nearest[flat], -np.inf)
         is_seen = np.isfinite(nearest)
         return is_seen, is_seen & (depths < nearest - least_mm)
 
-    def _turned(self, places: Floats) -> Floats:
+    def _turned_places(self, places: Floats) -> Floats:
         if self._viewpoint.stand != "origin":
             return places
         return np.stack([np.mod(places[:, 0] - self._turn, 2 * np.pi), places[:, 1]], axis=1)
@@ -136,20 +136,20 @@ def folds(points_mm: Floats, normals: Floats | None, spacing_mm: float) -> dict[
     fold_shares: dict[Stand, float] = {}
     ends: tuple[tuple[Stand, Stand], ...] = (("+x", "-x"), ("+y", "-y"), ("+z", "-z"))
     for stand, opposite in ends:
-        fold_share = DepthPicture(Viewpoint(stand), points_mm, spacing_mm).folded(step_mm)
+        fold_share = DepthPicture(Viewpoint(stand), points_mm, spacing_mm).folded_share(step_mm)
         is_turned = normals is not None and np.mean(normals @ _axis(stand) > 0) < 0.5
         fold_shares[opposite if is_turned else stand] = fold_share
     if float(np.linalg.norm(points_mm, axis=1).min()) > 20 * spacing_mm:
-        fold_shares["origin"] = DepthPicture(Viewpoint("origin"), points_mm, spacing_mm).folded(step_mm)
+        fold_shares["origin"] = DepthPicture(Viewpoint("origin"), points_mm, spacing_mm).folded_share(step_mm)
     return fold_shares
 
 
-def choose_viewpoints(folded: Sequence[dict[Stand, float]]) -> list[Viewpoint]:
+def choose_viewpoints(folded_shares: Sequence[dict[Stand, float]]) -> list[Viewpoint]:
     """One viewpoint for each scan: of all that they could have the one that folds them least, as all come from one
     scanner; the origin if it is as good. `none` for a scan that it does not fit: one that was merged, or moved."""
-    common_stands = set.intersection(*(set(of_scan) for of_scan in folded))
-    total = {stand: float(np.median([of_scan[stand] for of_scan in folded])) for stand in common_stands}
+    common_stands = set.intersection(*(set(of_scan) for of_scan in folded_shares))
+    total = {stand: float(np.median([of_scan[stand] for of_scan in folded_shares])) for stand in common_stands}
     best: Stand = min(total, key=lambda stand: (total[stand], stand)) if total else "none"
     if "origin" in total and total["origin"] <= max(_AS_GOOD, total.get(best, 1.0)):
         best = "origin"
-    return [Viewpoint(best if of_scan.get(best, 1.0) <= _MOST_FOLDED else "none") for of_scan in folded]
+    return [Viewpoint(best if of_scan.get(best, 1.0) <= _MOST_FOLDED else "none") for of_scan in folded_shares]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from coupole.appearance.render.rendering import Spectral, opened
+from coupole.appearance.render.rendering import Spectral, open_renderer
 from coupole.appearance.render.scene_file import Scene
 
 HERE = Path()
@@ -27,7 +27,7 @@ def scene(objects: list[dict[str, Any]], lights: list[dict[str, Any]], **others:
 
 
 def rendered(wanted: Scene) -> Spectral:
-    with opened(wanted, HERE) as renderer:
+    with open_renderer(wanted, HERE) as renderer:
         return renderer.render(wanted.cameras[0])
 
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from spectral_scenes import camera, constant, everywhere, illuminant, plane, rendered, scene
 
 from coupole.appearance.render.church import Size, church
-from coupole.appearance.render.spectra import luminous, scaled
+from coupole.appearance.render.spectra import luminous, scaled_power
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
@@ -53,7 +53,7 @@ def through_a_pane(colour: dict[str, Any], folder: Path) -> Any:
     }
     one = scene([plane(WHITE, 60.0), pane], [sun], cameras=[FROM_THE_SIDE], samples=32)
     found = rendered(one).radiance.mean(axis=(0, 1))
-    return found, found * np.pi / scaled(light.illuminant("D65"), 1e4)
+    return found, found * np.pi / scaled_power(light.illuminant("D65"), 1e4)
 
 
 def test_the_spot_behind_a_pane_is_the_sun_times_what_the_glass_lets_through(tmp_path: Path) -> None:

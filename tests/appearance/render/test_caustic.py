@@ -15,7 +15,7 @@ from coupole.appearance.render import by_gold
 from coupole.appearance.render.arcature import arcature
 from coupole.appearance.render.caustic import Niche, Sun, irradiance, photons
 from coupole.appearance.render.scene_file import Gathered, with_plain_lights
-from coupole.appearance.render.spectra import scaled
+from coupole.appearance.render.spectra import scaled_power
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import BANDS, Array
@@ -78,7 +78,9 @@ def test_light_reflected_once_by_the_arch_stays_on_its_side_of_the_nephroid(scal
 
 def test_light_is_neither_made_nor_lost_by_a_perfect_mirror() -> None:
     found = photons(niche(), sun(1.5, 0.53), OPENING_MM, 20_000, seed=2)
-    assert found.power.sum(axis=0, dtype=float) + found.escaped == pytest.approx(found.started, rel=1e-5)
+    assert found.power.sum(axis=0, dtype=float) + found.escaped_power == pytest.approx(
+        found.started_power, rel=1e-5
+    )
 
 
 def test_gold_that_reflects_half_leaves_half_of_each_bounce() -> None:
@@ -96,9 +98,9 @@ def test_where_the_sun_shines_directly_the_wall_has_its_irradiance_times_the_cos
 
 def test_rough_gold_spreads_light_but_does_not_make_any() -> None:
     found = photons(niche(roughness=0.2), sun(1.5), OPENING_MM, 20_000, seed=4)
-    returned = found.power.sum(axis=0, dtype=float) + found.escaped
-    assert np.all(returned <= found.started * (1.0 + 1e-6))
-    assert np.all(returned > 0.9 * found.started)  # what facets hide from each other is lost
+    returned = found.power.sum(axis=0, dtype=float) + found.escaped_power
+    assert np.all(returned <= found.started_power * (1.0 + 1e-6))
+    assert np.all(returned > 0.9 * found.started_power)  # what facets hide from each other is lost
 
 
 @pytest.mark.full
@@ -130,7 +132,7 @@ def test_photons_and_the_path_tracer_see_the_same_light_on_the_wall(scale: Scale
     leaf = layered.sheet([Film(indices.gold(), 100.0)], indices.EGG_WHITE).reflectance
     parts = arcature(400.0, 300.0, 350.0)
     lined = Niche(parts.gilded_mm, parts.stone_mm, lambda cosines: layered.at_cosine(leaf, cosines), 0.2)
-    source = Sun(way / np.linalg.norm(way), width_deg, scaled(light.illuminant("E"), lux))
+    source = Sun(way / np.linalg.norm(way), width_deg, scaled_power(light.illuminant("E"), lux))
     found = photons(lined, source, (-400.0, 400.0, 700.0), scale(300_000, 4_000_000), seed=5)
     lit = irradiance(found, (x - side_mm / 2, x + side_mm / 2), 300.0, side_mm, 350.0)[0, 0, ::8]
     assert lit == pytest.approx(traced, rel=0.06)  # 0.015 with four times the samples

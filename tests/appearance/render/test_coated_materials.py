@@ -17,8 +17,8 @@ from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.render.absorption import per_mm
 from coupole.appearance.render.materials import Layers, Material
 from coupole.appearance.render.materials.coatings import stack_of
-from coupole.appearance.render.rendering import opened
-from coupole.appearance.render.spectra import scaled
+from coupole.appearance.render.rendering import open_renderer
+from coupole.appearance.render.spectra import scaled_power
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
@@ -45,8 +45,8 @@ def reflected(material: dict[str, Any]) -> np.ndarray:
     }
     cameras = [camera(up, name=f"at{up:.0f}") for up in ELEVATIONS_DEG]
     one = scene([plane(material)], [sun], cameras=cameras, samples=4, bands={"step_nm": 40})
-    irradiance = scaled(light.illuminant("E"), 1000.0)[::8] * np.cos(tilt)
-    with opened(one, HERE) as renderer:
+    irradiance = scaled_power(light.illuminant("E"), 1000.0)[::8] * np.cos(tilt)
+    with open_renderer(one, HERE) as renderer:
         return np.stack([renderer.render(seen).radiance.mean(axis=(0, 1)) / irradiance for seen in one.cameras])
 
 
@@ -89,7 +89,7 @@ def test_paints_over_paint_are_kubelka_munk_and_saunderson() -> None:
 
     # By diffuse light seen along the normal: Saunderson; by exchange, the light along the normal that comes back.
     body = stack_of(Layers.model_validate(two), HERE).body[-1]
-    assert body == pytest.approx(face(1.5).seen(InternalReflectance(inside)).values, rel=2e-3)
+    assert body == pytest.approx(face(1.5).reflectance_in_air(InternalReflectance(inside)).values, rel=2e-3)
 
 
 def test_varnish_over_a_mirroring_leaf_is_beers_law_on_the_way_in_and_out() -> None:

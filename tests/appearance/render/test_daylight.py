@@ -12,7 +12,7 @@ from PIL import Image
 from spectral_scenes import HERE, constant, everywhere, illuminant, plane, rendered, scene
 
 from coupole.appearance.render import bands, colour, studio
-from coupole.appearance.render.rendering import opened
+from coupole.appearance.render.rendering import open_renderer
 from coupole.appearance.render.scene_file import Scene, with_plain_lights
 from coupole.appearance.render.spectra import luminous
 from coupole.appearance.spectra import light
@@ -61,7 +61,7 @@ def test_bands_of_20_nm_follow_a_lights_own_structure(name: str, most: float) ->
 
     power, found = light.led(name), patches()
     whole = colour.eye("10 deg", power, power, 5).tristimulus(found * power)
-    nodes = bands.chosen(20)
+    nodes = bands.rendered_bands(20)
     coarse = colour.eye("10 deg", power, power, 20).tristimulus((found * bands.around_nodes(power, 20))[:, nodes])
     white = colour.eye("10 deg", power, power, 5).tristimulus(power)
     labs = [light.lab(xyz, white) for xyz in (whole, coarse)]
@@ -73,7 +73,7 @@ def test_a_level_white_has_the_light_of_sun_and_sky() -> None:
     sun_disk, sky = with_plain_lights(wanted, HERE).lights
     found = rendered(wanted).radiance.mean(axis=(0, 1))
     level = np.sin(np.radians(5.02)) * np.array(sun_disk.spectrum.values) + np.array(sky.spectrum.values)
-    assert found == pytest.approx(bands.around_nodes(level / np.pi, 40)[bands.chosen(40)], rel=0.02)
+    assert found == pytest.approx(bands.around_nodes(level / np.pi, 40)[bands.rendered_bands(40)], rel=0.02)
 
 
 def test_the_first_light_of_a_page_is_the_sun() -> None:
@@ -174,13 +174,13 @@ def test_a_denoised_picture_says_so_and_has_less_noise_and_its_spectra_stay(tmp_
 def test_eyes_luminance_of_a_spectrum_is_that_of_v_lambda() -> None:
     power = light.illuminant("A")
     eye = colour.eye("10 deg", power, light.illuminant("D65"), 10)
-    found = eye.luminance(bands.around_nodes(power, 10)[bands.chosen(10)])
+    found = eye.luminance(bands.around_nodes(power, 10)[bands.rendered_bands(10)])
     assert found == pytest.approx(luminous(power), rel=1e-4)
     assert json.dumps(float(found))
 
 
 def test_a_renderer_has_plain_lights() -> None:
-    with opened(scene([plane(GREY)], [DAYLIGHT]), HERE) as renderer:
+    with open_renderer(scene([plane(GREY)], [DAYLIGHT]), HERE) as renderer:
         assert [one.kind for one in renderer.scene.lights] == ["distant", "environment"]
 
 

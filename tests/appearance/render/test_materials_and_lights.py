@@ -13,7 +13,7 @@ from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
 from coupole.appearance.render.equivalent import equivalent_index
 from coupole.appearance.render.led_squares import read_leds
-from coupole.appearance.render.spectra import LowSun, Measured, air_mass, luminous, power, scaled
+from coupole.appearance.render.spectra import LowSun, Measured, air_mass, luminous, power, scaled_power
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
 from coupole.errors import InputError
@@ -52,7 +52,7 @@ def test_a_face_that_the_scene_has_is_not_counted_again_by_the_metal_under_it() 
     face = {"kind": "glass", "index": indices.URUSHI}
     planes = [plane(gold), {**plane(face), "translation_mm": [0.0, 0.0, 0.5]}]
     one = scene(planes, [everywhere(illuminant("E"))], samples=64, bands={"step_nm": 20}, depth=16)
-    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::4]
+    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled_power(light.illuminant("E"), 100.0)[::4]
     above = float(fresnel.reflectance(1.0, indices.URUSHI))
     below = np.ravel(fresnel.reflectance(1.0, indices.gold() / indices.URUSHI))[::4]
     assert reflected == pytest.approx(above + (1 - above) ** 2 * below / (1 - above * below), abs=0.005)
@@ -67,7 +67,7 @@ def test_an_antireflective_film_on_glass_dims_it_as_its_stack_does() -> None:
         "roughness": 0.01,
     }
     one = scene([plane(coated)], [everywhere(illuminant("E"))], samples=64, bands={"step_nm": 20})
-    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::4]
+    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled_power(light.illuminant("E"), 100.0)[::4]
     expected, _ = stack_power(1.0, WAVELENGTHS_NM, [Film(indices.constant(1.38), 100.0)], substrate=1.5)
     assert reflected == pytest.approx(np.ravel(expected)[::4], abs=1e-3)
 

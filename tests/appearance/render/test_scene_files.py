@@ -13,7 +13,7 @@ from places import REPO
 
 from coupole.appearance.render import studio
 from coupole.appearance.render.materials import bsdf, paint_inside
-from coupole.appearance.render.rendering import opened
+from coupole.appearance.render.rendering import open_renderer
 from coupole.appearance.render.scene_file import remarks
 from coupole.commands.render_scene import read_scene, render, render_scene
 from coupole.errors import InputError, StorageError
@@ -56,7 +56,7 @@ def written(folder: Path, text: str = SMALL) -> Path:
 )
 def test_every_shipped_scene_renders(path: Path, tmp_path: Path) -> None:
     document, scene = read_scene(path)
-    small = studio.reduced(scene, samples=1, width_px=16, step_nm=40)
+    small = studio.reduced_scene(scene, samples=1, width_px=16, step_nm=40)
     if small.caustic is not None:
         small = small.model_copy(update={"caustic": small.caustic.model_copy(update={"photons": 20_000})})
     if small.film is not None:
@@ -165,7 +165,7 @@ def test_the_exr_holds_bands_by_wavelength_and_says_that_it_is_simulated(tmp_pat
     assert sorted(names) == sorted(["X", "Y", "Z", *wavelengths])
     assert told["spectralLayoutVersion"] == "1.0"
     assert told["synthetic"] == "true"
-    with opened(scene, tmp_path) as renderer:
+    with open_renderer(scene, tmp_path) as renderer:
         radiance = renderer.render(scene.cameras[0]).radiance
     assert pixels[..., names.index("S0.540nm")] == pytest.approx(radiance[..., 4])
 

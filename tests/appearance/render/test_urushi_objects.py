@@ -17,7 +17,7 @@ from coupole.appearance.optics import fresnel, indices
 from coupole.appearance.render.materials import Glass, Metal
 from coupole.appearance.render.objects import Object, pieces
 from coupole.appearance.render.pieces import Piece
-from coupole.appearance.render.spectra import scaled
+from coupole.appearance.render.spectra import scaled_power
 from coupole.appearance.shapes.triangles import flat_normals
 from coupole.appearance.spectra import light
 from coupole.errors import InputError
@@ -54,7 +54,7 @@ def test_lacquer_absorbs_along_the_refracted_way(elevation_deg: float) -> None:
         bands={"step_nm": 40},
         depth=16,
     )
-    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled(light.illuminant("E"), 100.0)[::8]
+    reflected = rendered(one).radiance.mean(axis=(0, 1)) / scaled_power(light.illuminant("E"), 100.0)[::8]
     cosine = np.sin(np.radians(elevation_deg))
     inside = np.sqrt(1.0 - (1.0 - cosine**2) / indices.URUSHI**2)
     face = float(fresnel.reflectance(cosine, indices.URUSHI))
@@ -194,7 +194,7 @@ def test_a_turntable_turns_objects_about_the_scenes_axis() -> None:
     )
     assert one.turntable is not None
     assert one.turntable.angles_deg() == [0.0, 90.0, 180.0, 270.0]
-    turned = one.turned(90.0).objects
+    turned = one.turned_about_z(90.0).objects
     assert turned[0].translation_mm == pytest.approx((0.0, 10.0, 3.0))
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     before = one.objects[0].scene_from_thing()[:3, :3]

@@ -33,5 +33,5 @@ def test_links_to_llvm_are_followed(tmp_path: Path) -> None:
 
 def test_an_old_llvm_is_never_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", f"libLLVM-{LEAST_LLVM - 1}.so.1")
-    assert spectral(polarised=False) == "scalar_spectral"
-    assert spectral(polarised=True) == "scalar_spectral_polarized"
+    assert spectral(is_polarised=False) == "scalar_spectral"
+    assert spectral(is_polarised=True) == "scalar_spectral_polarized"

@@ -10,8 +10,8 @@ from pydantic import TypeAdapter, ValidationError
 from spectral_scenes import constant, everywhere, illuminant, plane, rendered, scene
 
 from coupole.appearance.render.materials import Material
-from coupole.appearance.render.spectra import scaled
-from coupole.appearance.render.weathered_mesh import weathered
+from coupole.appearance.render.spectra import scaled_power
+from coupole.appearance.render.weathered_mesh import weathered_triangles
 from coupole.appearance.shapes import solid_masks
 from coupole.appearance.shapes.solids import relief
 from coupole.appearance.shapes.triangles import rectangle
@@ -38,7 +38,7 @@ def picture(thing: dict[str, Any], size_mm: float, pixels: int) -> np.ndarray:
     }
     lit = [everywhere(illuminant("E"))]
     one = scene([thing], lit, cameras=[far], samples=16, bands={"step_nm": 40})
-    return np.asarray(rendered(one).radiance[..., 0] / scaled(light.illuminant("E"), 100.0)[0])
+    return np.asarray(rendered(one).radiance[..., 0] / scaled_power(light.illuminant("E"), 100.0)[0])
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_cracks_have_their_width_and_cells_their_size() -> None:
     material = TypeAdapter(Material).validate_python(worn({"kind": "cracks", "cell_mm": 4.0, "width_mm": 0.4}))
     sheet = rectangle(24.0, 24.0)
 
-    made = weathered(sheet, material, smooth=False)
+    made = weathered_triangles(sheet, material, smooth=False)
 
     # Lines across the sheet cross a crack in pi/2 times its width, in the mean over directions.
     grid = np.linspace(-11.9, 11.9, 2000)
@@ -79,7 +79,7 @@ def test_edges_are_rubbed_where_a_relief_stands_out() -> None:
     corners = relief(40.0, 4000, 9.0, 1)
     material = TypeAdapter(Material).validate_python(worn({"kind": "edges", "reach_mm": 4.0}, 0.15))
 
-    made = weathered(corners, material, smooth=True)
+    made = weathered_triangles(corners, material, smooth=True)
 
     assert made.share == pytest.approx(0.15, abs=0.01)
     heights = made.corners_mm.mean(axis=1)[:, 2]
@@ -123,10 +123,10 @@ def test_what_cannot_be_worn_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     sheet = rectangle(40.0, 40.0)
     flat = TypeAdapter(Material).validate_python(worn({"kind": "edges", "reach_mm": 4.0}, 0.15))
     with pytest.raises(InputError, match="a flat sheet has no edges"):
-        weathered(sheet, flat, smooth=False)
+        weathered_triangles(sheet, flat, smooth=False)
     monkeypatch.setattr(solid_masks, "MOST_TRIANGLES", 20_000)
     fine = TypeAdapter(Material).validate_python(worn({"kind": "cracks", "cell_mm": 1.0, "width_mm": 0.01}))
     with pytest.raises(InputError, match="wider cracks"):
-        weathered(sheet, fine, smooth=False)
+        weathered_triangles(sheet, fine, smooth=False)
     with pytest.raises(ValidationError, match="give either `share`, or `width_mm`"):
         TypeAdapter(Material).validate_python(worn({"kind": "cracks", "cell_mm": 1.0}))

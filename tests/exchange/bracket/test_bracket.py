@@ -53,7 +53,7 @@ def test_the_response_comes_back_and_the_merged_picture_is_the_scene(curve: Curv
     taken = Photographs((), (photographed(curve) / 255).astype(np.float32), TIMES_S, 256, raw=False)
 
     found = camera_response.found_response(taken)
-    merged = exposure_merging.merged(taken, found)
+    merged = exposure_merging.merge_exposures(taken, found)
 
     z = np.linspace(0.0, 1.0, camera_response.NODES)[20:236]
     fine = np.linspace(1e-6, 1.0, 100_001)
@@ -61,7 +61,7 @@ def test_the_response_comes_back_and_the_merged_picture_is_the_scene(curve: Curv
     off = found.log_exposure[20:236] - found.log_exposure[128] - true[:, None]
     assert np.abs(off).max() < 0.04
     assert np.median(np.abs(off)) < 0.012
-    known = ~(merged.saturated | merged.dark).any(axis=2)
+    known = ~(merged.saturation_mask | merged.dark).any(axis=2)
     assert known.mean() > 0.95
     ratio = np.where(known[..., None], merged.radiance / radiance(), np.nan)
     ratio /= np.nanmedian(ratio, axis=(0, 1))

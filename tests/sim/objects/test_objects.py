@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coupole.appearance.matter import nashiji
-from coupole.appearance.shapes.triangles import cells_for, flat_normals, rectangle, welded
+from coupole.appearance.shapes.triangles import cells_for, flat_normals, rectangle, weld_corners
 from coupole.errors import InputError
 from sim.objects import appearance, colour_chart, fabric, shapes, standards, urushi, wedges
 from sim.objects.charuco import Charuco, charuco_board
@@ -41,7 +41,7 @@ SHEETS: dict[str, Callable[[], Surface]] = {
 
 
 def as_trimesh(surface: Surface) -> Any:
-    points, faces = welded(surface.corners_mm)
+    points, faces = weld_corners(surface.corners_mm)
     return trimesh.Trimesh(points, faces, process=False)
 
 

@@ -30,7 +30,7 @@ from coupole.appearance.render.materials.plain import (
     plain_bsdf,
     under_face,
 )
-from coupole.appearance.render.materials.weathering import Dusty, Weathered, Worn, blended
+from coupole.appearance.render.materials.weathering import Dusty, Weathered, Worn, blended_bsdf
 from coupole.appearance.render.spectra import matt
 
 __all__ = [
@@ -71,10 +71,10 @@ def bsdf(material: Material, folder: Path) -> Description:
 
 def _one_side(material: Plain | Coating | MeasuredMaterial | Weathered, folder: Path) -> Description:
     if isinstance(material, Worn):
-        return blended(material, _one_side(material.over, folder), _one_side(material.under, folder))
+        return blended_bsdf(material, _one_side(material.over, folder), _one_side(material.under, folder))
     if isinstance(material, Dusty):
         dust = diffuse(matt(material.reflectance, folder).values)
-        return blended(material, _one_side(material.over, folder), dust)
+        return blended_bsdf(material, _one_side(material.over, folder), dust)
     if isinstance(material, MeasuredMaterial):
         return measured_bsdf(material, folder)
     if isinstance(material, Coating):

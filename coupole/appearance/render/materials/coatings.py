@@ -118,7 +118,7 @@ class Layers(Model):
     """Roughness of the face; a leaf on top has its own."""
 
     @model_validator(mode="after")
-    def _covered(self) -> Layers:
+    def _check_top_leaf(self) -> Layers:
         first = self.layers[0]
         if isinstance(first, Leaf) and first.uncovered:
             raise ValueError("a leaf on top has no face where it is `uncovered`: take `kind: worn`, or varnish it")
@@ -148,13 +148,13 @@ def stack_of(material: Coating, folder: Path) -> Stack:
     first = material.layers[0]
     on_top = first if isinstance(first, Leaf) else None
     for layer in reversed(material.layers[1:] if on_top else material.layers):
-        below = _laid(binder, layer, below, folder, index)
+        below = _lay_on_ground(binder, layer, below, folder, index)
     if on_top:
         return stack(binder, below, on_top.roughness, [_film(on_top, folder)])
     return stack(binder, below, material.roughness)
 
 
-def _laid(binder: Binder, layer: Layer, below: Ground, folder: Path, index: Array) -> Ground:
+def _lay_on_ground(binder: Binder, layer: Layer, below: Ground, folder: Path, index: Array) -> Ground:
     match layer:
         case PaintLayer():
             if isinstance(layer.pigment, MeasuredPaint):

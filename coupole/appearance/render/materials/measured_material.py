@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from coupole.appearance.matter.alta_samples import interpolated, read_alta
+from coupole.appearance.matter.alta_samples import interpolated_brdf, read_alta
 from coupole.appearance.matter.baked_table import BakedTable, bake, from_file, wavelengths_of
 from coupole.appearance.matter.brdf import Brdf
 from coupole.appearance.matter.merl_table import read_merl
@@ -20,7 +20,7 @@ from coupole.appearance.matter.result_materials import read_result
 from coupole.appearance.matter.rgl_table import RglTable, read_bsdf
 from coupole.appearance.render.bands import Description
 from coupole.appearance.render.model import Model
-from coupole.appearance.render.variant import needed
+from coupole.appearance.render.variant import import_extra
 from coupole.appearance.spectra.grid import BANDS, Array
 from coupole.errors import InputError
 
@@ -84,7 +84,7 @@ def measured_brdf(material: MeasuredMaterial, folder: Path) -> Brdf:
         case ".bsdf":
             return read_bsdf(path)
         case _:
-            return interpolated(read_alta(path))
+            return interpolated_brdf(read_alta(path))
 
 
 def spectra_of_rgb() -> Array:
@@ -93,7 +93,7 @@ def spectra_of_rgb() -> Array:
     Mallett and Yuksel, Spectral primary decomposition for rendering with sRGB reflectance, EGSR 2019: smooth
     ones with the primaries' colours under D65, 2 degrees, none below 0.
     """
-    functions = needed("colour", "materials").recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+    functions = import_extra("colour", "materials").recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
     return np.asarray(functions.values, dtype=float).T
 
 

@@ -167,7 +167,7 @@ def metal(
     }
 
 
-def coated(body: InternalReflectance, index: Array, roughness: float) -> Description:
+def coated_body(body: InternalReflectance, index: Array, roughness: float) -> Description:
     """A body [81] inside a medium with a glossy face; the face itself reflects as its index [81] does at 587.6 nm.
 
     Mitsuba's polarised plastic (Baek et al. 2020) transmits light in and out once. With all internal reflections
@@ -214,7 +214,7 @@ def gilt_of(material: Gilt, folder: Path) -> tuple[gilding.Gilt, Complex]:
     if material.holes > 0.0:
         index = gilding.leaf_index(index, material.holes)
     bole = internal(material.bole, folder, indices.EGG_WHITE)
-    return gilding.gilt(index, material.thickness_nm, bole, uncovered=material.uncovered), index
+    return gilding.gilt(index, material.thickness_nm, bole, bare_share=material.uncovered), index
 
 
 def metal_of(material: Metal | Gilt, folder: Path) -> Complex:
@@ -242,9 +242,9 @@ def plain_bsdf(material: Plain, folder: Path) -> Description:
     if isinstance(material, Diffuse):
         return diffuse(matt(material.reflectance, folder).values)
     if isinstance(material, Paint):
-        return coated(paint_inside(material, folder), real_index(material.index, folder), material.roughness)
+        return coated_body(paint_inside(material, folder), real_index(material.index, folder), material.roughness)
     if isinstance(material, Lacquer):
-        return coated(lacquer_body(material, folder), real_index(material.index, folder), material.roughness)
+        return coated_body(lacquer_body(material, folder), real_index(material.index, folder), material.roughness)
     if isinstance(material, Metal):
         return _metal(material, folder)
     if isinstance(material, Films):
@@ -264,7 +264,7 @@ def _metal(material: Metal, folder: Path) -> Description:
 
 def _gilt(material: Gilt, folder: Path) -> Description:
     gilding, index = gilt_of(material, folder)
-    bare = coated(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
+    bare = coated_body(gilding.bole, np.full(BANDS, indices.EGG_WHITE), material.bole_roughness)
     if material.thickness_nm < THINNEST_NM or material.uncovered == 1.0:
         return bare
     films = [Film(index, material.thickness_nm)]

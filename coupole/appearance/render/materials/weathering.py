@@ -81,7 +81,7 @@ class Dusty(Model):
     reflectance: Reflectance = Constant(kind="constant", value=0.35)
     """Reflectance of thick dust."""
 
-    def covered(self, upward: Array) -> Array:
+    def covered_share(self, upward: Array) -> Array:
         """Share of the surface under grains, by the normals' upward parts [n].
 
         Spheres in random places hide 1 - exp(-N a), with N a = 3 m/(2 density diameter) of the mass m per area.
@@ -100,12 +100,12 @@ def needs_mesh(material: Weathered) -> bool:
     return not isinstance(material.pattern, Uniform)
 
 
-def blended(material: Weathered, over: Description, under: Description) -> Description:
+def blended_bsdf(material: Weathered, over: Description, under: Description) -> Description:
     """`under` by its share, one number or the mesh's."""
     weight: Description | float
     if isinstance(material, Worn):
         by_mesh, name, share = needs_mesh(material), WORN, material.share
     else:
-        by_mesh, name, share = material.settles == "up", DUSTY, float(material.covered(np.ones(1))[0])
+        by_mesh, name, share = material.settles == "up", DUSTY, float(material.covered_share(np.ones(1))[0])
     weight = {"type": "mesh_attribute", "name": f"vertex_{name}"} if by_mesh else float(share or 0.0)
     return {"type": "blendbsdf", "weight": weight, "over": over, "under": under}

@@ -53,7 +53,7 @@ class Call:
     """A call of a device (by its name in errors) or of the `DISK`; noted while its context lasts."""
 
     of: str
-    what: str
+    operation: str
     work_s: float = 0.0
     """Time that the work itself may take, if all is well."""
     since_s: float = 0.0
@@ -81,12 +81,12 @@ class Call:
         lasts_s = time.monotonic() - self.since_s
         if self.of == DISK:
             return StorageError(
-                f"{self.what}: the disk has not answered for {lasts_s:.0f} s. Check it (a network disk: its "
+                f"{self.operation}: the disk has not answered for {lasts_s:.0f} s. Check it (a network disk: its "
                 "server and the network), then resume the run."
             )
         return DeviceTimeout(
             self.of,
-            expected=f"an end of the call `{self.what}`",
+            expected=f"an end of the call `{self.operation}`",
             happened=f"it has not returned for {lasts_s:.0f} s, and was left behind",
             remedy="Switch the device off and on, then resume the run; if it comes back, report it with the "
             "versions of the device's library and firmware.",
@@ -134,7 +134,7 @@ def refuse_overdue(since_s: float) -> None:
 
 def hangs(of: str) -> str:
     """The call of this device, or of the `DISK`, that was left behind and is still under way; empty if none is."""
-    return next((call.what for call in list(_UNDER_WAY) if call.of == of), "") if left_behind() else ""
+    return next((call.operation for call in list(_UNDER_WAY) if call.of == of), "") if left_behind() else ""
 
 
 # -- whoever may hang -----------------------------------------------------------------------------------------
@@ -147,8 +147,8 @@ class _GivenUp(BaseException):
 class _Runner(Generic[T]):
     """Does something in a thread of its own."""
 
-    def __init__(self, do: Callable[[], T], unwanted: Callable[[T], object]) -> None:
-        self._do, self._unwanted = do, unwanted
+    def __init__(self, do: Callable[[], T], discard: Callable[[T], object]) -> None:
+        self._do, self._unwanted = do, discard
         self._done: Future[T] = Future()
         self._lock = threading.Lock()
         self.is_left = False
@@ -168,7 +168,7 @@ class _Runner(Generic[T]):
         with suppress(Exception):
             self._unwanted(outcome)
 
-    def ended(self, within_s: float) -> bool:
+    def has_ended(self, within_s: float) -> bool:
         with suppress(TimeoutError):
             self._done.exception(within_s)
         return self._done.done()
@@ -191,25 +191,25 @@ class _Runner(Generic[T]):
         return self._done.result()
 
 
-def bounded(
+def run_bounded(
     do: Callable[[], T],
     *,
     stop: threading.Event | None = None,
     rescue: Callable[[], object] = lambda: None,
-    unwanted: Callable[[T], object] = lambda found: None,
+    discard: Callable[[T], object] = lambda found: None,
     since_s: float | None = None,
 ) -> T:
     """Do it in a thread of its own, and wait until it has ended or a call is to be given up; what it raises is
     raised here. `stop` tells that it is to end, `rescue` is called before a call is given up, which may bring that
-    back; what comes after all is passed to `unwanted`. Calls are looked at that begin from now on, or `since_s`.
+    back; what comes after all is passed to `discard`. Calls are looked at that begin from now on, or `since_s`.
 
     Raises DeviceTimeout or StorageError for a call that is given up, and what a signal raises.
     """
     since_s = time.monotonic() if since_s is None else since_s
     stopped_s = math.inf
-    runner = _Runner(do, unwanted)
+    runner = _Runner(do, discard)
     try:
-        while not runner.ended(_LOOK_S):
+        while not runner.has_ended(_LOOK_S):
             if stop is not None and stop.is_set():
                 stopped_s = min(stopped_s, time.monotonic())
             call = overdue(since_s, stopped_s)
@@ -217,13 +217,13 @@ def bounded(
                 call = Call("cell", "session", 0.0, stopped_s)
             if call is not None:
                 rescue()
-                if not runner.ended(_BACK_S) and runner.leave():
+                if not runner.has_ended(_BACK_S) and runner.leave():
                     leave_behind(call)
                     raise call.error()
     except BaseException:
         if not runner.is_left:  # a signal, here
             runner.interrupt()
-            if not runner.ended(_BACK_S):
+            if not runner.has_ended(_BACK_S):
                 runner.leave()
         raise
     return runner.result()
@@ -234,14 +234,14 @@ NOW = threading.Event()
 NOW.set()
 
 
-def on_disk(what: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threading.Event | None = None) -> T:
+def on_disk(label: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threading.Event | None = None) -> T:
     """`bounded`, for work with files."""
 
     def work() -> T:
-        with under_way(DISK, what, work_s):
+        with under_way(DISK, label, work_s):
             return do()
 
-    return bounded(work, stop=stop)
+    return run_bounded(work, stop=stop)
 
 
 class Workers:

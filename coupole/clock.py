@@ -54,5 +54,5 @@ class Deadline:
         return max(0.0, (self._end_ns - self._clock.now_ns()) / 1e9)
 
     @property
-    def expired(self) -> bool:
+    def has_expired(self) -> bool:
         return self.remaining_s <= 0.0

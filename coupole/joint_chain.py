@@ -259,7 +259,7 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
     for branch in _raw_branches(wrist, nudged_pose):
         first, _, _ = wrist.theta(branch)[:3]
         fore = wrist.theta(branch)[1:3].sum()
-        turn = _turned(first, fore).T @ base_from_opw[:3, :3]
+        turn = _forearm_rotation(first, fore).T @ base_from_opw[:3, :3]
         if not turn[2, 2] >= 1.0 - 1e-12:  # also where the branch is NaN
             continue
         a6_deg = float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
@@ -268,7 +268,7 @@ def _branches_of_spherical_wrist(wrist: SphericalWrist, base_from_flange: Transf
     return branches_deg
 
 
-def _turned(first: float, fore: float) -> Floats:
+def _forearm_rotation(first: float, fore: float) -> Floats:
     """3x3, Rz(first) Ry(fore): the forearm's orientation by OPW's angles (Brandstoetter 2014, eq. 1 to 5)."""
     c1, s1, c, s = np.cos(first), np.sin(first), np.cos(fore), np.sin(fore)
     return np.array([[c1 * c, -s1, c1 * s], [s1 * c, c1, s1 * s], [-s, 0.0, c]])

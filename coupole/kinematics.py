@@ -29,7 +29,7 @@ __all__ = [
     "move_duration_s",
     "move_durations_s",
     "nearest",
-    "slowed",
+    "slowed_arm",
     "structure_of",
     "unreachable_reason",
     "within_limits",
@@ -53,7 +53,7 @@ class Arm:
     jerk_deg_s3: Six
 
 
-def slowed(arm: Arm, *, speed_fraction: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Arm:
+def slowed_arm(arm: Arm, *, speed_fraction: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Arm:
     """The same arm with a fraction of its speeds and one acceleration and jerk for all axes."""
     return replace(
         arm,

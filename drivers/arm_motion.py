@@ -19,14 +19,14 @@ State = TypeVar("State")
 _LIMIT_TOLERANCE_DEG = 1e-9
 
 
-def refused(expected: str, happened: str) -> DeviceRefused:
+def refusal(expectation: str, observation: str) -> DeviceRefused:
     """The error of a motion that is refused, or of a wait for it."""
-    return DeviceRefused("robot", expected=expected, happened=happened, remedy="Ask for another pose")
+    return DeviceRefused("robot", expected=expectation, happened=observation, remedy="Ask for another pose")
 
 
 def overtaken() -> DeviceRefused:
     """The error of a wait for a motion that another command has ended."""
-    return refused("the arm to continue to its target", "another command ended the motion")
+    return refusal("the arm to continue to its target", "another command ended the motion")
 
 
 def checked_target(
@@ -35,7 +35,7 @@ def checked_target(
     """Six finite angles within the limits of each axis; raises DeviceRefused, which names the axes."""
     target = np.asarray(joints_deg, dtype=np.float64)
     if target.shape != (6,) or not np.all(np.isfinite(target)):
-        raise refused("six finite joint angles in degrees", f"got {joints_deg!r}")
+        raise refusal("six finite joint angles in degrees", f"got {joints_deg!r}")
     a1, a2, a3, a4, a5, a6 = target.tolist()
     outside = [
         f"A{axis} would be {angle:.3f} deg, its limits are {low:g} to {high:g} deg"
@@ -43,14 +43,14 @@ def checked_target(
         if not low - _LIMIT_TOLERANCE_DEG <= angle <= high + _LIMIT_TOLERANCE_DEG
     ]
     if outside:
-        raise refused("joint angles within the arm's limits", "; ".join(outside))
+        raise refusal("joint angles within the arm's limits", "; ".join(outside))
     return a1, a2, a3, a4, a5, a6
 
 
 def checked_speed(speed: float) -> float:
     """A share of the driver's speeds; raises DeviceRefused for any other number."""
     if not 0.0 < speed <= 1.0:
-        raise refused("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
+        raise refusal("a speed above 0, at most 1, as a share of the arm's", f"got {speed!r}")
     return float(speed)
 
 
@@ -76,31 +76,31 @@ def farthest_stop_deg(
 
 
 def wait_for(
-    read: Callable[[], State],
-    done: Callable[[State], bool],
+    read_state: Callable[[], State],
+    is_done: Callable[[State], bool],
     deadline: Deadline,
-    expected: str,
+    expectation: str,
     *,
     check: Callable[[State], None] | None,
     pause: Callable[[], None],
     describe: Callable[[State], str],
     remedy: str,
 ) -> None:
-    """Read the arm's state until it is `done`, with a `pause` between reads; `check` is applied to every state.
+    """Read the arm's state until it is `is_done`, with a `pause` between reads; `check` is applied to every state.
 
-    Errors of `read` and `check` are raised unchanged. Raises DeviceTimeout at the deadline, with the last state
-    in the words of `describe`.
+    Errors of `read_state` and `check` are raised unchanged. Raises DeviceTimeout at the deadline, with the last
+    state in the words of `describe`.
     """
     while True:
-        state = read()
+        state = read_state()
         if check is not None:
             check(state)
-        if done(state):
+        if is_done(state):
             return
-        if deadline.expired:
+        if deadline.has_expired:
             raise DeviceTimeout(
                 "robot",
-                expected=f"{expected} within {deadline.seconds:.1f} s",
+                expected=f"{expectation} within {deadline.seconds:.1f} s",
                 happened=describe(state),
                 remedy=remedy,
             )

@@ -73,15 +73,15 @@ def make_run(
     diary.write(SessionStarted())
     for place, view in enumerate(views):
         path = run.view_path(view)
-        create(path, shots + 3, of, {**METADATA, "title": view}, packed=packed)
+        create(path, shots + 3, of, {**METADATA, "title": view}, is_packed=packed)
         writer = ViewWriter(path, {})
         pose = writer.add_pose(ArmState((1, 2, 3, 4, 5, 6), np.eye(4), 7, moving=False), 2 * np.eye(4))
-        writer.put(noisy_frame(999, of), frame_id=999, camera_ns=999, exposure_us=8000)
+        writer.store(noisy_frame(999, of), frame_id=999, camera_ns=999, exposure_us=8000)
         for number, label in enumerate(labels):
             shot, pixels = f"{view}/{label}", noisy_frame(100 * place + number, of)
             if shot in missing:
                 continue
-            slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
+            slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
             digest = writer.prove(slot, shot, led=number, pose=pose, board_temperature_dc=251, led_current_ma=700)
             file = str(path.relative_to(run.folder))
             diary.write(FrameProven(shot=shot, file=file, index=slot, frame_id=number, xxh3=f"{digest:016x}"))

@@ -56,7 +56,7 @@ def cpu_s() -> float:
 # -- check ------------------------------------------------------------------------------------------------
 
 
-def bench_check(asked: Asked) -> None:
+def bench_check(options: Asked) -> None:
     """`coupole check --no-paths` of 30 views x 1080 LEDs x 3 exposures, against the limit of 3 s and against a
     Python process that only imports numpy, pydantic and h5py."""
     command = [
@@ -70,7 +70,7 @@ def bench_check(asked: Asked) -> None:
     bare = [sys.executable, "-c", "import numpy, pydantic, h5py"]
     times_s: list[float] = []
     peers: list[float] = []
-    for _ in range(asked.rounds):
+    for _ in range(options.rounds):
         for argv, times in ((command, times_s), (bare, peers)):
             start = time.perf_counter()
             subprocess.run(argv, check=True, capture_output=True, cwd=ROOT)
@@ -83,7 +83,7 @@ def bench_check(asked: Asked) -> None:
 # -- sequencing -------------------------------------------------------------------------------------------
 
 
-def bench_sequencing(asked: Asked) -> None:
+def bench_sequencing(options: Asked) -> None:
     """A burst of 1080 LEDs at 100 frames/s, from INITiate to the last proven frame, against the table's own
     duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
@@ -96,11 +96,11 @@ def bench_sequencing(asked: Asked) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         plan = ROOT / "configs/plans/demo.yaml"
-        job = read_job(write_demo_plan(ROOT, Path(folder), **SMALL_DEMO) if asked.smallest else plan)
+        job = read_job(write_demo_plan(ROOT, Path(folder), **SMALL_DEMO) if options.smallest else plan)
     table_s = job.schedule.bursts[0][0].duration_s
     leds = len(set(job.schedule.bursts[0][0].table["led"].tolist()) - {NO_LED})
     world_s, machine_s, whole, cpu = [], [], [], []
-    for _ in range(asked.rounds):
+    for _ in range(options.rounds):
         with tempfile.TemporaryDirectory(dir=ROOT) as folder, open_cell(job.cell, job=job) as cell:
             run = Run.create(Path(folder), "bench", job.inputs, about_run(job, cell))
             recorder = RunRecorder(run, metadata_of_views(job, cell))
@@ -128,18 +128,18 @@ def bench_sequencing(asked: Asked) -> None:
 # -- store ------------------------------------------------------------------------------------------------
 
 
-def bench_store(asked: Asked) -> None:
+def bench_store(options: Asked) -> None:
     """Full-size frames to disk: the view writer and others, and the whole data path of a run."""
     from bench_store import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
 # -- matching ---------------------------------------------------------------------------------------------
 
 
-def bench_matching(asked: Asked) -> None:
+def bench_matching(options: Asked) -> None:
     """Proof of a whole burst of 1092 frames, 2 % of them lost, against numpy's nearest-neighbour pairing, which
     is given the clocks' offset and proves nothing; and against the 10 ms per frame at 100 frames/s."""
     from coupole.acquisition.frame_matching import compile_now, match
@@ -166,7 +166,7 @@ def bench_matching(asked: Asked) -> None:
         matching = match(log, frame_ids, stamps, complete=True)
         assert np.count_nonzero(matching.step_of_frame >= 0) == len(frame_ids)
 
-    for _ in range(2 if asked.smallest else max(asked.rounds, 3) * 20):
+    for _ in range(2 if options.smallest else max(options.rounds, 3) * 20):
         for work, times in ((prove, times_s), (pair, peers)):
             start = time.perf_counter()
             work()
@@ -179,94 +179,94 @@ def bench_matching(asked: Asked) -> None:
 # -- robot and collisions: in separate files ------------------------------------------------------------------
 
 
-def bench_rsi(asked: Asked) -> None:
+def bench_rsi(options: Asked) -> None:
     """Latency of answers to a KUKA controller at 4 ms, against a minimal program in C."""
     from bench_rsi import figures
 
-    for figure in figures(asked.rounds, smallest=asked.smallest):
+    for figure in figures(options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_collisions(asked: Asked) -> None:
+def bench_collisions(options: Asked) -> None:
     """Collision check of one pose of the arm, against python-fcl."""
     from bench_collisions import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_archive(asked: Asked) -> None:
+def bench_archive(options: Asked) -> None:
     """Compression ratio and speed of archiving a view, and reading from it, against h5py and the file before."""
     from bench_archive import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_codecs(asked: Asked) -> None:
+def bench_codecs(options: Asked) -> None:
     """Packing, compression and Exif against libraries with the same functions: equality of output, and speed."""
     from bench_codecs import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_mesh(asked: Asked) -> None:
+def bench_mesh(options: Asked) -> None:
     """Reading a scan of 10 million triangles against numpy and trimesh; memory for 40 million."""
     from bench_mesh import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_calibration(asked: Asked) -> None:
+def bench_calibration(options: Asked) -> None:
     """Finding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
     from bench_calibration import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_render(asked: Asked) -> None:
+def bench_render(options: Asked) -> None:
     """Pictures of the simulated dome, against Open3D, Embree and Mitsuba, and memory for a large scan."""
     from bench_render import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_reflectance(asked: Asked) -> None:
+def bench_reflectance(options: Asked) -> None:
     """Frames to samples, fits and relit pictures, against the disk, BLAS, SciPy, Mitsuba and published figures. It
     takes 12 GB of disk and some minutes; `--frames` makes it smaller."""
     from bench_reflectance import figures
 
-    for figure in figures(ROOT, asked.rounds, asked.frames, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, options.frames, smallest=options.smallest):
         line(**figure)
 
 
-def bench_console(asked: Asked) -> None:
+def bench_console(options: Asked) -> None:
     """The demo's efficiency while ten people watch it at a console, against that with nobody there; wants an idle
     machine."""
     from bench_console import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_workers(asked: Asked) -> None:
+def bench_workers(options: Asked) -> None:
     """Fits of the demo's samples by two workers of a cluster, against one; for two idle cores. It acquires the
     demo first, and takes 3 GB of disk."""
     from bench_workers import figures
 
-    for figure in figures(ROOT, asked.rounds, smallest=asked.smallest):
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
 
 
-def bench_urushi(asked: Asked) -> None:
+def bench_urushi(options: Asked) -> None:
     """Sphere maps of gold under ten lights, made anew for each place of the lights."""
     from bench_urushi import figures
 
-    for figure in figures(asked.rounds, smallest=asked.smallest):
+    for figure in figures(options.rounds, smallest=options.smallest):
         line(**figure)
 
 

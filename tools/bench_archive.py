@@ -49,7 +49,7 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         for name, codec in CODECS.items():
             _archive(path, proven, codec, target_folder)
             for reading, reader in (("tile_through_all_frames", _read_tile), ("one_frame", _read_frame)):
-                ours_s, before_s = _interleaved(rounds, reader, path, target_folder / path.name)
+                ours_s, before_s = _median_read_s(rounds, reader, path, target_folder / path.name)
                 figure = _figure(f"archive_{name}_{reading}", ours_s, "s", "contiguous", before_s / ours_s)
                 yield {**figure, "peer_value": round(before_s, 4), "frames": frames}
             (target_folder / path.name).replace(path)
@@ -82,10 +82,10 @@ def _speeds(
     yield _figure(f"archive_{name}_read_back", back, "MB/s", "compress", back / speed_mb_s)
 
 
-def _archive(path: Path, proven: list[Any], codec: Any, kept: Path) -> Any:
+def _archive(path: Path, proven: list[Any], codec: Any, archive_folder: Path) -> Any:
     from coupole.storage.archive_view import archive_view
 
-    return archive_view(path, proven, codec, lambda what, done, total: None, keep_in=kept)
+    return archive_view(path, proven, codec, lambda what, done, total: None, keep_in=archive_folder)
 
 
 def _figure(name: str, value: float, unit: str, peer: str, ratio: float, **more: Any) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def _write_view(path: Path, pictures: NDArray[np.uint16], frames: int) -> list[A
     writer = ViewWriter(path, {})
     proven: list[FrameProven] = []
     for number in range(frames):
-        slot = writer.put(pictures[number % DISTINCT], frame_id=number, camera_ns=0, exposure_us=8000)
+        slot = writer.store(pictures[number % DISTINCT], frame_id=number, camera_ns=0, exposure_us=8000)
         shot = ShotId.parse(f"view/led{number:04d}/e0")
         xxh3 = f"{writer.prove(slot, str(shot), led=number):016x}"
         proven.append(FrameProven(shot=shot, file=path.name, index=slot, frame_id=number, xxh3=xxh3))
@@ -167,19 +167,19 @@ def _forget(path: Path) -> None:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def _interleaved(
-    rounds: int, read: Callable[[h5py.Dataset], None], ours: Path, before: Path
+def _median_read_s(
+    rounds: int, read_dataset: Callable[[h5py.Dataset], None], archive_path: Path, before: Path
 ) -> tuple[float, float]:
     """Median seconds for reading from either file."""
-    times: dict[Path, list[float]] = {ours: [], before: []}
+    times: dict[Path, list[float]] = {archive_path: [], before: []}
     for _ in range(rounds):
         for path, times_s in times.items():
             _forget(path)
             with h5py.File(path) as file:
                 start_s = time.perf_counter()
-                read(file[_DATA])
+                read_dataset(file[_DATA])
                 times_s.append(time.perf_counter() - start_s)
-    return statistics.median(times[ours]), statistics.median(times[before])
+    return statistics.median(times[archive_path]), statistics.median(times[before])
 
 
 def _read_tile(data: h5py.Dataset) -> None:

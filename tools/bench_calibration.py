@@ -75,7 +75,7 @@ def _detection(rounds: int, scale: float) -> dict[str, Any]:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(charuco_board).detectBoard(grey)
         return corners, ids
 
-    return _compared(
+    return _compare_times(
         f"calibration_board_detection_{1e-6 * grey.size:.2g}mp",
         lambda: detect(board, Picture.of_grey(image, white=4095.0)),
         "opencv",
@@ -161,12 +161,12 @@ def _bundle(rounds: int, size: Size) -> dict[str, Any]:
     ]
     start, robot = Intrinsics(*LENS), RobotNoise(absolute_mm=0.0, absolute_deg=1e-5)
 
-    def ours() -> Any:
+    def run_coupole() -> Any:
         return calibrate_hand_eye(sightings, Poses(scene.base_from_flange), lens=start, robot=robot)
 
-    return _compared(
+    return _compare_times(
         f"calibration_bundle_{size.images}_images",
-        ours,
+        run_coupole,
         "scipy",
         lambda: _plain(scene, False, size.peers_steps),
         rounds,
@@ -195,7 +195,7 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
     sigma = np.concatenate([[0.3, 0.3, 0.5, 0.5, 2e-4, 2e-3, 1e-5, 1e-5], np.full(3, 0.02), np.full(3, 4e-5)])
     prior = CameraPrior(Intrinsics(*LENS), NAMES[:8], scene.flange_from_camera, np.diag(sigma**2))
 
-    def ours() -> Any:
+    def run_coupole() -> Any:
         return adjust_leds(
             sightings,
             scene.point,
@@ -206,8 +206,12 @@ def _leds(rounds: int, size: Size) -> dict[str, Any]:
             Stated(tolerance_mm=TOLERANCE_MM),
         )
 
-    figure = _compared(
-        f"calibration_leds_{count}_x_6", ours, "scipy", lambda: _plain(scene, True, size.peers_steps), rounds
+    figure = _compare_times(
+        f"calibration_leds_{count}_x_6",
+        run_coupole,
+        "scipy",
+        lambda: _plain(scene, True, size.peers_steps),
+        rounds,
     )
     return {**figure, "leds": count, "spots": len(scene.view), "views": len(scene.base_from_flange)}
 
@@ -347,12 +351,12 @@ def _towards(random: np.random.Generator, target_mm: Any, distance_mm: float) ->
     return pose
 
 
-def _compared(
-    name: str, ours: Callable[[], Any], peer: str, theirs: Callable[[], Any], rounds: int
+def _compare_times(
+    name: str, run_coupole: Callable[[], Any], peer: str, run_peer: Callable[[], Any], rounds: int
 ) -> dict[str, Any]:
     seconds: dict[str, list[float]] = {"coupole": [], peer: []}
     for _ in range(rounds):
-        for solver, work in (("coupole", ours), (peer, theirs)):
+        for solver, work in (("coupole", run_coupole), (peer, run_peer)):
             started_s = time.perf_counter()
             work()
             seconds[solver].append(time.perf_counter() - started_s)

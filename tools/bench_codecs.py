@@ -67,15 +67,17 @@ def _bitshuffle(frame: NDArray[np.uint16], rounds: int) -> Iterator[dict[str, An
     tile = tile_shape(*frame.shape)
     for name, codec in CODECS.items():
 
-        def ours(codec: Any = codec) -> list[bytes]:
+        def run_coupole(codec: Any = codec) -> list[bytes]:
             return [data for _, data in compressed_tiles(frame, tile, codec)]
 
-        def theirs(codec: Any = codec) -> list[bytes]:
+        def run_peer(codec: Any = codec) -> list[bytes]:
             return [_imagecodecs_tile(part, codec) for part in _tiles(frame, tile)]
 
-        same = ours() == theirs()
+        same = run_coupole() == run_peer()
         for threads in (1, 2):
-            times = _medians_s(rounds, partial(_at_once, ours, threads), partial(_at_once, theirs, threads))
+            times = _medians_s(
+                rounds, partial(_at_once, run_coupole, threads), partial(_at_once, run_peer, threads)
+            )
             yield _figure(f"bitshuffle_{name}_{threads}_threads", "imagecodecs", times, same)
 
 
@@ -121,14 +123,14 @@ def _exif(root: Path, rounds: int) -> Iterator[dict[str, Any]]:
         path = Path(folder) / "IMG_0001.DNG"
         write_dng(path, np.zeros((2, 2), np.uint16), taken="2026:03:04 05:06:07", subseconds="12")
 
-        def theirs() -> dict[str, Any]:
+        def run_peer() -> dict[str, Any]:
             with path.open("rb") as file:
                 return dict(exifread.process_file(file, details=False))
 
-        tags = theirs()
+        tags = run_peer()
         texts = (str(tags["EXIF DateTimeOriginal"]), str(tags["EXIF SubSecTimeOriginal"]))
         same = texts == ("2026:03:04 05:06:07", "12") and read_exif(path).taken_ns % 10**9 == 120_000_000
-        yield _figure("read_exif", "exifread", _medians_s(10 * rounds, partial(read_exif, path), theirs), same)
+        yield _figure("read_exif", "exifread", _medians_s(10 * rounds, partial(read_exif, path), run_peer), same)
 
 
 def _at_once(work: Callable[[], object], threads: int) -> None:
@@ -139,11 +141,13 @@ def _at_once(work: Callable[[], object], threads: int) -> None:
         thread.join()
 
 
-def _medians_s(rounds: int, ours: Callable[[], object], theirs: Callable[[], object]) -> tuple[float, float]:
+def _medians_s(
+    rounds: int, run_coupole: Callable[[], object], run_peer: Callable[[], object]
+) -> tuple[float, float]:
     """Medians of interleaved rounds, without the first of each: numba compiles, memory is allocated."""
     times: tuple[list[float], list[float]] = ([], [])
     for number in range(-1, rounds):
-        for work, seconds in zip((ours, theirs), times, strict=True):
+        for work, seconds in zip((run_coupole, run_peer), times, strict=True):
             start_s = time.perf_counter()
             work()
             if number >= 0:

@@ -26,11 +26,11 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
     poses = SMALLEST_POSES if smallest else POSES
     poses_deg = home_deg + np.random.default_rng(3).uniform(-40.0, 40.0, (poses, 6))
 
-    def ours() -> None:
+    def run_coupole() -> None:
         for joints_deg in poses_deg:
             job.motion.bodies.contacts(joints_deg)
 
-    works = list(filter(None, (ours, fcl_check(job, poses_deg))))
+    works = list(filter(None, (run_coupole, fcl_check(job, poses_deg))))
     times_us: list[list[float]] = [[] for _ in works]
     for _ in range(1 + 5 * rounds):
         for work, times in zip(works, times_us, strict=True):

@@ -71,7 +71,7 @@ class Seen:
     shots: set[str] = field(default_factory=set)
 
 
-async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, seen: Seen) -> None:
+async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, traffic: Seen) -> None:
     import aiohttp
     import socketio
 
@@ -79,7 +79,7 @@ async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, seen: 
         async with http.get(f"{url}/run") as reply:
             page = await reply.text()
         query = {
-            "client_id": _found(r"['\"]client_id['\"]: ?['\"]([0-9a-f-]+)['\"]", page),
+            "client_id": _first_match(r"['\"]client_id['\"]: ?['\"]([0-9a-f-]+)['\"]", page),
             "document_id": "bench",
             "tab_id": "bench",
             "old_tab_id": "",
@@ -88,28 +88,28 @@ async def _watch(url: str, cookies: dict[str, str], until: asyncio.Event, seen: 
         client = socketio.AsyncClient(http_session=http)
 
         async def update(data: Any) -> None:
-            seen.updates += 1
+            traffic.updates += 1
             for address in re.findall(r"/api/v1/runs/[^\"'\\ ]+", json.dumps(data)):
-                if address not in seen.shots:
-                    seen.shots.add(address)
+                if address not in traffic.shots:
+                    traffic.shots.add(address)
                     async with http.get(url + address.replace("&amp;", "&")) as picture:
-                        seen.bytes += len(await picture.read())
-                        seen.pictures += picture.status == 200
+                        traffic.bytes += len(await picture.read())
+                        traffic.pictures += picture.status == 200
 
-        async def connected() -> None:
-            seen.connections += 1
+        async def on_connect() -> None:
+            traffic.connections += 1
             assert await client.call("handshake", query), "the screen did not take the watcher"
             query["next_message_id"] = None  # of a connection that was lost: go on with what is next
 
         client.on("update", update)
-        client.on("connect", connected)
+        client.on("connect", on_connect)
         headers = {"Origin": url, "Cookie": "; ".join(f"{name}={value}" for name, value in cookies.items())}
         await client.connect(url, headers, transports=["websocket"], socketio_path="/_nicegui_ws/socket.io")
         await until.wait()
         await client.disconnect()
 
 
-def _found(pattern: str, text: str) -> str:
+def _first_match(pattern: str, text: str) -> str:
     match = re.search(pattern, text)
     assert match, f"no {pattern} in the page"
     return match.group(1)

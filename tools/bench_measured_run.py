@@ -61,7 +61,7 @@ def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
     width_px, height_px = size.size_px
     support = pose @ np.linalg.inv(camera_pose())
     pose[:3, 3] -= LIFT_MM * pose[:3, 2]
-    leds = _spread(by.leds.ids, frames)
+    leds = _evenly_spaced_ids(by.leds.ids, frames)
     labels = [*(f"led{led:04d}/e0" for led in leds), *(f"dark{n}/e0" for n in range(DARK_FRAMES))]
     inputs = Inputs(root / "configs/plans/demo.yaml", root / "configs/rigs/sim.yaml", ())
     about = {"views": [VIEW], "labels": labels, "simulated": True, "object": None}
@@ -88,7 +88,7 @@ def make_run(root: Path, folder: Path, frames: int, size: Size) -> Any:
     return run
 
 
-def _spread(ids: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _evenly_spaced_ids(ids: NDArray[np.int64], count: int) -> NDArray[np.int64]:
     subset: NDArray[np.int64] = np.sort(ids)[np.linspace(0, len(ids) - 1, count).astype(int)].astype(np.int64)
     return subset
 

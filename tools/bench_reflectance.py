@@ -50,12 +50,12 @@ class Scope:
     frames: int = FRAMES
     few_frames: int = 10
     """Frames of the run whose memory is compared with that of all frames."""
-    fitted: int = 16_384
+    fitted_count: int = 16_384
     """Triangles."""
     by_scipy: int = 256
 
 
-SMALLEST = Scope(Size((256, 192), 2_000), frames=40, few_frames=10, fitted=64, by_scipy=2)
+SMALLEST = Scope(Size((256, 192), 2_000), frames=40, few_frames=10, fitted_count=64, by_scipy=2)
 
 
 def figures(
@@ -67,7 +67,7 @@ def figures(
         folder = Path(name)
         yield from _memory(root, folder, scope)
         yield from _extraction(folder, rounds)
-        samples = _some_samples(folder, scope.fitted)
+        samples = _some_samples(folder, scope.fitted_count)
         yield from _fits(samples, rounds, scope.by_scipy)
         yield from _representations(samples, rounds)
         yield from _relit(root, folder, samples, rounds, scope.run.size_px)
@@ -77,7 +77,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _timed(work: Callable[[], Any]) -> float:
+def _elapsed_s(work: Callable[[], Any]) -> float:
     started_s = time.perf_counter()
     work()
     return time.perf_counter() - started_s
@@ -88,7 +88,7 @@ def _medians(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, floa
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(rounds):
         for name, work in works.items():
-            times[name].append(_timed(work))
+            times[name].append(_elapsed_s(work))
     return {name: statistics.median(seconds) for name, seconds in times.items()}
 
 
@@ -244,7 +244,7 @@ def _fits(samples: Any, rounds: int, by_scipy: int) -> Iterator[dict[str, Any]]:
     times_us = {name: 1e6 * seconds / count for name, seconds in _medians(works, rounds).items()}
     few = samples.of_triangles(np.arange(0, count, count // by_scipy))
     scipy = {
-        name: 1e6 * _timed(partial(fit, few)) / len(few.values) / _cores()
+        name: 1e6 * _elapsed_s(partial(fit, few)) / len(few.values) / _cores()
         for name, fit in (("sh", scipy_harmonics), ("ggx", scipy_ggx))
     }
     about = {"samples": round(samples_per_triangle), "triangles": count, "cores": _cores()}
@@ -332,7 +332,7 @@ def _relit(
     for work in works.values():
         work()
     seconds = _medians(works, rounds)
-    first_s = _timed(lambda: scene_of_view(result, fit="ggx_normal"))
+    first_s = _elapsed_s(lambda: scene_of_view(result, fit="ggx_normal"))
     more = {"triangles": len(result.triangles), "view_ready_s": round(first_s, 3)}
     more["in_new_memory_s"] = round(seconds["in_new_memory"], 3)
     tenth_s = seconds.get("mitsuba", float("nan")) / 10

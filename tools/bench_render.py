@@ -186,7 +186,7 @@ def photographer(root: Path, mesh: Path, size: tuple[int, int], **settings: Any)
     }
     config = Config.model_validate(world)
     pose = np.array(config.scene.base_from_support) @ support_from_object @ camera_pose()
-    return Photographer(config.scene, config.photographed, config.settings), pose
+    return Photographer(config.scene, config.rendered_camera, config.settings), pose
 
 
 def render_leds(by: Any, pose: NDArray[np.float64], out: NDArray[np.uint16], leds: range) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from coupole.plan.arm_description import shipped_arm
-from drivers.kuka.rsi.jitter import StandInController, above_the_loop, asked, free_port
+from drivers.kuka.rsi.jitter import StandInController, above_the_loop, answering_session, free_port
 from drivers.kuka.rsi.settings import Settings
 
 CYCLE_S = 0.004
@@ -33,7 +33,9 @@ _SOURCE = Path(__file__).with_name("bench_rsi_responder.c")
 @contextmanager
 def our_responder() -> Iterator[tuple[StandInController, bool]]:
     """The driver's process with a session, and True if it runs under SCHED_FIFO."""
-    with asked(Settings(arm_model=shipped_arm("kr10_r1100_sixx").arm, listen="127.0.0.1:0")) as responder:
+    with answering_session(
+        Settings(arm_model=shipped_arm("kr10_r1100_sixx").arm, listen="127.0.0.1:0")
+    ) as responder:
         yield responder
 
 
@@ -78,20 +80,22 @@ def figures(rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
                 for _ in range(rounds * blocks):
                     for controller, _ in responders:
                         controller.ask(cycles)
-                yield from compared(load, *responders)
+                yield from load_figures(load, *responders)
 
 
-def compared(
-    load: str, ours: tuple[StandInController, bool], theirs: tuple[StandInController, bool] | None = None
+def load_figures(
+    load: str,
+    coupole_session: tuple[StandInController, bool],
+    peer_session: tuple[StandInController, bool] | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Figures for one load. Without a peer they are compared with the cycle."""
-    peer = "c_responder" if theirs else "cycle"
-    more: dict[str, Any] = {"answers": len(ours[0].latencies_us), "sched_fifo": ours[1]}
-    if theirs:
-        more["peer_sched_fifo"] = theirs[1]
+    peer = "c_responder" if peer_session else "cycle"
+    more: dict[str, Any] = {"answers": len(coupole_session[0].latencies_us), "sched_fifo": coupole_session[1]}
+    if peer_session:
+        more["peer_sched_fifo"] = peer_session[1]
     for name, share in (("p50", 0.5), ("p99", 0.99), ("p99_9", 0.999)):
-        value = quantile_us(ours[0], share)
-        peer_value = quantile_us(theirs[0], share) if theirs else CYCLE_S * 1e6
+        value = quantile_us(coupole_session[0], share)
+        peer_value = quantile_us(peer_session[0], share) if peer_session else CYCLE_S * 1e6
         yield {
             "name": f"rsi_answer_{name}_{load}",
             "value": value,
@@ -101,14 +105,14 @@ def compared(
             "peer_value": round(peer_value, 1),
             **more,
         }
-    late = [late_share(controller) for controller, _ in filter(None, (ours, theirs))]
+    late = [late_share(controller) for controller, _ in filter(None, (coupole_session, peer_session))]
     yield {
         "name": f"rsi_late_share_{load}",
         "value": late[0],
         "unit": "1",
         "peer": f"{peer}, shares in time",
-        "ratio": (1.0 - late[0]) / (1.0 - late[-1]) if theirs else 1.0 - late[0],
-        "peer_value": late[-1] if theirs else 0.0,
+        "ratio": (1.0 - late[0]) / (1.0 - late[-1]) if peer_session else 1.0 - late[0],
+        "peer_value": late[-1] if peer_session else 0.0,
         **more,
     }
 

@@ -58,7 +58,7 @@ def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
     """Frames per second and CPU time per frame of each writer, in turn."""
     writer_of_name: dict[str, Writer] = {
         "coupole": _coupole,
-        "coupole_packed12": partial(_coupole, packed=True),
+        "coupole_packed12": partial(_coupole, is_packed=True),
         "o_direct_copy": _o_direct_copy,
         "h5py": _h5py,
         "zarr": _zarr,
@@ -66,7 +66,7 @@ def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
         "tensorstore": _tensorstore,
         "tifffile": _tifffile,
     }
-    for missing in [name for name in writer_of_name if not _installed(name)]:
+    for missing in [name for name in writer_of_name if not _is_installed(name)]:
         print(f"{missing} is not installed and is left out", file=sys.stderr)
         del writer_of_name[missing]
     seconds: dict[str, list[float]] = {name: [] for name in writer_of_name}
@@ -95,7 +95,7 @@ def writers(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
         }
 
 
-def _installed(name: str) -> bool:
+def _is_installed(name: str) -> bool:
     return name.startswith("coupole") or name == "o_direct_copy" or importlib.util.find_spec(name) is not None
 
 
@@ -115,7 +115,7 @@ def _cpu_s() -> float:
 # -- the writers ------------------------------------------------------------------------------------------
 
 
-def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: bool = False) -> None:
+def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, is_packed: bool = False) -> None:
     from coupole.devices import FrameFormat
     from coupole.storage.frame_file_creation import create
     from coupole.storage.view_writer import ViewWriter
@@ -123,9 +123,9 @@ def _coupole(folder: Path, pixels: NDArray[np.uint16], frames: int, *, packed: b
     view = folder / "view.h5"
     metadata = {"title": "bench", "sample": "none", "simulated": True, "pixel_pitch_um": 5.5}
     height_px, width_px = pixels.shape[1:]
-    create(view, frames, FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), metadata, packed=packed)
+    create(view, frames, FrameFormat(height_px, width_px, 12, "GBRG", 64, 4095), metadata, is_packed=is_packed)
     writer = ViewWriter(view, {})
-    keep = partial(writer.put, camera_ns=0, exposure_us=8000)
+    keep = partial(writer.store, camera_ns=0, exposure_us=8000)
     with ThreadPoolExecutor(3) as pool:  # as `coupole.acquisition.frame_grabber` does
         slots = [pool.submit(keep, pixels[k % len(pixels)], frame_id=k) for k in range(frames)]
         for k, slot in enumerate(slots):
@@ -253,7 +253,7 @@ def stream(root: Path, rounds: int, size: Size) -> Iterator[dict[str, Any]]:
             "peer_value": round(limit, 2),
             "frames": rounds * size.stream_frames,
             "frame_px": [size.width_px, size.height_px],
-            "lost": sum(burst.lost for burst in bursts),
+            "lost": sum(burst.lost_count for burst in bursts),
             "cpu_ms_per_frame": round(statistics.median(burst.cpu_ms_per_frame for burst in bursts), 2),
             "memory_grown_mb": round(max(burst.grown_mb for burst in bursts), 1),
         }
@@ -265,7 +265,7 @@ class Burst:
 
     frames_per_s: float
     cpu_ms_per_frame: float
-    lost: int
+    lost_count: int
     """Frames, or shots that were taken again."""
     grown_mb: float
     """Memory of the process."""
@@ -326,7 +326,7 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
     return Burst(
         frames_per_s=(last - first) / (last_s - first_s),
         cpu_ms_per_frame=1e3 * (cpu_after_s - cpu_before_s) / (last - first),
-        lost=outcome.lost_transfers + outcome.reshot,
+        lost_count=outcome.lost_transfers + outcome.reshot,
         grown_mb=mb_after - mb_before,
     )
 

@@ -102,9 +102,9 @@ def _cpu_s(pid: int) -> float:
     return (int(stat_fields[11]) + int(stat_fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _refuse_others(one: Path, other: Path) -> None:
+def _refuse_others(first_path: Path, second_path: Path) -> None:
     """Raises RuntimeError if a file of fits or samples has other numbers than the other's."""
-    for path in sorted(one.rglob("*.h5")):
-        with h5py.File(path) as file, h5py.File(other / path.relative_to(one)) as its:
+    for path in sorted(first_path.rglob("*.h5")):
+        with h5py.File(path) as file, h5py.File(second_path / path.relative_to(first_path)) as its:
             if wrong := [key for key in file if file[key][()].tobytes() != its[key][()].tobytes()]:
                 raise RuntimeError(f"{path.name}: two workers give another {wrong[0]} than one")

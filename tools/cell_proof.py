@@ -111,7 +111,7 @@ def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
     model: Arm | None = planning_arm(cell.cell.rig) if cell.absolute else None
     try:
         camera, hand_eye = _camera_and_hand_eye(cell, at, request, model)
-        if faults := [*_missed(camera), *_missed(hand_eye)]:
+        if faults := [*_missed_limits(camera), *_missed_limits(hand_eye)]:
             return Proof([], {}, "; ".join(faults))
         judgements = [Judged(*judgement) for judgement in judged_rays(cell, camera, hand_eye, at.board)]
         judgements += [judgement for judgement in _of_hand_eye(cell, hand_eye) if has_truth(cell, judgement.name)]
@@ -128,7 +128,7 @@ def _prove_strange_cell(cell: RandomCell, at: Postures) -> Proof:
     return proof
 
 
-def _missed(record: Record) -> Iterator[str]:
+def _missed_limits(record: Record) -> Iterator[str]:
     for limit in record.limits:
         if not limit.is_met:
             yield f"{record.kind}: {limit.what} above its limit"
@@ -176,7 +176,7 @@ def _of_camera(cell: RandomCell, record: Record) -> Iterator[Judged]:
     for parameter in record.parameters:
         assert parameter.value is not None
         error = parameter.value - cell.true_lens[parameter.name]
-        yield _judged(f"camera.{parameter.name}", error, parameter.u, parameter.degrees_of_freedom)
+        yield _judge(f"camera.{parameter.name}", error, parameter.u, parameter.degrees_of_freedom)
 
 
 def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
@@ -189,7 +189,7 @@ def _of_hand_eye(cell: RandomCell, record: Record) -> Iterator[Judged]:
         estimated_pose = transform(pose.translation_mm, pose.abc_deg)
         for step, error in zip(STEPS, _error(estimated_pose, true[name]), strict=True):
             parameter = by_name[f"{name}.{step}"]
-            yield _judged(parameter.name, error, parameter.u, parameter.degrees_of_freedom)
+            yield _judge(parameter.name, error, parameter.u, parameter.degrees_of_freedom)
 
 
 def _prove_leds(
@@ -220,7 +220,7 @@ def _prove_leds(
     for led, covariance in enumerate(geometry.centre_covariance):
         u = np.sqrt(np.diag(covariance))
         for axis, error in enumerate(geometry.centres_mm[led] - true_mm[led]):
-            proof.judged.append(_judged(f"leds.{'xyz'[axis]}_mm", error, u[axis]))
+            proof.judged.append(_judge(f"leds.{'xyz'[axis]}_mm", error, u[axis]))
     tilts_deg = []
     for number, board in enumerate(np.unique(table.boards)):
         row_of_board = int(np.flatnonzero(table.boards == board)[0])
@@ -228,7 +228,7 @@ def _prove_leds(
         u = np.sqrt(np.diag(geometry.normal_covariance[number]))
         tilts_deg.append(float(np.degrees(np.linalg.norm(true_normal[:2]))))
         for axis, error in enumerate(np.degrees([-true_normal[1], true_normal[0]])):
-            proof.judged.append(_judged(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis]))
+            proof.judged.append(_judge(f"leds.normal_r{'xy'[axis]}_deg", float(error), u[axis]))
     proof.accuracy["led_normal_deg"] = float(np.median(tilts_deg))
     proof.accuracy["led_normal_deg_worst"] = max(tilts_deg)
 
@@ -244,7 +244,7 @@ def _prove_mesh(
 ) -> None:
     place = cell.place(1)
     thing = {"kind": "sculpted_relief", "stickers": {"count": STICKERS, "seed": cell.seed}} | place
-    scan = _scanned(thing, cell.seed, folder)
+    scan = _scan_of(thing, cell.seed, folder)
     sources = Photographs(cell, at.mesh, 2000, thing).sources()
     depth_mm = (200.0, 900.0)
     images = find_all_stickers(sources, prior.lens, diameter_mm=STICKER_MM, depth_mm=depth_mm)
@@ -258,11 +258,11 @@ def _prove_mesh(
     for step, error, u_of_step in zip(
         STEPS, _error(mesh_pose.base_from_mesh, cell.own_base(true)), u, strict=True
     ):
-        proof.judged.append(_judged(f"base_from_mesh.{step}", error, u_of_step))
+        proof.judged.append(_judge(f"base_from_mesh.{step}", error, u_of_step))
     _far(proof, "mesh_mm", cell, apply(mesh_pose.base_from_mesh, scan.targets_mm), apply(true, scan.targets_mm))
 
 
-def _scanned(thing: dict[str, Any], seed: int, folder: Path) -> Scan:
+def _scan_of(thing: dict[str, Any], seed: int, folder: Path) -> Scan:
     mesh, targets = export_scan(thing, folder / "scanner", seed=seed)
     import_scan(
         mesh,
@@ -276,11 +276,11 @@ def _scanned(thing: dict[str, Any], seed: int, folder: Path) -> Scan:
     return read_scan(folder / "scan")
 
 
-def _error(found: Floats, true: Floats) -> Floats:
+def _error(estimate: Floats, true: Floats) -> Floats:
     """[6] of a transform: mm along the left frame's axes, degrees about the right one's."""
-    turn = Rotation.from_matrix(true[:3, :3].T @ found[:3, :3]).as_rotvec(degrees=True)
-    return np.array([*(found[:3, 3] - true[:3, 3]), *turn])
+    turn = Rotation.from_matrix(true[:3, :3].T @ estimate[:3, :3]).as_rotvec(degrees=True)
+    return np.array([*(estimate[:3, 3] - true[:3, 3]), *turn])
 
 
-def _judged(name: str, error: float, u: float, degrees: float = np.inf) -> Judged:
+def _judge(name: str, error: float, u: float, degrees: float = np.inf) -> Judged:
     return Judged(name, float(error), float(u), float(coverage_factor(min(degrees, 1e9))) * float(u))

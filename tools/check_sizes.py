@@ -26,7 +26,7 @@ def violations(root: Path) -> Iterator[str]:
     for folder in FOLDERS:
         for path in sorted((root / folder).rglob("*.py")):
             yield from _large(path, path.relative_to(root))
-    yield from _crowded(root / "coupole")
+    yield from _shared_module_names(root / "coupole")
 
 
 def _large(path: Path, shown: Path) -> Iterator[str]:
@@ -42,7 +42,7 @@ def _large(path: Path, shown: Path) -> Iterator[str]:
                 yield f"{shown}:{first}: {node.name} has {lines} lines, at most {MOST_FUNCTION_LINES} are allowed"
 
 
-def _crowded(package: Path) -> Iterator[str]:
+def _shared_module_names(package: Path) -> Iterator[str]:
     rooms_of: dict[str, set[str]] = defaultdict(set)
     for path in package.rglob("*.py"):
         room, *inside = path.relative_to(package).parts

@@ -48,13 +48,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="coupole-day-", dir=options.keep.parent) as folder:
         cell = cell_in(Path(folder), options.hours, options.leds, options.speed)
         with cell.world(**WORLD) as world:
-            day = _followed(Watcher(cell, world, seed=0), options.hours)
+            day = _follow_day(Watcher(cell, world, seed=0), options.hours)
         wrong = wrong_at_the_end(cell, day)
     options.keep.write_text("".join(json.dumps(sample) + "\n" for sample in day.samples))
     return report(day, wrong)
 
 
-def _followed(watcher: Watcher, hours: float) -> Day:
+def _follow_day(watcher: Watcher, hours: float) -> Day:
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task("hours of the rig", total=hours)
         for _ in watcher.follow(MOST_SESSIONS):

@@ -73,7 +73,7 @@ def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[P
         content = _content(read_record(path))
         if content["validity"]["size_px"] is not None:
             content["validity"]["size_px"] = scale.size_px
-            write_record(path, _sealed(content))
+            write_record(path, _seal_record(content))
     return records
 
 
@@ -125,7 +125,7 @@ def _draw_hand_eye(folder: Path, random: np.random.Generator, scale: Scale) -> N
         if parameter["value"] is not None and not name.startswith("base_from_board"):
             parameter["value"] = place_of_name.get(name, truth.get(name, 0.0) + float(errors[name]))
     content["covariance"] = covariance.tolist()
-    write_record(folder / "hand-eye.yaml", _sealed(content))
+    write_record(folder / "hand-eye.yaml", _seal_record(content))
 
 
 def _image_mm(cell: Cell) -> float:
@@ -146,7 +146,7 @@ def _set_sensor(folder: Path, scale: Scale) -> None:
                 "gain_dn_per_e": 1.0 / sensor.electrons_per_dn,
             }
             parameter["value"] = value_of_name.get(name, parameter["value"])
-        write_record(folder / "response.yaml", _sealed(content))
+        write_record(folder / "response.yaml", _seal_record(content))
     if scale.pitch_um == cell.rig.sensor.pixel_pitch_um and scale.size_px is None:
         return
     lens = cell.rig.lens
@@ -164,7 +164,7 @@ def _set_sensor(folder: Path, scale: Scale) -> None:
                 file[name] = values.astype(np.float32)
     content = _content(read_record(SHIPPED / "flat-field.yaml"))
     content["files"][0]["sha256"] = hashlib.sha256((folder / "flat-field.h5").read_bytes()).hexdigest()
-    write_record(folder / "flat-field.yaml", _sealed(content))
+    write_record(folder / "flat-field.yaml", _seal_record(content))
 
 
 def _draw_leds(folder: Path, random: np.random.Generator, scale: Scale) -> None:
@@ -236,10 +236,10 @@ def _write_with_table(folder: Path, kind: str, content: dict[str, Any], text: st
     for file in content["files"]:
         if file["name"] == f"{kind}.csv":
             file["sha256"] = hashlib.sha256(text.encode()).hexdigest()
-    write_record(folder / f"{kind}.yaml", _sealed(content))
+    write_record(folder / f"{kind}.yaml", _seal_record(content))
 
 
-def _sealed(content: dict[str, Any]) -> Record:
+def _seal_record(content: dict[str, Any]) -> Record:
     return Record.model_validate_json(json.dumps({**content, "sha256": content_sha256(content)}))
 
 

@@ -24,8 +24,8 @@ class Lit:
     rows: Array
     columns: Array
 
-    def of(self, picked: Array) -> Lit:
-        return Lit(*(getattr(self, field.name)[picked] for field in fields(self)))
+    def of(self, rows_picked: Array) -> Lit:
+        return Lit(*(getattr(self, field.name)[rows_picked] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,14 @@ def openpbr(of: Materials, lit: Lit, f0: Array) -> Array:
     return radiance
 
 
-def lab_differences(found: Array, wanted: Array) -> Array:
+def lab_differences(rendered_rgb: Array, true_rgb: Array) -> Array:
     """[n] dE00 of linear sRGB, white 1, cut off above it."""
     import colour
 
     white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
     labs = (
         colour.XYZ_to_Lab(colour.RGB_to_XYZ(np.clip(part, 0.0, 1.0), "sRGB", white), white)
-        for part in (found, wanted)
+        for part in (rendered_rgb, true_rgb)
     )
     return np.asarray(colour.delta_E(*labs, method="CIE 2000"))
 

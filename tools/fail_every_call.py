@@ -43,7 +43,7 @@ from sim.world import client  # noqa: E402
 Case = tuple[Event, ...]
 
 
-def one(case: Case) -> dict[str, Any]:
+def run_one(case: Case) -> dict[str, Any]:
     """One case, in a folder that is removed."""
     begun_s = time.monotonic()
     gc.unfreeze()  # `cells.here` freezes what a session leaves, with the files and memory that it holds
@@ -78,11 +78,11 @@ def begin_job(parent_pid: int) -> None:
     threading.Thread(target=look, daemon=True).start()
 
 
-def done(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
+def run_all(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
     """Cases as they come; each job is a process whose main thread takes the signals."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=begin_job, initargs=(os.getpid(),)) as pool:
-        yield from (future.result() for future in as_completed([pool.submit(one, case) for case in cases]))
+        yield from (future.result() for future in as_completed([pool.submit(run_one, case) for case in cases]))
 
 
 def main() -> int:
@@ -99,7 +99,7 @@ def main() -> int:
         parser.error(f"--first: expected `drawn` or one of {', '.join((*KINDS, *MEANWHILE))}")
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         calls = count_calls(Path(folder))
-    cases = chosen(options, len(calls))
+    cases = choose_cases(options, len(calls))
     options.keep.parent.mkdir(parents=True, exist_ok=True)
     outcomes = (
         [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
@@ -108,7 +108,7 @@ def main() -> int:
     remaining_cases = [case for case in cases if case not in earlier_cases]
     with options.keep.open("a") as file:
         for line in track(
-            done(remaining_cases, options.jobs), "cases", len(remaining_cases), console=Console(stderr=True)
+            run_all(remaining_cases, options.jobs), "cases", len(remaining_cases), console=Console(stderr=True)
         ):
             outcomes.append(line)
             file.write(json.dumps(line) + "\n")
@@ -117,7 +117,7 @@ def main() -> int:
     return report([line for line in outcomes if case_of(line) in selection])
 
 
-def chosen(options: argparse.Namespace, calls: int) -> list[Case]:
+def choose_cases(options: argparse.Namespace, calls: int) -> list[Case]:
     """The cases that are asked for, in an order that the seed gives."""
     draw = random.Random(options.seed)
     if options.pairs is not None:
@@ -149,7 +149,7 @@ def report(lines: list[dict[str, Any]]) -> int:
             continue
         wrong = sum(bool(line["wrong"]) for line in lines_of_kind)
         double_faults = sum(bool(line.get("call2")) for line in lines_of_kind)
-        times = [_spread(lines_of_kind, name) for name in ("dark_s", "stop_s", "still_s", "took_s")]
+        times = [_median_and_most(lines_of_kind, name) for name in ("dark_s", "stop_s", "still_s", "took_s")]
         table.add_row(kind, str(len(lines_of_kind)), str(wrong), str(double_faults or "-"), *times)
     console.print(table)
     bad = [line for line in lines if line["wrong"]]
@@ -163,7 +163,7 @@ def report(lines: list[dict[str, Any]]) -> int:
     return int(bool(bad))
 
 
-def _spread(lines: list[dict[str, Any]], name: str) -> str:
+def _median_and_most(lines: list[dict[str, Any]], name: str) -> str:
     values = sorted(line[name] for line in lines if line.get(name) is not None)
     return f"{values[len(values) // 2]:.3f}, {values[-1]:.3f} (of {len(values)})" if values else "-"
 

@@ -59,13 +59,13 @@ def one_run(arm: str, number: int, seed: int) -> list[dict[str, Any]]:
     return records
 
 
-def _wrong_at_the_end(ended: cells.Ended, which: str, state: dict[str, Any], run: Path) -> list[str]:
+def _wrong_at_the_end(process_end: cells.Ended, freeze_kind: str, state: dict[str, Any], run: Path) -> list[str]:
     wrong = []
-    if ended.code != (0 if which == FROZEN[0] else 4):
-        wrong.append(f"exit code {ended.code}: {ended.err[-500:]}")
+    if process_end.code != (0 if freeze_kind == FROZEN[0] else 4):
+        wrong.append(f"exit code {process_end.code}: {process_end.err[-500:]}")
     if state["arm_moving"] or state["shining"] or state["panels"]:
         wrong.append("the cell is not safe at the end")
-    if ended.code == 0:
+    if process_end.code == 0:
         try:
             cells.assert_each_shot_proven_once(run)
         except AssertionError as error:
@@ -89,8 +89,8 @@ def main() -> int:
     with Progress(console=console) as progress:
         bars = {arm: progress.add_task(arm, total=options.freezes) for arm in options.arm}
 
-        def keep(done: Future[list[dict[str, Any]]], file: TextIO) -> None:
-            lines.extend(new_lines := done.result())
+        def keep(future: Future[list[dict[str, Any]]], file: TextIO) -> None:
+            lines.extend(new_lines := future.result())
             file.writelines(json.dumps(line) + "\n" for line in new_lines)
             file.flush()
             for arm, bar in bars.items():
@@ -134,7 +134,9 @@ def report(lines: list[dict[str, Any]]) -> int:
                 ]
                 if cases:
                     wrong = sum(bool(record["wrong"]) for record in cases)
-                    spreads = (_spread(cases, name) for name in ("brakes_s", "still_s", "dark_s", "turned_deg"))
+                    spreads = (
+                        _median_and_most(cases, name) for name in ("brakes_s", "still_s", "dark_s", "turned_deg")
+                    )
                     table.add_row(
                         arm, process_name, "motion" if moving else "burst", str(len(cases)), str(wrong), *spreads
                     )
@@ -145,7 +147,7 @@ def report(lines: list[dict[str, Any]]) -> int:
     return int(bool(bad))
 
 
-def _spread(lines: list[dict[str, Any]], name: str) -> str:
+def _median_and_most(lines: list[dict[str, Any]], name: str) -> str:
     values = sorted(line[name] for line in lines if line[name] is not None)
     return f"{values[len(values) // 2]:.3f}, {values[-1]:.3f}" if values else "-"
 

@@ -142,16 +142,16 @@ def _commit() -> str:
 # -- what is kept ---------------------------------------------------------------------------------------------
 
 
-def kept() -> dict[str, Ended]:
+def last_ends() -> dict[str, Ended]:
     """The last end of each proof."""
     lines = ENDED.read_text(encoding="utf-8").splitlines() if ENDED.exists() else []
     ends = [Ended(**json.loads(line)) for line in lines]
     return {ended.name: ended for ended in ends}
 
 
-def keep(ended: Ended) -> None:
+def keep(proof_end: Ended) -> None:
     with ENDED.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(asdict(ended)) + "\n")
+        file.write(json.dumps(asdict(proof_end)) + "\n")
 
 
 def table(ends: dict[str, Ended]) -> str:
@@ -189,7 +189,7 @@ def main() -> int:
     LOGS.mkdir(parents=True, exist_ok=True)
     failed = False
     if not options.table:
-        good = set() if options.again else {name for name, ended in kept().items() if ended.code == 0}
+        good = set() if options.again else {name for name, ended in last_ends().items() if ended.code == 0}
         for proof in PROOFS:
             if proof.name in good or (options.only and proof.name not in options.only):
                 continue
@@ -200,7 +200,7 @@ def main() -> int:
             console.print(
                 f"{proof.name}: {ended.minutes:.1f} min, exit {ended.code}, {ended.figure}", markup=False
             )
-    print(table(kept()))
+    print(table(last_ends()))
     return int(failed)
 
 

@@ -57,12 +57,12 @@ def surface(cell_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 def _whole(places: Field) -> Field:
     parts = bodies(places)
-    head = _joined(parts["skin"], parts["lips"], 2.5)
-    head = _joined(head, parts["eyes"], 1.0)
-    head = _joined(head, parts["hair"], 4.0)
-    robe = _joined(_joined(parts["tunic"], parts["mantle"], 5.0), parts["border"], 2.0)
-    whole = _joined(_joined(head, robe, 6.0), parts["crown"], 1.5)
-    return _joined(whole, parts["pedestal"], 3.0)
+    head = _smooth_union(parts["skin"], parts["lips"], 2.5)
+    head = _smooth_union(head, parts["eyes"], 1.0)
+    head = _smooth_union(head, parts["hair"], 4.0)
+    robe = _smooth_union(_smooth_union(parts["tunic"], parts["mantle"], 5.0), parts["border"], 2.0)
+    whole = _smooth_union(_smooth_union(head, robe, 6.0), parts["crown"], 1.5)
+    return _smooth_union(whole, parts["pedestal"], 3.0)
 
 
 def bodies(p: Field) -> dict[str, Field]:
@@ -96,9 +96,9 @@ def _mantle(x: Field, y: Field, z: Field, turn: Field) -> Field:
     folds = 6.5 * down * np.sin(13.0 * turn + 0.03 * z) + 3.0 * down * np.sin(29.0 * turn + 1.3 - 0.05 * z)
     side = np.stack([np.abs(x), y, z], axis=-1)
     chest = _ellipsoid(side, (0, 8, 105), (128, 76, 92))
-    body = _joined(chest, _segment(side, (18, 12, 186), (106, 14, 146), 36.0, 40.0), 30.0) + folds
+    body = _smooth_union(chest, _segment(side, (18, 12, 186), (106, 14, 146), 36.0, 40.0), 30.0) + folds
     edge = np.abs(x) - (26.0 + 0.42 * np.maximum(200.0 - z, 0.0) + 4.0 * np.sin(0.09 * z))
-    open_mantle = _cut(body, np.maximum(edge, y + 20.0), 7.0)
+    open_mantle = _smooth_difference(body, np.maximum(edge, y + 20.0), 7.0)
     return np.asarray(np.maximum(open_mantle, 46.0 - z))
 
 
@@ -111,30 +111,30 @@ def _border(p: Field, turn: Field) -> Field:
 def _skin(p: Field, side: Field) -> Field:
     skull = _ellipsoid(p, (0, -8, 322), (58, 68, 70))
     jaw = _ellipsoid(p, (0, -30, 283), (43, 45, 50))
-    head = _joined(skull, jaw, 22.0)
-    head = _joined(head, _ellipsoid(side, (28, -56, 291), (19, 18, 20)), 12.0)
-    head = _joined(head, _ellipsoid(p, (0, -68, 246), (15, 11, 12)), 10.0)
-    head = _cut(head, _ellipsoid(side, (24, -84, 318), (15, 11, 10)), 8.0)
+    head = _smooth_union(skull, jaw, 22.0)
+    head = _smooth_union(head, _ellipsoid(side, (28, -56, 291), (19, 18, 20)), 12.0)
+    head = _smooth_union(head, _ellipsoid(p, (0, -68, 246), (15, 11, 12)), 10.0)
+    head = _smooth_difference(head, _ellipsoid(side, (24, -84, 318), (15, 11, 10)), 8.0)
     brow = _segment(side, (9, -77, 333), (40, -62, 331), 5.0, 4.0)
-    head = _joined(head, brow, 9.0)
+    head = _smooth_union(head, brow, 9.0)
     nose = _segment(p, (0, -74, 329), (0, -87, 293), 4.5, 6.8)
     wings = _ellipsoid(side, (7.5, -78, 289), (6, 7.5, 5.5))
-    head = _joined(_joined(head, nose, 8.0), wings, 4.0)
+    head = _smooth_union(_smooth_union(head, nose, 8.0), wings, 4.0)
     lids = np.maximum(_ellipsoid(side, (23, -66.5, 316), (15.5, 14.6, 12.2)), 318.5 - p[..., 2])
     lower = np.maximum(_ellipsoid(side, (23, -66.5, 316), (14.6, 13.6, 11.4)), p[..., 2] - 310.5)
-    head = _joined(_joined(head, lids, 3.0), lower, 3.0)
+    head = _smooth_union(_smooth_union(head, lids, 3.0), lower, 3.0)
     neck = _segment(p, (0, 4, 185), (0, -8, 280), 44.0, 40.0)
-    return _joined(head, neck, 12.0)
+    return _smooth_union(head, neck, 12.0)
 
 
 def _lips(p: Field, side: Field) -> Field:
-    upper = _joined(
+    upper = _smooth_union(
         _segment(side, (4, -76.5, 272.5), (17, -68.5, 268), 4.2, 2.2),
         _ellipsoid(p, (0, -77, 271), (5, 4, 3.2)),
         3.0,
     )
     lower = _segment(side, (0, -75.5, 264.5), (14, -69, 266.5), 4.6, 2.4)
-    return _joined(upper, lower, 1.0)
+    return _smooth_union(upper, lower, 1.0)
 
 
 def _hair(p: Field, side: Field) -> Field:
@@ -142,14 +142,14 @@ def _hair(p: Field, side: Field) -> Field:
     x, y, z = np.moveaxis(p, -1, 0)
     strands = 1.9 * np.sin(0.55 * np.abs(x) + 0.16 * z + 3.0 * np.sin(0.045 * z))
     cap = _ellipsoid(p, (0, 2, 322), (69, 76, 76)) + strands
-    cap = _cut(cap, _ellipsoid(p, (0, -84, 298), (50, 62, 62)), 6.0)
+    cap = _smooth_difference(cap, _ellipsoid(p, (0, -84, 298), (50, 62, 62)), 6.0)
     wave = np.sin(0.105 * z)
     shifted_side = side - np.stack([5.0 * wave, 7.0 * np.cos(0.105 * z), 0.0 * z], axis=-1)
     lock = _segment(shifted_side, (60, -14, 330), (74, -2, 232), 17.0, 19.0)
     curl = _ellipsoid(side, (78, -8, 222), (22, 22, 19))
-    lock = _joined(lock, curl, 10.0) + 2.3 * np.sin(0.5 * np.abs(x) - 0.42 * y + 0.3 * z)
+    lock = _smooth_union(lock, curl, 10.0) + 2.3 * np.sin(0.5 * np.abs(x) - 0.42 * y + 0.3 * z)
     back = _segment(p, (0, 48, 320), (0, 58, 215), 44.0, 48.0) + strands
-    return _joined(_joined(cap, lock, 7.0), back, 12.0)
+    return _smooth_union(_smooth_union(cap, lock, 7.0), back, 12.0)
 
 
 def _crown(x: Field, y: Field, z: Field) -> Field:
@@ -187,15 +187,15 @@ def _segment(
     return np.asarray(np.linalg.norm(p - a - share[..., None] * way, axis=-1) - first - share * (last - first))
 
 
-def _joined(a: Field, b: Field, round_mm: float) -> Field:
+def _smooth_union(a: Field, b: Field, round_mm: float) -> Field:
     """Both bodies, with a hollow of about `round_mm` between them (Quilez' smooth minimum)."""
     share = np.clip(0.5 + 0.5 * (b - a) / round_mm, 0.0, 1.0)
     return np.asarray(b + share * (a - b) - round_mm * share * (1.0 - share))
 
 
-def _cut(a: Field, b: Field, round_mm: float) -> Field:
+def _smooth_difference(a: Field, b: Field, round_mm: float) -> Field:
     """Return the part of `a` that is not in `b`, with a rounded edge."""
-    return -_joined(-a, b, round_mm)
+    return -_smooth_union(-a, b, round_mm)
 
 
 def _ramp(t: Field, start: float, end: float) -> Field:

@@ -195,7 +195,7 @@ def correction_rows(settings: kuka_rsi.Settings) -> str:
     )
 
 
-def filled(template: str, values: dict[str, str]) -> str:
+def fill_template(template: str, values: dict[str, str]) -> str:
     """The template with each @NAME@ replaced; raises KeyError for one without value."""
     return re.sub(r"@([A-Z_0-9]+)@", lambda match: values[match[1]], template)
 
@@ -238,7 +238,7 @@ def files(rsi: kuka_rsi.Settings, eki: kuka_eki.Settings, pc_address: str, load:
         ("rsi", "coupole_rsi.dat"),
         ("rsi", "context.md"),
     ):
-        yield f"{folder}/{name}", filled((TEMPLATES / name).read_text(), values)
+        yield f"{folder}/{name}", fill_template((TEMPLATES / name).read_text(), values)
 
 
 def main(arguments: list[str] | None = None) -> None:

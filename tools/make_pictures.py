@@ -115,7 +115,7 @@ def synthetic_frame(job: Job) -> bytes:
     fine = {"width_px": 1024, "height_px": 768, "pixel_pitch_um": rig.sensor.pixel_pitch_um / 2}
     config = Config.model_validate(world_config(job.cell, job, rig.sensor.model_copy(update=fine)))
     fine_light = config.model_copy(update={"settings": config.settings.model_copy(update={"shading": "pixel"})})
-    photographer = Photographer(fine_light.scene, fine_light.photographed, fine_light.settings)
+    photographer = Photographer(fine_light.scene, fine_light.rendered_camera, fine_light.settings)
     flange = kinematics.forward(ARM, joints_of_shown_view(job))
     raw = np.zeros((768, 1024), np.uint16)
     photographer.render(raw, Exposed({SHOWN_LED: 8e-3}, [], 8e-3, 1.0, 0, flange))

@@ -71,7 +71,7 @@ def _bust() -> None:
         print(f"{picture.name}: {picture.stat().st_size / 1000:.0f} kB")
 
 
-def _quiet(step: str, done: int, total: int) -> None: ...
+def _quiet(step: str, done_count: int, total: int) -> None: ...
 
 
 def _smaller(path: Path, to: Path) -> None:

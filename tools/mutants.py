@@ -85,7 +85,7 @@ def read_mutants(folder: Path) -> list[Mutant]:
     return mutants
 
 
-def mutated(mutant: Mutant, root: Path) -> str:
+def mutated_text(mutant: Mutant, root: Path) -> str:
     """The text of the mutant's file with the mistake in it. Raises Stale."""
     text = (root / mutant.path).read_text(encoding="utf-8")
     count = text.count(mutant.old)
@@ -99,7 +99,7 @@ def stale(mutants: Iterable[Mutant], root: Path) -> list[str]:
     faults = []
     for mutant in mutants:
         try:
-            mutated(mutant, root)
+            mutated_text(mutant, root)
         except (Stale, OSError) as error:
             faults.append(str(error))
         missing = [test for test in mutant.tests if not (root / test.split("::")[0]).exists()]
@@ -139,7 +139,7 @@ class Bench:
         key = self.key(mutant)
         if mutant.equivalent:
             return Verdict(mutant.name, EQUIVALENT, 0.0, key, mutant.equivalent)
-        text = mutated(mutant, self._root)
+        text = mutated_text(mutant, self._root)
         self._see_healthy(mutant)
         file = self._scratch / mutant.path
         started_s = time.monotonic()
@@ -243,8 +243,8 @@ def table(verdicts: Sequence[Verdict], mutants: Sequence[Mutant]) -> str:
     return "\n".join(lines)
 
 
-def _share(tried: Sequence[Verdict]) -> float:
-    return sum(verdict.outcome == KILLED for verdict in tried) / len(tried) if tried else 1.0
+def _share(verdicts: Sequence[Verdict]) -> float:
+    return sum(verdict.outcome == KILLED for verdict in verdicts) / len(verdicts) if verdicts else 1.0
 
 
 def main() -> int:

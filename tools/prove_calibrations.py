@@ -94,7 +94,7 @@ def main() -> None:
     add_smallest(parser, cells=1, width=768, images=20, led_boards=8, samples=2)
     arguments = parser.parse_args()
     settings = {name: getattr(arguments, name) for name in SETTINGS}
-    proof_of_seed, failures = kept(arguments.keep, settings), list[str]()
+    proof_of_seed, failures = read_proofs(arguments.keep, settings), list[str]()
     all_seeds = range(arguments.first_seed, arguments.first_seed + arguments.cells)
     seeds = [seed for seed in all_seeds if seed not in proof_of_seed]
     if seeds:
@@ -144,7 +144,7 @@ def _postures(arguments: argparse.Namespace) -> Postures:
     return postures(arguments.images, led_boards=arguments.led_boards, leds=needs_leds)
 
 
-def kept(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:
+def read_proofs(path: Path | None, settings: dict[str, Any]) -> dict[int, Proof]:
     """Cells of an earlier call with the same settings, by seed."""
     if path is None or not path.exists():
         return {}

@@ -168,8 +168,8 @@ def _colours(vertices_mm: NDArray[np.float64], waves: int) -> NDArray[np.uint8]:
     return codes
 
 
-def _say(step: str, done: int, of: int) -> None:
-    if done == of:
+def _say(step: str, done_count: int, of: int) -> None:
+    if done_count == of:
         print(f"{time.strftime('%H:%M:%S')} {step}", file=sys.stderr, flush=True)
 
 

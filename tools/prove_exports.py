@@ -61,8 +61,8 @@ def main() -> int:
     lines = ["| `--to` | relative error, median | 95 % | dE00, mean | 95 % |", "|---|---|---|---|---|"]
     worst = 0.0
     with tempfile.TemporaryDirectory(prefix="coupole-exports-") as name:
-        result = arguments.result or _made(Path(name))
-        for to, (exported_values, true_values) in _compared(result, Path(name), arguments.pixels).items():
+        result = arguments.result or _make_result(Path(name))
+        for to, (exported_values, true_values) in _compare_exports(result, Path(name), arguments.pixels).items():
             usable = (true_values > 1e-6) & np.isfinite(exported_values)
             off = np.abs(exported_values[usable] / true_values[usable] - 1.0)
             median, high = np.quantile(off, [0.5, 0.95])
@@ -83,7 +83,7 @@ def main() -> int:
     return int(worst > MOST)
 
 
-def _made(folder: Path) -> Path:
+def _make_result(folder: Path) -> Path:
     cell = shipped_cell(folder, material={"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS})
     outcome = cell.acquire()
     if outcome.code:
@@ -93,7 +93,7 @@ def _made(folder: Path) -> Path:
     return folder / "result"
 
 
-def _compared(result: Path, folder: Path, count: int) -> dict[str, Row]:
+def _compare_exports(result: Path, folder: Path, count: int) -> dict[str, Row]:
     console = Console(stderr=True)
     surface = read_surface(result)
     random = np.random.default_rng(1)
@@ -204,7 +204,7 @@ def _read_gltf(folder: Path, lit: Lit) -> np.ndarray:
         assert bgr is not None, "a texture is no picture"
         return bgr[..., ::-1].reshape(-1, 3) / 255.0
 
-    row = np.searchsorted(_known(folder), lit.triangles)
+    row = np.searchsorted(_known_triangles(folder), lit.triangles)
     normals = np.frombuffer(block(1), "<f4").reshape(-1, 3, 3)[row, 0].astype(float) @ Y_UP
     specular = document["materials"][0]["extensions"]["KHR_materials_specular"]
     f0 = 0.04 * np.array(specular["specularColorFactor"]) * _linear(texels(2)[row])
@@ -226,7 +226,7 @@ def _read_materialx(folder: Path, lit: Lit) -> np.ndarray:
     uv, normals = _first_corners((folder / "surface.obj").read_text())
     side = round(len(texels("specular_roughness")) ** 0.5)
     place = np.floor((1 - uv[:, 1]) * side).astype(int) * side + np.floor(uv[:, 0] * side).astype(int)
-    row = np.searchsorted(_known(folder), lit.triangles)
+    row = np.searchsorted(_known_triangles(folder), lit.triangles)
     normals = normals[row] @ Y_UP
     names = ("base_color", "specular_color", "specular_weight", "specular_roughness")
     base, tint, weight, roughness = (texels(name)[place[row]] for name in names)
@@ -247,7 +247,7 @@ Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _NUMBERS: dict[Path, np.ndarray] = {}
 
 
-def _known(folder: Path) -> np.ndarray:
+def _known_triangles(folder: Path) -> np.ndarray:
     """Triangles that have a material, by the PLY beside."""
     ply = folder.parent / "ply/surface.ply"
     if ply not in _NUMBERS:
@@ -309,10 +309,10 @@ def _merl(path: Path, light: np.ndarray, camera: np.ndarray) -> np.ndarray:
     return np.asarray(np.pi * f * light[:, 2:])
 
 
-def _of_samples(surface: MeasuredSurface, folder: Path, chosen: tuple[int, ...], to: str) -> Row:
+def _of_samples(surface: MeasuredSurface, folder: Path, chosen_triangles: tuple[int, ...], to: str) -> Row:
     """Each value beside the nearest of the result's, as neither file says which LED a sample is from; [n, 1]."""
     exported_values, true_values = [], []
-    for number in chosen:
+    for number in chosen_triangles:
         for channel, name in enumerate(("red", "green", "blue")[: surface.result.channels]):
             f = []
             for view in surface.result.views:

@@ -96,47 +96,47 @@ def main() -> int:
     return int(not arguments.smallest and not all(low <= share <= high for share, low, high in share_and_bounds))
 
 
-def _of(case: Case, folder: Path, acquired: loop.Acquired, seed: int) -> dict[str, Any]:
+def _of(case: Case, folder: Path, acquisition: loop.Acquired, seed: int) -> dict[str, Any]:
     scale = Scale(LED_MM, LED_NORMAL_DEG, CAMERA_MM, PITCH_UM, sensor=case.sensor)
     records = draw_records(folder / "records", seed, scale)
     random = np.random.default_rng((seed, 5))
-    scan = trimesh.load(acquired.mesh, process=False)
+    scan = trimesh.load(acquisition.mesh, process=False)
     scan.vertices = scan.vertices + 1e-3 * case.vertex_um * random.standard_normal(scan.vertices.shape)
     scan.vertices = scan.vertices + MESH_MM * random.standard_normal(3)
     scan.export(folder / "scan.ply")
-    request = RunRequest((acquired.old,), folder / "scan.ply", records, scan_noise_um=case.vertex_um)
+    request = RunRequest((acquisition.old,), folder / "scan.ply", records, scan_noise_um=case.vertex_um)
     extract_runs(request, folder / "result")
-    result, truth = RunResult(folder / "result"), loop.Truth.of(acquired, folder / "result")
+    result, truth = RunResult(folder / "result"), loop.Truth.of(acquisition, folder / "result")
     table = uncertainty_of(result, case.vertex_um, paper=False)
     assert table is not None
-    return {**asdict(case), "table": table, "held": _held(result, truth, case.vertex_um)}
+    return {**asdict(case), "table": table, "held": _inside_shares(result, truth, case.vertex_um)}
 
 
-def _acquire(folder: Path, case: Case, asked: argparse.Namespace) -> loop.Acquired:
-    side_mm = SIZE_MM * (asked.triangles / TRIANGLES) ** 0.5  # the triangles' edges stay as they are
-    mesh = trimesh.Trimesh(*_welded(relief(side_mm, asked.triangles, asked.depth, 1)), process=False)
+def _acquire(folder: Path, case: Case, options: argparse.Namespace) -> loop.Acquired:
+    side_mm = SIZE_MM * (options.triangles / TRIANGLES) ** 0.5  # the triangles' edges stay as they are
+    mesh = trimesh.Trimesh(*_weld(relief(side_mm, options.triangles, options.depth, 1)), process=False)
     mesh.export(folder / "object.ply")
     (folder / "cell").mkdir()
     cell = cells.CellFolder(folder / "cell", speed=10.0, write_now=False)
     cell.plan_data["object"]["mesh"] = str(folder / "object.ply")
     cell.rig_data["sensor"] |= {"width_px": 512, "height_px": 384, "pixel_pitch_um": PITCH_UM}
     sensor = {"full_well_e": case.sensor.full_well_e, "read_noise_e": case.sensor.read_noise_e}
-    cell.world_settings.update(white_at_us=8000, material={"specimen": asked.material}, shading="pixel")
+    cell.world_settings.update(white_at_us=8000, material={"specimen": options.material}, shading="pixel")
     cell.world_settings.update(interreflection=False, camera={"kind": "memory", "sensor": sensor})
-    cell.write(views=[VIEW], lights={"kind": "every", "every": asked.every}, darks_per_view=8)
+    cell.write(views=[VIEW], lights={"kind": "every", "every": options.every}, darks_per_view=8)
     outcome = cell.acquire()
     if outcome.code:
         raise RuntimeError(outcome.err)
-    return loop.Acquired(asked.material, cell.run_folder, cell.run_folder, folder / "object.ply")
+    return loop.Acquired(options.material, cell.run_folder, cell.run_folder, folder / "object.ply")
 
 
-def _welded(corners_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _weld(corners_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of triangles [n, 3, 3]."""
     places, faces = np.unique(corners_mm.reshape(-1, 3).round(6), axis=0, return_inverse=True)
     return places, faces.reshape(-1, 3)
 
 
-def _held(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, float]:
+def _inside_shares(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, float]:
     """Share of samples of all channels whose intervals hold the truth."""
     (view,) = result.views
     inside = {level: [0, 0] for level in LEVELS}
@@ -152,9 +152,9 @@ def _held(result: RunResult, truth: loop.Truth, vertex_um: float) -> dict[str, f
     return {level: n / of for level, (n, of) in inside.items()}
 
 
-def _print(found: list[dict[str, Any]]) -> None:
+def _print(case_figures: list[dict[str, Any]]) -> None:
     console = Console(soft_wrap=True)
-    for case in found:
+    for case in case_figures:
         table = Table(case["name"], "median, %", "95th, %", "less by, median and 95th", box=None)
         whole = case["table"]["monte_carlo"]
         for name, row in ({"all sources": whole} | case["table"]["without"]).items():

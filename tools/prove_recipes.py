@@ -32,10 +32,10 @@ _STEP = 1e-6
 _SEED = 11
 
 
-def seen(shares: np.ndarray, chosen: list[Paint], under: Face) -> np.ndarray:
+def mixture_reflectance(shares: np.ndarray, chosen_paints: list[Paint], under: Face) -> np.ndarray:
     """Return what a mixture shows, with NaN in bands that a paint does not know."""
     k, s = (
-        np.asarray(sum(c * getattr(p, coefficient) for c, p in zip(shares, chosen, strict=True)))
+        np.asarray(sum(c * getattr(p, coefficient) for c, p in zip(shares, chosen_paints, strict=True)))
         for coefficient in ("absorption", "scattering")
     )
     finite = np.isfinite(k + s)
@@ -48,8 +48,11 @@ def seen(shares: np.ndarray, chosen: list[Paint], under: Face) -> np.ndarray:
 def bound(shares: np.ndarray, chosen: list[Paint], under: Face, noise: float, bands: np.ndarray) -> np.ndarray:
     """Least standard deviations of the shares, which sum to 1: the inverse of Fisher's information in that plane
     (Stoica, Ng, IEEE Signal Processing Letters 5(7), 1998)."""
-    middle = seen(shares, chosen, under)
-    slopes = [(seen(shares + _STEP * e, chosen, under) - middle)[bands] / _STEP for e in np.eye(len(shares))]
+    middle = mixture_reflectance(shares, chosen, under)
+    slopes = [
+        (mixture_reflectance(shares + _STEP * e, chosen, under) - middle)[bands] / _STEP
+        for e in np.eye(len(shares))
+    ]
     plane = np.linalg.svd(np.ones((1, len(shares))))[2][1:].T
     within = np.stack(slopes, axis=1) @ plane
     return np.sqrt(np.diag(plane @ np.linalg.inv(within.T @ within) @ plane.T)) * noise
@@ -69,7 +72,7 @@ def main() -> int:
     for _ in range(arguments.mixtures):
         paints = [palette[k] for k in rng.choice(len(palette), 3, replace=False)]
         shares = rng.dirichlet(np.ones(3))
-        noisy = seen(shares, paints, under) + arguments.noise * rng.standard_normal(len(bands))
+        noisy = mixture_reflectance(shares, paints, under) + arguments.noise * rng.standard_normal(len(bands))
         recipes = recipe_search.find(noisy, palette, under, arguments.noise, 4)
         least += list(bound(shares, paints, under, arguments.noise, bands))
         names = {paint.name for paint in paints}

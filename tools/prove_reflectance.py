@@ -51,11 +51,11 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     add_smallest(parser, draws=1, materials=["layered"], every=40)
     arguments = parser.parse_args()
-    judgement_of_cell = {} if arguments.keep is None else _kept(arguments.keep, arguments.every)
+    judgement_of_cell = {} if arguments.keep is None else _kept_verdicts(arguments.keep, arguments.every)
     all_cells = [(m, scan, seed) for m in arguments.materials for scan in SCANS for seed in range(arguments.draws)]
     for material in arguments.materials:
         missing = [cell for cell in all_cells if cell[0] == material and cell not in judgement_of_cell]
-        for cell, judgement in _judged(material, missing, arguments.every):
+        for cell, judgement in _judge_missing(material, missing, arguments.every):
             judgement_of_cell[cell] = judgement
             if arguments.keep is not None:
                 with arguments.keep.open("a") as file:
@@ -108,7 +108,7 @@ def verdict(material: str, cells: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _judged(
+def _judge_missing(
     material: str, missing: list[tuple[str, str, int]], every: int
 ) -> Iterable[tuple[tuple[str, str, int], dict[str, Any]]]:
     if not missing:
@@ -133,11 +133,11 @@ def _faults_of_all(verdicts: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _rms(found: list[dict[str, Any]], name: str) -> float:
-    return float(np.sqrt(np.mean([figures[name] ** 2 for figures in found])))
+def _rms(verdicts: list[dict[str, Any]], name: str) -> float:
+    return float(np.sqrt(np.mean([figures[name] ** 2 for figures in verdicts])))
 
 
-def _kept(path: Path, every: int) -> dict[tuple[str, str, int], dict[str, Any]]:
+def _kept_verdicts(path: Path, every: int) -> dict[tuple[str, str, int], dict[str, Any]]:
     lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     return {tuple(line["cell"]): line["judged"] for line in lines if line["every"] == every}
 

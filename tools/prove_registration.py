@@ -62,7 +62,7 @@ def main() -> int:
         for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     )
     print(f"{merged_mesh.points:,} points; {merged_mesh.triangles:,} triangles; {merged_mesh.levels}")
-    off_mm, coverage = compared(registration, truth)
+    off_mm, coverage = compare_with_truth(registration, truth)
     loops = [loop.error_mm for loop in registration.loops] or [np.inf]
     print(
         f"{len(registration.placed_numbers)} placed, {len(registration.unplaced_numbers)} not; "
@@ -101,21 +101,25 @@ def make_scans(folder: Path, count: int, across: int) -> dict[str, np.ndarray]:
     return truth
 
 
-def compared(found: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
+def compare_with_truth(registration: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
     """Displacement of each placed scan's points from the truth, in the first one's frame; and the share of poses
     in their 95 % regions, on average over the frames of all scans, as the error of one frame is in all poses."""
-    world_from = [truth[found.names[number]] for number in found.placed_numbers]
+    world_from = [truth[registration.names[number]] for number in registration.placed_numbers]
     first_from_world = inverse_of(world_from[0])
     off_mm = [
-        displacement_mm(found.first_from_scan[n], first_from_world @ true, found.scans[n].coarse.points_mm)
-        for n, true in zip(found.placed_numbers, world_from, strict=True)
+        displacement_mm(
+            registration.first_from_scan[n], first_from_world @ true, registration.scans[n].coarse.points_mm
+        )
+        for n, true in zip(registration.placed_numbers, world_from, strict=True)
     ]
-    return np.array(off_mm), float(np.mean([_covered(found, world_from, r) for r in range(len(world_from))]))
+    return np.array(off_mm), float(
+        np.mean([_coverage(registration, world_from, r) for r in range(len(world_from))])
+    )
 
 
-def _covered(found: Registered, world_from: list[np.ndarray], reference: int) -> float:
+def _coverage(registration: Registered, world_from: list[np.ndarray], reference: int) -> float:
     """Share of the poses, seen from one scan, that lie in their 95 % regions."""
-    fit, inside = found.fit, []
+    fit, inside = registration.fit, []
     true_from_world = fit.common_from_scan[reference] @ inverse_of(world_from[reference])
     for k, pose in enumerate(fit.common_from_scan):
         if k == reference:
@@ -132,8 +136,8 @@ def _covered(found: Registered, world_from: list[np.ndarray], reference: int) ->
     return float(np.mean(inside))
 
 
-def _say(step: str, done: int, of: int) -> None:
-    if done == of:
+def _say(step: str, done_count: int, of: int) -> None:
+    if done_count == of:
         print(f"{time.strftime('%H:%M:%S')} {step}", file=sys.stderr, flush=True)
 
 

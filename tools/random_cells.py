@@ -30,7 +30,7 @@ from sim.devices.kuka_kinematics import PoseErrors, flange_pose
 from sim.strangers import Strangers
 from sim.world.config import Config
 from sim.world.stills import Stills
-from strange_cells import drawn
+from strange_cells import draw_stranger
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = ROOT / "configs/rigs/sim-imperfect.yaml"
@@ -139,7 +139,7 @@ class RandomCell:
 
     @cached_property
     def strangers(self) -> Strangers:
-        return Strangers.model_validate(drawn(self.stranger, self.seed, self.width_px))
+        return Strangers.model_validate(draw_stranger(self.stranger, self.seed, self.width_px))
 
     @cached_property
     def cell(self) -> Cell:
@@ -253,12 +253,12 @@ class Photographs:
         """Sources in the form of a run of the things on the support."""
         white = self.white_dn - self.camera["black_dn"]
 
-        def read(number: int) -> Picture:
+        def read_picture(number: int) -> Picture:
             frame = self.frame(number, self._lamps).astype(np.float64)
             return Picture(frame - self.camera["black_dn"], self.camera["bayer_pattern"], white, str(number))
 
         images = tuple(
-            Source(str(number), partial(read, number), tuple(joints))
+            Source(str(number), partial(read_picture, number), tuple(joints))
             for number, joints in enumerate(self._joints_deg.tolist())
         )
         return Sources(images, kuka_poses(self.reported), About(is_simulated=True), (("rendered", "0" * 64),))

@@ -18,7 +18,7 @@ from coupole.calibration.record import Record, intrinsics_of
 from coupole.geometry import inverse, transform
 from random_cells import SQUARE_MM, SQUARES, THICKNESS_MM, Floats, RandomCell
 from sim.devices.kuka_kinematics import flange_pose
-from sim.render.lens import Lens, distorted
+from sim.render.lens import Lens, distorted_points
 from sim.strangers.lens_stranger import TAPS
 
 ARM_STRANGERS = ("backlash", "sag", "ripple")
@@ -42,13 +42,13 @@ def true_lens(cell: RandomCell, down: float) -> Lens:
     focal_px = cell.true_lens["fx_px"]
     distortion = (cell.lens["k1"] + strange.rational[0], 0.0, cell.lens["p1"], cell.lens["p2"], 0.0)
     plain = Lens(width_px, height_px, focal_px, distortion)
-    return strange.breathed(strange.disturbed(plain, cell.lens["focus_mm"]), down)
+    return strange.with_breathing(strange.disturbed_lens(plain, cell.lens["focus_mm"]), down)
 
 
 def true_pixels(cell: RandomCell, in_camera_mm: Floats, down: float) -> Floats:
     """[n, 2] where points [n, 3] of the camera frame are seen; with coma, the centroids of their spots."""
     lens = true_lens(cell, down)
-    at = distorted(in_camera_mm[:, :2] / in_camera_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
+    at = distorted_points(in_camera_mm[:, :2] / in_camera_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
     return at + _COMA_CENTROID * cell.strangers.lens.coma_shift_px(at, cell.size_px)
 
 
@@ -67,12 +67,14 @@ def judged_rays(cell: RandomCell, camera: Record, hand_eye: Record, joints_deg: 
 
     turns = _derivatives(lambda step: optics.project(field @ _turn(step).T, lens.vector()).pixels, 3, 1e-6)
     without = np.eye(len(turns)) - turns @ np.linalg.pinv(turns)
-    yield from _judged("camera.ray_px", camera, pixels_by_lens, true_px, without)
+    yield from _judge_pixels("camera.ray_px", camera, pixels_by_lens, true_px, without)
     if cell.stranger in ARM_STRANGERS:
         yield from _judged_views(cell, hand_eye, joints_deg)
         return
     in_flange = field @ cell.flange_from_camera[:3, :3].T + cell.flange_from_camera[:3, 3]
-    yield from _judged("hand-eye.ray_px", hand_eye, lambda step: _by_hand_eye(hand_eye, step, in_flange), true_px)
+    yield from _judge_pixels(
+        "hand-eye.ray_px", hand_eye, lambda step: _by_hand_eye(hand_eye, step, in_flange), true_px
+    )
 
 
 def has_truth(cell: RandomCell, parameter: str) -> bool:
@@ -86,13 +88,13 @@ def has_truth(cell: RandomCell, parameter: str) -> bool:
     return cell.stranger not in LENS_STRANGERS or parameter.endswith("_mm")
 
 
-def _judged(
-    name: str, record: Record, pixels: Callable[[Floats], Floats], seen: Floats, keep: Floats | None = None
+def _judge_pixels(
+    name: str, record: Record, pixels: Callable[[Floats], Floats], seen_px: Floats, keep: Floats | None = None
 ) -> Iterator[Vector]:
     """`pixels` [n, 2] by a step of the record's parameters; `keep` [2 n, 2 n] is a projection."""
     covariance = record.covariance_matrix
     by = _derivatives(pixels, len(covariance), 1e-3 * np.sqrt(np.diag(covariance)))
-    off = (pixels(np.zeros(len(covariance))) - seen).ravel()
+    off = (pixels(np.zeros(len(covariance))) - seen_px).ravel()
     if keep is not None:
         by, off = keep @ by, keep @ off
     u = np.sqrt(np.einsum("ki,ij,kj->k", by, covariance, by))
@@ -120,7 +122,7 @@ def _judged_views(cell: RandomCell, record: Record, joints_deg: Floats) -> Itera
         true_px = true_pixels(cell, in_camera, 1.0)
 
         def pixels(step: Floats, reported: Floats = reported_pose) -> Floats:
-            at_stop = reported @ _moved(np.eye(4), step[count:])
+            at_stop = reported @ _moved_pose(np.eye(4), step[count:])
             return _of_board(record, step[:count], at_stop, corners)
 
         off = (pixels(np.zeros(count + 6)) - true_px).ravel()
@@ -142,17 +144,17 @@ def true_board(cell: RandomCell) -> Floats:
 
 
 def _by_hand_eye(record: Record, step: Floats, in_flange_mm: Floats) -> Floats:
-    lens, camera, _ = _stepped(record, step)
+    lens, camera, _ = _after_step(record, step)
     flange_in_camera = inverse(camera)
     return optics.project(in_flange_mm @ flange_in_camera[:3, :3].T + flange_in_camera[:3, 3], lens).pixels
 
 
 def _of_board(record: Record, step: Floats, base_from_flange: Floats, corners_mm: Floats) -> Floats:
-    lens, camera, board = _stepped(record, step)
+    lens, camera, board = _after_step(record, step)
     return optics.project(_board_points(corners_mm, board, base_from_flange @ camera), lens).pixels
 
 
-def _stepped(record: Record, step: Floats) -> tuple[Floats, Floats, Floats]:
+def _after_step(record: Record, step: Floats) -> tuple[Floats, Floats, Floats]:
     """Lens [9], flange_from_camera and base_from_board after a step of the record's parameters."""
     lens, free = intrinsics_of(record)
     vector, names = lens.vector(), [parameter.name for parameter in record.parameters]
@@ -163,11 +165,11 @@ def _stepped(record: Record, step: Floats) -> tuple[Floats, Floats, Floats]:
         pose_step = step[first : first + 6].copy()
         pose_step[3:] = np.radians(pose_step[3:])
         pose = record.transforms[name]
-        poses.append(_moved(transform(pose.translation_mm, pose.abc_deg), pose_step))
+        poses.append(_moved_pose(transform(pose.translation_mm, pose.abc_deg), pose_step))
     return vector, poses[0], poses[1]
 
 
-def _moved(pose: Floats, step: Floats) -> Floats:
+def _moved_pose(pose: Floats, step: Floats) -> Floats:
     """Shifted along the left frame's axes, turned about the right one's: as records state uncertainty."""
     moved_pose = pose.copy()
     moved_pose[:3, 3] += step[:3]

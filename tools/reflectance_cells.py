@@ -100,13 +100,13 @@ def acquire(folder: Path, material: str, *, every: int = 12, size_mm: float = 36
     return Acquired(material, old, new, mesh)
 
 
-def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
+def judge(acquisition: Acquired, scan: str, seed: int, folder: Path, scale: Scale | None = None) -> Judged:
     """Evaluate the runs of a material with errors of a seed."""
     records = draw_records(folder / "records", seed, scale)
-    scan_path, noise_um = _scan(folder, acquired.mesh, scan, seed)
-    request = RunRequest((acquired.old,), scan_path, records, scan_noise_um=noise_um)
+    scan_path, noise_um = _scan(folder, acquisition.mesh, scan, seed)
+    request = RunRequest((acquisition.old,), scan_path, records, scan_noise_um=noise_um)
     about = reflectance_of(request, folder / "old")
-    result, truth = RunResult(folder / "old"), Truth.of(acquired, folder / "old")
+    result, truth = RunResult(folder / "old"), Truth.of(acquisition, folder / "old")
     inside = np.sum([_inside(result, view, noise_um, truth) for view in result.views], axis=0)
     materials = result.materials("ggx_normal")
     has_fit = np.isfinite(materials.alpha)
@@ -117,8 +117,8 @@ def judge(acquired: Acquired, scan: str, seed: int, folder: Path, scale: Scale |
     spreads = np.sqrt(np.einsum("nii->ni", result.material_covariances("ggx_normal")[has_fit])[:, :2])
     inside_interval = np.abs(tilts) < QUANTILE * spreads
     scan_normals = _flat_normals(result.corners_mm[result.triangles].astype(float))
-    leds = tuple(_leds_of(acquired.new))
-    extract_runs(replace(request, runs=(acquired.new,), left_out=leds), folder / "new")
+    leds = tuple(_leds_of(acquisition.new))
+    extract_runs(replace(request, runs=(acquisition.new,), left_out=leds), folder / "new")
     return Judged(
         inside,
         _off_deg(scan_normals[has_fit], true_normals[has_fit]),
@@ -142,14 +142,14 @@ class Truth:
     cameras_mm: dict[str, Floats]
 
     @staticmethod
-    def of(acquired: Acquired, result: Path) -> Truth:
-        mesh = trimesh.load(acquired.mesh, process=False)
+    def of(acquisition: Acquired, result: Path) -> Truth:
+        mesh = trimesh.load(acquisition.mesh, process=False)
         corners = apply(RunResult(result).base_from_support, mesh.vertices)[mesh.faces]
         cameras = {}
-        for path in (acquired.old / "views").glob("*.h5"):
+        for path in (acquisition.old / "views").glob("*.h5"):
             with h5py.File(path, "r") as file:
                 cameras[path.stem] = file["entry/instrument/robot/poses"]["base_from_camera"][0][:3, 3]
-        table = specimen(acquired.material).table
+        table = specimen(acquisition.material).table
         assert table is not None
         return Truth(table, corners, _flat_normals(corners), true_leds().positions_mm, cameras)
 
@@ -182,15 +182,15 @@ def _inside(result: RunResult, view: ViewSamples, noise_um: float, truth: Truth)
     return counts
 
 
-def _new_view_error(fitted: RunResult, other: RunResult) -> float:
+def _new_view_error(fitted_result: RunResult, check_result: RunResult) -> float:
     """Mean error of GGX with normal, share of the range, in pictures of a view that it was not fitted to."""
-    (view,) = other.views
-    places = np.searchsorted(fitted.triangles, view.triangles).clip(max=len(fitted.triangles) - 1)
-    same = fitted.triangles[places] == view.triangles
-    frames = read_check_frames(other, view)
+    (view,) = check_result.views
+    places = np.searchsorted(fitted_result.triangles, view.triangles).clip(max=len(fitted_result.triangles) - 1)
+    same = fitted_result.triangles[places] == view.triangles
+    frames = read_check_frames(check_result, view)
     rows = slice(0, len(view.triangles))
-    samples = other.view_samples(view, rows, np.isin(view.leds, frames.leds))
-    predictions = model_values(samples, fitted.materials("ggx_normal").at(places))
+    samples = check_result.view_samples(view, rows, np.isin(view.leds, frames.leds))
+    predictions = model_values(samples, fitted_result.materials("ggx_normal").at(places))
     predictions[~same] = np.nan
     lit = lit_on(samples.centres_mm, samples.led_mm, view.led_normals, False)
     share = predictions * lit[..., None] * view.full_scales
@@ -239,9 +239,9 @@ def _leds_of(run: Path) -> list[int]:
     return [int(led) for led in np.unique(leds) if led != 65535]
 
 
-def _off_deg(found: Floats, truth: Floats) -> float:
+def _off_deg(normals: Floats, truth: Floats) -> float:
     """Root mean square."""
-    chord = np.linalg.norm(found - truth, axis=1)
+    chord = np.linalg.norm(normals - truth, axis=1)
     return float(np.degrees(np.sqrt(np.mean((2.0 * np.arcsin(0.5 * chord)) ** 2))))
 
 

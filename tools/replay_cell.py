@@ -172,7 +172,7 @@ class ReplayCell:
                 shape, center = fcl.Box(*(high - low)), (low + high) / 2
             around.append((f"keep-out `{keep_out.name}`", fcl.CollisionObject(shape, fcl.Transform(center))))
         if len(corners := job.shape.corners_mm):
-            around.append(("the object", fcl.CollisionObject(_bvh(*_shared(corners)))))
+            around.append(("the object", fcl.CollisionObject(_bvh(*_triangle_soup(corners)))))
         return around
 
     def touches(self, joints_deg: Floats) -> list[Touch]:
@@ -228,7 +228,7 @@ def _solids(capsules: Sequence[Capsule]) -> list[tuple[str, int, Any]]:
     return solids
 
 
-def _shared(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _triangle_soup(corners: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
 
 

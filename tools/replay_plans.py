@@ -130,7 +130,7 @@ def planned(job: Job, meshes: Path | None) -> Itinerary:
     return plan_itinerary(job.schedule.views, job.cell.rig, bodies, home_deg, job.plan.order)
 
 
-def replayed(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, list[Touch]]:
+def replay(job: Job, itinerary: Itinerary, cell: ReplayCell) -> tuple[int, list[Touch]]:
     """Number of replayed postures, and the collisions found."""
     here_deg = np.array(job.cell.rig.motion.home_joints_deg)
     places, touches = 0, []
@@ -172,7 +172,7 @@ def run(
             refusals[reason(itinerary.refusals[0])] += 1
             continue
         pass_count += 1
-        looked_at, touches_of_plan = replayed(job, itinerary, ReplayCell(job, meshes))
+        looked_at, touches_of_plan = replay(job, itinerary, ReplayCell(job, meshes))
         places += looked_at
         touches += [{"plan": number, **vars(touch)} for touch in touches_of_plan]
         if tell:

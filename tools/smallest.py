@@ -33,10 +33,10 @@ def add_smallest(parser: argparse.ArgumentParser, **values: Any) -> None:
     the command line still count."""
     destinations = {action.dest for action in parser._actions}
     assert destinations.issuperset(values), f"{sorted(set(values) - destinations)}: the parser has no such option"
-    options = " ".join(f"--{name.replace('_', '-')} {_shown(value)}" for name, value in values.items())
+    options = " ".join(f"--{name.replace('_', '-')} {_as_text(value)}" for name, value in values.items())
     help_text = "a size of seconds: shows that it runs, no more" + (f" (with {options})" if options else "")
     parser.add_argument("--smallest", action=_Smallest, values=values, help=help_text)
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -73,8 +73,8 @@ def report(lines: list[dict[str, Any]]) -> int:
     table = Table(box=None, show_header=False)
     for name in ("shots", "frames", "proven", "sessions", "reshot"):
         table.add_row(name, str(sum(line[name] for line in lines)))
-    table.add_row("faults", _counted(lines, "faults"))
-    table.add_row("sessions ended early", _counted(lines, "ended_by"))
+    table.add_row("faults", _count_text(lines, "faults"))
+    table.add_row("sessions ended early", _count_text(lines, "ended_by"))
     for name in ("told_missing", "unexplained", *WRONG):
         table.add_row(name.replace("_", " "), str(sum(len(line[name]) for line in lines)))
     any_growth = False
@@ -89,7 +89,7 @@ def report(lines: list[dict[str, Any]]) -> int:
     return int(any_growth or any(line[name] for line in lines for name in WRONG))
 
 
-def _counted(lines: list[dict[str, Any]], name: str) -> str:
+def _count_text(lines: list[dict[str, Any]], name: str) -> str:
     total: Counter[str] = Counter()
     for line in lines:
         total.update(line[name])

@@ -73,7 +73,7 @@ STRANGERS: dict[str, Draw] = {
 """The rig's `world.settings.strangers` by name."""
 
 
-def drawn(name: str | None, seed: int, width_px: int) -> Drawn:
+def draw_stranger(name: str | None, seed: int, width_px: int) -> Drawn:
     """The stranger of a cell; nothing without a name."""
     if name is None:
         return {}

@@ -33,7 +33,7 @@ def square(scene: Scene, size_px: int, step_nm: int, noise: float, most: int) ->
     return scene.model_copy(update={"cameras": (square_camera,), "bands": bands, "noise": noise, "samples": most})
 
 
-def timed(scene: Scene) -> tuple[Spectral, float, float]:
+def time_picture(scene: Scene) -> tuple[Spectral, float, float]:
     """The picture, and the seconds that it took: on the clock, and of all cores together."""
     wall, cpu = time.perf_counter(), time.process_time()
     with open_renderer(scene, SCENES) as renderer:
@@ -56,7 +56,7 @@ def main() -> None:
         noise = float(noise_text) if noise_text else NOISES.get(name, 0.1)
         for step_nm in options.step:
             _, scene = read_scene(SCENES / f"{name}.yaml")
-            rendering, wall_s, cpu_s = timed(square(scene, options.size, step_nm, noise, options.samples))
+            rendering, wall_s, cpu_s = time_picture(square(scene, options.size, step_nm, noise, options.samples))
             row = (name, f"{options.size} x {options.size}", len(rendering.wavelengths_nm), f"{noise:g}")
             figures = (f"{rendering.noise:.3f}", rendering.samples, f"{wall_s:.0f}", f"{cpu_s:.0f}")
             print(f"| {' | '.join(str(cell) for cell in (*row, *figures))} |", flush=True)

@@ -69,10 +69,10 @@ class Spent:
     wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     tests: int = 0
 
-    def add(self, other: Spent) -> None:
-        add_up(self.cpu_s, other.cpu_s)
-        add_up(self.wall_s, other.wall_s)
-        self.tests += other.tests
+    def add(self, addend: Spent) -> None:
+        add_up(self.cpu_s, addend.cpu_s)
+        add_up(self.wall_s, addend.wall_s)
+        self.tests += addend.tests
 
 
 def add_up(into: dict[str, float], more: Mapping[str, float]) -> None:
@@ -114,7 +114,7 @@ def count(paths: list[str], workers: int) -> int:
     tests = subprocess.Popen(command, cwd=ROOT, env=environment)
     code = 0
     with (KEPT / "outside.jsonl").open("w") as file:
-        for pid, name, status, cpu_s in buried():
+        for pid, name, status, cpu_s in bury_children():
             if pid == tests.pid:
                 code = tests.returncode = os.waitstatus_to_exitcode(status)
             else:
@@ -126,7 +126,7 @@ def count(paths: list[str], workers: int) -> int:
     return code
 
 
-def buried() -> Iterator[tuple[int, str, int, float]]:
+def bury_children() -> Iterator[tuple[int, str, int, float]]:
     """Each child, and each that lost its parent, when it ends: pid, name, status, CPU seconds."""
     while True:
         try:
@@ -146,18 +146,18 @@ def lines() -> list[dict[str, Any]]:
     return [json.loads(line) for path in sorted(KEPT.glob("*.jsonl")) for line in path.read_text().splitlines()]
 
 
-def processes(found: list[dict[str, Any]]) -> dict[int, Process]:
+def processes(lines_read: list[dict[str, Any]]) -> dict[int, Process]:
     """Return the processes of tests, by pid; a nursery belongs to no test, whichever test was its first."""
-    nurseries = {line["pid"] for line in found if line["what"] == "nursery"}
+    nurseries = {line["pid"] for line in lines_read if line["what"] == "nursery"}
     process_of_pid = {
         line["pid"]: Process(line["name"], line["test"])
-        for line in found
+        for line in lines_read
         if line["what"] == "process" and line["test"] and line["pid"] not in nurseries
     }
-    for line in found:  # a command's world is of the command's test
+    for line in lines_read:  # a command's world is of the command's test
         if line["what"] == "fork" and line["parent"] in process_of_pid:
             process_of_pid[line["pid"]] = Process("world", process_of_pid[line["parent"]].test)
-    for line in found:
+    for line in lines_read:
         if (process := process_of_pid.get(line.get("pid", 0))) is None:
             continue
         if line["what"] == "ended":
@@ -175,21 +175,21 @@ def columns(kinds: dict[str, float]) -> dict[str, float]:
     return dict(seconds_of_column)
 
 
-def add_cpu(spent: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
+def add_cpu(seconds_used: Spent, total_s: float, inside: dict[str, float], rest: str) -> None:
     """Add what was counted inside, and under `rest` the remainder of all that a process used."""
     seconds_of_kind = {kind: seconds for kind, seconds in inside.items() if kind != "work"}
-    add_up(spent.cpu_s, seconds_of_kind)
-    spent.cpu_s[rest] += max(0.0, total_s - sum(seconds_of_kind.values()))
+    add_up(seconds_used.cpu_s, seconds_of_kind)
+    seconds_used.cpu_s[rest] += max(0.0, total_s - sum(seconds_of_kind.values()))
 
 
-def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
+def of_tests(lines_read: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
     """Return seconds by test, and those that belong to no test."""
     by_test: dict[str, Spent] = defaultdict(Spent)
     nobody = Spent()
     processes_of_test: dict[str, list[Process]] = defaultdict(list)
-    for process in processes(found).values():
+    for process in processes(lines_read).values():
         processes_of_test[process.test].append(process)
-    for line in found:
+    for line in lines_read:
         if line["what"] == "start":
             nobody.cpu_s["imports"] += line["cpu_s"]
         if line["what"] == "nursery":
@@ -206,14 +206,16 @@ def of_tests(found: list[dict[str, Any]]) -> tuple[dict[str, Spent], Spent]:
     return by_test, nobody
 
 
-def wall(line: dict[str, Any], those: list[Process]) -> dict[str, float]:
-    """The wall seconds of a test by kind; `those` are its processes."""
+def wall(line: dict[str, Any], test_processes: list[Process]) -> dict[str, float]:
+    """The wall seconds of a test by kind; `test_processes` are its processes."""
     blocked_s = max(0.0, line["wall"] - line["main"] - line["queued"])
     kinds = line["kinds"]
     browser = min(blocked_s, max(0.0, kinds["wall_s"].get("browser", 0.0) - kinds["cpu_s"].get("browser", 0.0)))
-    processes_s = min(blocked_s - browser, sum(process.cpu_s for process in those if process.column != "browser"))
+    processes_s = min(
+        blocked_s - browser, sum(process.cpu_s for process in test_processes if process.column != "browser")
+    )
     rest = blocked_s - browser - processes_s
-    has_world = any(process.name in FORKS for process in those)
+    has_world = any(process.name in FORKS for process in test_processes)
     return {
         "cpu": line["main"],
         "queue": line["queued"],

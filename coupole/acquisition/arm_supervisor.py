@@ -91,7 +91,7 @@ class ArmSupervisor:
 
     def attend(self) -> None:
         """Raise Interrupted after the operator's stop, DeviceFault if the arm is in a fault."""
-        self._watched()
+        self._checked_state()
 
     def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
         """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
@@ -106,7 +106,7 @@ class ArmSupervisor:
         while targets:
             try:
                 self._before = None
-                self._keep_to(allowed_path, self._watched(), when)
+                self._keep_to(allowed_path, self._checked_state(), when)
                 self._follow(from_deg, targets[0], meanwhile, speed)
                 if len(targets) == 1:
                     self._settle()
@@ -124,7 +124,7 @@ class ArmSupervisor:
         self._control.go_on()
         self._robot.move_to(there_deg, speed)
         self.hurry(move_duration_s(self._arm, here_deg, there_deg) / speed + self._motion.settle_dwell_s)
-        while (arm := self._watched()).moving:
+        while (arm := self._checked_state()).moving:
             self._keep_to((here_deg, there_deg), arm, "during its motion")
             meanwhile()
             self._clock.sleep(_POLL_S, LOOK_S)
@@ -139,13 +139,13 @@ class ArmSupervisor:
             raise error
         self._robot.stop()
         if lapse_s:
-            asks = lapse_s >= ASKS_AFTER_LAPSE_S or self._control.held.is_set()
+            asks = lapse_s >= ASKS_AFTER_LAPSE_S or self._control.hold_pending.is_set()
             self._tell_lapse(str(error) if asks else _may_go_on(lapse_s))
         if lapse_s >= ASKS_AFTER_LAPSE_S:
             if self._stand is None:
                 raise error
             self._control.hold(str(error))
-        if self._control.held.is_set():
+        if self._control.hold_pending.is_set():
             if self._stand is None:
                 raise error
             self._stand()
@@ -159,22 +159,22 @@ class ArmSupervisor:
             self._halt()
         return self._control.stands
 
-    def await_return(self, moved: ArmMovedError) -> SettledPose:
+    def await_return(self, moved_error: ArmMovedError) -> SettledPose:
         """Wait after a push for the arm to spring back by itself; return the newly measured pose.
 
         Raises DeviceFault if it does not: then only a person may say that it can move again.
         """
         assert self._settled is not None
         deadline = Deadline(self._clock, _SPRING_BACK_S)
-        while not deadline.expired:
+        while not deadline.has_expired:
             self._clock.sleep(_POLL_S)
-            arm = self._watched()
+            arm = self._checked_state()
             if not arm.moving and self._off_deg(arm) <= self._motion.still_deg:
                 return self._settle()
         raise DeviceFault(
             "robot",
             expected="an arm that stays where it was measured",
-            happened=f"{moved} and has not come back by itself",
+            happened=f"{moved_error} and has not come back by itself",
             remedy="Find what pushed it and see that the cell is clear.",
         )
 
@@ -182,7 +182,7 @@ class ArmSupervisor:
         """Time of the arm's last reading, on the rig's clock; raises ArmMovedError if the arm is not at its
         measured posture."""
         assert self._settled is not None
-        arm = self._watched()
+        arm = self._checked_state()
         off_deg = self._off_deg(arm)
         if off_deg > self._motion.still_deg:
             raise ArmMovedError(f"the arm moved by {off_deg:.3f} deg during a burst")
@@ -193,7 +193,7 @@ class ArmSupervisor:
         since_ns = self._robot.measured().t_ns
         deadline = Deadline(self._clock, _NEWS_S)
         while self.heard_at_rest() <= since_ns:
-            if deadline.expired:
+            if deadline.has_expired:
                 raise DeviceLost(
                     "robot",
                     expected=f"a reading of the arm within {_NEWS_S:g} s of the burst's end",
@@ -212,7 +212,7 @@ class ArmSupervisor:
         assert self._settled is not None
         return float(np.abs(np.subtract(arm.joints_deg, self._settled.arm.joints_deg)).max())
 
-    def _watched(self) -> ArmState:
+    def _checked_state(self) -> ArmState:
         self._control.go_on()
         arm = self._robot.measured()
         if arm.fault:

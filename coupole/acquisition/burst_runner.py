@@ -47,7 +47,7 @@ class _RunningBurst:
     arm_after: ArmState | None = None
     """Measured after the last frame; None while the burst runs, and if the arm was not still."""
     log: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, STEP_RECORD_DTYPE))
-    judged: Match | None = None
+    match: Match | None = None
     proven: set[int] = field(default_factory=set)
     """Frames already passed to the recorder."""
     started_ns: int | None = None
@@ -146,7 +146,7 @@ class BurstRunner:
 
     def _by_cable(self, burst: Burst, following: Burst | None, buffers: int) -> Verdict:
         box, camera, clock = table_box(self._cell.ledbox), self._cell.camera, self._cell.clock
-        grabber = FrameGrabber(camera, lambda frame: self._recorder.put(frame, burst.timing.exposure_us))
+        grabber = FrameGrabber(camera, lambda frame: self._recorder.store(frame, burst.timing.exposure_us))
         running = _RunningBurst(burst, grabber, self._cell.robot.measured())
         camera.arm(buffers)
         try:
@@ -183,8 +183,8 @@ class BurstRunner:
         grabber.raise_error()  # after its last frame: all are stored, but the camera is not to be trusted
         log = running.log
         dark = (log["led"] != NO_LED) & log["led_open"]
-        assert running.judged is not None
-        return Verdict(running.judged, [shot for i in np.flatnonzero(dark) if (shot := burst.shots[i])])
+        assert running.match is not None
+        return Verdict(running.match, [shot for i in np.flatnonzero(dark) if (shot := burst.shots[i])])
 
     def _follow(self, running: _RunningBurst) -> None:
         """Read log and frames until the burst is over, and prove frames meanwhile."""
@@ -209,20 +209,20 @@ class BurstRunner:
             if len(running.log) == len(burst.table) and last_frames is None:
                 last_frames = Deadline(clock, readout_s + self._cell.camera.delivery_s)
                 edges = box.edges()
-            complete = last_frames is not None and (taken_frames >= edges or last_frames.expired)
+            complete = last_frames is not None and (taken_frames >= edges or last_frames.has_expired)
             if complete:
                 clock.sleep(readout_s)  # a surplus frame may still be in transfer
                 taken_frames = confirmed_frames = len(grabber)
                 running.arm_after = self._arm.await_news()
             if complete or (confirmed_frames, len(running.log)) != judged_at:
                 judged_at = (confirmed_frames, len(running.log))
-                running.judged = self._match(running, taken_frames, complete=complete)
+                running.match = self._match(running, taken_frames, complete=complete)
                 self._prove(running, confirmed_frames, complete=complete)
                 self._tell(burst, len(running.log))
             if complete:
                 return
             self._recorder.commit(now=False)
-            if last_frames is None and next_step.expired:
+            if last_frames is None and next_step.has_expired:
                 raise DeviceTimeout(
                     "led box",
                     expected=f"a step of the burst every {1e3 * step_s:.0f} ms",
@@ -232,8 +232,8 @@ class BurstRunner:
                 )
             clock.sleep(_POLL_S)
 
-    def _match(self, running: _RunningBurst, taken: int, *, complete: bool) -> Match:
-        frame_ids, timestamps_ns = running.grabber.frames(taken)
+    def _match(self, running: _RunningBurst, frame_count: int, *, complete: bool) -> Match:
+        frame_ids, timestamps_ns = running.grabber.frames(frame_count)
         return match(
             running.log,
             frame_ids,
@@ -243,12 +243,13 @@ class BurstRunner:
             model=FaultModel(jitter_us=self._cell.camera.timestamp_jitter_us + _BOX_JITTER_US),
         )
 
-    def _prove(self, running: _RunningBurst, confirmed: int, *, complete: bool) -> None:
-        """Pass newly proven frames among the first `confirmed` to the recorder, once their bytes are written."""
-        frame_match, grabber, log = running.judged, running.grabber, running.log
+    def _prove(self, running: _RunningBurst, confirmed_count: int, *, complete: bool) -> None:
+        """Pass newly proven frames among the first `confirmed_count` to the recorder, once their bytes are
+        written."""
+        frame_match, grabber, log = running.match, running.grabber, running.log
         assert frame_match is not None
         for frame in np.flatnonzero(frame_match.step_of_frame != UNLABELLED).tolist():
-            if frame in running.proven or frame >= confirmed or not (complete or grabber.kept(frame)):
+            if frame in running.proven or frame >= confirmed_count or not (complete or grabber.is_written(frame)):
                 continue
             record = StepRecord(*log[frame_match.step_of_frame[frame]].tolist())
             label = running.burst.labels[record.step]
@@ -267,7 +268,7 @@ class BurstRunner:
         if camera is not None:
             self._outcome.over_triggers += max(0, camera.over_triggers)
             self._outcome.lost_transfers += max(0, camera.lost_transfers)
-        clocks = running.judged.clocks if running.judged is not None else None
+        clocks = running.match.clocks if running.match is not None else None
         self._note(
             running.burst,
             log,
@@ -309,8 +310,8 @@ class BurstRunner:
                 steps=len(log),
                 on_s=round(float(log["on_us"][log["led"] != NO_LED].sum()) * 1e-6, 6),
                 given_lux_h=given_lux_h,
-                joints_before_deg=_rounded(arm_before),
-                joints_after_deg=_rounded(arm_after) if arm_after else None,
+                joints_before_deg=_rounded_joints_deg(arm_before),
+                joints_after_deg=_rounded_joints_deg(arm_after) if arm_after else None,
                 **figures,
             )
         )
@@ -334,5 +335,5 @@ def _hottest_c(log: NDArray[np.void]) -> float | None:
     return float(temperatures_c.max()) if len(temperatures_c) else None
 
 
-def _rounded(arm: ArmState) -> Joints:
+def _rounded_joints_deg(arm: ArmState) -> Joints:
     return tuple(round(angle, 6) for angle in arm.joints_deg)

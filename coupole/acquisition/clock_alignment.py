@@ -160,9 +160,9 @@ def _leave_out(frame_ns, step_ns, view, may_leave_out, jitter_ns):  # type: igno
 
 @numba.njit(cache=True, nogil=True)
 def agree_on_steps(  # type: ignore[no-untyped-def]
-    frame_ns, step_ns, jitter_ns, drift, max_surplus, in_flight, agreed, agrees
+    frame_ns, step_ns, jitter_ns, drift, max_surplus, in_flight, first_view, agrees
 ):
-    """Try all hypotheses; `agreed` [frames] is the first candidate's view, `agrees` where all others share it.
+    """Try all hypotheses; `first_view` [frames] is the first candidate's view, `agrees` where all others share it.
 
     Returns the number of candidates (the same alignment may count more than once), or -1 if one of them could
     not be decided.
@@ -182,10 +182,10 @@ def agree_on_steps(  # type: ignore[no-untyped-def]
             if not _leave_out(frame_ns, step_ns, view, max_surplus - surplus, jitter_ns):
                 continue
             if candidates == 0:
-                agreed[:] = view
+                first_view[:] = view
                 agrees[:] = True
             else:
                 for frame in range(n_frames):
-                    agrees[frame] &= view[frame] == agreed[frame]
+                    agrees[frame] &= view[frame] == first_view[frame]
             candidates += 1
     return candidates

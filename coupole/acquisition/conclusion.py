@@ -8,7 +8,7 @@ from rich.console import Console
 
 from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.signals import SignalReceived
-from coupole.bounded import DISK, bounded, hangs, left_behind, on_disk, under_way
+from coupole.bounded import DISK, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
 from coupole.storage.journal_events import SessionResumed, SessionStopped, TextUnread
@@ -40,7 +40,7 @@ def renew_report(run: Run) -> Path:
     StorageError."""
     if run.in_use:
         return report.write(run)
-    with run.locked():
+    with run.hold_lock():
         manifest.forget(run.folder, [run.report_path.name])
         path = report.write(run, in_use=False)
         manifest.enter(run.folder, [run.report_path.name])
@@ -53,12 +53,12 @@ def close_complete(run: Run, console: Console) -> float:
     console.print("all frames are there; no device is opened")
     open_for_session(run)
     writer = journal.Journal(run.journal_path)
-    writer.write(SessionResumed(simulated=run.simulated))
+    writer.write(SessionResumed(simulated=run.is_simulated))
     writer.write(SessionStopped(outcome="done"))
     writer.commit()
     writer.close()
     conclude(run, console)
-    return run_dose.highest_lux_h(journal.read(run.journal_path))
+    return run_dose.highest_lux_h(journal.read_events(run.journal_path))
 
 
 def conclude(run: Run, console: Console) -> None:
@@ -77,7 +77,7 @@ def conclude(run: Run, console: Console) -> None:
                 f"`coupole verify {run.folder} --manifest` enters them"
             )
         elif views:
-            bounded(lambda: _enter(run, views, size))
+            run_bounded(lambda: _enter(run, views, size))
     except (KeyboardInterrupt, SignalReceived):
         console.print(f"  {manifest.NAME} is not complete: `coupole verify {run.folder} --manifest` completes it")
     except Exception as error:  # noqa: BLE001  it must not hide what ended the run
@@ -91,9 +91,11 @@ def conclude(run: Run, console: Console) -> None:
 def _report(run: Run) -> tuple[list[str], int]:
     """Write the report, list what is small and complete; complete views that are not listed, and their bytes."""
     report.write(run, in_use=False)
-    unlisted_files = {name for name in manifest.unlisted(run.folder) if not name.startswith(f"{manifest.VIEWS}/")}
+    unlisted_files = {
+        name for name in manifest.unlisted_files(run.folder) if not name.startswith(f"{manifest.VIEWS}/")
+    }
     manifest.enter(run.folder, sorted(unlisted_files))
-    digests = manifest.read(run.folder)
+    digests = manifest.read_checksums(run.folder)
     views = [name for name in complete_views(run) if name not in digests]
     return views, sum((run.folder / name).stat().st_size for name in views)
 

@@ -63,9 +63,9 @@ class LightOnObject:
         cannot be read and written."""
         plan_object = job.plan.object
         self._ledger = ledger_of(job.cell, plan_object.id, only_grows=True) if plan_object else None
-        self._enters = self._ledger is not None and not cell.simulated
+        self._enters = self._ledger is not None and not cell.is_simulated
         if self._ledger is not None and self._enters:
-            _answered(self._ledger, self._ledger.prove_writable)
+            _ask_ledger(self._ledger, self._ledger.prove_writable)
         self._id, self._what_for = plan_object.id if plan_object else "", what_for
         self._asked = Asked(
             0.0, plan_object.dose_budget_lux_h if plan_object else None, plan=job.plan.name, name=user_name()
@@ -117,19 +117,23 @@ class LightOnObject:
     def _history(self) -> History:
         return self._ledger.newest() if self._ledger is not None else History()
 
-    def begin(self, at_most: LuxHours, expected: LuxHours | None = None, w_per_lm: float | None = None) -> None:
-        """Light is about to be given, `at_most` this; the budget is asked for what is `expected` (default: the
-        same). `w_per_lm`: its damaging power, if known.
+    def begin(
+        self, at_most: LuxHours, expected_lux_h: LuxHours | None = None, w_per_lm: float | None = None
+    ) -> None:
+        """Light is about to be given, `at_most` this; the budget is asked for what is `expected_lux_h` (default:
+        the same). `w_per_lm`: its damaging power, if known.
 
         Raises DoseBudgetReached, and StorageError if it cannot be entered: no light may then be given.
         """
-        request = replace(self._asked, lux_h=self.more_lux_h(at_most if expected is None else expected))
+        request = replace(
+            self._asked, lux_h=self.more_lux_h(at_most if expected_lux_h is None else expected_lux_h)
+        )
         plan_id = ""
         if self._ledger is not None and self._enters:
             entry = self._entry(at_most, w_per_lm)
-            plan_id = _answered(self._ledger, partial(self._ledger.plan, self._what_for, *entry, request))
+            plan_id = _ask_ledger(self._ledger, partial(self._ledger.plan, self._what_for, *entry, request))
         elif self._ledger is not None:
-            newest = _answered(self._ledger, self._ledger.newest)
+            newest = _ask_ledger(self._ledger, self._ledger.newest)
             request.refuse_beyond(self._id, newest, self._unentered_lux_h)
         self._planned = _Planned(at_most, w_per_lm, plan_id)
 
@@ -140,20 +144,21 @@ class LightOnObject:
             return
         request = replace(self._asked, lux_h=self.more_lux_h(so_far))
         if self._enters:
-            _answered(self._ledger, partial(self._ledger.ask_again, request, self._planned.plan_id))
+            _ask_ledger(self._ledger, partial(self._ledger.ask_again, request, self._planned.plan_id))
         else:
-            newest = _answered(self._ledger, self._ledger.newest)
+            newest = _ask_ledger(self._ledger, self._ledger.newest)
             request.refuse_beyond(self._id, newest, self._unentered_lux_h)
 
-    def end(self, given: LuxHours | None) -> LuxHours:
-        """The light of the last `begin` is over; `given` None: what was planned stands. Returns what counts."""
+    def end(self, given_lux_h: LuxHours | None) -> LuxHours:
+        """The light of the last `begin` is over; `given_lux_h` None: what was planned stands. Returns what
+        counts."""
         plan = self._planned
         if plan is None:
             return np.zeros_like(self._given_lux_h)
-        counts = plan.at_most if given is None else given
-        if self._ledger is not None and self._enters and given is not None:
+        counts = plan.at_most if given_lux_h is None else given_lux_h
+        if self._ledger is not None and self._enters and given_lux_h is not None:
             entry = self._entry(counts, plan.w_per_lm)
-            _answered(self._ledger, partial(self._ledger.correct, plan.plan_id, *entry))
+            _ask_ledger(self._ledger, partial(self._ledger.correct, plan.plan_id, *entry))
         if not self._enters:
             self._unentered_lux_h += self.more_lux_h(counts)
         self._given_lux_h, self._planned = self._given_lux_h + counts, None
@@ -174,7 +179,7 @@ class LightOnObject:
         return more_lux_h, None if w_per_lm is None else round(more_lux_h * w_per_lm, _DIGITS)
 
 
-def _answered(ledger: Ledger, do: Callable[[], T]) -> T:
+def _ask_ledger(ledger: Ledger, do: Callable[[], T]) -> T:
     """Noted, since the ledger's disk may hang; it waits for other writers by itself."""
     with under_way(DISK, str(ledger.path), LOCK_S):
         return do()

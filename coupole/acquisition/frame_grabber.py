@@ -57,13 +57,13 @@ class FrameGrabber:
             while not self._stopping.is_set():
                 frame = self._camera.next_frame(_TAKE_TIMEOUT_S)
                 if frame is not None:
-                    self._slots.append(self._pool.submit(self._put, frame))
+                    self._slots.append(self._pool.submit(self._store_frame, frame))
                     self._timestamps_ns.append(frame.timestamp_ns)
                     self._frame_ids.append(frame.frame_id)
         except BaseException as error:  # noqa: BLE001  raised again in the thread that asks for frames
             self._error = error
 
-    def _put(self, frame: Frame) -> int:
+    def _store_frame(self, frame: Frame) -> int:
         try:
             return self._keep(frame)
         finally:
@@ -91,7 +91,7 @@ class FrameGrabber:
             np.array(self._timestamps_ns[:count], np.int64),
         )
 
-    def kept(self, frame: int) -> bool:
+    def is_written(self, frame: int) -> bool:
         """True if the frame's bytes are written. Raises what writing raised."""
         if not self._slots[frame].done():
             return False

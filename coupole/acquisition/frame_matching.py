@@ -86,9 +86,9 @@ class Match:
 class _Aligned:
     """Steps that the candidates assign to each frame."""
 
-    edged: NDArray[np.int64]
+    edge_rows: NDArray[np.int64]
     """Rows of the log whose step sent an edge."""
-    agreed: NDArray[np.int64]
+    candidate_rows: NDArray[np.int64]
     """[frames] row of `edged` by the first candidate, or a negative code for no step."""
     agrees: NDArray[np.bool_]
     """[frames] all candidates give the same row or code."""
@@ -119,14 +119,14 @@ def match(
     n_frames, n_steps = len(frame_ids), len(log)
     edge_steps = np.flatnonzero(log["edge_sent"])
     if n_frames == 0:
-        return _unlabelled(n_frames, n_steps, missing=edge_steps)
+        return _match_without_labels(n_frames, n_steps, missing=edge_steps)
     in_flight = 0 if complete else model.in_flight
     id_steps = np.diff(frame_ids) % (id_modulus[1] - id_modulus[0] + 1)
     obstacle = _obstacle(edge_steps, id_steps, (id_modulus[1] - id_modulus[0]) // 2, timestamps_ns)
     if not obstacle and n_frames <= model.max_surplus + in_flight:
         obstacle = "too few frames: all of them may be surplus, or of steps that are not in the log yet"
     if obstacle:
-        return _unlabelled(n_frames, n_steps, reason=obstacle)
+        return _match_without_labels(n_frames, n_steps, reason=obstacle)
 
     step_ns = log["t_trigger_ns"][edge_steps]
     alignment = _Aligned(edge_steps, np.full(n_frames, UNLABELLED, np.int64), np.zeros(n_frames, np.bool_))
@@ -137,23 +137,23 @@ def match(
         model.drift_ppm * 1e-6,
         model.max_surplus,
         in_flight,
-        alignment.agreed,
+        alignment.candidate_rows,
         alignment.agrees,
     )
     if candidates == 0:
         reason = f"no alignment of box and camera leaves {model.max_surplus} frames or fewer unexplained"
-        return _unlabelled(n_frames, n_steps, reason=reason)
+        return _match_without_labels(n_frames, n_steps, reason=reason)
     if candidates < 0:
         reason = "a gap is so long that the clocks' drift hides which step comes next"
-        return _unlabelled(n_frames, n_steps, reason=reason)
+        return _match_without_labels(n_frames, n_steps, reason=reason)
     return _verdict(log, timestamps_ns, id_steps, alignment)
 
 
 def _obstacle(
-    edged: NDArray[np.int64], id_steps: NDArray[np.int64], most_id_step: int, timestamps_ns: NDArray[np.int64]
+    edge_rows: NDArray[np.int64], id_steps: NDArray[np.int64], most_id_step: int, timestamps_ns: NDArray[np.int64]
 ) -> str:
     """Return why frames that have come cannot be aligned with the log; empty if they can."""
-    if len(edged) == 0:
+    if len(edge_rows) == 0:
         return "frames came before the box sent an edge"
     if np.any(id_steps == 0) or np.any(id_steps > most_id_step):
         return "the camera's frame ids do not increase"
@@ -162,7 +162,7 @@ def _obstacle(
     return ""
 
 
-def _unlabelled(
+def _match_without_labels(
     n_frames: int, n_steps: int, *, missing: NDArray[np.intp] | None = None, reason: str = ""
 ) -> Match:
     """The verdict where no frame gets a label; `missing` are rows of the log."""
@@ -182,10 +182,10 @@ def _unlabelled(
 
 
 def _verdict(
-    log: NDArray[np.void], timestamps_ns: NDArray[np.int64], id_steps: NDArray[np.int64], aligned: _Aligned
+    log: NDArray[np.void], timestamps_ns: NDArray[np.int64], id_steps: NDArray[np.int64], alignment: _Aligned
 ) -> Match:
     """Labels on which all candidates agree and that one frame alone claims; missing steps; what stays open."""
-    edge_steps, agreed_steps, agrees = aligned.edged, aligned.agreed, aligned.agrees
+    edge_steps, agreed_steps, agrees = alignment.edge_rows, alignment.candidate_rows, alignment.agrees
     steps = np.full(len(agreed_steps), UNLABELLED, np.int64)
     claims = np.bincount(agreed_steps[agreed_steps >= 0], minlength=len(edge_steps))
     is_labelled = agrees & (agreed_steps >= 0)

@@ -138,23 +138,23 @@ class HostBurst:
             self._note(burst, log, arm_before, arm_after, panel_s=self._panel_s, frames=taken_frames)
         return Verdict(replace(NOTHING_TO_MATCH, reason=reason), dead)
 
-    def _keep(self, taken: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
+    def _keep(self, exposure: _Taken, frame: Frame, burst: Burst, shot: ShotId | None) -> list[_Kept]:
         """The frame, stored but not proven yet; None if it cannot be proven."""
-        if shot is None or not taken.alone or taken.record.invalid_exposure:
+        if shot is None or not exposure.alone or exposure.record.invalid_exposure:
             frame.release()
             return []
-        slot = self._recorder.put(frame, burst.timing.exposure_us)
+        slot = self._recorder.store(frame, burst.timing.exposure_us)
         frame.release()
-        return [_Kept(slot, shot, step_fields(taken.record, taken.t_trigger_ns))]
+        return [_Kept(slot, shot, step_fields(exposure.record, exposure.t_trigger_ns))]
 
-    def _prove(self, kept: list[_Kept]) -> None:
-        while kept:
-            kept_frame = kept.pop(0)
+    def _prove(self, stored_frames: list[_Kept]) -> None:
+        while stored_frames:
+            kept_frame = stored_frames.pop(0)
             self._recorder.prove(kept_frame.slot, kept_frame.shot, kept_frame.fields)
 
-    def _fire_one(self, burst: Burst, index: int, given: list[StepRecord]) -> _Taken:
+    def _fire_one(self, burst: Burst, index: int, step_records: list[StepRecord]) -> _Taken:
         """Light one step, trigger the camera, wait for the light's end, and keep the burst's period. The light is
-        appended to `given` even if this raises."""
+        appended to `step_records` even if this raises."""
         box, camera, clock = self._cell.ledbox, self._cell.camera, self._cell.clock
         step, timing = burst.table[index], burst.timing
         record: StepRecord | None = None
@@ -175,7 +175,7 @@ class HostBurst:
                 box.lights_off()
             finally:
                 lasted_ns = clock.now_ns() - started_ns
-                given.append(record or _cut_short(int(step["led"]), lasted_ns / 1e3))
+                step_records.append(record or _cut_short(int(step["led"]), lasted_ns / 1e3))
                 self._panel_s += lasted_ns / 1e9 if burst.panel else 0.0
                 camera.disarm()
         clock.sleep(max(0.0, timing.period_us * 1e-6 - (clock.now_ns() - started_ns) / 1e9))

@@ -16,11 +16,11 @@ class CellSource:
     """A cell's camera under one light at a time; the arm does not move. Without a viewer no light is given."""
 
     def __init__(
-        self, opened: OpenedCell, shots: SingleShots, leds: tuple[int, ...], meter: FlashMeter | None
+        self, opened_cell: OpenedCell, shots: SingleShots, leds: tuple[int, ...], meter: FlashMeter | None
     ) -> None:
         """`leds` may be chosen; `meter` for an object whose light is counted."""
         self.leds = leds
-        self._opened, self._shots, self._meter = opened, shots, meter
+        self._opened, self._shots, self._meter = opened_cell, shots, meter
 
     def frames(self, studio: Studio) -> None:
         try:

@@ -29,7 +29,7 @@ from coupole.acquisition.operator import (
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.single_shots import SingleShots
-from coupole.bounded import NOW, bounded, refuse_overdue
+from coupole.bounded import NOW, refuse_overdue, run_bounded
 from coupole.errors import CoupoleError, InputError, PreflightRefused
 from coupole.geometry import apply
 from coupole.plan.cell import Cell
@@ -90,8 +90,8 @@ def metered(
 ) -> exposure_advice.Advice:
     """Advice by the pictures of a metering job. When this raises the cell is safe and cannot be used any more."""
     recorder = MeterRecorder()
-    sequencer = bounded(partial(Sequencer, small, cell, recorder, observer=observer, control=control))
-    bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
+    sequencer = run_bounded(partial(Sequencer, small, cell, recorder, observer=observer, control=control))
+    run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
     return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(small.cell.rig))
 
 
@@ -133,7 +133,7 @@ def lux_of_leds(cell: Cell, job: Job | None) -> NDArray[np.float64]:
 def _ask_the_ledger(job: Job, console: Console) -> None:
     """Raise PreflightRefused if the object may receive no more light; print what its ledger warns of."""
     assert job.plan.object is not None
-    history = ledger_of(job.cell, job.plan.object.id).read()
+    history = ledger_of(job.cell, job.plan.object.id).read_history()
     if refusals := light_refusals(job, history):
         raise PreflightRefused(refusals)
     for warning in ledger_warnings(job, history, 0.0):
@@ -180,7 +180,7 @@ def _show_live(
         finally:
             studio.closing.set()
             try:
-                bounded(filling.join, stop=NOW, since_s=began_s)
+                run_bounded(filling.join, stop=NOW, since_s=began_s)
             except CoupoleError as error:
                 failures.append(error)
                 alarm(str(error))
@@ -188,6 +188,6 @@ def _show_live(
             server.server_close()
     if control.stop.is_set():  # what failed then was ended by `halt`
         if not control.stopped_by_hand:
-            raise control.interrupted()
+            raise control.interruption()
     elif failures:
         raise failures[0]

@@ -45,7 +45,7 @@ class MemoryRecorder:
     ) -> None:
         self._view, self._format = view, frame_format
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         raise NotImplementedError
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
@@ -74,7 +74,7 @@ class DryRecorder(MemoryRecorder):
         self.exposures: dict[str, ViewExposure] = {}
         self._slots: list[tuple[float, float] | None] = []
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         assert self._format is not None
         if not frame.rendered:
             self._slots.append(None)
@@ -104,7 +104,7 @@ class MeterRecorder(MemoryRecorder):
         self.views: dict[str, Metered] = {}
         self._slots: list[tuple[int, NDArray[np.int32]]] = []
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         assert self._format is not None
         self._slots.append((exposure_us, sample_of(frame.pixels) - self._format.black_dn))
         return len(self._slots) - 1

@@ -44,9 +44,9 @@ class NotedDevice:
         if name == "wait_settled":
             work_s = self._longest_motion_s
 
-        def call(*arguments: Any, **named: Any) -> Any:
-            with under_way(of, name, work_s(*arguments, **named) if work_s else 0.0):
-                return value(*arguments, **named)
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            with under_way(of, name, work_s(*arguments, **keywords) if work_s else 0.0):
+                return value(*arguments, **keywords)
 
         self.__dict__[name] = call  # found at once the next time
         return call

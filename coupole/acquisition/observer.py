@@ -60,11 +60,11 @@ class Control:
 
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)
-    paused: threading.Event = field(default_factory=threading.Event)
+    standing: threading.Event = field(default_factory=threading.Event)
     """Set while the session stands: lights off, the arm at rest."""
     can_stand: bool = False
     """True if the session can stand and go on; one that cannot is stopped by a hold."""
-    held: threading.Event = field(default_factory=threading.Event)
+    hold_pending: threading.Event = field(default_factory=threading.Event)
     """Set from a hold until the session stands."""
     halting: threading.Event = field(default_factory=threading.Event)
     """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
@@ -81,10 +81,10 @@ class Control:
     stopped_by: str = ""
     """Cause that set `stop`, in words; empty: the signal."""
 
-    def stop_by(self, number: int, what: str = "") -> None:
-        """Stop for this signal, or for `what` as if by it; the first one counts."""
+    def stop_by(self, number: int, cause: str = "") -> None:
+        """Stop for this signal, or for `cause` as if by it; the first one counts."""
         if not self.stop.is_set():
-            self.signal_number, self.stopped_by = number, what
+            self.signal_number, self.stopped_by = number, cause
             self.stop.set()
 
     def toggle_pause(self) -> None:
@@ -100,7 +100,7 @@ class Control:
     @property
     def coming_to_stand(self) -> bool:
         """True from a hold until all is safe and the session stands: no word is heard."""
-        return self.halting.is_set() or self.held.is_set()
+        return self.halting.is_set() or self.hold_pending.is_set()
 
     def hold(self, why: str) -> None:
         """Stand at once, wherever the session is; the first reason counts until it stands."""
@@ -109,17 +109,17 @@ class Control:
                 self.held_because = why
             self.stop_by(signal.SIGINT)
             return
-        if not self.held.is_set():
+        if not self.hold_pending.is_set():
             self.held_because = why
         self.pause.set()
-        self.held.set()
+        self.hold_pending.set()
 
     @property
     def stopped_by_hand(self) -> bool:
         """Stopped as by Ctrl-C, and not by a hold: so a live view or a bench ends as it should."""
         return self.stop.is_set() and self.signal_number == signal.SIGINT and not self.held_because
 
-    def interrupted(self) -> Interrupted:
+    def interruption(self) -> Interrupted:
         """The error that ends a stopped session."""
         word = "stopped by the operator" if self.signal_number == signal.SIGINT else "stopped"
         name = self.stopped_by or signal.Signals(self.signal_number).name
@@ -134,20 +134,20 @@ class Control:
         because this process was. If it did not run for a while, this waits for the word of the thread that hears
         of SIGCONT: whether it was frozen, or the machine only busy."""
         if self.awaits_word:
-            self.held.wait(HEARD_WITHIN_S)
-        return self.held.is_set()
+            self.hold_pending.wait(HEARD_WITHIN_S)
+        return self.hold_pending.is_set()
 
     @property
     def awaits_word(self) -> bool:
         """True if `stands` would wait: this process did not run for a while, and it is not known yet why."""
         now_s = time.monotonic()
         late = now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S
-        return late and not self.held.is_set()
+        return late and not self.hold_pending.is_set()
 
     def go_on(self) -> None:
         """Raise Interrupted if the session is to stop, Held if it is to stand: to be called before each command
         that lights or moves."""
         if self.stop.is_set():
-            raise self.interrupted()
-        if self.held.is_set():
+            raise self.interruption()
+        if self.hold_pending.is_set():
             raise Held(self.held_because)

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from coupole.acquisition.cell_marks import in_use
 from coupole.acquisition.noted_devices import NAMES, NotedDevice
 from coupole.acquisition.safeguard import Safeguard
-from coupole.acquisition.signals import held
-from coupole.bounded import NOW, bounded, hangs, under_way
+from coupole.acquisition.signals import drop_signals
+from coupole.bounded import NOW, hangs, run_bounded, under_way
 from coupole.clock import Clock, SystemClock
 from coupole.devices import Camera, Identity, LedBox, Robot
 from coupole.errors import DeviceTimeout
@@ -45,7 +45,7 @@ class OpenedCell:
     robot: Robot
     sensor: Sensor
     """The frame format: the rig's sensor, or its reduced twin in a dry run."""
-    simulated: bool
+    is_simulated: bool
     world_endpoints: Mapping[str, Any] | None
     identities: dict[str, Identity]
     trouble: list[str] = field(default_factory=list)
@@ -59,7 +59,7 @@ class OpenedCell:
     """Times on the rig's clock, the newest last: when the box was told to switch the lights off, and when it had
     answered."""
     _first: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _done: threading.Event = field(default_factory=threading.Event, repr=False)
+    _safeguards_ended: threading.Event = field(default_factory=threading.Event, repr=False)
 
     def halt(self) -> list[Safeguard]:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
@@ -85,15 +85,15 @@ class OpenedCell:
         with self._first:
             is_first, self.made_safe = not self.made_safe, True
         if not is_first:
-            self._done.wait()  # each safeguard is given up after its time
+            self._safeguards_ended.wait()  # each safeguard is given up after its time
             return
         try:
             self._make_safe()
         finally:
-            self._done.set()
+            self._safeguards_ended.set()
 
     def _make_safe(self) -> None:
-        with held():
+        with drop_signals():
             safeguards = self.halt()
             for safeguard in safeguards:
                 safeguard.wait()
@@ -126,17 +126,17 @@ def open_cell(
         sensor = coarse(cell.rig.sensor) if dry_run else cell.rig.sensor
         if in_world(cell.rig, dry_run=dry_run):
             begin = partial(_get_world, cell, job, sensor, dry_run=dry_run, speed=speed)
-            world = bounded(begin, unwanted=lambda late: late.close())
+            world = run_bounded(begin, discard=lambda late: late.close())
             stack.callback(world.close)
             clock, endpoints = world.clock, world.endpoints
         devices: dict[str, Any] = {}
         identities: dict[str, Identity] = {}
         for kind in ("ledbox", "camera", "robot"):
             begin = partial(_open_device, cell.rig, kind, clock, endpoints, dry_run=dry_run, speed=speed or 1.0)
-            device = bounded(begin, unwanted=lambda late: late.close())
+            device = run_bounded(begin, discard=lambda late: late.close())
             devices[kind] = NotedDevice(device, kind, cell.rig)
             stack.push(partial(_close, devices[kind], NAMES[kind]))
-            identities[kind] = bounded(devices[kind].identify)
+            identities[kind] = run_bounded(devices[kind].identify)
             on_opened(kind, identities[kind])
         if not dry_run:
             remember_controller(cell, identities["robot"])
@@ -144,7 +144,7 @@ def open_cell(
             clock,
             **devices,
             sensor=sensor,
-            simulated=endpoints is not None,
+            is_simulated=endpoints is not None,
             world_endpoints=endpoints,
             identities=identities,
         )
@@ -176,7 +176,7 @@ def _close(device: Any, name: str, _: object, failing: BaseException | None, __:
         alarm(f"{name}: not closed, because the call `{call}` has not returned; it ends with this process")
         return
     try:
-        bounded(device.close, stop=NOW)
+        run_bounded(device.close, stop=NOW)
     except DeviceTimeout as error:
         if failing is None:
             raise

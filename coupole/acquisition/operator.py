@@ -21,9 +21,9 @@ UNLIMITED_BYTES = 2**62
 """A dry run stores nothing, so the disk does not matter."""
 
 
-def refuse(found: Report) -> None:
-    if found.refusals:
-        raise PreflightRefused(found.refusals)
+def refuse(report: Report) -> None:
+    if report.refusals:
+        raise PreflightRefused(report.refusals)
 
 
 def refuse_uncommissioned(cell: Cell, identities: Mapping[str, Identity] | None = None) -> None:

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol
 
-from coupole.bounded import DISK, NOW, Workers, bounded, hangs, left_behind, on_disk, under_way
+from coupole.bounded import DISK, NOW, Workers, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
@@ -57,7 +57,7 @@ class Recorder(Protocol):
         """
         ...
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         """Store an unproven frame; returns its slot."""
         ...
 
@@ -83,15 +83,15 @@ class RunRecorder:
         self,
         run: Run,
         metadata: Mapping[str, Any],
-        described: Collections | None = None,
+        collections: Collections | None = None,
         *,
-        packed: bool = False,
+        is_packed: bool = False,
     ) -> None:
-        """`described` is stored in each view's file, beside the view's own collections. Frames may be stored
-        `packed`, two pixels in three bytes."""
-        self._run, self._metadata, self._packed = run, dict(metadata), packed
+        """`collections` is stored in each view's file, beside the view's own collections. Frames may be stored
+        `is_packed`, two pixels in three bytes."""
+        self._run, self._metadata, self._packed = run, dict(metadata), is_packed
         self.name = run.folder.name
-        self._described = dict(described or {})
+        self._described = dict(collections or {})
         self._journal = Journal(run.journal_path)
         self._proven = {shot: frame.index for shot, frame in run.proven().items()}
         self._writer: ViewWriter | None = None
@@ -106,7 +106,7 @@ class RunRecorder:
         """Proven shots whose lines are on the disk."""
 
     def light_before_lux_h(self) -> tuple[float, ...]:
-        return run_dose.lux_h_of_points(journal.read(self._run.journal_path))
+        return run_dose.lux_h_of_points(journal.read_events(self._run.journal_path))
 
     def proven(self) -> set[ShotId]:
         return set(self._proven)
@@ -143,7 +143,7 @@ class RunRecorder:
                     frame_format,
                     metadata,
                     {**self._described, **collections},
-                    packed=self._packed,
+                    is_packed=self._packed,
                 )
             self._writer = ViewWriter(path, view_slots)
 
@@ -152,10 +152,10 @@ class RunRecorder:
         assert self._writer is not None, "begin_view() comes before frames"
         return self._writer
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         self._unsynced_bytes += frame.pixels.nbytes
         with under_way(DISK, self._file):
-            return self._view.put(
+            return self._view.store(
                 frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
             )
 
@@ -183,12 +183,14 @@ class RunRecorder:
             committing, self._committing = self._committing, None
             committing.result()
         if now:
-            self._commit_in_place(self._writer, *self._taken())
+            self._commit_in_place(self._writer, *self._take_uncommitted())
         elif self._committing is None and time.monotonic() - self._committed_s > COMMIT_EVERY_S:
             self._committed_s = time.monotonic()
-            self._committing = self._committer.submit(self._commit_in_place, self._writer, *self._taken())
+            self._committing = self._committer.submit(
+                self._commit_in_place, self._writer, *self._take_uncommitted()
+            )
 
-    def _taken(self) -> tuple[list[str], list[ShotId]]:
+    def _take_uncommitted(self) -> tuple[list[str], list[ShotId]]:
         """Lines that are to be written, and the shots that they prove."""
         shots, self._uncommitted = self._uncommitted, []
         return self._journal.take(), shots
@@ -245,10 +247,10 @@ class RunRecorder:
     def close_quietly(self) -> None:
         """Commit the last events if possible; a failure here must not hide the error that ended the run. A disk
         that hangs with frames may still take the other lines, which are written then."""
-        lines, shots = self._taken()
+        lines, shots = self._take_uncommitted()
         try:
             if not hangs(DISK):
-                bounded(lambda: self._commit_last(lines, shots))
+                run_bounded(lambda: self._commit_last(lines, shots))
                 return
         except StorageError:
             pass
@@ -269,7 +271,7 @@ class RunRecorder:
         which was left behind may still use."""
         if not left_behind():
             with contextlib.suppress(StorageError):
-                bounded(self._close)
+                run_bounded(self._close)
 
     def _close(self) -> None:
         self._committer.end()

@@ -80,12 +80,12 @@ class RunControl:
         control = self._control
         state = "running"
         if control.pause.is_set():
-            state = "paused" if control.paused.is_set() and not control.coming_to_stand else "pausing"
+            state = "paused" if control.standing.is_set() and not control.coming_to_stand else "pausing"
         state = "stopping" if control.stop.is_set() else state
         progress = self._progress()
         return {**self._about, "state": state, **(vars(progress) if progress else {})}
 
-    def _answer(self, line: bytes, gone: Gone) -> State:
+    def _answer(self, line: bytes, is_gone: Gone) -> State:
         try:
             request = json_of(line, "request")
             version, command = request["version"], request["command"]
@@ -99,7 +99,7 @@ class RunControl:
             case "pause":
                 self._control.pause.set()
             case "go-on":
-                if not self._control.stands and not gone():  # which waits for the word of what was frozen
+                if not self._control.stands and not is_gone():  # which waits for the word of what was frozen
                     self._control.let_go_on()
             case "stop":
                 self._control.stop_by(signal.SIGINT, "`coupole stop`, or the console")

@@ -15,12 +15,12 @@ _SAFE_WITHIN_S = 15.0
 class Safeguard:
     """One action that makes a cell safe, in a thread of its own, so that none waits for another."""
 
-    def __init__(self, what: str, act: Callable[[], None]) -> None:
-        self.what, self._act = what, act
+    def __init__(self, label: str, act: Callable[[], None]) -> None:
+        self.what, self._act = label, act
         self.trouble = f"no answer within {_SAFE_WITHIN_S:g} s"
         """Reason why the action is not sure to be done; empty when it is done."""
         self._begun_s = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name=what, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=label, daemon=True)
         self._thread.start()
 
     def wait(self, at_most_s: float = _SAFE_WITHIN_S) -> None:
@@ -38,9 +38,9 @@ class Safeguard:
             self.trouble = ""
 
 
-def unsure(done: Sequence[Safeguard], within_s: float) -> list[str]:
+def unsure(safeguards: Sequence[Safeguard], within_s: float) -> list[str]:
     """Wait for the actions for a while; list what is not sure to be done then."""
     end_s = time.monotonic() + within_s
-    for safeguard in done:
+    for safeguard in safeguards:
         safeguard.wait(max(0.0, end_s - time.monotonic()))
-    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in done if safeguard.trouble]
+    return [f"not sure: {safeguard.what}: {safeguard.trouble}" for safeguard in safeguards if safeguard.trouble]

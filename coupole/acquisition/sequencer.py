@@ -134,20 +134,22 @@ class Sequencer:
             raise UnprovenError(self._say_missing())
         return self.outcome
 
-    def conclude(self, done: set[ShotId]) -> None:
+    def conclude(self, proven_shots: set[ShotId]) -> None:
         """The outcome's figures, if these shots are proven."""
         self.outcome.dose_lux_h = self._dose.lux_h_in_all
-        self.outcome.proven = sum(shot.is_shot for shot in done)
+        self.outcome.proven = sum(shot.is_shot for shot in proven_shots)
         bursts = (burst for bursts in self._job.schedule.bursts for burst in bursts)
         expected_shots = [shot for burst in bursts for shot in burst.shots if shot]
-        self.outcome.missing = [shot for shot in expected_shots if shot.is_shot and shot not in done]
-        self.outcome.missing_darks = [shot for shot in expected_shots if not shot.is_shot and shot not in done]
+        self.outcome.missing = [shot for shot in expected_shots if shot.is_shot and shot not in proven_shots]
+        self.outcome.missing_darks = [
+            shot for shot in expected_shots if not shot.is_shot and shot not in proven_shots
+        ]
 
-    def give_up(self, done: set[ShotId]) -> None:
+    def give_up(self, proven_shots: set[ShotId]) -> None:
         """The session's thread was left behind: its figures with these proven shots, whose lines are on the disk.
         The light of a burst under way counts as planned."""
         self._dose.give_up()
-        self.conclude(done)
+        self.conclude(proven_shots)
 
     def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)
@@ -167,16 +169,16 @@ class Sequencer:
         self._check_format(frame_format)
         frames = sum(len(burst.labels) for burst in all_bursts)
 
-        def begin(settled: SettledPose) -> None:
+        def begin(settled_pose: SettledPose) -> None:
             self._recorder.note(
                 ArmSettled(
                     view=view.name,
-                    joints_deg=tuple(round(angle, 6) for angle in settled.arm.joints_deg),
-                    base_from_camera=tuple(map(tuple, np.round(settled.base_from_camera, 6).tolist())),
+                    joints_deg=tuple(round(angle, 6) for angle in settled_pose.arm.joints_deg),
+                    base_from_camera=tuple(map(tuple, np.round(settled_pose.base_from_camera, 6).tolist())),
                 )
             )
             self._recorder.begin_view(
-                view.name, frames, frame_format, settled.arm, settled.base_from_camera, collections
+                view.name, frames, frame_format, settled_pose.arm, settled_pose.base_from_camera, collections
             )
 
         begin(settled_pose)
@@ -248,14 +250,14 @@ class Sequencer:
         leg_s = visit.leg.duration_s if visit else 0.0
         return leg_s + self._job.cell.rig.motion.settle_dwell_s + SETTLE_CHECK_S
 
-    def _note_gap(self, burst: Burst, verdict: Verdict, left: Sequence[ShotId]) -> None:
+    def _note_gap(self, burst: Burst, verdict: Verdict, shots_left: Sequence[ShotId]) -> None:
         frame_match = verdict.match
         missing_frames = int(frame_match.missing.sum())
         lost_frames = int(frame_match.lost_in_transfer.sum())
         self._recorder.note(
             GapFound(
                 view=burst.view,
-                shots=tuple(left),
+                shots=tuple(shots_left),
                 missing=missing_frames,
                 lost_in_transfer=lost_frames,
                 surplus=int(frame_match.surplus.sum()),
@@ -267,7 +269,7 @@ class Sequencer:
         why += [f"{missing_frames - lost_frames} never exposed"] if missing_frames > lost_frames else []
         why += [f"{len(verdict.dead)} with an LED that draws no current"] if verdict.dead else []
         why += [frame_match.reason] if frame_match.reason else []
-        self._observer.note(f"{burst.view}: {len(left)} frames not proven ({'; '.join(why) or 'aborted'})")
+        self._observer.note(f"{burst.view}: {len(shots_left)} frames not proven ({'; '.join(why) or 'aborted'})")
 
     def _say_missing(self) -> str:
         missing, bad = self.outcome.missing + self.outcome.missing_darks, self.outcome.bad
@@ -296,12 +298,12 @@ class Sequencer:
             self._cell.clock.sleep(_PAUSE_NAP_S, _PAUSE_NAP_S)
         if was_held:
             self._note_fault("Held", control.held_because)
-            control.held.clear()
+            control.hold_pending.clear()
         self._recorder.note(Paused())
         self._recorder.commit(now=True)
         self._tell_figures("dark", self._dose.lux_h_in_all, self._ahead_s)
         self._observer.note("paused: lights are off, the arm is at rest; the key p or `coupole go-on` continues")
-        control.paused.set()
+        control.standing.set()
         try:
             while control.pause.is_set() or control.halting.is_set():
                 if control.unsure:
@@ -311,15 +313,15 @@ class Sequencer:
                         happened="; ".join(control.unsure),
                         remedy="Look at the cell, then resume the run.",
                     )
-                if control.held.is_set():  # again, while it stands
+                if control.hold_pending.is_set():  # again, while it stands
                     self._note_fault("Held", control.held_because)
-                    control.held.clear()
+                    control.hold_pending.clear()
                     was_held = True
                 with contextlib.suppress(Held):  # it is held already
                     self._arm.attend()
                 self._cell.clock.sleep(_PAUSE_NAP_S)
         finally:
-            control.paused.clear()
+            control.standing.clear()
         if was_held:  # the box may have switched off by its watchdog, which it keeps as a fault
             self._burst_runner.forget_upload()
             self._cell.ledbox.acknowledge()

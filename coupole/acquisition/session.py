@@ -39,7 +39,7 @@ from coupole.acquisition.session_failure import (
 )
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
-from coupole.bounded import bounded, left_behind, on_disk
+from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
     DeviceError,
     Interrupted,
@@ -75,10 +75,10 @@ def acquire_plan(
     parent: Path | None,
     resume: Path | None,
     confirm: bool,
-    found: dict[str, Any],
+    figures: dict[str, Any],
     with_mesh: bool = False,
 ) -> None:
-    """Run a plan into a run folder; `found` is filled with the figures of `--json`, also when this raises.
+    """Run a plan into a run folder; `figures` is filled with the figures of `--json`, also when this raises.
 
     A mesh of more than 100 MB is copied into the folder only `with_mesh`.
     """
@@ -90,7 +90,14 @@ def acquire_plan(
             run.refuse_changes(job.inputs)
         job = without_hidden(job, run.hidden_leds if run else None)
         _acquire_into(
-            run, job, console, parent=parent, confirm=confirm, found=found, held=stack, with_mesh=with_mesh
+            run,
+            job,
+            console,
+            parent=parent,
+            confirm=confirm,
+            figures=figures,
+            exit_stack=stack,
+            with_mesh=with_mesh,
         )
 
 
@@ -101,8 +108,8 @@ def _acquire_into(
     *,
     parent: Path | None,
     confirm: bool,
-    found: dict[str, Any],
-    held: contextlib.ExitStack,
+    figures: dict[str, Any],
+    exit_stack: contextlib.ExitStack,
     with_mesh: bool,
 ) -> None:
     is_resumed = run is not None
@@ -118,7 +125,7 @@ def _acquire_into(
     if run is not None and not preflight.frames:
         dose_lux_h = close_complete(run, console)
         outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
-        found.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
+        figures.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
         _say_outcome(console, run, outcome, "done")
         return
     faults_of(job.cell).refuse(job.cell.document.path)
@@ -128,28 +135,28 @@ def _acquire_into(
         faults = faults_of(job.cell, cell.identities["robot"])  # by its serial number too
         on_disk(faults.where, partial(faults.refuse, job.cell.document.path))
         on_disk("the cell's commissioning record", partial(refuse_uncommissioned, job.cell, cell.identities))
-        room_c = bounded(lambda: _refuse_other_calibrations(job, cell))
+        room_c = run_bounded(lambda: _refuse_other_calibrations(job, cell))
         if run is None:
             inputs = replace(job.inputs, copy_large=with_mesh)
             create = partial(Run.create, folder, job.plan.name, inputs, about_run(job, cell))
             run = on_disk(str(folder), create, copied_s(inputs))
-            held.callback(os.close, run.lock())
+            exit_stack.callback(os.close, run.lock())
         on_disk(str(run.folder), partial(open_for_session, run))
-        held.callback(conclude, run, console)  # when the devices are closed
+        exit_stack.callback(conclude, run, console)  # when the devices are closed
         console.print(f"run {run.folder}")
         is_packed = job.cell.rig.storage.pixels == "packed12"
         about = metadata_of_views(job, cell), described_cell(job)
-        recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, packed=is_packed))
+        recorder = on_disk(str(run.folder), partial(RunRecorder, run, *about, is_packed=is_packed))
         try:
             event_class = SessionResumed if is_resumed else SessionStarted
             acknowledgement = on_disk(faults.where, partial(faults.begin_session, run.folder.name))
-            event = event_class(simulated=cell.simulated, room_c=room_c, acknowledged=acknowledgement)
+            event = event_class(simulated=cell.is_simulated, room_c=room_c, acknowledged=acknowledgement)
             fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
             recorder.note(event.model_copy(update=fields))
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
-            _acquire(job, cell, run, recorder, console, faults, light, found=found)
+            _acquire(job, cell, run, recorder, console, faults, light, figures=figures)
         finally:
             recorder.close()
 
@@ -176,7 +183,7 @@ def _camera_name(cell: OpenedCell) -> str:
 def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
     """The contents of run.json in addition to the inputs."""
     return {
-        "simulated": cell.simulated,
+        "simulated": cell.is_simulated,
         "proof": _proof(job),
         "licence": job.plan.licence or job.cell.rig.licence,
         "contact": job.plan.contact or job.cell.rig.contact,
@@ -211,7 +218,7 @@ def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
     return {
         "program_name": "coupole",
         "sample": job.plan.object.id if job.plan.object else "none",
-        "simulated": cell.simulated,
+        "simulated": cell.is_simulated,
         "proof": _proof(job),
         "pixel_pitch_um": cell.sensor.pixel_pitch_um,
         "focal_length_mm": rig.lens.focal_length_mm,
@@ -232,13 +239,13 @@ def _acquire(
     faults: ArmFaults,
     light: Mapping[str, float],
     *,
-    found: dict[str, Any],
+    figures: dict[str, Any],
 ) -> None:
     """The session itself; its object will have received `light`, lux hours by id. First the cell is made safe,
     whatever ended it; then the disk hears of it."""
     control = Control()
     observer = RunObserver(console, job.cell.rig.frame_bytes, len(recorder.proven()))
-    sequencer = bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
+    sequencer = run_bounded(partial(Sequencer, job, cell, recorder, observer=observer, control=control))
     outcome: Literal["done", "interrupted", "failed"] = "failed"
     failure: BaseException | None = None
     remote = RunControl(run.folder, job.cell.document.path, control, cell.halt, lambda: observer.newest, light)
@@ -256,13 +263,13 @@ def _acquire(
                 if keys_read:
                     console.print("keys: p pauses after the burst, and goes on; q stops")
                 try:
-                    bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
+                    run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
                 finally:
                     cell.make_safe()
                 _refuse_unsafe_end(cell)
                 outcome = "done"
         except BaseException as error:
-            failure = control.interrupted() if control.stop.is_set() else error
+            failure = control.interruption() if control.stop.is_set() else error
             outcome = "interrupted" if isinstance(failure, Interrupted) else "failed"
             if isinstance(failure, Interrupted):
                 note_what_hangs(error, cell, run, recorder)
@@ -279,7 +286,7 @@ def _acquire(
             recorder.note(SessionStopped(outcome=outcome, reason=str(failure or ""), robot=statistics(cell)))
             recorder.close_quietly()
             (sequencer.give_up if left_behind() else sequencer.conclude)(recorder.committed)
-            found.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
+            figures.update({**_figures(run, job, sequencer.outcome, recorder.committed), "unsafe": cell.trouble})
             _say_outcome(console, run, sequencer.outcome, outcome)
             _say_what_comes_first(job, faults)
 
@@ -287,7 +294,7 @@ def _acquire(
 def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
     """A run whose arm is in a fault is not resumed before a person has confirmed it."""
     with contextlib.suppress(StorageError):
-        if bounded(faults.standing):
+        if run_bounded(faults.standing):
             alarm(
                 f"  first   coupole confirm {job.cell.document.path} --name NAME   "
                 "(the arm is in a fault: find the cause, see that the cell is clear)"
@@ -325,23 +332,23 @@ def _figures(run: Run, job: Job, outcome: Outcome, proven: Collection[ShotId]) -
     }
 
 
-def _say_outcome(console: Console, run: Run, outcome: Outcome, ended: str) -> None:
+def _say_outcome(console: Console, run: Run, outcome: Outcome, ending: str) -> None:
     console.print(
-        f"{ended}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
+        f"{ending}: {outcome.proven} of {outcome.shots} shots proven, {outcome.reshot} re-shot, "
         f"{outcome.duration_s:.1f} s (at best {outcome.ideal_s:.1f} s), {outcome.dose_lux_h:.3f} lux.h"
     )
     if run.is_lost:
         console.print(f"  frames  lost with {run.folder}, unless that is found")
         return
     console.print(f"  frames  {run.folder / 'views'}")
-    if ended != "done":
+    if ending != "done":
         console.print(f"  go on   {run.go_on_command}")
 
 
 # -- the dry run ------------------------------------------------------------------------------------------
 
 
-def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any]) -> None:
+def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any]) -> None:
     """Run a whole plan on the rig's twin, faster than real time, and report what preflight cannot compute."""
     job = without_hidden(job)
     job, preflight = check_job(job, StorageFacts(UNLIMITED_BYTES))
@@ -355,10 +362,10 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
         started_s = time.monotonic()
         try:
             with obeyed_by(control, cell.halt), observer.showing(job.schedule.frames, len(job.schedule.views)):
-                bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
+                run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
         finally:
             machine_s = time.monotonic() - started_s
-            found.update(
+            figures.update(
                 {
                     "dry_run": True,
                     "shots": outcome.shots,
@@ -385,4 +392,4 @@ def rehearse(job: Job, console: Console, *, speed: float, found: dict[str, Any])
                     },
                 }
             )
-            show_dry_run(console, recorder.exposures, outcome, found)
+            show_dry_run(console, recorder.exposures, outcome, figures)

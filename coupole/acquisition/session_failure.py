@@ -8,7 +8,7 @@ from functools import partial
 
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import RunRecorder
-from coupole.bounded import NOW, bounded, hangs, left_behind, on_disk
+from coupole.bounded import NOW, hangs, left_behind, on_disk, run_bounded
 from coupole.errors import CoupoleError, DeviceError, StorageError
 from coupole.storage.arm_faults import ArmFaults
 from coupole.storage.journal_events import FaultNoted
@@ -20,7 +20,7 @@ from coupole.viewing.terminal import alarm
 def statistics(cell: OpenedCell) -> dict[str, float]:
     """Return the statistics of the arm's link; empty if its driver has none to give any more."""
     try:
-        return {} if hangs("robot") else dict(bounded(cell.robot.statistics, stop=NOW))
+        return {} if hangs("robot") else dict(run_bounded(cell.robot.statistics, stop=NOW))
     except Exception:  # noqa: BLE001  the session's end is told without them
         return {}
 

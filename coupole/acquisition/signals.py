@@ -88,12 +88,12 @@ def unheard_end() -> Iterator[None]:
         os.close(write_fd)
 
 
-def _end_unheard(ours: int) -> None:
+def _end_unheard(read_fd: int) -> None:
     number, since_s, heard_s = 0, math.inf, math.inf
     while True:
-        if select.select([ours], [], [], _PULSE_S)[0]:
-            if not (numbers := os.read(ours, 64)):
-                os.close(ours)
+        if select.select([read_fd], [], [], _PULSE_S)[0]:
+            if not (numbers := os.read(read_fd, 64)):
+                os.close(read_fd)
                 return
             if since_s == math.inf and (ending := [signum for signum in numbers if signum in ENDING]):
                 number, since_s = ending[0], time.monotonic()
@@ -105,7 +105,7 @@ def _end_unheard(ours: int) -> None:
 
 
 @contextmanager
-def held() -> Iterator[None]:
+def drop_signals() -> Iterator[None]:
     """Drop signals that arrive within the context: whoever uses this is ending the session already."""
     with _handlers(dict.fromkeys(ENDING, _drop)):
         yield
@@ -144,13 +144,13 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
         control.pulse_s = math.inf
 
 
-def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
+def _obey(read_fd: int, control: Control, act: Callable[[], object]) -> None:
     """Obey the signals whose numbers come through a pipe, until it is closed; and prove that the process runs."""
     has_acted, stood_s, noticed_s = False, 0.0, 0.0
     slept_s = _slept_s()
     control.pulse_s = time.monotonic()
     while True:
-        ready = select.select([ours], [], [], _PULSE_S)[0]
+        ready = select.select([read_fd], [], [], _PULSE_S)[0]
         now_s = time.monotonic()
         silent_s, control.pulse_s = now_s - control.pulse_s, now_s
         if silent_s > ASKS_FROM_S:  # SIGCONT may be heard a moment later; without it the machine was only busy
@@ -161,7 +161,7 @@ def _obey(ours: int, control: Control, act: Callable[[], object]) -> None:
             _hold(control, act, frozen(asleep_s))
         if not ready:
             continue
-        if not (numbers := os.read(ours, 64)):
+        if not (numbers := os.read(read_fd, 64)):
             return
         for number in numbers:
             if number in ENDING and not has_acted:  # whether or not the main thread's handler was first
@@ -214,13 +214,13 @@ def _tell(text: str) -> None:
 
 
 @contextmanager
-def _handlers(wanted: dict[signal.Signals, Any]) -> Iterator[None]:
+def _handlers(new_handlers: dict[signal.Signals, Any]) -> Iterator[None]:
     """These handlers, in the main thread; the former ones at the end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    wanted = {number: handler for number, handler in wanted.items() if not _stays_ignored(number)}
-    before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
+    new_handlers = {number: handler for number, handler in new_handlers.items() if not _stays_ignored(number)}
+    before = {number: signal.signal(number, handler) for number, handler in new_handlers.items()}
     try:
         yield
     finally:

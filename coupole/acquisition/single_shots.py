@@ -43,14 +43,14 @@ class SingleShots:
     def __init__(
         self,
         cell: Cell,
-        opened: OpenedCell,
+        opened_cell: OpenedCell,
         lux: NDArray[np.float64],
         meter: FlashMeter | None,
         every_s: float = 0.0,
     ) -> None:
         """`lux` [points, LEDs of the table]; `meter` for an object whose light is counted; LEDs are lit every
         `every_s` at most."""
-        self._cell, self._rig, self._opened = cell, cell.rig, opened
+        self._cell, self._rig, self._opened = cell, cell.rig, opened_cell
         self._lux, self._meter, self._every_s = lux, meter, every_s
         self._row_of_led = {int(led): row for row, led in enumerate(cell.leds.ids)}
         self._armed_for: Exposure | None = None
@@ -183,7 +183,7 @@ class SingleShots:
         deadline = Deadline(self._opened.clock, 2.0 * self._period_s + _FRAME_S)
         while box.running():
             box.poll_log()
-            if deadline.expired:
+            if deadline.has_expired:
                 raise DeviceTimeout(
                     "led box",
                     expected=f"a step of {self._period_s:.3f} s to end within {deadline.seconds:.1f} s",

@@ -135,7 +135,7 @@ def _of_run(run: Run) -> Sources:
     for shot, frame in run.proven().items():
         by_view.setdefault(shot.view, []).append(frame)
     images, flanges, inputs = [], [], [(f"{run.folder.name}/run.json", sha256(run.folder / "run.json"))]
-    about = About(is_simulated=run.simulated)
+    about = About(is_simulated=run.is_simulated)
     lit_records: list[np.void] = []
     for view, frames in by_view.items():
         path = run.view_path(view)
@@ -154,7 +154,7 @@ def _of_run(run: Run) -> Sources:
         about = about_of(run, file)
     if not images:
         raise InputError(f"{run.folder}: no proven frame under light; acquire the plan first")
-    about = replace(about, temperature_c=temperature_range_c(lit_records), begun=run.created)
+    about = replace(about, temperature_c=temperature_range_c(lit_records), begun=run.created_at)
     return Sources(tuple(images), kuka_poses(np.stack(flanges)), about, tuple(inputs))
 
 
@@ -207,7 +207,7 @@ def about_of(run: Run, file: View) -> About:
     """Camera and lens by the attributes of a view's file. Raises StorageError."""
     camera = file.attributes.get("camera")
     return About(
-        is_simulated=run.simulated,
+        is_simulated=run.is_simulated,
         camera=str(camera) if camera is not None else None,
         focal_length_mm=file.number("focal_length_mm"),
         focus_distance_mm=file.number("focus_distance_mm"),

@@ -111,20 +111,20 @@ def _say(words: str) -> None:
 
 def _driven(asked: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
     """Plan, show, ask, drive; the work's figures when the arm has arrived."""
-    from coupole.acquisition.cell_bench.bench_client import obeyed
+    from coupole.acquisition.cell_bench.bench_client import checked_answer
     from coupole.viewing.terminal import ask
 
-    path = obeyed(asked("plan_path", to=goal))
+    path = checked_answer(asked("plan_path", to=goal))
     steps = len(path["waypoints_deg"]) - 1
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
     if not yes and not ask("Drive the arm along this path?"):
         raise Interrupted("not driven: answer the question, or say `--yes`")
     try:
-        work = obeyed(asked("drive", path=path["path"]))
+        work = checked_answer(asked("drive", path=path["path"]))
         while work["state"] == "running":
             control.go_on()
             time.sleep(_LOOK_EVERY_S)
-            work = obeyed(asked("state"))["work"]
+            work = checked_answer(asked("state"))["work"]
     except BaseException:
         try:
             asked("stop")

@@ -122,7 +122,7 @@ class Campaign:
         summary: dict[str, Any] = {}
         job = read_job(plan)
         acquire_plan(
-            job, self._console, parent=self._out / "runs", resume=resumed_run, confirm=self._ask, found=summary
+            job, self._console, parent=self._out / "runs", resume=resumed_run, confirm=self._ask, figures=summary
         )
         return Path(summary["run"])
 

@@ -65,7 +65,7 @@ def dose(
     request = {"dose_lux_h": budget, "name": person, "reason": reason.strip()}
     if budget is not None and not _sent(cell, object_id, "budget", request):
         ledger.set_budget(budget, person, reason)
-    history, similar_objects = ledger.read(), similar_ids(ledger.folder, object_id)
+    history, similar_objects = ledger.read_history(), similar_ids(ledger.folder, object_id)
     show_dose(make_console(quiet=as_json), ledger, history, similar_objects)
     if as_json:
         print(json.dumps(document(ledger, history, similar_objects)))

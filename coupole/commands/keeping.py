@@ -87,12 +87,12 @@ def verify(
 
         check = verify_run(folder, show)
         if with_manifest and not check.bad:
-            with folder.locked():
-                manifest.enter(folder.folder, manifest.unlisted(folder.folder), show)
+            with folder.hold_lock():
+                manifest.enter(folder.folder, manifest.unlisted_files(folder.folder), show)
             check.unlisted = []
     _show_verified(console, folder, check)
     if as_json:
-        document = {"ok": check.ok, "proof": folder.proof, "frames": check.frames, "listed": check.listed}
+        document = {"ok": check.ok, "proof": folder.proof, "frames": check.frames, "listed": check.listed_count}
         print(
             json.dumps(
                 {
@@ -104,7 +104,8 @@ def verify(
     if check.bad:
         subject = "1 thing is" if len(check.bad) == 1 else f"{len(check.bad)} things are"
         raise ChecksumMismatch(
-            f"{subject} not right (above); read back were {check.frames} frames, and {check.listed} files that "
+            f"{subject} not right (above); read back were {check.frames} frames, and {check.listed_count} files "
+            f"that "
             "the manifest lists"
         )
     if check.missing:
@@ -126,8 +127,8 @@ def _show_verified(console: Console, run: Run, found: Verification) -> None:
         console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {run.proof}")
     if found.not_compared:
         console.print(f"[yellow]not compared with the plan:[/] {escape(found.not_compared)}")
-    if found.listed and not found.bad:
-        console.print(f"{found.listed} files are as manifest.sha256 lists them")
+    if found.listed_count and not found.bad:
+        console.print(f"{found.listed_count} files are as manifest.sha256 lists them")
     if found.unlisted:
         console.print(f"not listed there: {', '.join(found.unlisted[:5])}{' ...' if found.unlisted[5:] else ''}")
 

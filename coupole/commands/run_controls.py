@@ -91,7 +91,7 @@ def _unsafe(run: Run) -> list[str]:
 
     reasons = ["the session has no end in its journal: its process was killed, or could not write it"]
     has_end = False
-    for event in journal.read(run.journal_path):
+    for event in journal.read_events(run.journal_path):
         if isinstance(event, SessionStarted | SessionResumed):
             reasons, has_end = reasons[:1], False
         elif isinstance(event, FaultNoted) and event.kind == "unsafe":

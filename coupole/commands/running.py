@@ -69,11 +69,11 @@ def acquire(
                 console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, found=summary
             )
         elif dry_run:
-            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, found=summary)
+            rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
             acquire_plan(
-                job, console, parent=output, resume=resume, confirm=not yes, found=summary, with_mesh=with_mesh
+                job, console, parent=output, resume=resume, confirm=not yes, figures=summary, with_mesh=with_mesh
             )
     except CoupoleError as error:
         fail(error, as_json=as_json, found=summary)
@@ -93,7 +93,7 @@ def devices(
     from rich.table import Table
 
     from coupole.acquisition.opened_cell import open_cell
-    from coupole.bounded import bounded
+    from coupole.bounded import run_bounded
     from coupole.console.command_line.client import borrowed
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
@@ -104,7 +104,7 @@ def devices(
     table = Table("device", "identity", "self-test", box=None)
     with borrowed(cell, "devices"), open_cell(cell) as open_devices:
         for kind in ("ledbox", "camera", "robot"):
-            identity, self_test = open_devices.identities[kind], bounded(getattr(open_devices, kind).self_test)
+            identity, self_test = open_devices.identities[kind], run_bounded(getattr(open_devices, kind).self_test)
             document[kind] = {**vars(identity), "self_test": dict(self_test)}
             identity_text = f"{identity.vendor} {identity.model} {identity.serial} ({identity.firmware})"
             table.add_row(

@@ -86,7 +86,7 @@ def export_colmap(
             say("views", number + 1, len(pictures))
         centres_mm = apply(inverse(measured_run.base_from_support), measured_run.corners_mm.mean(axis=1))
         origin = "refined by overlapping views" if refined_folder is not None else "by the run's calibrations"
-        source = "simulated" if measured_run.run.simulated else "measured"
+        source = "simulated" if measured_run.run.is_simulated else "measured"
         head = (
             f"# Coupole {coupole.__version__}: {measured_run.run.folder.name}, {source}; {origin}; world in mm\n"
         )

@@ -123,7 +123,7 @@ def _source_facts(source: Path) -> dict[str, Any]:
     return {
         "kind": "run",
         "ended": run.about["created"],
-        "simulated": run.simulated,
+        "simulated": run.is_simulated,
         "software": {run.about["software"]["name"]: run.about["software"]["version"]},
         "inputs": {},
         "licence": run.about.get("licence"),

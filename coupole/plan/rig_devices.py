@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from coupole.errors import Problem
-from coupole.kinematics import Arm, slowed
+from coupole.kinematics import Arm, slowed_arm
 from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm, shipped_arm
 from coupole.plan.registry import (
     ARMS_OF_DRIVERS,
@@ -71,7 +71,7 @@ def planning_arm(rig: Rig) -> Arm | None:
         arm: Arm = model(**_known(NOWHERE["robot"], model) | settings).arm()  # type: ignore[attr-defined]
         return arm
     motion = rig.motion
-    return slowed(
+    return slowed_arm(
         description.arm,
         speed_fraction=motion.speed_fraction,
         acceleration_deg_s2=motion.acceleration_deg_s2,

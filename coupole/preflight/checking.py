@@ -87,7 +87,7 @@ def check_job(
     plan_views = job.motion.itinerary if paths else job.motion.unchecked_itinerary
     itinerary = plan_views(views, home_deg)
     all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
-    history = ledger_of(job.cell, job.plan.object.id).read() if job.plan.object else History()
+    history = ledger_of(job.cell, job.plan.object.id).read_history() if job.plan.object else History()
     before = history.total_lux_h
 
     def checked(pace: Pace) -> tuple[Job, Report]:

@@ -138,7 +138,7 @@ def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredR
         "refined": None if request.refined_folder is None else what_was_refined(request.refined_folder),
         **_pose_summary(request, token),
         "emission": measured_runs[0].emission,
-        "simulated": any(m.run.simulated for m in measured_runs),
+        "simulated": any(m.run.is_simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),
         "view_names": [_name(measured_runs, m, view) for m in measured_runs for view in m.views],
     }

@@ -79,7 +79,7 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
         assert stored_picture is not None
         brightest = np.maximum(brightest, stored_picture.reshape(*brightest.shape, -1).max(axis=2))
         say("pictures", number + 1, len(leds))
-    pictured_view = _nominal(files, frame_of_led, run.simulated)
+    pictured_view = _nominal(files, frame_of_led, run.is_simulated)
     rows = files.cell.leds.rows(leds)
     target_mm = _target_mm(files, frame_of_led[leds[0]].base_from_camera)
     light = files.cell.leds.illuminance_lux(target_mm[None])[0, rows]
@@ -98,7 +98,7 @@ def lights_of_view(folder: Path, view: str | None) -> PicturedView:
     `write_pictures`."""
     run = Run(folder)
     frame_of_led = frames_of_leds(folder, open_light_frames([folder]), view)
-    return _nominal(read_plan(run.plan_path, run.rig_path), frame_of_led, run.simulated)
+    return _nominal(read_plan(run.plan_path, run.rig_path), frame_of_led, run.is_simulated)
 
 
 def _nominal(files: PlanFiles, frame_of_led: dict[int, LightFrame], is_simulated: bool) -> PicturedView:

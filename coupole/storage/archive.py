@@ -67,7 +67,7 @@ def archive_run(
     `partial`), ChecksumMismatch if a frame is not what was proven, before or after, and DiskFull; the current view
     is then unchanged.
     """
-    with run.locked():
+    with run.hold_lock():
         proven = run.proven()
         missing = [shot for shot in run.expected_shots() if shot not in proven]
         if missing and not partial:
@@ -80,7 +80,7 @@ def archive_run(
             path = run.view_path(view)
             if view in result.incomplete:
                 continue
-            if frame_file.read_layout(path).archived:
+            if frame_file.read_layout(path).is_archived:
                 result.already.append(view)
                 continue
             name, kept_name = str(path.relative_to(run.folder)), f"{KEPT_FOLDER}/{path.name}"

@@ -190,7 +190,7 @@ def _copy_all_but_frames(
     shape: tuple[int, int, int],
     tile: tuple[int, int],
     codec: Codec,
-    kept: set[int],
+    proven_slots: set[int],
 ) -> h5py.Dataset:
     """Copy groups, tables, values, links and attributes unchanged; returns the frames' dataset, still empty."""
     frames = before[frame_file.DATA]
@@ -215,7 +215,9 @@ def _copy_all_but_frames(
     data.attrs["not_stored"] = f"slots without a proven frame have no pixels and read as {bitshuffle.FILL_DN}"
     table = after[frame_file.FRAMES]
     records = table[:]
-    records[[slot for slot in range(len(records)) if slot not in kept]] = np.zeros((), frame_file.FRAME_DTYPE)
+    records[[slot for slot in range(len(records)) if slot not in proven_slots]] = np.zeros(
+        (), frame_file.FRAME_DTYPE
+    )
     table[:] = records
     return data
 
@@ -307,9 +309,9 @@ def _read_back(path: Path, partial: Path, frames: list[FrameProven], progress: P
             progress(f"{path.stem}: read back", count, len(frames))
 
 
-def _not_the_same(path: Path, what: str) -> ChecksumMismatch:
+def _not_the_same(path: Path, part: str) -> ChecksumMismatch:
     return ChecksumMismatch(
-        f"{path}: {what} differs when read back from the archive. The view is unchanged; check disk and "
+        f"{path}: {part} differs when read back from the archive. The view is unchanged; check disk and "
         "memory of this machine, then archive again."
     )
 

@@ -84,7 +84,7 @@ class ArmFaults:
         }
         faults: dict[tuple[str, str], ArmFault] = {}
         for lines in files:
-            for fault in _unconfirmed(lines):
+            for fault in _unconfirmed_faults(lines):
                 if not fault.id or fault.id not in confirmed_ids:
                     faults.setdefault((fault.t, fault.id or fault.message), fault)
         return sorted(faults.values(), key=lambda fault: fault.t)
@@ -133,7 +133,7 @@ def faults_of(cell: Cell, identity: Identity | None = None) -> ArmFaults:
     return ArmFaults(*places_of_arm(cell, identity))
 
 
-def _unconfirmed(lines: list[Line]) -> list[ArmFault]:
+def _unconfirmed_faults(lines: list[Line]) -> list[ArmFault]:
     """Faults after the last confirmation in the same file."""
     faults: list[ArmFault] = []
     for line in lines:
@@ -174,10 +174,10 @@ def _lines(path: Path) -> list[Line]:
         return []
     except OSError as error:
         raise StorageError(f"{path}: cannot read the faults of the arm: {error.strerror}") from error
-    return [_read(text) for text in texts]
+    return [_parse_line(text) for text in texts]
 
 
-def _read(text: bytes) -> Line:
+def _parse_line(text: bytes) -> Line:
     try:
         return _LINE.validate_json(text)
     except ValidationError:

@@ -66,7 +66,7 @@ class AsPlanned:
     def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
         """Say how a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do
         not."""
-        planned_light = self._asked(shot.view).get(shot.label)
+        planned_light = self._planned_exposures(shot.view).get(shot.label)
         if planned_light is None:
             return f"{shot}: the run's plan has no such shot" if shot.is_shot else ""
         led, exposure_us = planned_light
@@ -78,7 +78,7 @@ class AsPlanned:
         return f"{shot}: {off}" if (off := self._off(shot.view, pose["joints_deg"].tobytes())) else ""
 
     @lru_cache(maxsize=1)  # noqa: B019  an object of one `verify`
-    def _asked(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
+    def _planned_exposures(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
         """LED and exposure, us, of each frame of a view."""
         light_of_label: dict[ShotLabel, tuple[int, int]] = {}
         for pose, bursts in zip(self.schedule.views, self.schedule.bursts, strict=True):

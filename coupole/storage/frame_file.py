@@ -85,9 +85,9 @@ class Layout:
     """0 if the file is archived."""
     table_offset: int
     poses_offset: int
-    archived: bool
+    is_archived: bool
     """True if the frames are compressed by `coupole.storage.archive`; the file is then read-only."""
-    packed: bool
+    is_packed: bool
     """True if two pixels are packed in three bytes (`coupole.storage.packing`, `lsb`)."""
     inode: int
     """Inode of the file; it changes when the file is archived."""
@@ -96,11 +96,11 @@ class Layout:
     def frame_bytes(self) -> int:
         """Size of a frame in the file."""
         pixels = self.height_px * self.width_px
-        return pixels * 3 // 2 if self.packed else pixels * 2
+        return pixels * 3 // 2 if self.is_packed else pixels * 2
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
+def open_view(path: Path) -> Iterator[h5py.File]:
     """A view's file, to be read. What h5py or the caller then finds wrong in it raises StorageError."""
     try:
         with h5py.File(path, "r") as file:
@@ -111,7 +111,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 def read_layout(path: Path) -> Layout:
     """Layout of a view's file. Raises StorageError if it is not such a file."""
-    with opened(path) as file:
+    with open_view(path) as file:
         inode = os.fstat(file.id.get_vfd_handle()).st_ino
         data, frames, poses = file[DATA], file[FRAMES], file[POSES]
         is_packed = data.dtype == np.uint8
@@ -127,15 +127,15 @@ def read_layout(path: Path) -> Layout:
             data.id.get_offset() or 0,
             frames.id.get_offset(),
             poses.id.get_offset(),
-            archived=data.chunks is not None,
-            packed=is_packed,
+            is_archived=data.chunks is not None,
+            is_packed=is_packed,
             inode=inode,
         )
 
 
 def read_facts(path: Path) -> dict[str, Any]:
     """`pattern`, `black_dn` and `white_dn` of a view's frames. Raises StorageError."""
-    with opened(path) as file:
+    with open_view(path) as file:
         detector = file["entry/instrument/detector"]
         facts = {
             "pattern": detector["bayer_pattern"][()].decode("ascii"),
@@ -150,7 +150,7 @@ def read_facts(path: Path) -> dict[str, Any]:
 def read_poses_and_attributes(path: Path) -> tuple[NDArray[np.void], dict[str, Any]]:
     """The table of poses, POSE_DTYPE, and the attributes of a view's file. Raises StorageError."""
     read_layout(path)
-    with opened(path) as file:
+    with open_view(path) as file:
         return file[POSES][:], dict(file["entry"].attrs)
 
 
@@ -170,7 +170,7 @@ def read_frame(path: Path, layout: Layout, slot: int) -> NDArray[np.uint16]:
 
     Raises StorageError if the frame cannot be read.
     """
-    if layout.archived:
+    if layout.is_archived:
         return _read_archived_frame(path, slot)
     with path.open("rb") as file:
         if os.fstat(file.fileno()).st_ino == layout.inode:
@@ -186,7 +186,7 @@ def read_frame_into(path: Path, layout: Layout, slot: int, pixels: NDArray[np.ui
     """Read a frame as `read_frame` does, into `pixels` [H, W], C order, of the caller: past the page cache
     where the file system, the size of the frames and the memory's alignment (512 bytes) allow it. Raises
     StorageError."""
-    if layout.archived or layout.packed or not _read_direct(path, layout, slot, pixels):
+    if layout.is_archived or layout.is_packed or not _read_direct(path, layout, slot, pixels):
         pixels[:] = read_frame(path, layout, slot)
 
 
@@ -213,21 +213,21 @@ def _read_direct(path: Path, layout: Layout, slot: int, pixels: NDArray[np.uint1
         os.close(fd)
 
 
-def pixels_of(stored: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
+def pixels_of(frame_bytes: bytes | mmap.mmap, layout: Layout) -> NDArray[np.uint16]:
     """Pixels [H, W] of a frame from its bytes in a file that is not archived, DN; not copied unless it is
     packed."""
-    if layout.packed:
+    if layout.is_packed:
         from coupole.storage.packing import unpack12
 
-        pixels = unpack12(np.frombuffer(stored, np.uint8))
+        pixels = unpack12(np.frombuffer(frame_bytes, np.uint8))
     else:
-        pixels = np.frombuffer(stored, np.uint16)
+        pixels = np.frombuffer(frame_bytes, np.uint16)
     return pixels.reshape(layout.height_px, layout.width_px)
 
 
 def _read_archived_frame(path: Path, slot: int) -> NDArray[np.uint16]:
     import hdf5plugin  # noqa: F401  # registers the filter
 
-    with opened(path) as file:
+    with open_view(path) as file:
         pixels: NDArray[np.uint16] = file[DATA][slot]
         return pixels

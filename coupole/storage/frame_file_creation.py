@@ -63,10 +63,10 @@ def create(
     metadata: dict[str, Any],
     collections: Collections | None = None,
     *,
-    packed: bool = False,
+    is_packed: bool = False,
 ) -> None:
     """Create a view's file with `slots` free slots, and allocate its space; frames of up to 12 bits may be
-    `packed`.
+    `is_packed`.
 
     `metadata`: `title`, `sample`, `simulated`, `pixel_pitch_um` and any further attributes of the entry. Raises
     DiskFull if the disk has not enough space.
@@ -76,7 +76,7 @@ def create(
         with h5py.File(
             partial, "w", alignment_threshold=PAGE, alignment_interval=PAGE, libver=("v108", "v110")
         ) as file:
-            _describe(file, slots, frame_format, metadata, packed=packed)
+            _describe(file, slots, frame_format, metadata, is_packed=is_packed)
             for name, arrays in (collections or {}).items():
                 collection = _group(file["entry"], name, "NXcollection")
                 for key, values in arrays.items():
@@ -92,7 +92,7 @@ def create(
 
 
 def _describe(
-    file: h5py.File, slots: int, frame_format: FrameFormat, metadata: dict[str, Any], *, packed: bool
+    file: h5py.File, slots: int, frame_format: FrameFormat, metadata: dict[str, Any], *, is_packed: bool
 ) -> None:
     file.attrs["default"] = "entry"
     entry = _group(file, "entry", "NXentry", default="data")
@@ -106,10 +106,10 @@ def _describe(
     instrument = _group(entry, "instrument", "NXinstrument")
     instrument["name"] = "La Coupole"
     detector = _group(instrument, "detector", "NXdetector")
-    columns, dtype = (frame_format.width_px * 3 // 2, "u1") if packed else (frame_format.width_px, "<u2")
+    columns, dtype = (frame_format.width_px * 3 // 2, "u1") if is_packed else (frame_format.width_px, "<u2")
     shape = (slots, frame_format.height_px, columns)
     data = _contiguous(detector, "data", shape, np.dtype(dtype), fill=False)
-    if packed:
+    if is_packed:
         data.attrs["packing"] = "three bytes hold two pixels a, b: a[7:0], b[3:0] a[11:8], b[11:4] (GenICam 12p)"
     data.attrs["units"] = "DN"
     data.attrs["long_name"] = "raw frames, one a slot; `frames` says what each slot holds"

@@ -82,7 +82,7 @@ def event_line(event: Event) -> str:
     return json.dumps({**first, **fields}, separators=(",", ":")) + "\n"
 
 
-def read(path: Path) -> Iterator[Event]:
+def read_events(path: Path) -> Iterator[Event]:
     """Events of a journal, also of one by version 0.1; none if there is no journal yet.
 
     A line truncated by a crash is skipped: its event was not committed. Raises StorageError for a complete line
@@ -133,7 +133,7 @@ class Follower:
 
 def version(path: Path) -> int:
     """Version of a journal; the current one if it does not exist yet."""
-    first = next(read(path), None)
+    first = next(read_events(path), None)
     if first is None:
         return JOURNAL_VERSION
     return first.version if isinstance(first, JournalBegun) else 1

@@ -67,40 +67,42 @@ class Ledger:
         self.path = folder / f"{object_id}.jsonl"
         self._reading = Reading(only_grows=only_grows)
 
-    def read(self) -> History:
+    def read_history(self) -> History:
         """Raises StorageError if a file cannot be read."""
         texts = read_lines(self.path)
         return history_of([*self._former_lines(texts), *texts])
 
     def newest(self) -> History:
         """The same as `read`, for who asks often: only lines that are new are read. Not to be changed."""
-        self._reading = self._reading.renewed(self.path)
+        self._reading = self._reading.with_new_lines(self.path)
         if self._former_folder is not None and (self._former_folder / self.path.name).exists():
-            return self.read()
+            return self.read_history()
         return self._reading.history
 
-    def plan(self, run: str, dose_lux_h: float, damage_wh_m2: float | None, asked: Asked | None = None) -> str:
+    def plan(
+        self, run: str, dose_lux_h: float, damage_wh_m2: float | None, budget_request: Asked | None = None
+    ) -> str:
         """Light that is about to be given, at most; returns the id for `correct`.
 
-        The budget is asked for what is `asked`; a plan's budget becomes the object's if that has none. Raises
-        DoseBudgetReached: nothing is entered then.
+        The budget is asked for what is `budget_request`; a plan's budget becomes the object's if that has none.
+        Raises DoseBudgetReached: nothing is entered then.
         """
         line = LightPlanned(id=uuid.uuid4().hex, run=run, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
         lines: list[Line] = [line]
-        with self._locked() as file:
-            if asked is not None:
+        with self._open_locked() as file:
+            if budget_request is not None:
                 history = self.newest()
-                asked.refuse_beyond(self.object_id, history)
-                if asked.budget_lux_h is not None and history.budget_lux_h is None:
-                    lines.insert(0, asked.as_the_objects())
+                budget_request.refuse_beyond(self.object_id, history)
+                if budget_request.budget_lux_h is not None and history.budget_lux_h is None:
+                    lines.insert(0, budget_request.as_the_objects())
             file.append([new_line.model_dump_json() + "\n" for new_line in lines])
         return line.id
 
-    def ask_again(self, asked: Asked, plan_id: str) -> None:
+    def ask_again(self, budget_request: Asked, plan_id: str) -> None:
         """Ask the budget once more for light whose plan has this id. Raises DoseBudgetReached."""
-        with self._locked():
+        with self._open_locked():
             history = self.newest()
-            asked.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
+            budget_request.refuse_beyond(self.object_id, history, -history.planned_lux_h(plan_id))
 
     def correct(self, plan_id: str, dose_lux_h: float, damage_wh_m2: float | None) -> None:
         """Enter the light that was given of that plan, in place of the planned light."""
@@ -124,13 +126,15 @@ class Ledger:
             self._refuse_no_figure("a limit", dose_lux_h)
         self._append(WarningSet(dose_lux_h=dose_lux_h))
 
-    def _refuse_no_figure(self, what: str, dose_lux_h: float) -> None:
+    def _refuse_no_figure(self, quantity: str, dose_lux_h: float) -> None:
         if not (math.isfinite(dose_lux_h) and dose_lux_h >= 0):
-            raise InputError(f"object {self.object_id}: expected {what} of 0 lux.h or more, found {dose_lux_h}")
+            raise InputError(
+                f"object {self.object_id}: expected {quantity} of 0 lux.h or more, found {dose_lux_h}"
+            )
 
     def prove_writable(self) -> None:
         """Raise StorageError now if lines could not be appended later."""
-        with self._locked():
+        with self._open_locked():
             pass
 
     def _former_lines(self, texts: list[bytes]) -> list[bytes]:
@@ -141,11 +145,11 @@ class Ledger:
         return [text for text in read_lines(self._former_folder / self.path.name) if text not in known_texts]
 
     def _append(self, line: Line) -> None:
-        with self._locked() as file:
+        with self._open_locked() as file:
             file.append([line.model_dump_json() + "\n"])
 
     @contextmanager
-    def _locked(self) -> Iterator[LineFile]:
+    def _open_locked(self) -> Iterator[LineFile]:
         try:
             new = [folder for folder in (self.folder, *self.folder.parents) if not folder.exists()]
             self.folder.mkdir(parents=True, exist_ok=True)

@@ -88,7 +88,7 @@ class Entry:
     dose_lux_h: float
     damage_wh_m2: float | None
     note: str = ""
-    settled: bool = True
+    is_settled: bool = True
     """False while only the plan is known: what was given is at most this."""
 
 
@@ -134,7 +134,7 @@ class History:
     @property
     def unsettled_lux_h(self) -> float:
         """Planned, with nobody left who could say what was given."""
-        return sum(entry.dose_lux_h for entry in self.entries if not entry.settled)
+        return sum(entry.dose_lux_h for entry in self.entries if not entry.is_settled)
 
     def planned_lux_h(self, plan_id: str) -> float:
         """Return the light that counts of the plan with this id; 0 if it is not known."""
@@ -184,7 +184,7 @@ class Asked:
 def read_lines(path: Path) -> list[bytes]:
     """Lines of a file; none if there is no file. Raises StorageError."""
     try:
-        with _opened(path) as file:
+        with _open_regular(path) as file:
             return file.read().split(b"\n")
     except FileNotFoundError:
         return []
@@ -192,7 +192,7 @@ def read_lines(path: Path) -> list[bytes]:
         raise _unreadable(path, error) from error
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open_regular(path: Path) -> BinaryIO:
     """A file for reading. Raises OSError, also for a pipe or a device, which is not waited for."""
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -219,11 +219,11 @@ class Reading:
         self._only_grows = only_grows
         self._inode, self._read_bytes, self._tail = 0, 0, b""
 
-    def renewed(self, path: Path) -> Reading:
+    def with_new_lines(self, path: Path) -> Reading:
         """Add the complete lines that came since; read all of them anew if the file is another one now. Raises
         StorageError."""
         try:
-            with _opened(path) as file:
+            with _open_regular(path) as file:
                 return self._with_rest(path, file)
         except FileNotFoundError:
             self._refuse_loss(path, "was removed")
@@ -231,10 +231,10 @@ class Reading:
         except OSError as error:
             raise _unreadable(path, error) from error
 
-    def _refuse_loss(self, path: Path, what: str) -> None:
+    def _refuse_loss(self, path: Path, loss: str) -> None:
         if self._only_grows and self._read_bytes:
             raise StorageError(
-                f"{path}: the dose ledger {what} while light was given, so nobody knows what the object may "
+                f"{path}: the dose ledger {loss} while light was given, so nobody knows what the object may "
                 "still receive. Put it back, then go on."
             )
 
@@ -288,11 +288,11 @@ def _add(history: History, line: Line) -> None:
     if isinstance(line, LightGiven):
         entry = history.of_plan.get(line.id)
         if entry is not None:
-            entry.dose_lux_h, entry.damage_wh_m2, entry.settled = line.dose_lux_h, line.damage_wh_m2, True
+            entry.dose_lux_h, entry.damage_wh_m2, entry.is_settled = line.dose_lux_h, line.damage_wh_m2, True
             return
         entry = Entry(line.t, "unknown", line.dose_lux_h, line.damage_wh_m2)
     elif isinstance(line, LightPlanned):
-        entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, settled=False)
+        entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, is_settled=False)
         history.of_plan[line.id] = entry
     else:
         entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, line.note)

@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
-def read(run: Path) -> dict[str, str]:
+def read_checksums(run: Path) -> dict[str, str]:
     """SHA-256 by path in the run; empty without a manifest. Raises StorageError for a line that is none."""
     path = run / NAME
     try:
@@ -70,12 +70,12 @@ def open_for_session(run: Path, complete_views: Iterable[str]) -> None:
     """Take out what a session may write, before it begins. `complete_views` are files of views that it will not
     open."""
     kept_names = set(complete_views)
-    forget(run, [name for name in read(run) if _written_by_sessions(name) and name not in kept_names])
+    forget(run, [name for name in read_checksums(run) if _written_by_sessions(name) and name not in kept_names])
 
 
 def forget(run: Path, names: Iterable[str]) -> None:
     """Take files out of the list before they change. Nothing happens without a manifest."""
-    digests, forgotten_names = read(run), set(names)
+    digests, forgotten_names = read_checksums(run), set(names)
     if forgotten_names & digests.keys():
         _write(run, {name: digest for name, digest in digests.items() if name not in forgotten_names})
 
@@ -93,7 +93,7 @@ def enter(
     """Hash these files at low priority and list them; `on_read` is called after every 4 MiB. Raises
     StorageError."""
     entered_names = list(names)
-    digests = read(run)
+    digests = read_checksums(run)
     stop = threading.Event()
     with ThreadPoolExecutor(1, "manifest", initializer=_yield_to_others) as hashing:
         try:
@@ -130,7 +130,7 @@ def problems(
     run: Path, progress: Progress = lambda done, total: None, *, only: AbstractSet[str] | None = None
 ) -> dict[str, str]:
     """Say what is wrong with each listed file (of `only` these) that is missing or has changed, by its name."""
-    digests, messages = read(run), {}
+    digests, messages = read_checksums(run), {}
     digests = {name: digest for name, digest in digests.items() if only is None or name in only}
     for count, (name, digest) in enumerate(digests.items()):
         progress(count, len(digests))
@@ -144,14 +144,14 @@ def problems(
     return messages
 
 
-def unlisted(run: Path) -> list[str]:
+def unlisted_files(run: Path) -> list[str]:
     """Files that the manifest does not cover (yet)."""
-    digests = read(run)
+    digests = read_checksums(run)
     return [name for name in files(run) if name not in digests]
 
 
-def _write(run: Path, listed: dict[str, str]) -> None:
-    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(listed.items()))
+def _write(run: Path, checksums: dict[str, str]) -> None:
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(checksums.items()))
     try:
         write_synced(run / NAME, text)
     except OSError as error:

@@ -39,40 +39,40 @@ def pack12(
     return packed_bytes
 
 
-def unpack12(packed: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint16]:
+def unpack12(packed_bytes: NDArray[np.uint8], order: Order = "lsb") -> NDArray[np.uint16]:
     """Pixels [2 n / 3] of n bytes that `pack12` or a camera made. Raises ValueError unless 3 divides n."""
-    if packed.size % 3:
-        raise ValueError(f"expected a multiple of 3 bytes, found {packed.size}")
-    pixels = np.empty(packed.size // 3 * 2, np.uint16)
-    _unpack(np.ascontiguousarray(packed).reshape(-1), pixels, order == "msb")
+    if packed_bytes.size % 3:
+        raise ValueError(f"expected a multiple of 3 bytes, found {packed_bytes.size}")
+    pixels = np.empty(packed_bytes.size // 3 * 2, np.uint16)
+    _unpack(np.ascontiguousarray(packed_bytes).reshape(-1), pixels, order == "msb")
     return pixels
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack(pixels, packed, msb_first):  # type: ignore[no-untyped-def]
+def _pack(pixels, packed_bytes, msb_first):  # type: ignore[no-untyped-def]
     """Returns the bitwise or of all pixels."""
     all_bits = np.uint16(0)
-    for pair in range(len(packed) // 3):
+    for pair in range(len(packed_bytes) // 3):
         a, b = pixels[2 * pair], pixels[2 * pair + 1]
         all_bits |= a | b
         if msb_first:
-            packed[3 * pair] = a >> 4
-            packed[3 * pair + 1] = (a & 0xF) << 4 | b >> 8
-            packed[3 * pair + 2] = b & 0xFF
+            packed_bytes[3 * pair] = a >> 4
+            packed_bytes[3 * pair + 1] = (a & 0xF) << 4 | b >> 8
+            packed_bytes[3 * pair + 2] = b & 0xFF
         else:
-            packed[3 * pair] = a & 0xFF
-            packed[3 * pair + 1] = (b & 0xF) << 4 | a >> 8
-            packed[3 * pair + 2] = b >> 4
+            packed_bytes[3 * pair] = a & 0xFF
+            packed_bytes[3 * pair + 1] = (b & 0xF) << 4 | a >> 8
+            packed_bytes[3 * pair + 2] = b >> 4
     return all_bits
 
 
 @numba.njit(cache=True, nogil=True)
-def _unpack(packed, pixels, msb_first):  # type: ignore[no-untyped-def]
-    for pair in range(len(packed) // 3):
+def _unpack(packed_bytes, pixels, msb_first):  # type: ignore[no-untyped-def]
+    for pair in range(len(packed_bytes) // 3):
         first, middle, last = (
-            np.uint16(packed[3 * pair]),
-            np.uint16(packed[3 * pair + 1]),
-            np.uint16(packed[3 * pair + 2]),
+            np.uint16(packed_bytes[3 * pair]),
+            np.uint16(packed_bytes[3 * pair + 1]),
+            np.uint16(packed_bytes[3 * pair + 2]),
         )
         if msb_first:
             pixels[2 * pair] = first << 4 | middle >> 4

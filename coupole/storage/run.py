@@ -81,7 +81,7 @@ class Run:
         return Run(folder)
 
     @property
-    def created(self) -> datetime:
+    def created_at(self) -> datetime:
         return datetime.fromisoformat(self.about["created"])
 
     @property
@@ -112,7 +112,7 @@ class Run:
         return leds_by_view
 
     @property
-    def simulated(self) -> bool:
+    def is_simulated(self) -> bool:
         """True if its frames come from a simulated cell."""
         return bool(self.about["simulated"])
 
@@ -124,7 +124,9 @@ class Run:
 
     def proven(self) -> dict[ShotId, FrameProven]:
         """Proven shots, by the journal."""
-        return {event.shot: event for event in journal.read(self.journal_path) if isinstance(event, FrameProven)}
+        return {
+            event.shot: event for event in journal.read_events(self.journal_path) if isinstance(event, FrameProven)
+        }
 
     def lock(self) -> int:
         """Lock the run for this process. Raises InputError if another process acquires into it."""
@@ -141,7 +143,7 @@ class Run:
         return fd
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
+    def hold_lock(self) -> Iterator[None]:
         """The lock while the context lasts."""
         fd = self.lock()
         try:
@@ -181,8 +183,8 @@ class Run:
         """The rig, likewise."""
         return self._input("rig")
 
-    def _input(self, what: str) -> Path:
-        record = self.about[what]
+    def _input(self, kind: str) -> Path:
+        record = self.about[kind]
         return self.folder / record["stored"] if "stored" in record else Path(record["path"])
 
     @property
@@ -204,7 +206,10 @@ class Run:
         """Raise InputError unless plan, rig and the files they name mean what those meant that the run began
         with."""
         if changes := changes_since(self.about, self.folder, inputs):
-            own_files = {RUN_JSON, *(name for name in manifest.read(self.folder) if name.startswith("inputs/"))}
+            own_files = {
+                RUN_JSON,
+                *(name for name in manifest.read_checksums(self.folder) if name.startswith("inputs/")),
+            }
             if altered_files := manifest.problems(self.folder, only=own_files):
                 raise InputError(
                     f"{self.folder}: cannot be resumed, because the run's own files were changed after it began: "
@@ -233,7 +238,7 @@ def _settled_bytes(view_file: Path) -> int:
     from coupole.storage import frame_file
 
     layout = frame_file.read_layout(view_file)
-    return layout.frames * layout.frame_bytes if layout.archived else view_file.stat().st_blocks * 512
+    return layout.frames * layout.frame_bytes if layout.is_archived else view_file.stat().st_blocks * 512
 
 
 def user_name() -> str:

@@ -48,7 +48,7 @@ class Inputs:
 
     plan: Path
     rig: Path
-    others: tuple[Path, ...]
+    other_files: tuple[Path, ...]
     """LED table, mesh, calibration records."""
     arm: ArmDescription | None = None
     """The arm in force, whatever names it."""
@@ -60,7 +60,7 @@ class Inputs:
 
 def copied_s(inputs: Inputs) -> float:
     """Time for the copies of a new run on a disk that is slow."""
-    return sum(path.stat().st_size for path in inputs.others if path.is_file()) / _SLOWEST_BYTES_S
+    return sum(path.stat().st_size for path in inputs.other_files if path.is_file()) / _SLOWEST_BYTES_S
 
 
 def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
@@ -69,19 +69,22 @@ def keep(inputs: Inputs, run: Path) -> dict[str, Any]:
     keeper = _Keeper(run, inputs.files, inputs.copy_large)
     make_folder(run / FOLDER)
     plan_and_rig = {
-        kind: {**_described(path, inputs.files), "text": _text(path, inputs.files), "stored": copy}
+        kind: {**_path_and_hash(path, inputs.files), "text": _text(path, inputs.files), "stored": copy}
         for kind, path, copy in (("plan", inputs.plan, PLAN), ("rig", inputs.rig, RIG))
     }
     write_synced(run / PLAN, keeper.plan_text(inputs))
     write_synced(run / RIG, keeper.rig_text(inputs))
-    other_paths = {path.absolute() for path in inputs.others}
-    files = [{**_described(path, inputs.files), "stored": keeper.file(path, "others")} for path in inputs.others]
+    other_paths = {path.absolute() for path in inputs.other_files}
+    files = [
+        {**_path_and_hash(path, inputs.files), "stored": keeper.file(path, "others")}
+        for path in inputs.other_files
+    ]
     files += [
-        {**_described(path, inputs.files), "stored": copy}
-        for path, copy in keeper.stored.items()
+        {**_path_and_hash(path, inputs.files), "stored": copy}
+        for path, copy in keeper.stored_places.items()
         if path not in other_paths and path in inputs.files
     ]
-    for folder in {run / FOLDER, *((run / copy).parent for copy in keeper.stored.values() if copy)}:
+    for folder in {run / FOLDER, *((run / copy).parent for copy in keeper.stored_places.values() if copy)}:
         sync_folder(folder)
     arm = {} if inputs.arm is None else {"arm_sha256": _arm_sha256(inputs.arm)}
     return {**plan_and_rig, **arm, "files": files}
@@ -92,7 +95,7 @@ def _arm_sha256(arm: ArmDescription) -> str:
     return hashlib.sha256(arm.model_dump_json(exclude={"link_meshes"}).encode()).hexdigest()
 
 
-def _described(path: Path, files: InputFiles) -> dict[str, str]:
+def _path_and_hash(path: Path, files: InputFiles) -> dict[str, str]:
     return {"path": str(path), "sha256": files.sha256(path)}
 
 
@@ -100,7 +103,7 @@ def _text(path: Path, files: InputFiles) -> str:
     return files.read_bytes(path).decode("utf-8").replace("\r\n", "\n")
 
 
-def _read(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
+def _read_model(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
     """A plan or rig and its model; None if it is none."""
     try:
         document = yamlfile.read(path, files)
@@ -116,17 +119,17 @@ class _Keeper:
     run: Path
     files: InputFiles
     copy_large: bool
-    stored: dict[Path, str | None] = field(default_factory=dict)
+    stored_places: dict[Path, str | None] = field(default_factory=dict)
     """Place in the run, by absolute path; None for a file that is too large."""
 
     def plan_text(self, inputs: Inputs) -> str:
-        plan_file = _read(inputs.plan, self.files, Plan)
+        plan_file = _read_model(inputs.plan, self.files, Plan)
         if plan_file is None:
             return _text(inputs.plan, self.files)
         return self._with_copies(*plan_file, {("rig",): Path(RIG).name})
 
     def rig_text(self, inputs: Inputs) -> str:
-        rig_file = _read(inputs.rig, self.files, Rig)
+        rig_file = _read_model(inputs.rig, self.files, Rig)
         if rig_file is None:
             return _text(inputs.rig, self.files)
         changes: dict[KeyPath, str] = {}
@@ -159,23 +162,23 @@ class _Keeper:
     def file(self, path: Path, folder: str) -> str | None:
         """Copy a file into a folder of `inputs`; None if it is too large, or not there."""
         path = path.absolute()
-        if path not in self.stored:
+        if path not in self.stored_places:
             if not self.files.there(path) or (
                 len(self.files.read_bytes(path)) > MOST_COPIED_BYTES and not self.copy_large
             ):
-                self.stored[path] = None
+                self.stored_places[path] = None
             else:
                 name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)
-                self.stored[path] = self._new_place(f"{FOLDER}/{folder}", name)
-                self._write(path, str(self.stored[path]))
-        return self.stored[path]
+                self.stored_places[path] = self._new_place(f"{FOLDER}/{folder}", name)
+                self._write(path, str(self.stored_places[path]))
+        return self.stored_places[path]
 
-    def _write(self, path: Path, stored: str) -> None:
-        make_folder((self.run / stored).parent)
-        write_synced(self.run / stored, self.files.read_bytes(path))
+    def _write(self, path: Path, place: str) -> None:
+        make_folder((self.run / place).parent)
+        write_synced(self.run / place, self.files.read_bytes(path))
 
     def _new_place(self, folder: str, name: str) -> str:
-        taken_places = set(self.stored.values())
+        taken_places = set(self.stored_places.values())
         places = (
             f"{folder}/{name}" if n == 1 else f"{folder}/{n}/{name}" for n in range(1, len(taken_places) + 2)
         )
@@ -189,7 +192,7 @@ class _Keeper:
             for name in _files_of_record(path, self.files):
                 beside = self.run / Path(copy).with_name(name)
                 if not beside.exists():
-                    self.stored[(path.parent / name).absolute()] = str(Path(copy).with_name(name))
+                    self.stored_places[(path.parent / name).absolute()] = str(Path(copy).with_name(name))
                     self._write(path.parent / name, str(Path(copy).with_name(name)))
         return copy
 
@@ -209,7 +212,7 @@ class _Keeper:
             link_meshes = beside or (str(arm.link_meshes) if arm.link_meshes else None)
             changes: dict[KeyPath, str] = {("link_meshes",): link_meshes} if link_meshes else {}
             text = rewritten(source, source.text, changes)
-            self.stored[source.path.absolute()] = place
+            self.stored_places[source.path.absolute()] = place
         else:
             shipped_arm = arm.model_copy(update={"link_meshes": Path(beside) if beside else arm.link_meshes})
             text = shipped_arm.model_dump_json(indent=1, exclude_none=True) + "\n"
@@ -251,7 +254,7 @@ def changes_since(about: Mapping[str, Any], run: Path, now: Inputs) -> list[str]
     }
     changes += [
         f"{path} is another file"
-        for path in now.others
+        for path in now.other_files
         if now.files.sha256(path) not in before and _meaning(path, now.files) not in before
     ]
     if now.arm is not None and arm_known and about["arm_sha256"] != _arm_sha256(now.arm):
@@ -264,7 +267,7 @@ def _changes_of(
     path: Path,
     files: InputFiles,
     model: type[Plan] | type[Rig],
-    what: str,
+    kind: str,
     apart: Set[str] = frozenset(),
 ) -> Iterator[str]:
     if files.sha256(path) == before["sha256"]:
@@ -272,11 +275,11 @@ def _changes_of(
     try:
         then = yamlfile.parse(Path(before["path"]), _plain(before["text"])).validate(model)
     except InputError:
-        yield f"the {what} {path} is another file, and the old one is not understood any more"
+        yield f"the {kind} {path} is another file, and the old one is not understood any more"
         return
     now = yamlfile.read(path, files).validate(model)
     if changes := differences(then, now, apart):
-        yield f"the {what} {path}: {'; '.join(changes)}"
+        yield f"the {kind} {path}: {'; '.join(changes)}"
 
 
 def _plain(text: str) -> str:

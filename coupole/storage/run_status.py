@@ -113,7 +113,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     per_view = Counter(shot.view for shot in shots)
     in_use = run.in_use if in_use is None else in_use
     proven = set()
-    events = list(journal.read(run.journal_path))
+    events = list(journal.read_events(run.journal_path))
     status.dose_lux_h = run_dose.highest_lux_h(events)
     for event in events:
         if isinstance(event, FrameProven):
@@ -169,7 +169,7 @@ def _note_event(found: Status, event: Event) -> None:
     session.ended = event.t
 
 
-def _seconds(begun: str, ended: str) -> float:
-    if not begun or not ended:
+def _seconds(begin_time: str, end_time: str) -> float:
+    if not begin_time or not end_time:
         return 0.0
-    return (datetime.fromisoformat(ended) - datetime.fromisoformat(begun)).total_seconds()
+    return (datetime.fromisoformat(end_time) - datetime.fromisoformat(begin_time)).total_seconds()

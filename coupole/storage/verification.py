@@ -23,7 +23,7 @@ class Verification:
     bad: list[str] = field(default_factory=list)
     """One line for each error."""
     missing: list[str] = field(default_factory=list)
-    listed: int = 0
+    listed_count: int = 0
     """Files of the manifest, each read and compared."""
     unlisted: list[str] = field(default_factory=list)
     """Files that the manifest does not cover yet."""
@@ -44,9 +44,11 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     by_file: dict[str, list[FrameProven]] = {}
     for frame in proven.values():
         by_file.setdefault(frame.file, []).append(frame)
-    lines = Counter(event.shot for event in journal.read(run.journal_path) if isinstance(event, FrameProven))
+    lines = Counter(
+        event.shot for event in journal.read_events(run.journal_path) if isinstance(event, FrameProven)
+    )
     result.bad += [f"{shot}: proven {n} times in the journal" for shot, n in lines.items() if n > 1]
-    plan = _planned(run, result)
+    plan = _read_as_planned(run, result)
     count = 0
     for name, frames in sorted(by_file.items()):
         path = run.folder / name
@@ -72,12 +74,12 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     result.bad += [
         problem for name, problem in manifest.problems(run.folder).items() if name not in reported_files
     ]
-    result.listed = len(manifest.read(run.folder))
-    result.unlisted = manifest.unlisted(run.folder)
+    result.listed_count = len(manifest.read_checksums(run.folder))
+    result.unlisted = manifest.unlisted_files(run.folder)
     return result
 
 
-def _planned(run: Run, result: Verification) -> AsPlanned | None:
+def _read_as_planned(run: Run, result: Verification) -> AsPlanned | None:
     try:
         plan = as_planned(run)
     except InputError as error:
@@ -87,12 +89,12 @@ def _planned(run: Run, result: Verification) -> AsPlanned | None:
     return plan
 
 
-def _other_than_planned(planned: AsPlanned | None, record: Any, poses: Any, frame: FrameProven) -> str:
-    if planned is None:
+def _other_than_planned(run_plan: AsPlanned | None, record: Any, poses: Any, frame: FrameProven) -> str:
+    if run_plan is None:
         return ""
     if record["pose"] >= len(poses):
         return f"{frame.shot}: its record names a pose that the file does not have"
-    return planned.problem(frame.shot, record, poses[record["pose"]])
+    return run_plan.problem(frame.shot, record, poses[record["pose"]])
 
 
 def _frame_problem(path: Path, layout: frame_file.Layout, table: Any, frame: FrameProven) -> str:

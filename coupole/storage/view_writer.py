@@ -47,7 +47,7 @@ class ViewWriter:
         Raises StorageError if the file was archived."""
         self.path = path
         self._layout = read_layout(path)
-        if self._layout.archived:
+        if self._layout.is_archived:
             raise StorageError(
                 f"{path}: is archived, so nothing can be written into it. Only complete views are archived: "
                 "see with `coupole verify` whether the journal lost lines."
@@ -58,7 +58,7 @@ class ViewWriter:
         self._free = deque(slot for slot in range(self._layout.frames) if slot not in taken_slots)
         self._packed: queue.SimpleQueue[mmap.mmap] = queue.SimpleQueue()
         """Memory to pack frames in, page-aligned as direct writing requires."""
-        if self._layout.packed:
+        if self._layout.is_packed:
             from coupole.storage.packing import pack12
 
             self._pack12 = pack12
@@ -102,7 +102,7 @@ class ViewWriter:
         self._poses += 1
         return self._poses - 1
 
-    def put(self, pixels: NDArray[np.uint16], *, frame_id: int, camera_ns: int, exposure_us: int) -> int:
+    def store(self, pixels: NDArray[np.uint16], *, frame_id: int, camera_ns: int, exposure_us: int) -> int:
         """Write a frame into a free slot and record it as stored but not proven; returns the slot."""
         try:
             with self._lock:
@@ -124,7 +124,7 @@ class ViewWriter:
     @contextlib.contextmanager
     def _as_stored(self, pixels: NDArray[np.uint16]) -> Iterator[memoryview]:
         """A frame's bytes in the file's format, valid within the context."""
-        if not self._layout.packed:
+        if not self._layout.is_packed:
             yield pixels.data.cast("B")
             return
         try:

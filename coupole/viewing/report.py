@@ -42,7 +42,7 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
 
 
 def _page(run: Run, found: Status) -> str:
-    events = list(journal.read(run.journal_path))
+    events = list(journal.read_events(run.journal_path))
     views = sampled_views(run, (event for event in events if isinstance(event, FrameProven)))
     object_coverage = _coverage(run, views)
     lines = told.troubles(events, views, found)
@@ -61,7 +61,7 @@ def _page(run: Run, found: Status) -> str:
         "technical": ("Devices and software", told.technical(run, events, found)),
     }
     parts = {name: part for name, part in sections.items() if part[1]}
-    remark = "<p>Simulated: no real light, no real object.</p>" if run.simulated else ""
+    remark = "<p>Simulated: no real light, no real object.</p>" if run.is_simulated else ""
     glance = facts(_glance(run, found, views, object_coverage, lines))
     body = "".join(section(name, *part) for name, part in parts.items())
     head = f"<header><h1>{text(run.folder.name)}</h1>{remark}</header>"
@@ -107,7 +107,7 @@ def _glance(
 
 def _exposure_in_words(run: Run, views: Sequence[SampledView]) -> str:
     verdicts = exposure_in_words(views)
-    return f"{verdicts}{' (by simulated light)' if run.simulated else ''}" if verdicts else "no picture yet"
+    return f"{verdicts}{' (by simulated light)' if run.is_simulated else ''}" if verdicts else "no picture yet"
 
 
 def _plans_budget_lux_h(run: Run) -> float | None:

@@ -19,7 +19,7 @@ class Features(Protocol):
 
     def first_of(self, *names: str) -> str | None: ...
 
-    def read(self, name: str) -> Value: ...
+    def read_value(self, name: str) -> Value: ...
 
     def number(self, name: str) -> float: ...
 
@@ -34,10 +34,10 @@ class Features(Protocol):
     def write_all(self, values: Mapping[str, Value]) -> None: ...
 
 
-def alike(held: Value, wanted: Value) -> bool:
-    """True if `held`, read back, is the value that was set, within the rounding of cameras."""
-    if isinstance(held, bool) != isinstance(wanted, bool):
+def alike(readback: Value, setting: Value) -> bool:
+    """True if `readback`, read back, is the value that was set, within the rounding of cameras."""
+    if isinstance(readback, bool) != isinstance(setting, bool):
         return False
-    if isinstance(held, float) and not isinstance(wanted, str):
-        return math.isclose(held, wanted, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
-    return held == wanted
+    if isinstance(readback, float) and not isinstance(setting, str):
+        return math.isclose(readback, setting, rel_tol=_READBACK_TOLERANCE, abs_tol=1e-9)
+    return readback == setting

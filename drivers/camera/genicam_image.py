@@ -16,11 +16,11 @@ from drivers.camera.genicam_trigger import set_trigger
 from drivers.camera.pixel_formats import FORMATS, PixelFormat, pixels_in_a_group
 
 
-def set_up(features: Features, settings: GenICamSettings, *, triggered: bool) -> dict[str, str]:
+def set_up(features: Features, settings: GenICamSettings, *, is_triggered: bool) -> dict[str, str]:
     """Bring a camera that was just opened into its state, whatever it was left in; returns what was read back.
 
     First the driver's table, then the rig's features in their order, the region, the pixel format and, if frames
-    are `triggered`, the trigger. Raises DeviceRefused, naming the feature that does not take its value.
+    are `is_triggered`, the trigger. Raises DeviceRefused, naming the feature that does not take its value.
     """
     state = State(features, settings)
     state.apply(AT_OPENING)
@@ -32,7 +32,7 @@ def set_up(features: Features, settings: GenICamSettings, *, triggered: bool) ->
     else:
         state.use_whole_sensor()
     features.write("PixelFormat", settings.pixel_format)
-    if triggered:
+    if is_triggered:
         set_trigger(state, features, settings, by_edges=True)
     state.note(*settings.features, *settings.leave)
     state.note_all()
@@ -55,7 +55,7 @@ def _set_region(features: Features, region: Region) -> None:
 
 def pixel_format(features: Features, device: str) -> PixelFormat:
     """The camera's present pixel format. Raises DeviceRefused for one that the driver does not support."""
-    name = str(features.read("PixelFormat"))
+    name = str(features.read_value("PixelFormat"))
     if name not in FORMATS:
         raise DeviceRefused(
             device,

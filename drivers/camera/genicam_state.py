@@ -123,10 +123,10 @@ class State:
 
     def set(self, name: str, value: Value, entry: str = "") -> None:
         """Set a feature, unless it holds the value already, and keep what it then holds."""
-        read_back = self._features.read(name)
+        read_back = self._features.read_value(name)
         if not alike(read_back, value):
             self._features.write(name, value)
-            read_back = self._features.read(name)
+            read_back = self._features.read_value(name)
         self.held[f"{name}[{entry}]" if entry else name] = str(read_back)
 
     def select(self, selector: str, entry: str) -> None:
@@ -138,7 +138,7 @@ class State:
         """Keep what these features hold, where the camera has them."""
         for name in names:
             if self._features.has(name):
-                self.held[name] = str(self._features.read(name))
+                self.held[name] = str(self._features.read_value(name))
 
     def note_all(self) -> None:
         """Keep what is worth knowing beside what was set."""
@@ -154,10 +154,10 @@ class State:
             for entry in sorted(entries, key=lambda entry: entry == entry_in_use):
                 self._features.write(selector, entry)
                 if self._features.has(switch):
-                    self.set(switch, self._switched(switch, on=entry == entry_in_use), entry)
+                    self.set(switch, self._switch_value(switch, on=entry == entry_in_use), entry)
 
-    def _switched(self, name: str, *, on: bool) -> Value:
-        if isinstance(self._features.read(name), bool):
+    def _switch_value(self, name: str, *, on: bool) -> Value:
+        if isinstance(self._features.read_value(name), bool):
             return on
         return "On" if on else "Off"
 
@@ -218,13 +218,13 @@ class State:
                 self.note(name)
                 return
             value = fitting[0] if fitting else value
-        self.set(name, _typed(value, self._features.read(name)), entry)
+        self.set(name, _in_type_of(value, self._features.read_value(name)), entry)
 
 
-def _typed(value: Value, held: Value) -> Value:
+def _in_type_of(value: Value, readback: Value) -> Value:
     """A number in the type in which the camera has the feature."""
-    if isinstance(value, float) and isinstance(held, int) and math.isfinite(value):
+    if isinstance(value, float) and isinstance(readback, int) and math.isfinite(value):
         return int(value)
-    if isinstance(value, bool) and not isinstance(held, bool) and isinstance(held, int | str):
-        return ("On" if value else "Off") if isinstance(held, str) else int(value)
+    if isinstance(value, bool) and not isinstance(readback, bool) and isinstance(readback, int | str):
+        return ("On" if value else "Off") if isinstance(readback, str) else int(value)
     return value

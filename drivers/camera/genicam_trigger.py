@@ -38,7 +38,7 @@ def frame_id_range(features: Features, *, gige: bool) -> tuple[int, int]:
     if not gige:
         return (0, _LAST_WIDE_ID)
     extended_id_feature = "GevGVSPExtendedIDMode"
-    wide = features.has(extended_id_feature) and features.read(extended_id_feature) in {"On", True}
+    wide = features.has(extended_id_feature) and features.read_value(extended_id_feature) in {"On", True}
     return (1, _LAST_WIDE_ID if wide else 65535)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from coupole.errors import DeviceRefused
 
 
-def misused(device: str, expected: str, happened: str) -> DeviceRefused:
+def misuse_error(device: str, expectation: str, observation: str) -> DeviceRefused:
     """The error to raise; `device` is the camera's name in the rig."""
     return DeviceRefused(
         device,
-        expected=expected,
-        happened=happened,
+        expected=expectation,
+        happened=observation,
         remedy="This is a fault of the program that drives the camera.",
     )

@@ -170,7 +170,7 @@ class LedBox:
 
     def _await_end(self, on_s: float, deadline: Deadline) -> StepRecord:
         while self.running():
-            if deadline.expired:
+            if deadline.has_expired:
                 raise DeviceTimeout(
                     self._settings.name,
                     expected=f"a light of {on_s:.3f} s to end within {deadline.seconds:.1f} s",
@@ -180,7 +180,7 @@ class LedBox:
             self._clock.sleep(on_s / 10)
         records = self.poll_log()
         if len(records) != 1:
-            self._scpi.unexpected("one record in the log of a table with one step", f"{len(records)} came")
+            self._scpi.raise_unexpected("one record in the log of a table with one step", f"{len(records)} came")
         return StepRecord(*records[0].tolist())
 
     def lights_off(self) -> None:
@@ -220,7 +220,7 @@ class LedBox:
             return None
         (switch_state,) = self._scpi.ask("INP:ENAB?", 1)
         if switch_state not in ("0", "1"):
-            self._scpi.unexpected("0 or 1 in the answer to INPut:ENABle?", repr(switch_state))
+            self._scpi.raise_unexpected("0 or 1 in the answer to INPut:ENABle?", repr(switch_state))
         return switch_state == "1"
 
     def close(self) -> None:
@@ -264,7 +264,7 @@ class LedBox:
             (text,) = self._scpi.ask("*RST;*CLS;*IDN?", 1)
         fields = str(text).split(",")
         if len(fields) != 4:
-            self._scpi.unexpected("four fields in the answer to *IDN?", repr(text))
+            self._scpi.raise_unexpected("four fields in the answer to *IDN?", repr(text))
         vendor, model, serial, firmware = fields
         return Identity(vendor, model, serial, firmware, simulated=serial.startswith("SIM"))
 
@@ -357,41 +357,41 @@ class LedBox:
         state, index, log = self._scpi.ask(command, 3, reply_bytes=limit * RECORD_BYTES)
         self._note_state(str(state))
         if not isinstance(log, bytes):
-            self._scpi.unexpected("a block of log records", repr(log))
+            self._scpi.raise_unexpected("a block of log records", repr(log))
         try:
             records = unpack_log(log, self._started)
         except ValueError as error:
-            self._scpi.unexpected(f"the log of a table of {len(self._started)} steps", str(error))
+            self._scpi.raise_unexpected(f"the log of a table of {len(self._started)} steps", str(error))
         finished_count = int(self._scpi.number(index))
         if finished_count > len(self._started) or self._next_record + len(records) > len(self._started):
-            self._scpi.unexpected(f"at most {len(self._started)} records", f"the box claims {finished_count}")
+            self._scpi.raise_unexpected(f"at most {len(self._started)} records", f"{finished_count} are claimed")
         steps = np.arange(self._next_record, self._next_record + len(records))
         wrong = (records["step"] != steps) | (records["led"] != self._started["led"][steps])
         if wrong.any():
             first = int(np.flatnonzero(wrong)[0])
-            self._scpi.unexpected(f"the log's record of step {steps[first]}", f"{records[first]} came")
+            self._scpi.raise_unexpected(f"the log's record of step {steps[first]}", f"{records[first]} came")
         self._next_record += len(records)
         return self._next_record < finished_count, records
 
     def _note_state(self, state: str) -> bool:
         if state not in ("IDLE", "RUN", "ABORTED", "FAULT"):
-            self._scpi.unexpected("IDLE, RUN, ABORTED or FAULT", repr(state))
+            self._scpi.raise_unexpected("IDLE, RUN, ABORTED or FAULT", repr(state))
         if state == "FAULT" or (state == "ABORTED" and self._running_bank is not None):
             self._raise_fault(f"the burst ended in state {state}")
         if state != "RUN":
             self._running_bank = None
         return state == "RUN"
 
-    def _raise_fault(self, what: str) -> NoReturn:
+    def _raise_fault(self, observation: str) -> NoReturn:
         raise DeviceFault(
             self._settings.name,
             expected="a box without fault",
-            happened=what,
+            happened=observation,
             remedy="Find the cause, then open the box anew: that resets the fault.",
         )
 
-    def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
-        raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
+    def _refuse(self, expectation: str, observation: str, remedy: str) -> NoReturn:
+        raise DeviceRefused(self._settings.name, expected=expectation, happened=observation, remedy=remedy)
 
 
 def _block(payload: bytes) -> bytes:

@@ -61,7 +61,7 @@ class ScpiSession:
             units = self._exchange(message, command_text, seconds, clears)
             self._raise_errors(units[-1], command_text, clears)
         if len(units) != replies + 1:
-            self.unexpected(f"{replies} replies to {command_text}", f"{len(units) - 1} came")
+            self.raise_unexpected(f"{replies} replies to {command_text}", f"{len(units) - 1} came")
         return tuple(units[:-1])
 
     @contextlib.contextmanager
@@ -86,29 +86,29 @@ class ScpiSession:
         try:
             self._link.device_clear()
         except ConnectionError as error:
-            raise self._lost("a device clear", error) from error
+            raise self._loss("a device clear", error) from error
 
     def number(self, unit: Unit) -> float:
         """A response unit that must be a decimal number."""
         try:
             return float(unit)
         except ValueError:
-            self.unexpected("a number", f"{unit!r} came")
+            self.raise_unexpected("a number", f"{unit!r} came")
 
-    def unexpected(self, expected: str, happened: str) -> NoReturn:
+    def raise_unexpected(self, expectation: str, observation: str) -> NoReturn:
         """Raise DeviceError for an invalid reply; before the next message the line is cleared."""
         self._in_step = None
         raise DeviceError(
             self._name,
-            expected=expected,
-            happened=happened,
+            expected=expectation,
+            happened=observation,
             remedy="Check the line for interference, and the firmware against the protocol's reference.",
         )
 
     def close(self) -> None:
         self._link.close()
 
-    def _exchange(self, message: bytes, shown: str, seconds: float, clears: int) -> list[Unit]:
+    def _exchange(self, message: bytes, message_text: str, seconds: float, clears: int) -> list[Unit]:
         link = self._link
         try:
             if self._in_step != clears:
@@ -117,34 +117,34 @@ class ScpiSession:
             self._in_step = None
             deadline = Deadline(self._clock, seconds)
             link.write(message, deadline, clears)
-            units = _read_response(lambda: link.read(deadline, clears))
+            units = _read_response(lambda: link.read_bytes(deadline, clears))
             self._in_step = clears
         except Cleared as cleared:
-            raise CallEnded(self._name, shown) from cleared
+            raise CallEnded(self._name, message_text) from cleared
         except TimeoutError as error:
             raise DeviceTimeout(
                 self._name,
-                expected=f"an answer to {shown} within {seconds:.2f} s",
+                expected=f"an answer to {message_text} within {seconds:.2f} s",
                 happened=str(error),
                 remedy=f"Check that the device at {self._port} has power and the rig's baud rate, then resume.",
             ) from error
         except ConnectionError as error:
-            raise self._lost(f"an answer to {shown}", error) from error
+            raise self._loss(f"an answer to {message_text}", error) from error
         except ValueError as error:
-            self.unexpected(f"a SCPI response to {shown}", str(error))
+            self.raise_unexpected(f"a SCPI response to {message_text}", str(error))
         return units
 
-    def _lost(self, expected: str, error: Exception) -> DeviceLost:
+    def _loss(self, expectation: str, error: Exception) -> DeviceLost:
         return DeviceLost(
             self._name,
-            expected=expected,
+            expected=expectation,
             happened=str(error),
             remedy=f"Check the cable at {self._port} and the device's power, then resume.",
         )
 
-    def _raise_errors(self, unit: Unit, shown: str, clears: int) -> None:
+    def _raise_errors(self, unit: Unit, message_text: str, clears: int) -> None:
         """Empty the device's error queue, whose first entry is `unit`, and raise if it holds errors."""
-        errors = [self._error(unit, shown)]
+        errors = [self._error(unit, message_text)]
         while errors[-1][0] and len(errors) <= _MOST_ERRORS:
             units = self._exchange(b"SYST:ERR?\n", "SYST:ERR?", REPLY_MARGIN_S, clears)
             errors.append(self._error(units[-1], "SYST:ERR?"))
@@ -153,29 +153,29 @@ class ScpiSession:
         kind = DeviceFault if any(code > 0 for code, _ in errors) else DeviceRefused
         raise kind(
             self._name,
-            expected=f"{shown} to be executed",
+            expected=f"{message_text} to be executed",
             happened="; ".join(f"{code} {text}" for code, text in errors if code),
             remedy="Find and correct what the device names"
             + ("; reopening it resets the fault." if kind is DeviceFault else "."),
         )
 
-    def _error(self, unit: Unit, shown: str) -> tuple[int, str]:
+    def _error(self, unit: Unit, message_text: str) -> tuple[int, str]:
         try:
             return _error_of(unit)
         except ValueError as error:
-            self.unexpected(f"the error state after {shown}", str(error))
+            self.raise_unexpected(f"the error state after {message_text}", str(error))
 
 
-def _read_response(read: Callable[[], bytes]) -> list[Unit]:
-    """The units of one response line; `read` returns the next bytes at each call.
+def _read_response(receive: Callable[[], bytes]) -> list[Unit]:
+    """The units of one response line; `receive` returns the next bytes at each call.
 
-    Raises ValueError for an invalid response; errors of `read` are raised unchanged.
+    Raises ValueError for an invalid response; errors of `receive` are raised unchanged.
     """
     data = bytearray()
 
     def at_least(count: int) -> None:
         while len(data) < count:
-            data.extend(read())
+            data.extend(receive())
 
     units: list[Unit] = []
     while True:
@@ -193,7 +193,7 @@ def _read_response(read: Callable[[], bytes]) -> list[Unit]:
             while end is None:
                 if len(data) > _MAX_TEXT_BYTES:
                     raise ValueError(f"{len(data)} bytes came without an end: {bytes(data[:40])!r}...")
-                data.extend(read())
+                data.extend(receive())
                 end = _text_end(data)
             units.append(data[:end].decode("ascii"))
             del data[:end]

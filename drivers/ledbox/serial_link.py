@@ -49,7 +49,7 @@ class SerialLink:
         self._gate = threading.Lock()
         """Held for the moment of one write, and to begin a device clear: no byte of an exchange follows it."""
         self._is_socket, self._hung_up = url.startswith("socket://"), False
-        self._port: Any = self._opened()
+        self._port: Any = self._open_port()
 
     def write(self, data: bytes, deadline: Deadline, clears: int) -> None:
         """Send all of `data`."""
@@ -65,14 +65,14 @@ class SerialLink:
                     continue
             except self._lost as error:
                 raise self._failure(error, clears) from error
-            if deadline.expired:
+            if deadline.has_expired:
                 raise TimeoutError(f"{len(rest)} of {len(data)} bytes could not be sent")
 
-    def read(self, deadline: Deadline, clears: int) -> bytes:
+    def read_bytes(self, deadline: Deadline, clears: int) -> bytes:
         """Read at least one byte, and all others that have arrived."""
         while True:
             self._refuse_closed(clears)
-            late = deadline.expired  # read first: bytes that arrived in time are accepted even if read late
+            late = deadline.has_expired  # read first: bytes that arrived in time are accepted even if read late
             try:
                 data: bytes = self._port.read(max(1, self._port.in_waiting))
             except self._lost as error:
@@ -120,8 +120,8 @@ class SerialLink:
             self._connect_again()
         deadline, clears = Deadline(self._clock, _DRAIN_S), self.clears
         with contextlib.suppress(TimeoutError):
-            while not deadline.expired:
-                self.read(Deadline(self._clock, _QUIET_S), clears)
+            while not deadline.has_expired:
+                self.read_bytes(Deadline(self._clock, _QUIET_S), clears)
 
     def close(self) -> None:
         """Release the port; a second call does nothing."""
@@ -136,7 +136,7 @@ class SerialLink:
         if connection is not None:
             connection.close()  # pyserial 3.5 does not, if the other side of a socket:// has hung up
 
-    def _opened(self) -> Any:
+    def _open_port(self) -> Any:
         import serial
 
         own_port = {} if "://" in self._url else {"exclusive": True}
@@ -167,9 +167,9 @@ class SerialLink:
             if not self._url:
                 raise ConnectionError("the port was closed")
             try:
-                self._port, self._hung_up = self._opened(), False
+                self._port, self._hung_up = self._open_port(), False
             except ConnectionError:
-                if deadline.expired:
+                if deadline.has_expired:
                     raise
                 self._clock.sleep(_QUIET_S)
             else:

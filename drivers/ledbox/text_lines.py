@@ -119,7 +119,7 @@ class _Flash:
     sent_ns: int
     """Rig time at which its command was sent: it cannot have begun earlier."""
     deadline: Deadline
-    ended: threading.Event = field(default_factory=threading.Event)
+    end_event: threading.Event = field(default_factory=threading.Event)
     """Set before the command that ends the light is sent."""
     off_ns: int | None = None
     """Rig time at which the box confirmed that command; None until then."""
@@ -197,7 +197,7 @@ class TextLineBox:
         """False once the flash's time is over, even if the thread that ends it is late: the box may have ended
         it by itself."""
         flash = self._flash
-        return flash is not None and not flash.ended.is_set() and not flash.deadline.expired
+        return flash is not None and not flash.end_event.is_set() and not flash.deadline.has_expired
 
     def end_flash(self) -> StepRecord:
         """End the flash now, if its time has not ended it. `on_us`: from the command to the box's confirmation."""
@@ -233,7 +233,7 @@ class TextLineBox:
         self._link.end_exchanges()
         with self._lock:
             if self._flash is not None:
-                self._flash.ended.set()
+                self._flash.end_event.set()
             for _ in range(_ENDED_AT_ONCE):
                 with contextlib.suppress(CallEnded):  # by another thread's lights_off: say it again
                     self._all_off()
@@ -267,20 +267,20 @@ class TextLineBox:
     def _watch(self, flash: _Flash) -> None:
         """End a flash when its time is over. Runs in its own thread."""
         ends = self._ends
-        while not flash.deadline.expired:
-            if flash.ended.wait(_LOOK_S):
+        while not flash.deadline.has_expired:
+            if flash.end_event.wait(_LOOK_S):
                 return
         with self._lock:
-            if not flash.ended.is_set():
+            if not flash.end_event.is_set():
                 with contextlib.suppress(DeviceError):  # kept in flash.failure, for the caller
                     self._end(ends)
 
     def _end(self, ends: int) -> None:
         """End the present flash, if it has not ended."""
         flash = self._flash
-        if flash is None or flash.ended.is_set():
+        if flash is None or flash.end_event.is_set():
             return
-        flash.ended.set()
+        flash.end_event.set()
         try:
             if flash.led != NO_LED:
                 settings = self._settings
@@ -335,13 +335,13 @@ class TextLineBox:
                 self._in_step = False
                 self._refuse(
                     f"silence before `{line}`",
-                    f"the box said `{_shown(stray_bytes)}` unasked",
+                    f"the box said `{_printable(stray_bytes)}` unasked",
                     "Check whether it has restarted, and whether it answers each command with one line.",
                 )
             self._in_step = False
             deadline = Deadline(self._clock, seconds)
             link.write(data, deadline, clears)
-            reply = read_reply(lambda: link.read(deadline, clears), settings.line_ending)
+            reply = read_reply(lambda: link.read_bytes(deadline, clears), settings.line_ending)
             self._in_step = True
         except Cleared as cleared:
             raise CallEnded(settings.name, f"`{line}`") from cleared
@@ -363,31 +363,31 @@ class TextLineBox:
             self._refuse(f"one line in answer to `{line}`", str(error), "Make the box answer with one short line.")
         return reply
 
-    def _refuse(self, expected: str, happened: str, remedy: str) -> NoReturn:
-        raise DeviceRefused(self._settings.name, expected=expected, happened=happened, remedy=remedy)
+    def _refuse(self, expectation: str, observation: str, remedy: str) -> NoReturn:
+        raise DeviceRefused(self._settings.name, expected=expectation, happened=observation, remedy=remedy)
 
 
-def read_reply(read: Callable[[], bytes], line_ending: str) -> str:
-    """One line of a box's reply, without its ending; `read` returns the next bytes at each call.
+def read_reply(receive: Callable[[], bytes], line_ending: str) -> str:
+    """One line of a box's reply, without its ending; `receive` returns the next bytes at each call.
 
     Raises ValueError for a line that is too long, or followed by more bytes; TimeoutError, with the bytes
-    received, if `read` raises it.
+    received, if `receive` raises it.
     """
     ending = b"\r" if line_ending == "cr" else b"\n"
     data = b""
     while ending not in data:
         if len(data) > _LONGEST_REPLY_BYTES:
-            raise ValueError(f"{len(data)} bytes came without an end: `{_shown(data[:40])}`...")
+            raise ValueError(f"{len(data)} bytes came without an end: `{_printable(data[:40])}`...")
         try:
-            data += read()
+            data += receive()
         except TimeoutError as error:
-            raise TimeoutError(f"only `{_shown(data)}` came" if data else str(error)) from error
+            raise TimeoutError(f"only `{_printable(data)}` came" if data else str(error)) from error
     line, _, rest = data.partition(ending)
     if rest.strip():
-        raise ValueError(f"it said `{_shown(data)}`")
-    return _shown(line.strip())
+        raise ValueError(f"it said `{_printable(data)}`")
+    return _printable(line.strip())
 
 
-def _shown(data: bytes) -> str:
+def _printable(data: bytes) -> str:
     """The box's reply with unprintable bytes escaped."""
     return data.decode("ascii", "backslashreplace").replace("\r", "\\r").replace("\n", "\\n")

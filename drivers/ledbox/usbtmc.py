@@ -78,7 +78,7 @@ class UsbtmcLink:
             except self._usb_error as error:
                 raise self._failure(ConnectionError(str(error)), clears) from error
 
-    def read(self, deadline: Deadline, clears: int) -> bytes:
+    def read_bytes(self, deadline: Deadline, clears: int) -> bytes:
         """The payload of one DEV_DEP_MSG_IN transfer; a response may take several."""
         self._refuse_cleared(clears)
         if self._requested_tag is None:
@@ -149,7 +149,7 @@ class UsbtmcLink:
     def _read_bulk(self, deadline: Deadline, clears: int) -> bytes:
         while True:
             self._refuse_cleared(clears)
-            late = deadline.expired
+            late = deadline.has_expired
             try:
                 return bytes(self._device.read(self._in, _HEADER.size + _MAX_IN_BYTES + 4, _LOOK_MS))
             except self._usb_timeout as error:

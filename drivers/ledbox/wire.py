@@ -56,7 +56,7 @@ def pack(table: NDArray[np.void]) -> bytes:
     return steps.tobytes()
 
 
-def unpack_log(log: bytes, started: NDArray[np.void]) -> NDArray[np.void]:
+def unpack_log(log: bytes, step_table: NDArray[np.void]) -> NDArray[np.void]:
     """Records (STEP_RECORD_DTYPE [k]) of a log received for the started table (STEP_DTYPE [n]).
 
     Raises ValueError for incomplete records, and for records of steps that the table does not have.
@@ -64,8 +64,8 @@ def unpack_log(log: bytes, started: NDArray[np.void]) -> NDArray[np.void]:
     if len(log) % RECORD_BYTES:
         raise ValueError(f"{len(log)} bytes came, not a multiple of {RECORD_BYTES}")
     raw = np.frombuffer(log, _RECORD)
-    if np.any(raw["step"] >= len(started)):
-        raise ValueError(f"a record of step {raw['step'].max()} came, of a table of {len(started)}")
+    if np.any(raw["step"] >= len(step_table)):
+        raise ValueError(f"a record of step {raw['step'].max()} came, of a table of {len(step_table)}")
     records = np.zeros(len(raw), STEP_RECORD_DTYPE)
     status = raw["status"]
     lit = raw["led"] != _NO_LED
@@ -75,7 +75,7 @@ def unpack_log(log: bytes, started: NDArray[np.void]) -> NDArray[np.void]:
     records["led_open"] = (status & _LED_OPEN) != 0
     records["over_temperature"] = (status & _OVER_TEMPERATURE) != 0
     records["waited"] = (status & _WAITED) != 0
-    records["on_us"] = np.where(lit, started["on_us"][raw["step"]], 0)
+    records["on_us"] = np.where(lit, step_table["on_us"][raw["step"]], 0)
     records["t_on_ns"] = raw["t_on_ns"]
     records["t_trigger_ns"] = np.where(records["edge_sent"], raw["t_trigger_ns"].astype(np.int64), UNKNOWN_NS)
     records["board_temperature_c"] = raw["board_temperature_dc"] / 10

@@ -27,10 +27,10 @@ class CannotBegin(Exception):
     """Carries a `Failure` to the driver."""
 
     def __init__(
-        self, kind: Literal["refused", "fault", "lost"], expected: str, happened: str, remedy: str
+        self, kind: Literal["refused", "fault", "lost"], expectation: str, observation: str, remedy: str
     ) -> None:
-        self.failure = Failure(kind, expected, happened, remedy)
-        super().__init__(happened)
+        self.failure = Failure(kind, expectation, observation, remedy)
+        super().__init__(observation)
 
 
 class Dashboard:

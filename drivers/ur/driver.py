@@ -27,7 +27,7 @@ from coupole.devices import ArmCondition, ArmState, Identity
 from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
 from coupole.supervision import ATTENTION_S, LOOK_S, Attention
-from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refused, wait_for
+from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refusal, wait_for
 from drivers.fair_lock import FairLock
 from drivers.ur.messages import (
     BACKDRIVE,
@@ -140,13 +140,13 @@ class UrRobot:
             self.close()
             raise
 
-    def _check_model(self, reported: str) -> None:
+    def _check_model(self, reported_model: str) -> None:
         """Plans are computed for one arm model; no other must run them. The dashboard calls a UR10e `UR10`."""
-        if reported.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
+        if reported_model.lower().removesuffix("e") != self.settings.model.removesuffix("e"):
             raise DeviceRefused(
                 "robot",
                 expected=f"a {self.settings.model.upper().replace('E', 'e')}, as the rig has it",
-                happened=f"the controller says that it moves a {reported}",
+                happened=f"the controller says that it moves a {reported_model}",
                 remedy="Correct `model` in the robot's settings, and `arm`, if the rig names one",
             )
 
@@ -179,7 +179,7 @@ class UrRobot:
         self._lapses = state.lapses
         raise_fault(state)
         if state.speed_fraction <= 0.0:
-            raise refused("a speed slider above 0 %", "it is at 0 %: the arm will not move")
+            raise refusal("a speed slider above 0 %", "it is at 0 %: the arm will not move")
         turn_deg = float(np.max(np.abs(np.subtract(target_deg, state.joints_deg))))
         # A moving arm brakes first, and may turn away from the target while it does.
         turn_deg += self.settings.speed_deg_s * self.settings.stop_s
@@ -189,9 +189,9 @@ class UrRobot:
         settings, number = self.settings, self._number
         settle_s = settings.settle_samples / settings.frequency_hz
         deadline = Deadline(self._clock, 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0)
-        self._wait(lambda state: self._settled(state, number), deadline, "the arm at its target and still")
+        self._wait(lambda state: self._is_settled(state, number), deadline, "the arm at its target and still")
         self._clock.sleep(settings.dwell_s)
-        self._wait(lambda state: self._settled(state, number), deadline, "the arm still after the dwell")
+        self._wait(lambda state: self._is_settled(state, number), deadline, "the arm still after the dwell")
         return self.measured()
 
     def measured(self) -> ArmState:
@@ -264,13 +264,13 @@ class UrRobot:
             return self._process.ask(Ask("state", looks=self._attention.look() is not None))
 
     def _wait(
-        self, done: Callable[[State], bool], deadline: Deadline, expected: str, *, faults: bool = True
+        self, is_done: Callable[[State], bool], deadline: Deadline, expectation: str, *, faults: bool = True
     ) -> None:
         wait_for(
             self._state,
-            done,
+            is_done,
             deadline,
-            expected,
+            expectation,
             check=raise_fault if faults else None,
             pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
@@ -280,7 +280,7 @@ class UrRobot:
             remedy="See the controller's messages; its speed slider must not be moved during a motion",
         )
 
-    def _settled(self, state: State, number: int) -> bool:
+    def _is_settled(self, state: State, number: int) -> bool:
         if self._number != number:
             raise overtaken()
         if state.lapses != self._lapses:

@@ -129,7 +129,7 @@ class Link:
             self._looked_s = time.monotonic()
         if ask.verb == "state" or self.state.fault:
             return
-        stands = self._settled()
+        stands = self._is_settled()
         self.state = replace(self.state, command=ask.number, still_samples=0)
         self._quiet_samples, self._goal_deg = 0, None
         if ask.verb == "move" and ask.target_deg is not None and stands:
@@ -140,7 +140,7 @@ class Link:
 
     def _attend(self) -> None:
         """Brake if nobody has looked at a motion for too long (`coupole.supervision`)."""
-        pursues = self._pending_deg is not None or (self._goal_deg is not None and not self._settled())
+        pursues = self._pending_deg is not None or (self._goal_deg is not None and not self._is_settled())
         if pursues and time.monotonic() - self._looked_s > self.config.attention_s:
             self.state = replace(self.state, lapses=self.state.lapses + 1, still_samples=0)
             self._quiet_samples, self._goal_deg, self._pending_deg = 0, None, None
@@ -150,13 +150,13 @@ class Link:
         """Bring the arm to rest and end the program. A hang here ends the process by SIGALRM."""
         signal.alarm(_LEAVE_S)
         self.obey(Ask("stop", self.state.command))
-        while not self.state.fault and not self._settled():
+        while not self.state.fault and not self._is_settled():
             time.sleep(1.0 / self.config.frequency_hz)
             self.tick()
         if not self.state.lost:
             end_program(self.config.host)
 
-    def _settled(self) -> bool:
+    def _is_settled(self) -> bool:
         return self.state.still_samples >= self.config.settle_samples
 
     def _start(self, target_deg: Six, share: float) -> None:
@@ -185,11 +185,11 @@ class Link:
         age_s = now_s - self._changed_s
         if not (self._receive.isConnected() and self._control.isConnected()):
             end_program(self.config.host)
-            self._latch("link lost: the controller closed it", lost=True)
+            self._latch("link lost: the controller closed it", is_lost=True)
             return
         if timestamp_s == self._timestamp_s:
             if age_s > self.config.link_timeout_s:
-                self._latch(f"link lost: no sample for {age_s:.2f} s", lost=True)
+                self._latch(f"link lost: no sample for {age_s:.2f} s", is_lost=True)
             return
         self._timestamp_s, self._changed_s = timestamp_s, now_s
         joints_deg, wanted_deg = _degrees(self._receive.getActualQ()), _degrees(self._receive.getTargetQ())
@@ -230,11 +230,11 @@ class Link:
         elif self._ended_samples >= _NAMING_SAMPLES:
             self._latch(why_ended(config.host))
 
-    def _latch(self, fault: str, *, lost: bool = False) -> None:
+    def _latch(self, fault: str, *, is_lost: bool = False) -> None:
         """Latch a fault: no more commands; the program is ended, so that no acknowledgement resumes a motion."""
         self._goal_deg = self._pending_deg = None
-        self.state = replace(self.state, fault=fault, lost=lost)
-        if not lost:
+        self.state = replace(self.state, fault=fault, lost=is_lost)
+        if not is_lost:
             end_program(self.config.host)
 
 

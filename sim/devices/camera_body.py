@@ -89,7 +89,7 @@ class Shot:
     timestamp_ns: int
     deliver_ns: int
     """World time at which its readout ends."""
-    rendered: bool
+    is_rendered: bool
     ready: bool = False
 
 
@@ -264,7 +264,7 @@ class CameraBody:
         is_rendered = every > 0 and number % every == 0
         shot = Shot(slot, frame_id, stamp_ns, end_ns + self.readout_ns, is_rendered)
         self._pending.append(shot)
-        if not shot.rendered or (self._settings.render_once and slot in self.pictured):
+        if not shot.is_rendered or (self._settings.render_once and slot in self.pictured):
             shot.ready = True
             self._reactor.at(shot.deliver_ns, self.deliver)
             return
@@ -288,8 +288,8 @@ class CameraBody:
             wait([working], _RENDER_PATIENCE_S)
             self.deliver()
 
-    def _work(self, shot: Shot, exposed: Exposed) -> None:
-        self._render(self._wire.pixels(shot.slot), exposed)
+    def _work(self, shot: Shot, exposure: Exposed) -> None:
+        self._render(self._wire.pixels(shot.slot), exposure)
         shot.ready = True
         self._reactor.call_threadsafe(self.deliver)
 

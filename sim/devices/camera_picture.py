@@ -21,7 +21,7 @@ class PictureSettings:
     binning: tuple[int, int] = (1, 1)
     decimation: tuple[int, int] = (1, 1)
     """Across and down."""
-    mirrored: tuple[bool, bool] = (False, False)
+    mirror_axes: tuple[bool, bool] = (False, False)
     """Left to right, and top to bottom."""
     gamma: float = 1.0
     inverts: bool = False
@@ -45,9 +45,9 @@ def read_out(frame: NDArray[np.uint16], settings: PictureSettings, white_dn: int
     image = image[::every_row, ::every_column]
     left_px, top = settings.left_px, settings.top_px
     image = image[top : top + settings.height_px, left_px : left_px + settings.width_px]
-    if settings.mirrored[0]:
+    if settings.mirror_axes[0]:
         image = image[:, ::-1]
-    if settings.mirrored[1]:
+    if settings.mirror_axes[1]:
         image = image[::-1]
     if settings.balance != (1.0, 1.0):
         image = image.copy()

@@ -65,7 +65,7 @@ _COMMAND: TypeAdapter[_Configure | _Arm | _Plain] = TypeAdapter(
 """Commands that a client may send."""
 
 
-def _received(client: socket.socket, size: int) -> bytes:
+def _receive_message(client: socket.socket, size: int) -> bytes:
     """The next message; empty if the client is gone. (Killed with unread messages, it resets the connection.)"""
     try:
         return client.recv(size)
@@ -104,7 +104,7 @@ class CameraServer:
         reactor.add_reader(self._listener, self._accept)
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         return self._body.armed
 
     # -- the wire (see sim.devices.camera_body.Wire) --------------------------------------------------------------
@@ -126,7 +126,7 @@ class CameraServer:
         if self._stream is None:
             return False
         try:
-            self._stream.send(FRAME_MESSAGE.pack(shot.slot, shot.frame_id, shot.timestamp_ns, shot.rendered))
+            self._stream.send(FRAME_MESSAGE.pack(shot.slot, shot.frame_id, shot.timestamp_ns, shot.is_rendered))
         except BlockingIOError:
             self._reactor.after(1e-3, self._body.deliver)
             return False
@@ -148,7 +148,7 @@ class CameraServer:
     def _welcome(self, client: socket.socket) -> None:
         """A new client has said what it wants."""
         self._reactor.remove_reader(client)
-        purpose = _received(client, 64)
+        purpose = _receive_message(client, 64)
         if purpose == b"control" and self._control is None:
             self._control = client
             self._reactor.add_reader(client, self._on_command)
@@ -165,7 +165,7 @@ class CameraServer:
 
     def _on_command(self) -> None:
         assert self._control is not None
-        data = _received(self._control, 4096)
+        data = _receive_message(self._control, 4096)
         if not data:
             self._drop_control()
             return
@@ -252,7 +252,7 @@ class CameraServer:
     def _take_slots_back(self) -> None:
         while self._stream is not None:
             try:
-                data = _received(self._stream, SLOT_MESSAGE.size)
+                data = _receive_message(self._stream, SLOT_MESSAGE.size)
             except BlockingIOError:
                 return
             if not data:

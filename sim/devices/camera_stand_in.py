@@ -32,7 +32,7 @@ class CameraStandIn(Protocol):
     """Numbers of frames (counted from power-on) whose transfer is lost."""
 
     @property
-    def armed(self) -> bool: ...
+    def is_armed(self) -> bool: ...
 
     def edge(self, t_ns: int) -> None:
         """A rising edge on the trigger line at world time `t_ns`."""

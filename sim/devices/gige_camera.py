@@ -225,7 +225,7 @@ class GigeCamera:
         return self._body.ready()
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         return self._body.armed
 
     # -- what the client wrote ----------------------------------------------------------------------------
@@ -364,7 +364,7 @@ class GigeCamera:
             height_px=integer(reg.HEIGHT),
             binning=(integer(reg.BINNING_X), integer(reg.BINNING_Y)),
             decimation=(integer(reg.DECIMATION_X), integer(reg.DECIMATION_Y)),
-            mirrored=(bool(integer(reg.REVERSE_X)), bool(integer(reg.REVERSE_Y))),
+            mirror_axes=(bool(integer(reg.REVERSE_X)), bool(integer(reg.REVERSE_Y))),
             gamma=real(reg.GAMMA) if integer(reg.GAMMA_ENABLE) else 1.0,
             inverts=bool(integer(reg.LUT_ENABLE)),
             balance=(real(reg.BALANCE_RATIO), real(reg.BALANCE_RATIO + 8)),

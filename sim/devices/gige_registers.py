@@ -79,7 +79,7 @@ class Registers:
     def __init__(self, memory: memoryview) -> None:
         self._memory = memory
 
-    def read(self, address: int, size: int) -> bytes:
+    def read_bytes(self, address: int, size: int) -> bytes:
         return bytes(self._memory[address : address + size])
 
     def write(self, address: int, data: bytes) -> None:
@@ -120,7 +120,7 @@ class Writable:
     step: int = 0
     size: int = 4
     """8: a float."""
-    locked: bool = False
+    is_locked: bool = False
     """Not while the camera acquires."""
     most: Callable[[Registers], float] | None = None
     """Upper limit that depends on other registers."""
@@ -136,7 +136,7 @@ class Writable:
 
 
 def _image(low: int, step: int, most: Callable[[Registers], float]) -> Writable:
-    return Writable(low, math.inf, step, locked=True, most=most)
+    return Writable(low, math.inf, step, is_locked=True, most=most)
 
 
 def _real(low: float, high: float, most: Callable[[Registers], float] | None = None) -> Writable:
@@ -144,7 +144,7 @@ def _real(low: float, high: float, most: Callable[[Registers], float] | None = N
 
 
 _ANY, _SWITCH = Writable(0, 2**32 - 1), Writable(0, 1)
-_LOCKED_SWITCH, _FACTOR = Writable(0, 1, locked=True), Writable(1, 2, locked=True)
+_LOCKED_SWITCH, _FACTOR = Writable(0, 1, is_locked=True), Writable(1, 2, is_locked=True)
 _GAIN, _RATIO = _real(0.0, 24.0), _real(0.125, 8.0)
 WRITABLE: dict[int, Writable] = {
     HEARTBEAT_MS: Writable(500, 2**32 - 1),
@@ -157,7 +157,7 @@ WRITABLE: dict[int, Writable] = {
     HEIGHT: _image(8, 2, lambda held: held.highest() - held.integer(OFFSET_Y)),
     OFFSET_X: _image(0, 4, lambda held: held.widest() - held.integer(WIDTH)),
     OFFSET_Y: _image(0, 2, lambda held: held.highest() - held.integer(HEIGHT)),
-    PIXEL_FORMAT: Writable(0, 2**32 - 1, locked=True, among=PIXEL_FORMATS),
+    PIXEL_FORMAT: Writable(0, 2**32 - 1, is_locked=True, among=PIXEL_FORMATS),
     BINNING_X: _FACTOR,
     BINNING_Y: _FACTOR,
     DECIMATION_X: _FACTOR,
@@ -165,7 +165,7 @@ WRITABLE: dict[int, Writable] = {
     REVERSE_X: _LOCKED_SWITCH,
     REVERSE_Y: _LOCKED_SWITCH,
     TEST_PATTERN: _SWITCH,
-    ACQUISITION_MODE: Writable(CONTINUOUS, MULTI_FRAME, locked=True),
+    ACQUISITION_MODE: Writable(CONTINUOUS, MULTI_FRAME, is_locked=True),
     ACQUISITION: _SWITCH,
     FRAME_COUNT: Writable(1, 65535),
     FRAME_RATE_ENABLE: _SWITCH,
@@ -206,7 +206,7 @@ def refusal(registers: Registers, address: int, data: bytes) -> int:
     if not 0 <= address <= REGISTER_BYTES - len(data):
         return INVALID_ADDRESS
     rule = WRITABLE.get(address)
-    if rule is None or (rule.locked and registers.integer(ACQUISITION)):
+    if rule is None or (rule.is_locked and registers.integer(ACQUISITION)):
         return WRITE_PROTECTED
     if len(data) != rule.size:
         return BAD_ALIGNMENT

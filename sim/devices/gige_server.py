@@ -78,7 +78,7 @@ class _Image:
     timestamp_ns: int
     width: int
     height: int
-    left: int
+    left_px: int
     top: int
     pixel_format: int
     size: int
@@ -163,12 +163,12 @@ class GigeServer:
     def _obey(self, command: int, content: bytes, client: tuple[str, int]) -> tuple[int, bytes]:
         """Status and content of the acknowledgement."""
         if command == _DISCOVERY:
-            return reg.DONE, self._registers.read(0, _DISCOVERY_BYTES)
+            return reg.DONE, self._registers.read_bytes(0, _DISCOVERY_BYTES)
         if command == _READ_REGISTERS and content and len(content) % 4 == 0:
             return self._read_all([address for (address,) in struct.iter_unpack(">I", content)])
         if command == _READ_MEMORY and len(content) == 8:
             address, _, count = struct.unpack(">IHH", content)
-            status, data = self._read(address, count)
+            status, data = self._read_registers(address, count)
             return status, content[:4] + data if status == reg.DONE else b""
         if command == _WRITE_REGISTERS and content and len(content) % 8 == 0:
             write_count = 0
@@ -187,13 +187,13 @@ class GigeServer:
     def _read_all(self, addresses: list[int]) -> tuple[int, bytes]:
         content = b""
         for address in addresses:
-            status, data = self._read(address, 4)
+            status, data = self._read_registers(address, 4)
             if status != reg.DONE:
                 return status, content
             content += data
         return reg.DONE, content
 
-    def _read(self, address: int, count: int) -> tuple[int, bytes]:
+    def _read_registers(self, address: int, count: int) -> tuple[int, bytes]:
         if address % 4 or count % 4:
             return reg.BAD_ALIGNMENT, b""
         if not 0 < count <= _MOST_BYTES:
@@ -203,7 +203,7 @@ class GigeServer:
             return reg.DONE, self._description[start : start + count].ljust(count, b"\0")
         if address > reg.REGISTER_BYTES - count:
             return reg.INVALID_ADDRESS, b""
-        return reg.DONE, self._registers.read(address, count)
+        return reg.DONE, self._registers.read_bytes(address, count)
 
     def _write(self, address: int, data: bytes, client: tuple[str, int]) -> int:
         """Write a register for a client; returns the status."""
@@ -278,7 +278,7 @@ class GigeServer:
                 image.pixel_format,
                 image.width,
                 image.height,
-                image.left,
+                image.left_px,
                 image.top,
                 0,
                 0,
@@ -298,7 +298,7 @@ class GigeServer:
             self._transmit(struct.pack(">HHI", 0, frame_id, kind << 24 | number), content)
 
     def _transmit(self, *parts: bytes | memoryview) -> None:
-        host = socket.inet_ntoa(self._registers.read(reg.HOST_ADDRESS, 4))
+        host = socket.inet_ntoa(self._registers.read_bytes(reg.HOST_ADDRESS, 4))
         port = self._registers.integer(reg.HOST_PORT)
         with contextlib.suppress(OSError):  # nobody listens there
             self._stream.sendmsg(parts, [], 0, (host, port))

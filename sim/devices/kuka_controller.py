@@ -187,15 +187,15 @@ class KukaController:
             values = None
         if values is None:
             self._delay += 1
-            self._refusals.refused("a cycle without an answer in time", f"delay counter {self._delay}")
+            self._refusals.note_refusal("a cycle without an answer in time", f"delay counter {self._delay}")
             if self._delay >= self._settings.delay_limit:
                 self._stop_axes(f"KSS29002: {self._delay} late answers", _Does.WAIT, self._settings.restart_s)
                 return
         elif self._settings.delay_counts == "consecutive":
             self._delay = 0
         target_deg, fault = self._corrections.take(values)
-        if self._corrections.clamped:
-            self._refusals.refused("a correction is clamped", self._corrections.clamped)
+        if self._corrections.clamp_text:
+            self._refusals.note_refusal("a correction is clamped", self._corrections.clamp_text)
         if fault := fault or self._axes.follow(target_deg, self._reactor.now_ns):
             self._stop_axes(fault, _Does.REST, 0.0)
         elif self._end_requested and values is not None:
@@ -222,16 +222,16 @@ class KukaController:
                 return None
             answer = self._read_answer(data)
             if not isinstance(answer, Answer):
-                self._refusals.refused(*answer)
+                self._refusals.note_refusal(*answer)
             elif answer.ipoc != expected_ipoc:
-                self._refusals.refused(
+                self._refusals.note_refusal(
                     "an answer with another IPOC than that of the last packet is ignored",
                     f"{answer.ipoc}, expected {expected_ipoc}",
                 )
             else:
                 self._end_requested = answer.stops
                 if answer.remark:
-                    self._refusals.refused(answer.remark)
+                    self._refusals.note_refusal(answer.remark)
                 return answer.values
 
     def _patience_s(self) -> float:
@@ -251,7 +251,7 @@ class KukaController:
             while not isinstance(answer, Answer) or answer.ipoc <= self._ended_ipoc:
                 answer = self._read_answer(self._socket.recv(4096))
                 if not isinstance(answer, Answer):
-                    self._refusals.refused(*answer)
+                    self._refusals.note_refusal(*answer)
         if isinstance(answer, Answer) and answer.ipoc > self._ended_ipoc:
             self.fault = ""
             self._does = _Does.FOLLOW
@@ -267,7 +267,7 @@ class KukaController:
 
     def _stop_axes(self, fault: str, then: _Does, seconds: float) -> None:
         """End the session: brake, then stop sending (REST) or resume sending (WAIT) `seconds` from now."""
-        self._refusals.refused("RSI stops", fault)
+        self._refusals.note_refusal("RSI stops", fault)
         self.fault = self.fault or fault
         self._brake(then, seconds)
 

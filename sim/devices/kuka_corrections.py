@@ -40,7 +40,7 @@ class Corrections:
         self._last = _NOTHING
 
     @property
-    def clamped(self) -> str:
+    def clamp_text(self) -> str:
         """Values to which the last correction was clamped, as text; empty if it was applied as it came."""
         axis_names: str = self._sum.clamped
         return axis_names
@@ -97,23 +97,23 @@ class _PoseSum:
     def replace(self, values: Axes6) -> str:
         return self._lead(np.array(values[:3]), _rotation(values))
 
-    def _lead(self, moved_mm: NDArray[np.float64], turned: NDArray[np.float64]) -> str:
+    def _lead(self, moved_mm: NDArray[np.float64], rotation: NDArray[np.float64]) -> str:
         limits = self._limits
         wanted_mm = moved_mm
         moved_mm = np.clip(moved_mm, -limits.pose_clamp_mm, limits.pose_clamp_mm)
         self.clamped = "" if np.array_equal(moved_mm, wanted_mm) else f"to {np.round(moved_mm, 1).tolist()} mm"
-        vector = rotation_vector(turned)
+        vector = rotation_vector(rotation)
         angle_deg = float(np.degrees(np.linalg.norm(vector)))
         if angle_deg > limits.pose_clamp_deg:
-            angle_deg, turned = limits.pose_clamp_deg, turn(_unit(vector), limits.pose_clamp_deg)
+            angle_deg, rotation = limits.pose_clamp_deg, turn(_unit(vector), limits.pose_clamp_deg)
             self.clamped = f"to a turn of {angle_deg:g} deg"
         if not np.linalg.norm(moved_mm) <= limits.pose_monitor_mm or not angle_deg <= limits.pose_monitor_deg:
             return f"POSCORRMON: correction by {np.round(moved_mm, 1).tolist()} mm, {angle_deg:.1f} deg"
-        if np.array_equal(moved_mm, self._moved_mm) and np.array_equal(turned, self._turned):
+        if np.array_equal(moved_mm, self._moved_mm) and np.array_equal(rotation, self._turned):
             return ""
-        self._moved_mm, self._turned = moved_mm, turned
+        self._moved_mm, self._turned = moved_mm, rotation
         base_from_flange = np.eye(4)
-        base_from_flange[:3, :3] = turned @ self._start[:3, :3]
+        base_from_flange[:3, :3] = rotation @ self._start[:3, :3]
         base_from_flange[:3, 3] = self._start[:3, 3] + moved_mm
         axes_deg = joints_near(base_from_flange, self.axes_deg)
         if axes_deg is None:

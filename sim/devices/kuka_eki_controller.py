@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coupole.geometry import Transform, abc_from_rotation
 from sim.devices.kuka_eki_wire import ASK, BEAT, MOVE, Command, Messages
 from sim.devices.kuka_kinematics import AXIS_LIMITS_DEG, AXIS_SPEEDS_DEG_S, PoseErrors, flange_pose
-from sim.devices.kuka_ptp import Motion, braked, point_to_point, standing
+from sim.devices.kuka_ptp import Motion, braking_motion, point_to_point, standing
 from sim.strangers.arm_stranger import NO_STRANGER, ArmStranger
 from sim.world.pushes import Pushes
 from sim.world.reactor import Reactor, Timer
@@ -321,7 +321,7 @@ class KukaEkiController:
     def _brake(self, acceleration_deg_s2: float, jerk_deg_s3: float) -> None:
         """Brake along the path; then the pending motion begins."""
         t_s = (self._reactor.now_ns - self._begun_ns) / 1e9
-        self._begin(braked(self._motion, t_s, acceleration_deg_s2, jerk_deg_s3))
+        self._begin(braking_motion(self._motion, t_s, acceleration_deg_s2, jerk_deg_s3))
 
     def _begin(self, motion: Motion) -> None:
         self._motion, self._begun_ns = motion, self._reactor.now_ns

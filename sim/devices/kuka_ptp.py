@@ -80,7 +80,7 @@ def point_to_point(
     return Motion(tuple(start_deg), line_deg, (0.0, 0.0, 0.0), (*speed_up, (cruise_s, 0.0), *slow_down))
 
 
-def braked(motion: Motion, t_s: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Motion:
+def braking_motion(motion: Motion, t_s: float, acceleration_deg_s2: float, jerk_deg_s3: float) -> Motion:
     """The same path from time `t_s` on, coming to rest as fast as the limits allow."""
     s, v, acceleration = motion.state(t_s)
     if t_s >= motion.duration_s or v <= 0.0:

@@ -46,7 +46,7 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
     ends = bool(settings.stop_tag)
     in_order = re.compile(rb"<%s " % tag + rb" ".join(rb'%s="([^"]+)"' % name for name in names) + rb"\s*/>")
 
-    def read(data: bytes) -> Answer | Unread:
+    def read_answer(data: bytes) -> Answer | Unread:
         ipoc, text = _IPOC.search(data), data[:200].decode(errors="replace")
         if ipoc is None:
             return Unread("an answer without IPOC is ignored", text)
@@ -64,7 +64,7 @@ def answer_reader(settings: Settings) -> Callable[[bytes], Answer | Unread]:
         except ValueError:
             return Unread("an answer with a correction that is no number is ignored", text)
 
-    return read
+    return read_answer
 
 
 def _finite(texts: Iterable[bytes]) -> tuple[float, ...]:

@@ -80,7 +80,7 @@ class Burst:
         self._begin(0, quartz.box_ns(reactor.now_ns) + _START_LEAD_NS, 0)
 
     @property
-    def finished(self) -> int:
+    def finished_count(self) -> int:
         """Steps whose LED went off and whose edge was sent: records in the log."""
         return len(self.log) // _LOG_RECORD.size
 
@@ -139,18 +139,18 @@ class Burst:
             self._boards.heat(led, (now_ns - on_ns) / 1e9, now_ns)
             self._lit = None
 
-    def _finish(self, done: _Done) -> None:
-        temperature_c = self._boards.temperature_of_led_c(done.led, self._reactor.now_ns)
+    def _finish(self, finished_step: _Done) -> None:
+        temperature_c = self._boards.temperature_of_led_c(finished_step.led, self._reactor.now_ns)
         too_hot = self._boards.tripped or temperature_c > self._boards.limit_c
-        status = done.status | (STATUS_OVER_TEMPERATURE if too_hot else 0)
+        status = finished_step.status | (STATUS_OVER_TEMPERATURE if too_hot else 0)
         self.log += _LOG_RECORD.pack(
-            done.step,
-            done.led,
+            finished_step.step,
+            finished_step.led,
             status,
-            done.t_on,
-            done.t_edge,
+            finished_step.t_on,
+            finished_step.t_edge,
             round(temperature_c * 10),
-            done.current_ma,
+            finished_step.current_ma,
         )
         if too_hot:
             self._end("FAULT")

@@ -215,7 +215,7 @@ class LedBoxFirmware:
             "SEQuence:COUNt?": Command(lambda: str(len(self._tables[self._bank]))),
             "SEQuence:CRC?": Command(lambda: str(zlib.crc32(self._tables[self._bank].tobytes()))),
             "SEQuence:STATe?": Command(self._state),
-            "SEQuence:INDex?": Command(lambda: str(self._burst.finished if self._burst else 0)),
+            "SEQuence:INDex?": Command(lambda: str(self._burst.finished_count if self._burst else 0)),
             "SEQuence:LOG?": Command(self._log, 2, 2),
             "TRIGger:COUNt?": Command(lambda: str(self._burst.edges if self._burst else 0)),
             "TRIGger:OUTPut:WIDTh": Command(self._set_width, 1, 1),
@@ -282,7 +282,7 @@ class LedBoxFirmware:
     def _burst_ended(self) -> None:
         if self._burst is not None and self._burst.state == "FAULT":
             board, celsius = self._boards.hottest(self._reactor.now_ns)
-            self._latch(ScpiError(102, f"board {board} at {celsius:.1f} C, step {self._burst.finished - 1}"))
+            self._latch(ScpiError(102, f"board {board} at {celsius:.1f} C, step {self._burst.finished_count - 1}"))
 
     def _set_bank(self, bank: Argument) -> None:
         self._bank = integer(bank, 0, 1)

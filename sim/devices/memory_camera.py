@@ -102,9 +102,9 @@ class MemoryCamera:
                 remedy="Restart the world.",
             ) from error
         except OSError as error:
-            raise self._lost(str(error)) from error
+            raise self._loss(str(error)) from error
         if not data:
-            raise self._lost("the connection was closed")
+            raise self._loss("the connection was closed")
         reply: dict[str, Any] = json.loads(data)
         if "error" in reply:
             raise DeviceRefused(
@@ -115,11 +115,11 @@ class MemoryCamera:
             )
         return reply, descriptors
 
-    def _lost(self, happened: str) -> DeviceLost:
+    def _loss(self, observation: str) -> DeviceLost:
         return DeviceLost(
             self._name,
             expected="a link to the camera",
-            happened=happened,
+            happened=observation,
             remedy="Check cable and power, then resume the run.",
         )
 
@@ -183,9 +183,9 @@ class MemoryCamera:
                 return None
             data = self._stream.recv(FRAME_MESSAGE.size)
         except OSError as error:
-            raise self._lost(str(error)) from error
+            raise self._loss(str(error)) from error
         if not data:
-            raise self._lost("the camera's stream was closed")
+            raise self._loss("the camera's stream was closed")
         slot, frame_id, timestamp_ns, is_rendered = FRAME_MESSAGE.unpack(data)
         return Frame(
             frame_id,

@@ -46,9 +46,9 @@ class PtyPort:
         self._timers: dict[str, Timer] = {}
         self._reading = self._sending = False
 
-    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
-        """Call `received` with bytes as they arrive, and `on_break`, if given, at a BREAK."""
-        self._received, self._on_break = received, on_break
+    def listen(self, on_bytes: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        """Call `on_bytes` with bytes as they arrive, and `on_break`, if given, at a BREAK."""
+        self._received, self._on_break = on_bytes, on_break
         fcntl.ioctl(self._master, termios.TIOCPKT, struct.pack("i", 1))
         self._wait_for_bytes()
 

@@ -25,7 +25,7 @@ class Refusals:
         self._since: dict[str, tuple[float, int]] = {}
         """Time at which each reason was last told, s, and number of times that it has occurred since."""
 
-    def refused(self, reason: str, details: str = "") -> None:
+    def note_refusal(self, reason: str, details: str = "") -> None:
         """`reason` is equal for equal mistakes; `details` are those of this occurrence."""
         now_s = time.monotonic()
         told_s, count = self._since.get(reason, (-_AGAIN_S, 0))

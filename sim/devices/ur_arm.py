@@ -113,11 +113,11 @@ class Motion:
                 return *self._place(distance, speed), True
         return self.places_deg[-1], (0.0,) * 6, False
 
-    def _place(self, gone: float, speed: float) -> tuple[Six, Six]:
-        """Joint angles and their speeds at path length `gone`."""
+    def _place(self, path_length: float, speed: float) -> tuple[Six, Six]:
+        """Joint angles and their speeds at path length `path_length`."""
         pieces = len(self.places_deg) - 1
-        piece = min(int(gone / self.length * pieces), pieces - 1)
-        share = gone / self.length * pieces - piece
+        piece = min(int(path_length / self.length * pieces), pieces - 1)
+        share = path_length / self.length * pieces - piece
         here_deg, there_deg = self.places_deg[piece : piece + 2]
         steps_deg = [b - a for a, b in zip(here_deg, there_deg, strict=True)]
         joints_deg = tuple(a + share * step for a, step in zip(here_deg, steps_deg, strict=True))

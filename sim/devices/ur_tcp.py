@@ -85,10 +85,10 @@ class TcpPort:
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection = Connection(link)
         self._connections.append(connection)
-        self._reactor.add_reader(link, lambda: self._read(connection))
+        self._reactor.add_reader(link, lambda: self._receive(connection))
         self._on_open(connection)
 
-    def _read(self, connection: Connection) -> None:
+    def _receive(self, connection: Connection) -> None:
         if connection not in self._connections:
             return  # muted or closed by a callback of the same round
         try:

@@ -63,12 +63,12 @@ def paint(
     )
 
 
-def gilt(thickness_nm: float, *, uncovered: float = 0.0, roughness: float = 0.12) -> Material:
+def gilt(thickness_nm: float, *, bare_fraction: float = 0.0, roughness: float = 0.12) -> Material:
     """Gold leaf on bole (`appearance.matter.gilding`): its specular part, and the bole visible through it.
 
-    `uncovered` is the fraction bared by holes and cracks; a roughness of 0.12 is well burnished (assumed).
+    `bare_fraction` is the fraction bared by holes and cracks; a roughness of 0.12 is well burnished (assumed).
     """
-    gilt_layers = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), bare_share=uncovered)
+    gilt_layers = gilding.gilt(indices.gold(), thickness_nm, typical.bole(), bare_share=bare_fraction)
     specular, diffuse = gilding.reflectances(gilt_layers)
     return Material(f"gold leaf, {thickness_nm:g} nm", rgb(diffuse), rgb(specular), roughness)
 

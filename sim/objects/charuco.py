@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coupole.appearance.shapes.triangles import Array, skirt
 from coupole.errors import InputError
 from sim.objects import appearance
-from sim.objects.surfaces import joined, of_material
+from sim.objects.surfaces import joined_surface, of_material
 from sim.scene.surface import Surface
 
 
@@ -42,7 +42,7 @@ def charuco_board(board: Charuco) -> Surface:
     xs_mm, ys_mm, black = cells(board)
     top = _rectangles(xs_mm, ys_mm, board.thickness_mm)
     is_black = np.repeat(black.ravel(), 2)
-    return joined(
+    return joined_surface(
         [
             of_material(top[~is_black], appearance.WHITE_PRINT),
             of_material(top[is_black], appearance.BLACK_PRINT),

@@ -13,7 +13,7 @@ import numpy as np
 from coupole.appearance.shapes.triangles import rectangle, skirt
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 from sim.objects import appearance
-from sim.objects.surfaces import joined, of_material
+from sim.objects.surfaces import joined_surface, of_material
 from sim.scene.surface import Material, Surface
 
 ROWS, COLUMNS = 4, 6
@@ -91,4 +91,4 @@ def colour_chart() -> Surface:
         patch = np.maximum(np.abs(off_x_mm), np.abs(off_y_mm)) < PATCH_MM / 2.0
         black &= ~patch
         parts.append(of_material(face[patch], Material(name, appearance.rgb(spectrum.at(WAVELENGTHS_NM)))))
-    return joined([*parts, of_material(face[black], appearance.BLACK_PRINT)])
+    return joined_surface([*parts, of_material(face[black], appearance.BLACK_PRINT)])

@@ -32,7 +32,7 @@ _NODES = 24
 @cache
 def merl_material(path: Path) -> Material:
     """Raises InputError for another kind of file."""
-    return _shown(path.stem, read_merl(path))
+    return _scene_material(path.stem, read_merl(path))
 
 
 @cache
@@ -41,7 +41,7 @@ def bsdf_material(path: Path) -> Material:
     table = read_bsdf(path)
     if table.wavelengths_nm is not None:
         table = table.seen_with(_weights_of(table.wavelengths_nm))
-    return _shown(path.stem, table if table.isotropic else _turned_to_all_sides(table))
+    return _scene_material(path.stem, table if table.isotropic else _turned_to_all_sides(table))
 
 
 @cache
@@ -57,13 +57,13 @@ def alta_material(paths: tuple[Path, ...]) -> Material:
     up = np.array([0.0, 0.0, 1.0])
     if (channels := whole(up, up).shape[-1]) != 3:
         raise InputError(f"{paths[0]}: expected one or three values in each sample; found {channels} in all")
-    return _shown(paths[0].stem, whole)
+    return _scene_material(paths[0].stem, whole)
 
 
-def _shown(name: str, made: Brdf) -> Material:
+def _scene_material(name: str, reflectance: Brdf) -> Material:
     """Return a material of the scene, with its diffuse reflectance as in `specimens.specimen`."""
-    red, green, blue = np.clip(albedo(made, np.array([np.sqrt(0.5)]), nodes=_NODES)[0], 1e-6, 1.0).tolist()
-    return Material(name, (red, green, blue), table=tabulate(made, np.eye(3)))
+    red, green, blue = np.clip(albedo(reflectance, np.array([np.sqrt(0.5)]), nodes=_NODES)[0], 1e-6, 1.0).tolist()
+    return Material(name, (red, green, blue), table=tabulate(reflectance, np.eye(3)))
 
 
 def _weights_of(wavelengths_nm: Array) -> Array:
@@ -74,11 +74,11 @@ def _weights_of(wavelengths_nm: Array) -> Array:
     return np.asarray(camera_weights(LedModel(), light.camera()) @ between.T)
 
 
-def _turned_to_all_sides(made: Brdf) -> Brdf:
+def _turned_to_all_sides(reflectance: Brdf) -> Brdf:
     angles = 2.0 * np.pi * (np.arange(_TURNS) + 0.5) / _TURNS
     turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in angles]
 
     def mean(wi: Array, wo: Array) -> Array:
-        return np.asarray(sum(made(wi @ turn, wo @ turn) for turn in turns) / len(turns))
+        return np.asarray(sum(reflectance(wi @ turn, wo @ turn) for turn in turns) / len(turns))
 
     return mean

@@ -37,11 +37,11 @@ def tabulated_finish() -> Brdf:
     of rough diffuse grains."""
     grains = typical.reflectance("dull_yellow_shape").values
 
-    def measured(wi: Array, wo: Array) -> Array:
+    def paint_brdf(wi: Array, wo: Array) -> Array:
         body = brdf.oren_nayar(wi, wo, reflectance=0.6 * grains, roughness=0.6)
         return np.asarray(body + 0.12 * brdf.cook_torrance(wi, wo, slope=0.28, fresnel=_gold))
 
-    return partial(tabulated.tabulated_brdf, table=tabulated.tabulate(measured, np.linspace(0.0, 88.0, 12)))
+    return partial(tabulated.tabulated_brdf, table=tabulated.tabulate(paint_brdf, np.linspace(0.0, 88.0, 12)))
 
 
 def layered_paint() -> Brdf:

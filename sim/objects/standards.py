@@ -9,7 +9,7 @@ from coupole.appearance.shapes.triangles import Array, disk, flat_normals, recta
 from coupole.errors import InputError
 from sim.objects import appearance
 from sim.objects.shapes import sphere
-from sim.objects.surfaces import joined, moved, of_material
+from sim.objects.surfaces import joined_surface, moved_surface, of_material
 from sim.scene.surface import Material, Surface
 
 _SEGMENTS = 48
@@ -45,7 +45,7 @@ def sticker(diameter_mm: float = 6.0, *, border_mm: float = 10.0) -> Surface:
             f"sticker: expected a disk smaller than its border, found {diameter_mm} mm in {border_mm} mm; "
             "give diameters of both"
         )
-    return joined(
+    return joined_surface(
         [
             of_material(disk(diameter_mm / 2, _SEGMENTS), appearance.RETROREFLECTIVE),
             of_material(disk(border_mm / 2, _SEGMENTS, inner_mm=diameter_mm / 2), appearance.BLACK_PRINT),
@@ -56,7 +56,7 @@ def sticker(diameter_mm: float = 6.0, *, border_mm: float = 10.0) -> Surface:
 def stuck_on(surface: Surface, poses: Array, *, diameter_mm: float = 6.0) -> Surface:
     """The surface with a flat sticker at each of `poses` [n, 4, 4]."""
     sticker_surface = sticker(diameter_mm, border_mm=diameter_mm * _BORDER)
-    return joined([surface, *(moved(sticker_surface, pose) for pose in poses)])
+    return joined_surface([surface, *(moved_surface(sticker_surface, pose) for pose in poses)])
 
 
 def sticker_poses(

@@ -14,7 +14,7 @@ from coupole.appearance.shapes.triangles import Array, flat_normals
 from sim.scene.surface import Material, Surface
 
 
-def joined(parts: Sequence[Surface]) -> Surface:
+def joined_surface(parts: Sequence[Surface]) -> Surface:
     """One surface from several, with all their materials."""
     first = np.cumsum([0, *(len(part.materials) for part in parts)])
     has_tint = any(part.tint is not None for part in parts)
@@ -43,7 +43,7 @@ def normals_of(surface: Surface) -> Array:
     return flat_normals(surface.corners_mm) if surface.normals is None else surface.normals
 
 
-def moved(surface: Surface, frame_from_surface: Array) -> Surface:
+def moved_surface(surface: Surface, frame_from_surface: Array) -> Surface:
     """The surface transformed by a rigid 4x4, mm."""
     rotation, origin = frame_from_surface[:3, :3], frame_from_surface[:3, 3]
     normals = None if surface.normals is None else surface.normals @ rotation.T

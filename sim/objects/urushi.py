@@ -9,7 +9,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.shapes import samples
 from coupole.appearance.shapes.triangles import slab
 from sim.objects import appearance
-from sim.objects.surfaces import joined, of_material
+from sim.objects.surfaces import joined_surface, of_material
 from sim.scene.surface import Surface
 
 _BODY_MM = 6.0
@@ -25,7 +25,7 @@ def makie_tile(side_mm: float = 60.0, *, triangles: int = 60_000, petals: int = 
     parts = samples.makie_tile(side_mm, triangles, petals, seed)
     powder = appearance.metal("makie gold", indices.gold(), 0.25)
     black = appearance.black_lacquer()
-    return joined(
+    return joined_surface(
         [
             of_material(parts.powder, powder),
             of_material(parts.ground, black),
@@ -56,4 +56,4 @@ def nashiji_slab(slab_of: nashiji.Slab | None = None) -> Surface:
             f"gold flakes, {middle_mm:.2f} mm deep", indices.gold(), middle_mm, roughness=0.08
         )
         parts.append(of_material(corners[level == k].reshape(-1, 3, 3), metal))
-    return joined(parts)
+    return joined_surface(parts)

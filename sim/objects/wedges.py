@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from coupole.appearance.shapes.samples import GILT_NM, PAINT_MM, stepped_panel
 from sim.objects import appearance
-from sim.objects.surfaces import joined, of_material
+from sim.objects.surfaces import joined_surface, of_material
 from sim.scene.surface import Material, Surface
 
 
@@ -50,4 +50,4 @@ def _panel(fields: Sequence[Sequence[Material]], step_mm: float, row_mm: float) 
     panel = stepped_panel(len(fields), len(fields[0]), step_mm, row_mm)
     materials = [material for row in fields for material in row]
     parts = [of_material(corners, material) for corners, material in zip(panel.fields, materials, strict=True)]
-    return joined([*parts, of_material(panel.body, appearance.BLACK_PRINT)])
+    return joined_surface([*parts, of_material(panel.body, appearance.BLACK_PRINT)])

@@ -33,7 +33,7 @@ def through(
     """
     out = np.empty(image.shape[:2], np.float32)
     for channel in np.unique(channels):
-        channel_image = _magnified(image[..., channel], 1.0 + objective.lateral_colour[channel])
+        channel_image = _magnify(image[..., channel], 1.0 + objective.lateral_colour[channel])
         spread_px = float(diffraction_px(objective, CHANNEL_UM[channel], pixel_pitch_um))
         _blur(channel_image, disk_px, spread_px, channels == channel, out)
     return out
@@ -45,8 +45,8 @@ def defocus_blur_px(objective: Objective, depth_mm: Image, pixel_pitch_um: float
     return np.asarray(0.25 * defocus_px(objective, np.minimum(depth_mm, 1e6), pixel_pitch_um), np.float32)
 
 
-def _blur(image: Image, sigma_px: Image, more_px: float, wanted: NDArray[np.bool_], out: Image) -> None:
-    """Fill the pixels of `out` whose place in the Bayer cell is `wanted` [2, 2]; the blur's variance is that of
+def _blur(image: Image, sigma_px: Image, more_px: float, cell_mask: NDArray[np.bool_], out: Image) -> None:
+    """Fill the pixels of `out` whose place in the Bayer cell is `cell_mask` [2, 2]; the blur's variance is that of
     `sigma_px` [h, w] and of `more_px` together."""
     low, high = (float(np.hypot(edge, more_px)) for edge in (sigma_px.min(), sigma_px.max()))
     layers = _layers(max(low, _SHARP_PX), high) if high > _SHARP_PX else []
@@ -59,7 +59,7 @@ def _blur(image: Image, sigma_px: Image, more_px: float, wanted: NDArray[np.bool
         row[: len(curve)] = curve
     lengths = np.array([len(curve) - 1 for curve in curves])
     variances = np.square(np.array(layers, np.float32))
-    _blur_tiles(image, sigma_px, np.float32(more_px**2), variances, table, lengths, wanted, out)
+    _blur_tiles(image, sigma_px, np.float32(more_px**2), variances, table, lengths, cell_mask, out)
 
 
 def _curve(sigma_px: float) -> NDArray[np.float32]:
@@ -82,7 +82,7 @@ def _layers(low: float, high: float) -> list[float]:
     return [float(v) for v in np.geomspace(low, high, count + 1)]
 
 
-def _magnified(image: Image, scale: float) -> Image:
+def _magnify(image: Image, scale: float) -> Image:
     """The image magnified by `scale` about its middle."""
     if scale == 1.0:
         return image
@@ -96,7 +96,7 @@ def _magnified(image: Image, scale: float) -> Image:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _blur_tiles(image, sigma, more, variances, curves, lengths, wanted, out):  # type: ignore[no-untyped-def]
+def _blur_tiles(image, sigma, more, variances, curves, lengths, cell_mask, out):  # type: ignore[no-untyped-def]
     height, width = image.shape
     across = -(-width // _COLUMNS)
     for tile in numba.prange(across * -(-height // _ROWS)):
@@ -111,13 +111,13 @@ def _blur_tiles(image, sigma, more, variances, curves, lengths, wanted, out):  #
         for row in range(top, bottom):
             if dark:
                 for col in range(first_column, right):
-                    if wanted[row & 1, col & 1]:
+                    if cell_mask[row & 1, col & 1]:
                         out[row, col] = 0.0
-            elif wanted[row & 1, 0] or wanted[row & 1, 1]:
+            elif cell_mask[row & 1, 0] or cell_mask[row & 1, 1]:
                 for layer in range(first, last + 1):
                     _down(source, row - top + reach, curves[layer], lengths[layer], columns, halves)
                     for parity in range(2):
-                        if wanted[row & 1, parity]:  # tiles begin at even columns
+                        if cell_mask[row & 1, parity]:  # tiles begin at even columns
                             _along(halves, reach + parity, curves[layer], lengths[layer], sums)
                             before = np.float32(-1.0) if layer == first else variances[layer - 1]
                             pixels, spread_variance = (
@@ -157,21 +157,21 @@ def _mix(pixels, layer, sigma, more, before, variance):  # type: ignore[no-untyp
 
 
 @numba.njit(cache=True, nogil=True)
-def _copy(image, top, left, source):  # type: ignore[no-untyped-def]
+def _copy(image, top, left_px, source):  # type: ignore[no-untyped-def]
     """Fill `source` from the image, continued by reflection, and return its greatest value."""
     height, width = image.shape
     brightest = np.float32(0.0)
     for y in range(source.shape[0]):
-        row = _mirrored(top + y, height)
+        row = _mirrored_index(top + y, height)
         for x in range(source.shape[1]):
-            value = image[row, _mirrored(left + x, width)]
+            value = image[row, _mirrored_index(left_px + x, width)]
             source[y, x] = value
             brightest = max(brightest, value)
     return brightest
 
 
 @numba.njit(cache=True, nogil=True)
-def _mirrored(place, count):  # type: ignore[no-untyped-def]
+def _mirrored_index(place, count):  # type: ignore[no-untyped-def]
     """Index in an axis of `count` that is continued by reflection, edges doubled."""
     if 0 <= place < count:
         return place

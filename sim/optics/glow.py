@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform, inverse
 from sim.optics.objective import Objective, defocus_px
 from sim.render.emitter import Emitter
-from sim.render.lens import Sight, distorted
+from sim.render.lens import Sight, distorted_points
 
 _NEAR_MM = 1.0
 _LEAST_DISK_PX = 0.25
@@ -75,7 +75,7 @@ def glow(
     if unevenness > 0.0:
         coverage *= _evenness(unevenness, corners_in_camera, rows, columns, through)
     if disk_px > _LEAST_DISK_PX:
-        coverage = _spread(coverage, disk_px)
+        coverage = _spread_over_disk(coverage, disk_px)
     if not coverage.any():
         return None
     area_m2 = 4e-6 * float(np.linalg.norm(np.cross(u, v)))
@@ -89,7 +89,7 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
     height, width = lens.height_px, lens.width_px
     if (seen_mm[:, 2] < _NEAR_MM).any():
         return slice(0, height), slice(0, width)
-    at = distorted(seen_mm[:, :2] / seen_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
+    at = distorted_points(seen_mm[:, :2] / seen_mm[:, 2:], lens.terms) * lens.focal_px + lens.centre_px
     # Distortion bends the edges outwards by less than it moves the corners.
     straight = seen_mm[:, :2] / seen_mm[:, 2:] * lens.focal_px + lens.centre_px
     points = np.concatenate([at, straight])
@@ -102,7 +102,7 @@ def _box(seen_mm: NDArray[np.float64], through: Sight, margin_px: float) -> tupl
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # type: ignore[no-untyped-def]
+def _cover(coverage, edges, top, left_px, focal, centre_x, centre_y, shift):  # type: ignore[no-untyped-def]
     """Fraction of each pixel whose rays are on the inner side of all planes through camera centre and edge.
 
     Within a pixel rays are linear in position, so the fraction is the area of a square cut by straight lines.
@@ -115,10 +115,10 @@ def _cover(coverage, edges, top, left, focal, centre_x, centre_y, shift):  # typ
         for col in range(width):
             # The ray at the pixel's centre, and its change to the next pixel along the row and down the column.
             at[:] = 0.0
-            at[0, 0], at[0, 1], at[0, 2] = (left + col - centre_x) / focal, (top + row - centre_y) / focal, 1.0
+            at[0, 0], at[0, 1], at[0, 2] = (left_px + col - centre_x) / focal, (top + row - centre_y) / focal, 1.0
             at[1, 0] = at[2, 1] = 1.0 / focal
             if has_distortion:
-                _bend(at, shift, top + row, left + col)
+                _bend(at, shift, top + row, left_px + col)
             for k in range(4):
                 for i in range(3):
                     lines[k, i] = edges[k, 0] * at[i, 0] + edges[k, 1] * at[i, 1] + edges[k, 2] * at[i, 2]
@@ -145,7 +145,7 @@ def _bend(at, shift, row, col):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _area_within(lines, square, cut):  # type: ignore[no-untyped-def]
+def _area_within(lines, square, cut_corners):  # type: ignore[no-untyped-def]
     """Area of the part of the unit square about 0 where a + b x + c y > 0 for all `lines` [4, 3] (a, b, c).
 
     Sutherland and Hodgman, Comm. ACM 17, 32 (1974).
@@ -161,14 +161,17 @@ def _area_within(lines, square, cut):  # type: ignore[no-untyped-def]
             to_x, to_y = square[(k + 1) % count]
             here, there = a + b * x + c * y, a + b * to_x + c * to_y
             if here > 0.0:
-                cut[corner_count, 0], cut[corner_count, 1] = x, y
+                cut_corners[corner_count, 0], cut_corners[corner_count, 1] = x, y
                 corner_count += 1
             if (here > 0.0) != (there > 0.0):
                 share = here / (here - there)
-                cut[corner_count, 0], cut[corner_count, 1] = x + share * (to_x - x), y + share * (to_y - y)
+                cut_corners[corner_count, 0], cut_corners[corner_count, 1] = (
+                    x + share * (to_x - x),
+                    y + share * (to_y - y),
+                )
                 corner_count += 1
         count = corner_count
-        square[:count] = cut[:count]
+        square[:count] = cut_corners[:count]
     twice = 0.0
     for k in range(count):
         x, y = square[k]
@@ -197,7 +200,7 @@ def _evenness(
     return even
 
 
-def _spread(coverage: NDArray[np.float32], disk_px: float) -> NDArray[np.float32]:
+def _spread_over_disk(coverage: NDArray[np.float32], disk_px: float) -> NDArray[np.float32]:
     """The image convolved with a uniform disk of diameter `disk_px`, its edge softened over a pixel."""
     from scipy.signal import fftconvolve
 

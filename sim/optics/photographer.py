@@ -32,7 +32,7 @@ from sim.render.radiance import albedo, led_radiance, panel_radiance
 from sim.render.shadows import Shadows
 from sim.scene.scene import Scene, build_scene, load_surface, support_disk
 from sim.scene.surface import Material, Surface
-from sim.scene.things import placed
+from sim.scene.things import placed_surfaces
 from sim.world.config import (
     CameraConfig,
     MaterialConfig,
@@ -98,7 +98,7 @@ class Photographer:
             (_surface(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
             for mesh in scene.objects
         ]
-        surfaces += placed(settings.things, base_from_support, settings.strangers.target)
+        surfaces += placed_surfaces(settings.things, base_from_support, settings.strangers.target)
         self._strangers = settings.strangers
         self._up = base_from_support[:3, 2]
         self._scene = build_scene(surfaces)
@@ -107,7 +107,7 @@ class Photographer:
         self.leds: Leds = as_built(table, settings.dome)
         """The LEDs where they really are; the controller has the table."""
         self._led_model = settings.leds
-        dies = settings.strangers.light.tilted(self.leds.normals, self.leds.ids)
+        dies = settings.strangers.light.tilted_normals(self.leds.normals, self.leds.ids)
         self._emitters = _emitters(replace(self.leds, normals=dies))
         self._row_of_led = {int(led): row for row, led in enumerate(self.leds.ids)}
         self._objective = Objective(
@@ -119,7 +119,7 @@ class Photographer:
             lateral_colour=camera.lateral_colour,
         )
         self._camera = camera
-        lens = Lens.focused(
+        lens = Lens.at_focus(
             camera.width_px,
             camera.height_px,
             pixel_pitch_um=camera.pixel_pitch_um,
@@ -127,9 +127,9 @@ class Photographer:
             focus_distance_mm=camera.focus_distance_mm,
             distortion=camera.distortion,
         )
-        self._lens = settings.strangers.lens.disturbed(lens, camera.focus_distance_mm)
+        self._lens = settings.strangers.lens.disturbed_lens(lens, camera.focus_distance_mm)
         self._sight = sight(self._lens)
-        self._falloff = self._vignetted()
+        self._falloff = self._relative_illuminance()
         self._shading = settings.shading
         self._viewer = Viewer(self._scene, self._lens, camera.samples_per_side, self._shading)
         self.sensor = camera.true_sensor(settings.seed)
@@ -161,7 +161,7 @@ class Photographer:
         arm_shadow.warm_up()
         glow(_AHEAD, "lambertian", self._sight, np.eye(4), look.empty, None)
 
-    def _vignetted(self) -> NDArray[np.float32]:
+    def _relative_illuminance(self) -> NDArray[np.float32]:
         """[h, w] illuminance of each pixel over that of the centre."""
         x, y = slopes(self._sight)
         tangent = np.hypot(x, y)
@@ -170,22 +170,22 @@ class Photographer:
         stop_mm = (along_mm, float(np.hypot(shift_x, shift_y)))
         return vignetting(self._objective, tangent, stop_mm).astype(np.float32)
 
-    def render(self, out: NDArray[np.uint16], exposed: Exposed) -> None:
+    def render(self, out: NDArray[np.uint16], exposure: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
-        look = self._look_from(exposed.base_from_flange, exposed.arm_mm)
-        radiance, seconds = self._lit(look, exposed)
+        look = self._look_from(exposure.base_from_flange, exposure.arm_mm)
+        radiance, seconds = self._lit(look, exposure)
         sensor_arguments: dict[str, Any] = {
             "model": self.sensor,
-            "frame": exposed.number,
-            "exposure_s": exposed.exposure_s,
-            "gain": exposed.gain * self._strangers.sensor.gain(exposed.number),
+            "frame": exposure.number,
+            "exposure_s": exposure.exposure_s,
+            "gain": exposure.gain * self._strangers.sensor.gain(exposure.number),
             "temperature_c": self._camera.sensor_temperature_c,
         }
-        glows = self._glows(look, exposed)
+        glows = self._glows(look, exposure)
         scale = self._electrons * seconds
         if self._camera.blur or self._strangers.lens.coma_px:
             sharp = electrons(look.view.site, radiance, self._falloff, electrons_per_radiance=scale)
-            mean_e = self._blurred(look, sharp)
+            mean_e = self._blurred_electrons(look, sharp)
             if glows is not None:
                 mean_e += glows
             expose_electrons(out, mean_e, **sensor_arguments)
@@ -199,12 +199,12 @@ class Photographer:
                 more_e=glows,
                 **sensor_arguments,
             )
-        self._strangers.sensor.add_tails(out, exposed.number, self.sensor.white_dn)
+        self._strangers.sensor.add_tails(out, exposure.number, self.sensor.white_dn)
 
-    def _blurred(self, look: Look, sharp: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _blurred_electrons(self, look: Look, sharp: NDArray[np.float32]) -> NDArray[np.float32]:
         """[h, w] electrons after the Bayer filter, from those [h, w, 3] of a perfect lens."""
         if self._strangers.lens.coma_px:
-            sharp = self._strangers.lens.blurred(sharp)
+            sharp = self._strangers.lens.with_coma(sharp)
         channels = self.sensor.channels()
         if not self._camera.blur:
             rows, columns = np.ogrid[: sharp.shape[0], : sharp.shape[1]]
@@ -219,10 +219,10 @@ class Photographer:
             look.disk_px = defocus_blur_px(self._objective, depth_mm, self._camera.pixel_pitch_um)
         return look.disk_px
 
-    def _lit(self, look: Look, exposed: Exposed) -> tuple[Radiance, float]:
+    def _lit(self, look: Look, exposure: Exposed) -> tuple[Radiance, float]:
         """Radiance of the sites, and its duration in seconds."""
-        lights = [(self._led(look, led), lit_s) for led, lit_s in exposed.seconds_of_led.items()]
-        lights += [(self._panel(look, panel), exposed.exposure_s) for panel in exposed.panels]
+        lights = [(self._led(look, led), lit_s) for led, lit_s in exposure.seconds_of_led.items()]
+        lights += [(self._panel(look, panel), exposure.exposure_s) for panel in exposure.panels]
         if len(lights) == 1:
             return lights[0]
         count = len(look.view.points_mm)
@@ -239,7 +239,7 @@ class Photographer:
             viewer, lens_now = self._viewer, self._sight
             if self._strangers.lens.breathing:
                 down = -float(base_from_camera[:3, 2] @ self._up)
-                lens = self._strangers.lens.breathed(self._lens, down)
+                lens = self._strangers.lens.with_breathing(self._lens, down)
                 viewer = Viewer(self._scene, lens, self._camera.samples_per_side, self._shading)
                 lens_now = sight(lens)
             view = viewer.look(base_from_camera)
@@ -258,10 +258,10 @@ class Photographer:
     def _led(self, look: Look, led: int) -> Radiance:
         """Radiance of the sites under one LED at its tabulated flux."""
         row = self._row_of_led[led]
-        return _remembered(look, led, lambda: self._lit_by_led(look, row, led))
+        return _remembered_radiance(look, led, lambda: self._lit_by_led(look, row, led))
 
     def _lit_by_led(self, look: Look, row: int, led: int) -> Radiance:
-        radiance = self._shaded(look, self._emitters[row], row)
+        radiance = self._shaded_radiance(look, self._emitters[row], row)
         self._add_indirect(radiance, look, self._emitters[row], self._emission)
         if self._led_model.pump_spread_nm > 0.0:
             radiance *= self._colour_of(led)
@@ -273,21 +273,21 @@ class Photographer:
             return panel_radiance(look.view, self._scene.materials, self.reference_lux)
         if panel > len(self._panels):
             return np.zeros((len(look.view.points_mm), 3), np.float32)
-        return _remembered(look, -panel, lambda: self._lit_by_panel(look, panel))
+        return _remembered_radiance(look, -panel, lambda: self._lit_by_panel(look, panel))
 
     def _lit_by_panel(self, look: Look, panel: int) -> Radiance:
         count = panels.PARTS**2
         radiance = np.zeros((len(look.view.points_mm), 3), np.float32)
         self._add_indirect(radiance, look, self._panels[panel - 1][0], "lambertian")
         for piece in range((panel - 1) * count, panel * count):
-            radiance += self._shaded(look, self._pieces[piece], len(self._emitters) + piece, "lambertian")
+            radiance += self._shaded_radiance(look, self._pieces[piece], len(self._emitters) + piece, "lambertian")
         return radiance
 
-    def _shaded(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
+    def _shaded_radiance(self, look: Look, emitter: Emitter, row: int, emission: str = "") -> Radiance:
         view, emission = look.view, emission or self._emission
         matter = self._scene.materials, self._scene.tables
         if look.places is not None:
-            visibility = self._shadows.reached(row)
+            visibility = self._shadows.reached_bits(row)
             radiance = led_radiance(view, *matter, emitter, emission, look.places, visibility)
         else:
             radiance = led_radiance(view, *matter, emitter, emission)
@@ -317,20 +317,20 @@ class Photographer:
 
     # -- lamps in the picture -----------------------------------------------------------------------------
 
-    def _glows(self, look: Look, exposed: Exposed) -> NDArray[np.float32] | None:
+    def _glows(self, look: Look, exposure: Exposed) -> NDArray[np.float32] | None:
         """[h, w] mean electrons from lamps in the picture, or None if there are none."""
         glows: list[tuple[Glow, NDArray[np.float32]]] = []
-        for led, lit_s in exposed.seconds_of_led.items():
+        for led, lit_s in exposure.seconds_of_led.items():
             die = self._emitters[self._row_of_led[led]]
             if self._strangers.light.primary_lens_mm:
                 die = self._strangers.light.seen_from(die, look.base_from_camera[:3, 3])
             if spot := self._glow(look, led, die, self._emission):
                 glows.append((spot, self._colour_of(led) * np.float32(lit_s)))
-        for panel in exposed.panels:
+        for panel in exposure.panels:
             if panel <= len(self._panels):
                 whole, unevenness = self._panels[panel - 1]
                 if area := self._glow(look, -panel, whole, "lambertian", unevenness):
-                    glows.append((area, np.full(3, exposed.exposure_s, np.float32)))
+                    glows.append((area, np.full(3, exposure.exposure_s, np.float32)))
         if not glows:
             return None
         mean_e = np.zeros(self._falloff.shape, np.float32)
@@ -350,7 +350,7 @@ class Photographer:
         return look.glows[light]
 
 
-def _remembered(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
+def _remembered_radiance(look: Look, light: int, compute: Callable[[], Radiance]) -> Radiance:
     """The radiance under a light, computed once per pose as long as memory suffices."""
     if light in look.radiance:
         return look.radiance[light]
@@ -380,16 +380,16 @@ def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
 
             material = specimen(config.specimen)
         case MeasuredConfig():
-            material = _measured(config)
+            material = _measured_material(config)
         case MaterialConfig():
             material = Material(mesh.path.stem, config.diffuse, config.f0, config.roughness)
     surface = load_surface(mesh.path, mesh.unit, material, settings.detail, mesh.pictures_beside)
     return settings.stickers.on(surface) if settings.stickers else surface
 
 
-def _measured(given: MeasuredConfig) -> Material:
+def _measured_material(config: MeasuredConfig) -> Material:
     from sim.objects.measured_files import alta_material, bsdf_material, merl_material
 
-    if given.merl is not None:
-        return merl_material(given.merl)
-    return bsdf_material(given.bsdf) if given.bsdf is not None else alta_material(given.alta_files)
+    if config.merl is not None:
+        return merl_material(config.merl)
+    return bsdf_material(config.bsdf) if config.bsdf is not None else alta_material(config.alta_files)

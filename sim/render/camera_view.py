@@ -72,7 +72,7 @@ class Viewer:
 
     def __init__(self, scene: Scene, lens: Lens, samples: int = 1, shading: Shading = "flat") -> None:
         self._scene = scene
-        self._sight: Sight = sight(lens.supersampled(samples))
+        self._sight: Sight = sight(lens.with_supersampling(samples))
         self._shading = shading
 
     def look(self, base_from_camera: Transform) -> View:
@@ -108,16 +108,16 @@ def slopes(through: Sight) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _gather(corners, seen, eye, sides, centroids, normals):  # type: ignore[no-untyped-def]
+def _gather(corners, triangles, eye, sides, centroids, normals):  # type: ignore[no-untyped-def]
     chunk = 4096
-    for part in numba.prange(-(-len(seen) // chunk)):
+    for part in numba.prange(-(-len(triangles) // chunk)):
         centroid, normal = np.empty(3), np.empty(3)
-        for i in range(part * chunk, min(len(seen), (part + 1) * chunk)):
-            centroid_and_normal(corners, seen[i], centroid, normal)
+        for i in range(part * chunk, min(len(triangles), (part + 1) * chunk)):
+            centroid_and_normal(corners, triangles[i], centroid, normal)
             back = 0.0
             for k in range(3):
                 back += (eye[k] - centroid[k]) * normal[k]
-            sides[i] = 2 * seen[i] + (back < 0.0)
+            sides[i] = 2 * triangles[i] + (back < 0.0)
             for k in range(3):
                 centroids[i, k] = centroid[k]
                 normals[i, k] = -normal[k] if back < 0.0 else normal[k]

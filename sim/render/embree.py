@@ -173,7 +173,7 @@ def centroid_and_normal(corners, t, centroid, normal):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # type: ignore[no-untyped-def]
+def _trace(occlusion_test, scene, corners, sides, light, first, bits, arguments):  # type: ignore[no-untyped-def]
     chunks = -(-len(sides) // _CHUNK)
     start = first // _CHUNK
     for chunk in numba.prange(start, chunks):
@@ -198,7 +198,7 @@ def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # t
             if lane == _PACKET or (place == last - 1 and lane > 0):
                 valid[lane:] = 0
                 _call_embree(
-                    occluded,
+                    occlusion_test,
                     np.uint64(valid.ctypes.data),
                     scene,
                     np.uint64(rays.ctypes.data),
@@ -211,7 +211,7 @@ def _trace(occluded, scene, corners, sides, light, first, bits, arguments):  # t
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _cast(occluded, scene, points, triangle, normals, light, radiance, arguments):  # type: ignore[no-untyped-def]
+def _cast(occlusion_test, scene, points, triangle, normals, light, radiance, arguments):  # type: ignore[no-untyped-def]
     for chunk in numba.prange(-(-len(points) // _CHUNK)):
         rays, words, valid = _packet()
         site_of_lane = np.empty(_PACKET, np.int64)
@@ -229,7 +229,7 @@ def _cast(occluded, scene, points, triangle, normals, light, radiance, arguments
             if lane == _PACKET or (i == last - 1 and lane > 0):
                 valid[lane:] = 0
                 _call_embree(
-                    occluded,
+                    occlusion_test,
                     np.uint64(valid.ctypes.data),
                     scene,
                     np.uint64(rays.ctypes.data),
@@ -242,11 +242,11 @@ def _cast(occluded, scene, points, triangle, normals, light, radiance, arguments
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _meet(intersect, scene, corners, origins, ways, met, arguments):  # type: ignore[no-untyped-def]
-    for chunk in numba.prange(-(-len(met) // _CHUNK)):
+def _meet(intersect, scene, corners, origins, ways, hit_triangles, arguments):  # type: ignore[no-untyped-def]
+    for chunk in numba.prange(-(-len(hit_triangles) // _CHUNK)):
         rays, words, valid = _packet()
         centroid, normal = np.empty(3), np.empty(3)
-        last = min(len(met), (chunk + 1) * _CHUNK)
+        last = min(len(hit_triangles), (chunk + 1) * _CHUNK)
         for first in range(chunk * _CHUNK, last, _PACKET):
             count = min(_PACKET, last - first)
             valid[:count], valid[count:] = -1, 0
@@ -264,13 +264,13 @@ def _meet(intersect, scene, corners, origins, ways, met, arguments):  # type: ig
                 np.uint64(arguments.ctypes.data),
             )
             for lane in range(count):
-                met[first + lane] = -1
+                hit_triangles[first + lane] = -1
                 if words[18, lane] != np.uint32(0xFFFFFFFF):
                     triangle, facing = np.int64(words[17, lane]), 0.0
                     centroid_and_normal(corners, triangle, centroid, normal)
                     for k in range(3):
                         facing += ways[first + lane, k] * normal[k]
-                    met[first + lane] = 2 * triangle + (facing > 0.0)
+                    hit_triangles[first + lane] = 2 * triangle + (facing > 0.0)
 
 
 @numba.njit(cache=True, nogil=True)

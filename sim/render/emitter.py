@@ -65,7 +65,7 @@ def irradiance(
         np.atleast_2d(np.ascontiguousarray(normals, np.float64)),
     )
     out = np.empty(len(points))
-    _irradiance(points, facing, packed(emitter), out)
+    _irradiance(points, facing, packed_emitter(emitter), out)
     if emission == "paper":
         to_light = emitter.centre_mm - points
         out *= np.maximum(0.0, -(to_light @ emitter.normal) / np.linalg.norm(to_light, axis=1))
@@ -75,12 +75,12 @@ def irradiance(
 def irradiance_of_each(emitters: Sequence[Emitter], point_mm: ArrayLike, normal: ArrayLike) -> NDArray[np.float64]:
     """[emitters] lux that each gives at one point [3] with unit normal [3], Lambertian, nothing in between."""
     out = np.empty(len(emitters))
-    leds = np.array([packed(emitter) for emitter in emitters]).reshape(-1, 13)
+    leds = np.array([packed_emitter(emitter) for emitter in emitters]).reshape(-1, 13)
     _irradiance_of_each(np.asarray(point_mm, np.float64), np.asarray(normal, np.float64), leds, out)
     return out
 
 
-def packed(emitter: Emitter) -> NDArray[np.float64]:
+def packed_emitter(emitter: Emitter) -> NDArray[np.float64]:
     """[13] centre, normal, half_u, half_v in mm, and flux in lm, for compiled code."""
     return np.array([*emitter.centre_mm, *emitter.normal, *emitter.half_u_mm, *emitter.half_v_mm, emitter.flux_lm])
 

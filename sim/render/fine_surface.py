@@ -48,7 +48,7 @@ def fine_surface(
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def _look_closer(  # type: ignore[no-untyped-def]
-    waves, first, points, triangle, normals, material, sides, texture, turned
+    waves, first, points, triangle, normals, material, sides, texture, turned_normals
 ):
     for chunk in numba.prange(-(-len(points) // _CHUNK)):
         slope = np.empty(3)
@@ -81,4 +81,8 @@ def _look_closer(  # type: ignore[no-untyped-def]
             )
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             texture[i] = factor
-            turned[i, 0], turned[i, 1], turned[i, 2] = nx / length, ny / length, nz / length
+            turned_normals[i, 0], turned_normals[i, 1], turned_normals[i, 2] = (
+                nx / length,
+                ny / length,
+                nz / length,
+            )

@@ -44,7 +44,7 @@ class Exchange:
     """[2 patches * POINTS, 3] flat unit normals there."""
     albedo: NDArray[np.float32]
     """[2 patches, 3]."""
-    seen: NDArray[np.int32]
+    seen_sides: NDArray[np.int32]
     """[2 patches, rays] side that each ray meets, or -1."""
     neighbours: NDArray[np.int32]
     """[patches, _NEIGHBOURS] nearest patches of the same material, itself first; filled up with itself."""
@@ -87,7 +87,7 @@ def exchange(scene: Scene, obstacles: Obstacles, rays: int) -> Exchange:
         diffuse = diffuse * np.add.reduceat(scene.tint[order].astype(np.float64), starts, axis=0) / counts[:, None]
     albedo = np.repeat((diffuse + scene.materials[material, 3:6]).astype(np.float32), 2, axis=0)
     centres = points[:, 0].mean(axis=1)
-    side_seen = _seen(obstacles, points.reshape(-1, 3), normals.reshape(-1, 3), patch, -(-rays // POINTS))
+    side_seen = _sides_met(obstacles, points.reshape(-1, 3), normals.reshape(-1, 3), patch, -(-rays // POINTS))
     return Exchange(
         patch,
         points.reshape(-1, 3),
@@ -141,7 +141,7 @@ def indirect_lux(
     total: NDArray[np.float32] = np.zeros_like(sent_lux)
     for _ in range(bounces - 1):
         received_lux = np.empty_like(sent_lux)
-        _gather_light(between.seen, sent_lux, received_lux)
+        _gather_light(between.seen_sides, sent_lux, received_lux)
         total += received_lux
         sent_lux = received_lux * between.albedo
     return total
@@ -189,7 +189,7 @@ def _neighbours(centres_mm: NDArray[np.float32], material: NDArray[np.int32]) ->
     return neighbours
 
 
-def _seen(
+def _sides_met(
     obstacles: Obstacles,
     points: NDArray[np.float32],
     normals: NDArray[np.float32],
@@ -240,11 +240,11 @@ def _find_keys(corners, material, cells, key):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _place(corners, chosen, points, normals):  # type: ignore[no-untyped-def]
+def _place(corners, chosen_triangles, points, normals):  # type: ignore[no-untyped-def]
     centroid, normal = np.empty(3), np.empty(3)
-    for patch in range(len(chosen)):
-        for number in range(chosen.shape[1]):
-            centroid_and_normal(corners, chosen[patch, number], centroid, normal)
+    for patch in range(len(chosen_triangles)):
+        for number in range(chosen_triangles.shape[1]):
+            centroid_and_normal(corners, chosen_triangles[patch, number], centroid, normal)
             for k in range(3):
                 points[patch, 0, number, k] = points[patch, 1, number, k] = centroid[k]
                 normals[patch, 0, number, k], normals[patch, 1, number, k] = normal[k], -normal[k]
@@ -276,23 +276,27 @@ def _aim(points, normals, first, rays, origins, ways):  # type: ignore[no-untype
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _gather_light(seen, sent, received):  # type: ignore[no-untyped-def]
-    for side in numba.prange(len(seen)):
+def _gather_light(seen_sides, sent_light, received_light):  # type: ignore[no-untyped-def]
+    for side in numba.prange(len(seen_sides)):
         red, green, blue = 0.0, 0.0, 0.0
-        for ray in range(seen.shape[1]):
-            source_side = seen[side, ray]
+        for ray in range(seen_sides.shape[1]):
+            source_side = seen_sides[side, ray]
             if source_side >= 0:
                 red, green, blue = (
-                    red + sent[source_side, 0],
-                    green + sent[source_side, 1],
-                    blue + sent[source_side, 2],
+                    red + sent_light[source_side, 0],
+                    green + sent_light[source_side, 1],
+                    blue + sent_light[source_side, 2],
                 )
-        rays = seen.shape[1]
-        received[side, 0], received[side, 1], received[side, 2] = red / rays, green / rays, blue / rays
+        rays = seen_sides.shape[1]
+        received_light[side, 0], received_light[side, 1], received_light[side, 2] = (
+            red / rays,
+            green / rays,
+            blue / rays,
+        )
 
 
 @numba.njit(cache=True, nogil=True, parallel=True)
-def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, found, weights):  # type: ignore[no-untyped-def]
+def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, side_numbers, weights):  # type: ignore[no-untyped-def]
     """A smooth bump two patches wide, times how much the normals agree."""
     for chunk in numba.prange(-(-len(sides) // _CHUNK)):
         centroid, normal = np.empty(3), np.empty(3)
@@ -310,7 +314,7 @@ def _weigh(corners, sides, normals, patch, neighbours, centres, facing, cells, f
                 weight = max(0.0, 1.0 - squared_distance / (reach * reach)) ** 2 * max(0.0, agree) ** 4
                 if n > 0 and neighbour == own_patch:
                     weight = 0.0
-                found[i, n], weights[i, n] = 2 * neighbour + back, weight
+                side_numbers[i, n], weights[i, n] = 2 * neighbour + back, weight
                 total += weight
             if total < _LEAST_WEIGHT:
                 weights[i, :] = 0.0

@@ -47,7 +47,7 @@ class Lens:
     """Principal point less image centre, over the focal length; distortion stays centred on the image."""
 
     @staticmethod
-    def focused(
+    def at_focus(
         width_px: int,
         height_px: int,
         *,
@@ -74,7 +74,7 @@ class Lens:
         more = (0.0,) * (12 - len(self.distortion))
         return np.array([*self.distortion, *more, -self.off_axis[0], -self.off_axis[1]])
 
-    def supersampled(self, factor: int) -> Lens:
+    def with_supersampling(self, factor: int) -> Lens:
         """The lens with sensor pixels divided into `factor` x `factor`; see `rook_shifts_px`."""
         return replace(
             self,
@@ -139,14 +139,15 @@ def _bend_slope(lens: Lens, reach: tuple[float, float]) -> float:
     grid = np.stack(np.meshgrid(*(np.linspace(-far, far, _PROBES) for far in reach)), axis=-1)
     step = 1e-6
     columns = [
-        (distorted(grid + np.array(direction) * step, lens.terms) - distorted(grid, lens.terms)) / step
+        (distorted_points(grid + np.array(direction) * step, lens.terms) - distorted_points(grid, lens.terms))
+        / step
         for direction in ((1, 0), (0, 1))
     ]
     jacobian = np.stack(columns, axis=-1) - np.eye(2)
     return float(np.linalg.norm(jacobian, ord=2, axis=(-2, -1)).max()) * _MARGIN
 
 
-def distorted(xy: NDArray[np.float64], distortion: Distortion | NDArray[np.float64]) -> NDArray[np.float64]:
+def distorted_points(xy: NDArray[np.float64], distortion: Distortion | NDArray[np.float64]) -> NDArray[np.float64]:
     """The model on normalised image coordinates [..., 2]; `distortion` may also be `Lens.terms`."""
     terms = np.zeros(14)
     terms[: len(distortion)] = distortion

@@ -104,12 +104,12 @@ def _fill(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _look_through(triangle, k, top, left, pose, centre, rooks, shift, rays, met):  # type: ignore[no-untyped-def]
-    """Fill `rays` [k k, 3] with a pixel's rays in the base frame, of length 1 along the axis, and `met` [k k] with
-    the triangles that they meet."""
+def _look_through(triangle, k, top, left_px, pose, centre, rooks, shift, rays, hit_triangles):  # type: ignore[no-untyped-def]
+    """Fill `rays` [k k, 3] with a pixel's rays in the base frame, of length 1 along the axis, and `hit_triangles`
+    [k k] with the triangles that they meet."""
     for part in range(k * k):
-        row, col = top + part // k, left + part % k
-        met[part] = triangle[row, col]
+        row, col = top + part // k, left_px + part % k
+        hit_triangles[part] = triangle[row, col]
         x, y = (col - centre[0]) * centre[2], (row - centre[1]) * centre[2]
         if shift is not None:
             x, y = x + shift[0, row, col], y + shift[1, row, col]
@@ -120,16 +120,20 @@ def _look_through(triangle, k, top, left, pose, centre, rooks, shift, rays, met)
 
 
 @numba.njit(cache=True, nogil=True)
-def _mean_point(rays, met, seen, centroids, normals, pose, point):  # type: ignore[no-untyped-def]
-    """Fill `point` [3] with the mean of the points where rays meet the plane of the triangle `seen`."""
+def _mean_point(rays, hit_triangles, site_triangle, centroids, normals, pose, point):  # type: ignore[no-untyped-def]
+    """Fill `point` [3] with the mean of the points where rays meet the plane of the triangle `site_triangle`."""
     height, depth, x, y, z, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0
     for i in range(3):
-        way = np.float64(centroids[seen, i]) - pose[i, 3]
-        height, depth = height + normals[seen, i] * way, depth + pose[i, 2] * way
-    for part in range(len(met)):
-        if met[part] == seen:
+        way = np.float64(centroids[site_triangle, i]) - pose[i, 3]
+        height, depth = height + normals[site_triangle, i] * way, depth + pose[i, 2] * way
+    for part in range(len(hit_triangles)):
+        if hit_triangles[part] == site_triangle:
             ray = rays[part]
-            slope = normals[seen, 0] * ray[0] + normals[seen, 1] * ray[1] + normals[seen, 2] * ray[2]
+            slope = (
+                normals[site_triangle, 0] * ray[0]
+                + normals[site_triangle, 1] * ray[1]
+                + normals[site_triangle, 2] * ray[2]
+            )
             # A ray within the plane, by rounding, is given the centroid's depth.
             along = height / slope if abs(slope) > _LEAST_SLOPE else depth
             x, y, z, count = x + along * ray[0], y + along * ray[1], z + along * ray[2], count + 1

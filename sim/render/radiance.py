@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.render.camera_view import View
-from sim.render.emitter import Emitter, packed, per_lumen
+from sim.render.emitter import Emitter, packed_emitter, per_lumen
 from sim.scene.brdf_table import look_up
 
 FINE_ROUGHNESS = 0.3
@@ -30,10 +30,10 @@ def led_radiance(
     emitter: Emitter,
     emission: str,
     places: NDArray[np.int32] | None = None,
-    reached: NDArray[np.uint8] | None = None,
+    reached_bits: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.float32]:
-    """[sites, 3] lm/(m^2 sr), red green blue. `reached` are the bits of `Shadows.reached`, `places` the indices;
-    without them nothing is in the light's way.
+    """[sites, 3] lm/(m^2 sr), red green blue. `reached_bits` are the bits of `Shadows.reached`, `places` the
+    indices; without them nothing is in the light's way.
 
     `paper` applies the emitter's cosine, towards the site, twice (seed 003, Eq. 2).
     """
@@ -50,10 +50,10 @@ def led_radiance(
         None if view.fine is None else view.fine.normals,
         materials,
         tables,
-        packed(emitter),
+        packed_emitter(emitter),
         emission == "paper",
         places,
-        reached,
+        reached_bits,
         radiance,
     )
     return radiance
@@ -82,13 +82,13 @@ def _shade(  # type: ignore[no-untyped-def]
     material,
     eye,
     texture,
-    turned,
+    turned_normals,
     materials,
     tables,
     led,
     paper,
     places,
-    reached,
+    reached_bits,
     out,
 ):
     count = len(out)
@@ -96,7 +96,7 @@ def _shade(  # type: ignore[no-untyped-def]
         shares, work = np.empty(4), np.empty((2, 8, 3))
         for i in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             out[i, 0], out[i, 1], out[i, 2] = 0.0, 0.0, 0.0
-            if reached is not None and not (reached[places[i] >> 3] >> (places[i] & 7)) & 1:
+            if reached_bits is not None and not (reached_bits[places[i] >> 3] >> (places[i] & 7)) & 1:
                 continue
             hit_triangle, factor = triangle[i], 1.0
             px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -107,8 +107,8 @@ def _shade(  # type: ignore[no-untyped-def]
             ):
                 continue
             normal = shading_normals[hit_triangle]
-            if turned is not None:
-                factor, normal = texture[i], turned[i]
+            if turned_normals is not None:
+                factor, normal = texture[i], turned_normals[i]
             nx, ny, nz = np.float64(normal[0]), np.float64(normal[1]), np.float64(normal[2])
             if tx * nx + ty * ny + tz * nz <= 0.0:
                 continue

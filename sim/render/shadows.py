@@ -45,7 +45,7 @@ class Shadows:
         self._place_of_side[sides[new]] = np.arange(first, len(self._side_of_place), dtype=np.int32)
         return self._place_of_side[sides]
 
-    def reached(self, led: int) -> _Bits:
+    def reached_bits(self, led: int) -> _Bits:
         """Bit p % 8 of byte p // 8 is 1 if the LED in row `led` reaches the side in place p."""
         places = len(self._side_of_place)
         known_places, bits = self._kept.get(led, (0, np.empty(0, np.uint8)))

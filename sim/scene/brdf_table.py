@@ -30,7 +30,10 @@ def tabulate(brdf: Brdf, weights: NDArray[np.float64]) -> NDArray[np.float32]:
     parts = []
     for first in range(0, NODES[0], _CHUNK):
         light, view = _directions(*np.ix_(theta_h[first : first + _CHUNK], theta_d, phi_d))
-        reciprocal_mean = 0.5 * (brdf(_lifted(light), _lifted(view)) + brdf(_lifted(view), _lifted(light)))
+        reciprocal_mean = 0.5 * (
+            brdf(_lift_above_horizon(light), _lift_above_horizon(view))
+            + brdf(_lift_above_horizon(view), _lift_above_horizon(light))
+        )
         parts.append(np.asarray(reciprocal_mean @ weights.T, np.float32))
     return np.concatenate(parts)
 
@@ -41,14 +44,14 @@ def _directions(
     """Light and view [..., 3] of angles: turned about y by theta_h, from where the half vector is the normal."""
     x, y, z = np.sin(theta_d) * np.cos(phi_d), np.sin(theta_d) * np.sin(phi_d), np.cos(theta_d)
 
-    def turned(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def turned_about_y(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         across, along = np.cos(theta_h) * x + np.sin(theta_h) * z, np.cos(theta_h) * z - np.sin(theta_h) * x
         return np.stack(np.broadcast_arrays(across, y, along), axis=-1)
 
-    return turned(x, y), turned(-x, -y)
+    return turned_about_y(x, y), turned_about_y(-x, -y)
 
 
-def _lifted(way: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lift_above_horizon(way: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions [..., 3] at least at the least height above the horizon."""
     z = np.maximum(way[..., 2], _LOWEST_Z)
     shrink = np.sqrt(1.0 - z**2) / np.maximum(np.hypot(way[..., 0], way[..., 1]), 1e-12)

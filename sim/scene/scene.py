@@ -173,13 +173,13 @@ def build_scene(things: Sequence[tuple[Surface, Transform]]) -> Scene:
             surface_normals = surface.normals if surface.normals is not None else _flat_normals(surface.corners_mm)
             normals[part] = surface_normals @ base_from_surface[:3, :3].T
         first += count
-    table, tables = _packed(materials)
+    table, tables = _packed_materials(materials)
     firsts = np.cumsum([0, *(len(surface_normals) for surface_normals in waves)])
     fine = Waves(np.concatenate(waves), firsts) if firsts[-1] else None
     return Scene(corners, material, table, tables, tint, normals, fine)
 
 
-def _packed(materials: Sequence[Material]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _packed_materials(materials: Sequence[Material]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """`materials` and `tables` of a scene."""
     tables = [m.table for m in materials if m.table is not None]
     rows = np.cumsum([m.table is not None for m in materials]) - 1

@@ -159,16 +159,16 @@ Thing = Annotated[CharucoBoard | Sphere | Sample, Field(discriminator="kind")]
 class Disturbance(Protocol):
     """Change of a thing's surface that its description does not know."""
 
-    def disturbed(self, kind: str, surface: Surface) -> Surface: ...
+    def disturbed_surface(self, kind: str, surface: Surface) -> Surface: ...
 
 
-def placed(
+def placed_surfaces(
     things: tuple[Thing, ...], base_from_support: Transform, disturbance: Disturbance
 ) -> list[tuple[Surface, Transform]]:
     """Surfaces and their `base_from_surface`."""
     return [
         (
-            disturbance.disturbed(thing.kind, thing.surface()),
+            disturbance.disturbed_surface(thing.kind, thing.surface()),
             np.asarray(base_from_support @ thing.support_from_thing()),
         )
         for thing in things

@@ -40,13 +40,13 @@ class LensStranger(BaseModel):
     coma_deg: float = 0.0
     """Its direction in the image, the same everywhere: from x towards y."""
 
-    def disturbed(self, lens: Lens, focus_distance_mm: float) -> Lens:
+    def disturbed_lens(self, lens: Lens, focus_distance_mm: float) -> Lens:
         """The lens with these terms, when the camera looks straight down."""
         more = (*self.rational, *self.prism) if any((*self.rational, *self.prism)) else ()
         x, y = (shift / focus_distance_mm for shift in self.stop_shift_mm)
         return replace(lens, distortion=(*lens.distortion, *more), off_axis=(x, y))
 
-    def breathed(self, lens: Lens, down: float) -> Lens:
+    def with_breathing(self, lens: Lens, down: float) -> Lens:
         """The lens when the cosine between its axis and straight down is `down`."""
         return replace(lens, focal_px=lens.focal_px * (1.0 + self.breathing * (1.0 - down)))
 
@@ -57,7 +57,7 @@ class LensStranger(BaseModel):
         direction = np.radians(self.coma_deg)
         return np.asarray(self.coma_px * share * np.array([np.cos(direction), np.sin(direction)]))
 
-    def blurred(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    def with_coma(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """An image [h, w, channels] with coma: each point becomes a streak that fades linearly to its end."""
         from scipy.ndimage import map_coordinates
 

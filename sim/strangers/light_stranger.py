@@ -42,7 +42,7 @@ class LightStranger(BaseModel):
             raise ValueError("expected angles that rise from 0 to at most 90 deg, and intensities of 0 or more")
         return lobe
 
-    def tilted(self, normals: Floats, ids: NDArray[np.int64]) -> Floats:
+    def tilted_normals(self, normals: Floats, ids: NDArray[np.int64]) -> Floats:
         """Unit normals [n, 3] of the dies of LEDs `ids` on boards with these normals."""
         if not self.die_tilt_deg:
             return normals

@@ -28,14 +28,14 @@ class TargetStranger(BaseModel):
     tile_stain_mm: Annotated[float, Field(gt=0)] = 8.0
     """Radius where the stain takes 0.6 of that; it lies off the tile's middle by as much, along x."""
 
-    def disturbed(self, kind: str, surface: Surface) -> Surface:
+    def disturbed_surface(self, kind: str, surface: Surface) -> Surface:
         if kind == "charuco_board" and self.board_bend_um:
-            return self._bent(surface)
+            return self._bend(surface)
         if kind == "spectralon_tile":
-            return self._stained(self._glossy(surface))
+            return self._stain(self._glossy(surface))
         return surface
 
-    def _bent(self, surface: Surface) -> Surface:
+    def _bend(self, surface: Surface) -> Surface:
         corners = surface.corners_mm.copy()
         top = corners[..., 2].max()
         direction = np.radians(self.board_bend_deg)
@@ -53,7 +53,7 @@ class TargetStranger(BaseModel):
         )
         return replace(surface, materials=materials)
 
-    def _stained(self, surface: Surface) -> Surface:
+    def _stain(self, surface: Surface) -> Surface:
         if not self.tile_stain:
             return surface
         middle = surface.corners_mm.mean(axis=1)

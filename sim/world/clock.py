@@ -113,7 +113,7 @@ class SharedClock:
         self._looked_ns = time.monotonic_ns()
         self._gone_since_ns: int | None = None
         try:
-            self._process = os.pidfd_open(self._read()[3])
+            self._process = os.pidfd_open(self._read_block()[3])
         except ProcessLookupError:
             self._gone_since_ns = self._looked_ns
         except (AttributeError, OSError):  # neither Linux nor a new one: a killed world is not noticed
@@ -123,7 +123,7 @@ class SharedClock:
         if self._process is not None:
             os.close(self._process)
 
-    def _read(self) -> tuple[Pace, int, bool, int]:
+    def _read_block(self) -> tuple[Pace, int, bool, int]:
         while True:
             sequence, *pace, horizon_ns, alive, pid = _BLOCK.unpack_from(self._memory)
             is_consistent = sequence % 2 == 0 and _SEQUENCE.unpack_from(self._memory)[0] == sequence
@@ -151,15 +151,15 @@ class SharedClock:
         """World time; it never runs backwards."""
         self._look()
         if self._gone_since_ns is not None:
-            return self._last_ns + int((time.monotonic_ns() - self._gone_since_ns) * self._read()[0].speed)
-        pace, horizon_ns, _, _ = self._read()
+            return self._last_ns + int((time.monotonic_ns() - self._gone_since_ns) * self._read_block()[0].speed)
+        pace, horizon_ns, _, _ = self._read_block()
         self._last_ns = max(self._last_ns, min(pace.world_at(time.monotonic_ns()), horizon_ns))
         return self._last_ns
 
     def sleep(self, seconds: float, at_most_s: float = math.inf) -> None:
         end_ns = self.now_ns() + int(seconds * 1e9)
         end_s = time.monotonic() + at_most_s
-        speed = self._read()[0].speed
+        speed = self._read_block()[0].speed
         while (left_ns := end_ns - self.now_ns()) > 0 and (left_s := end_s - time.monotonic()) > 0.0:
             time.sleep(min(_NAP_S, left_s, max(left_ns / 1e9 / speed, 2e-5)))
 

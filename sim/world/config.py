@@ -235,7 +235,7 @@ class Config(_Model):
     """Stand-ins tell on standard error what they refuse, for clients that are not Coupole."""
 
     @property
-    def photographed(self) -> CameraConfig:
+    def rendered_camera(self) -> CameraConfig:
         """The camera as the renderer needs it: with the true lens, and the rays per pixel set in the rig."""
         true = {name: getattr(self.settings.camera, name) for name in _OF_THE_TRUE_CAMERA}
         if true["blur"] is None:

@@ -20,7 +20,7 @@ class Stills:
 
     def __init__(self, config: Mapping[str, Any]) -> None:
         valid_config = Config.model_validate(config)
-        self._photographer = Photographer(valid_config.scene, valid_config.photographed, valid_config.settings)
+        self._photographer = Photographer(valid_config.scene, valid_config.rendered_camera, valid_config.settings)
         self._tool, self._arm_shadows = valid_config.scene.tool, valid_config.settings.arm_shadows
         self._shape = (valid_config.camera.height_px, valid_config.camera.width_px)
         self._taken = 0

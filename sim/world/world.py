@@ -50,14 +50,14 @@ class World:
         self.reactor = Reactor(self.clock)
         self.lighting = Lighting()
         self._exposures = ExposureLog(self.lighting, settings.exposures_remembered)
-        self._photographer = Photographer(config.scene, config.photographed, settings)
+        self._photographer = Photographer(config.scene, config.rendered_camera, settings)
         self._flashes = Flashes(settings.leds)
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
         self._ruler = Ruler(config.scene, settings.things, self._photographer.leds.positions_mm)
         self._cables = tool_capsules(np.array(config.scene.base_from_support), settings.cables)
-        tell = _told if config.tells_refusals else untold
+        tell = _tell if config.tells_refusals else untold
         self.robot, robot_endpoint = robot.build(self.reactor, settings.robot, tell, settings.strangers.arm)
         self.camera, camera_endpoint = self._build_camera(config.camera, folder)
         self.box = ledbox_stand_in.build(
@@ -246,7 +246,7 @@ class World:
                     "panels": self.lighting.panels(now_ns),
                     "arm_moving": self.robot.moving,
                     "joints_deg": list(self.robot.joints_deg),
-                    "camera_armed": self.camera.armed,
+                    "camera_armed": self.camera.is_armed,
                 }
             case "ruler":
                 return self._ruler.lengths_mm(self.robot.true_base_from_flange())
@@ -293,7 +293,7 @@ class OneFault(BaseModel):
     fault: script.Fault
 
 
-def _told(message: str) -> None:
+def _tell(message: str) -> None:
     """Print a message on the terminal of whoever serves this world; standard output is for the endpoints."""
     print(message, file=sys.stderr, flush=True)
 

@@ -93,15 +93,15 @@ class Onlooker:
         self.heard.append(question)
         return True
 
-    def measures(self, what: str, question: str) -> float | None:
+    def measures(self, quantity: str, question: str) -> float | None:
         self.heard.append(question)
-        return self.lengths_mm.get(what)
+        return self.lengths_mm.get(quantity)
 
-    def told(self, message: str) -> None:
+    def tell(self, message: str) -> None:
         self.heard.append(message)
 
-    def hold_enabling_switch(self, *, held: bool) -> None:
-        self.hold(held)
+    def hold_enabling_switch(self, *, is_held: bool) -> None:
+        self.hold(is_held)
 
     def press_emergency_stop(self) -> None:
         self.press()

@@ -241,7 +241,7 @@ class Cell:
         return self._arm()
 
     # recorder
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         with self._written:
             self.slots.append(int(frame.pixels[0, 0]))
             self._written.notify_all()

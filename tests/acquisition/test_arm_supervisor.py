@@ -110,7 +110,7 @@ def test_nobody_is_sent_to_the_cell_while_the_arm_may_move_on_by_itself(
 
     def stand() -> None:
         stood.append("stood")
-        supervisor._control.held.clear()
+        supervisor._control.hold_pending.clear()
 
     supervisor._stand = stand
     supervisor.go(VISIT)

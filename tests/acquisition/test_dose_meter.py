@@ -81,7 +81,7 @@ def log_of(burst: Burst, steps: int) -> np.ndarray:
 
 
 def total(job: Job) -> float:
-    return ledger_of(job.cell, "relief").read().total_lux_h
+    return ledger_of(job.cell, "relief").read_history().total_lux_h
 
 
 def lit(burst: Burst) -> np.ndarray:
@@ -146,7 +146,7 @@ def test_if_it_is_not_sure_that_the_lights_are_off_all_that_was_planned_counts(j
     found.begin(burst)
     whole = total(job)
     end(found, burst, log_of(burst, 3), table_ran_s=0.01, panel_s=0.0)
-    history = ledger_of(job.cell, "relief").read()
+    history = ledger_of(job.cell, "relief").read_history()
     assert history.total_lux_h == history.unsettled_lux_h == whole
     assert found.lux_h == pytest.approx(whole, abs=1e-8)
 
@@ -208,13 +208,13 @@ def test_damage_is_entered_where_the_lamps_spectrum_is_known(job: Job, burst: Bu
     found = meter(known)
     found.begin(burst)
     end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
-    history = ledger_of(job.cell, "relief").read()
+    history = ledger_of(job.cell, "relief").read_history()
     assert history.damage_wh_m2 == pytest.approx(1e-3 * history.total_lux_h, rel=1e-5)
     assert history.of_unknown_spectrum_lux_h == 0
 
 
 def test_flashes_with_different_highest_points_count_as_the_highest_of_their_sum(job: Job) -> None:
-    opened = SimpleNamespace(simulated=False, lights_confirmed=True)
+    opened = SimpleNamespace(is_simulated=False, lights_confirmed=True)
     flashes = FlashMeter(job, opened, "bench", 1.0)  # type: ignore[arg-type]
     points = np.eye(len(job.shape.dose_points_mm))
     for lux_h in 1e-3 * points[0], 8e-4 * points[0] + 7e-4 * points[1], 9e-4 * points[1]:
@@ -263,14 +263,14 @@ def test_light_that_comes_by_hand_is_asked_for_before_the_next_flash_and_those_b
 ) -> None:
     ledger_of(job.cell, "relief").set_budget(1.0, "A. Keeper")
     flash = np.full(len(job.shape.dose_points_mm), 0.05)
-    flashes = FlashMeter(job, SimpleNamespace(simulated=False, lights_confirmed=True), "live", 10.0)  # type: ignore[arg-type]
+    flashes = FlashMeter(job, SimpleNamespace(is_simulated=False, lights_confirmed=True), "live", 10.0)  # type: ignore[arg-type]
     for _ in range(3):
         flashes.begin(flash, flash)
     ledger_of(job.cell, "relief").enter(0.84, "studio")
     assert flashes.left_lux_h == pytest.approx(0.16)
     with pytest.raises(DoseBudgetReached):
         flashes.begin(flash, flash)
-    history = ledger_of(job.cell, "relief").read()
+    history = ledger_of(job.cell, "relief").read_history()
     assert (history.total_lux_h, history.unsettled_lux_h) == (pytest.approx(0.99), 0.0)
 
 

@@ -68,7 +68,7 @@ SHORTER = {"translation_mm": [0, 0, 60]}
 def test_a_right_rig_passes_and_the_arm_is_back(bench: Bench) -> None:
     geometry_step.geometry(bench)
     assert missed(bench) == []
-    assert bench.findings.passed
+    assert bench.findings.has_passed
     assert np.abs(bench.joints_deg() - ABOVE_THE_BALL_DEG).max() < 0.01
     (said,) = [remark for remark in bench.findings.remarks if "sights" in remark]
     assert said.startswith("5 sights"), said
@@ -130,7 +130,7 @@ def test_volumes_are_described_one_by_one_and_a_no_ends_the_step(bench: Bench) -
     assert "x from -740 to 740, y from -740 to 740, z from -50 to 20 mm" in heard[0]
     assert "these volumes: support" in heard[1]
     assert [one.yes for one in bench.findings.answers] == [True, False]
-    assert not bench.findings.passed
+    assert not bench.findings.has_passed
 
 
 def test_what_was_not_measured_is_no_measure(bench: Bench) -> None:

@@ -129,7 +129,7 @@ class Cell:
         self.done.append("disarm")
 
     # recorder
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         self.slots += 1
         return self.slots
 

@@ -35,7 +35,9 @@ def cell_of(
         "camera": SimpleNamespace(disarm=disarm),
     }
     unused: Any = None
-    return OpenedCell(clock=unused, sensor=unused, simulated=True, world_endpoints=None, identities={}, **devices)
+    return OpenedCell(
+        clock=unused, sensor=unused, is_simulated=True, world_endpoints=None, identities={}, **devices
+    )
 
 
 def raising(error: BaseException, called: list[str], what: str) -> Callable[[], None]:

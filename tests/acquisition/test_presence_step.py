@@ -101,7 +101,7 @@ def check_for(check: Callable[[], None], seconds: float) -> None:
 
 def test_the_box_is_not_asked_for_a_caller_that_hangs_and_the_motion_goes_on_after_a_rest() -> None:
     box: Any = Box(held=True)
-    with EnablingSwitch(box, must_exist=True).held() as check:
+    with EnablingSwitch(box, must_exist=True).release_check() as check:
         check()
         time.sleep(0.5)
         before = box.asked

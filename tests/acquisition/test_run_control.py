@@ -75,26 +75,26 @@ def test_it_pauses_goes_on_and_stops_and_tells_its_state_each_time(served: Serve
     }  # fmt: skip
     assert say(b'{"version": 1, "command": "pause"}\n')["state"] == "pausing"
     assert served.control.pause.is_set()
-    served.control.paused.set()
+    served.control.standing.set()
     assert ask(served.run, "pause")["state"] == "paused", "asked again it is no other"
     assert [state["state"] for state in running()] == ["paused"]
-    served.control.paused.clear()
+    served.control.standing.clear()
     assert ask(served.run, "go-on")["state"] == "running"
     assert not served.control.pause.is_set()
     assert served.halted == 0
-    served.control.paused.set()
+    served.control.standing.set()
     assert ask(served.run, "go-on")["state"] == "running", "before the sequencer has seen it, too"
-    served.control.paused.clear()
+    served.control.standing.clear()
     stopped = ask(served.run, "stop")
     assert (stopped["state"], stopped["trouble"], served.halted) == ("stopping", [], 1)
-    assert served.control.interrupted().exit_code == 130
+    assert served.control.interruption().exit_code == 130
 
 
 def test_a_word_before_the_session_stands_does_not_end_its_hold(served: Served) -> None:
     served.control.can_stand = True
     served.control.hold("the machine slept")
     assert ask(served.run, "go-on")["state"] == "pausing"
-    served.control.held.clear()  # it stands, and has said why
+    served.control.hold_pending.clear()  # it stands, and has said why
     assert ask(served.run, "go-on")["state"] == "running"
 
 

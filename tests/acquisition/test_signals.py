@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 
 from coupole.acquisition.observer import Control
-from coupole.acquisition.signals import ENDING, SignalReceived, held, obeyed_by, raise_outside_sessions
+from coupole.acquisition.signals import ENDING, SignalReceived, drop_signals, obeyed_by, raise_outside_sessions
 from coupole.errors import Interrupted
 
 BLOCKED_S = 0.8
@@ -63,7 +63,7 @@ def test_the_first_signal_counts() -> None:
     control = Control()
     control.stop_by(signal.SIGTERM)
     control.stop_by(signal.SIGINT)
-    assert control.interrupted().exit_code == 143
+    assert control.interruption().exit_code == 143
 
 
 def test_sigusr1_pauses_and_continues_and_stops_nothing() -> None:
@@ -86,7 +86,7 @@ def test_outside_sessions_a_signal_raises_and_after_one_again(number: signal.Sig
         assert received.value.number == number
         with obeyed_by(Control(), lambda: None):
             os.kill(os.getpid(), number)
-        with held():
+        with drop_signals():
             os.kill(os.getpid(), number)
 
 

@@ -60,7 +60,7 @@ def write_light_run(folder: Path, frames: Sequence[Taken]) -> Path:
         for number, frame in enumerate(mine):
             pixels = np.frombuffer(mmap.mmap(-1, FORMAT.frame_bytes), np.uint16).reshape(frame.pixels.shape)
             pixels[:] = frame.pixels
-            slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=frame.exposure_us)
+            slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=frame.exposure_us)
             digest = writer.prove(
                 slot, frame.shot, led=0, pose=pose, board_temperature_dc=250, t_trigger_ns=10**9 * number
             )

@@ -118,7 +118,7 @@ def write_run(
             pixels = np.frombuffer(mmap.mmap(-1, FORMAT.frame_bytes), np.uint16).reshape(picture.shape)
             signal = 64 + share * _bayer(200 + 3000 * picture, red_scale) + random.normal(0, 6, picture.shape)
             pixels[:] = np.clip(np.rint(signal), 0, 4095)
-            slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
+            slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=8000)
             warmth = {"board_temperature_dc": round(10 * room_c), "led_current_ma": 700}
             digest = writer.prove(slot, f"{view}/{label}", led=number, pose=at, **warmth)
             file = str(path.relative_to(run.folder))

@@ -79,7 +79,7 @@ def write_raw_run(folder: Path, frames: Sequence[Frame], *, pattern: str = "GBRG
         for number, one in enumerate(mine):
             pixels = np.frombuffer(mmap.mmap(-1, of.frame_bytes), np.uint16).reshape(one.pixels.shape)
             pixels[:] = one.pixels
-            slot = writer.put(pixels, frame_id=number, camera_ns=number, exposure_us=1000)
+            slot = writer.store(pixels, frame_id=number, camera_ns=number, exposure_us=1000)
             shot = f"{view}/{one.light}/e0"
             warmth = {"board_temperature_dc": round(10 * room_c), "led_current_ma": 700}
             digest = writer.prove(slot, shot, led=number, pose=pose, **warmth)

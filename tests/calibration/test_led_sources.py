@@ -53,7 +53,7 @@ def write_run(folder: Path, labels: tuple[str, ...], *, hot: bool = False) -> Ru
             if hot:
                 pixels[70:84, 100:116] = 4095
             exposure_us = 1000 if label.endswith("e0") else 8000
-            slot = writer.put(pixels, frame_id=slot_number, camera_ns=slot_number, exposure_us=exposure_us)
+            slot = writer.store(pixels, frame_id=slot_number, camera_ns=slot_number, exposure_us=exposure_us)
             digest = writer.prove(
                 slot, f"{view}/{label}", led=slot_number, pose=at, board_temperature_dc=251, led_current_ma=700
             )

@@ -142,7 +142,7 @@ def test_a_kind_that_is_missing_or_named_twice_is_refused() -> None:
         ({"size_px": (2048, 1536)}, "holds for frames of 4096 x 3072"),
         ({"camera": "CB120CG-CM 99"}, "holds for the camera CB120CG-CM 1234"),
         ({"temperature_c": 31.0}, "holds from 18 to 26 C"),
-        ({"simulated": True}, "made in a real cell"),
+        ({"is_simulated": True}, "made in a real cell"),
     ],
 )
 def test_a_record_that_does_not_hold_here_is_refused_with_the_reason(here: dict[str, Any], reason: str) -> None:

@@ -44,7 +44,7 @@ class CameraWorld(Protocol):
         ...
 
     @property
-    def armed(self) -> bool: ...
+    def is_armed(self) -> bool: ...
 
 
 def flat(out: NDArray[np.uint16], exposed: Exposed) -> None:
@@ -248,7 +248,7 @@ class CameraConformance:
         take_numbers(camera, 1)
         camera.disarm()
         world.fire(10_000)
-        assert not world.armed
+        assert not world.is_armed
         assert camera.next_frame(A_MOMENT_S) is None
 
     def test_disarming_twice_does_no_harm(self, camera: Camera) -> None:
@@ -318,7 +318,7 @@ class CameraConformance:
         first.arm(8)
         first.close()
         second = _when_free(world.open)
-        _wait_until(lambda: not world.armed)
+        _wait_until(lambda: not world.is_armed)
         second.configure(EXPOSURE)
         second.arm(8)
         world.fire()

@@ -43,8 +43,8 @@ class UsbLink:
         self.refused = 0
         self.gone = False
 
-    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
-        self._received, self._on_break = received, on_break
+    def listen(self, on_bytes: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        self._received, self._on_break = on_bytes, on_break
 
     def send(self, data: bytes) -> bool:
         with self._ready:

@@ -194,7 +194,7 @@ class StandIn:
             height_px=self.integer(HEIGHT),
             binning=(self.integer(BINNING_X), self.integer(BINNING_Y)),
             decimation=(self.integer(DECIMATION_X), self.integer(DECIMATION_Y)),
-            mirrored=(bool(self.integer(REVERSE_X)), bool(self.integer(REVERSE_Y))),
+            mirror_axes=(bool(self.integer(REVERSE_X)), bool(self.integer(REVERSE_Y))),
             gamma=self.real(GAMMA) if self.integer(GAMMA_ENABLE) else 1.0,
             inverts=bool(self.integer(LUT_ENABLE)),
             balance=(self.real(BALANCE_RED), self.real(BALANCE_BLUE)),
@@ -320,7 +320,7 @@ class Cell:
     def unplug(self, silently: bool) -> None:
         in_world(self._reactor, lambda: self.camera.unplug(silently=silently))
 
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         return self.camera.body.armed
 
     def sent(self) -> int:

@@ -145,7 +145,7 @@ class GenTLWorld:
         return images
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         return bool(self._ask("armed"))
 
     def close(self) -> None:

@@ -79,8 +79,8 @@ class GigeWorld:
         return begun_ns(frame)
 
     @property
-    def armed(self) -> bool:
-        return self.camera.armed
+    def is_armed(self) -> bool:
+        return self.camera.is_armed
 
     def close(self) -> None:
         self._drivers.close()

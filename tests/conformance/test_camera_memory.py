@@ -47,8 +47,8 @@ class MemoryWorld:
         in_world(self._reactor, self._server.unplug)
 
     @property
-    def armed(self) -> bool:
-        return self._server.armed
+    def is_armed(self) -> bool:
+        return self._server.is_armed
 
     def close(self) -> None:
         self._drivers.close()

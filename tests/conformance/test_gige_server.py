@@ -224,5 +224,5 @@ def test_the_cameras_process_may_die_without_the_world(
         camera.next_frame(30.0)
     world.fire(10_000)
     in_world(world.reactor, lambda: None)
-    assert not world.armed
+    assert not world.is_armed
     assert "the simulated GigE Vision camera is gone: its process ended (-9)" in capfd.readouterr().err

@@ -44,8 +44,8 @@ class TcpLink:
         self.port = f"socket://127.0.0.1:{self._server.getsockname()[1]}"
         reactor.add_reader(self._server, self._accept)
 
-    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
-        self._received, self._on_break = received, on_break
+    def listen(self, on_bytes: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        self._received, self._on_break = on_bytes, on_break
 
     def send(self, data: bytes) -> bool:
         if self._client is not None and self._received is not None:

@@ -70,7 +70,7 @@ class XiWorld:
         at_ns = [start_ns + int(offset) * 1000 for offset in np.cumsum([0, *periods_us])]
         for t_ns in at_ns:
             end_s = time.monotonic() + _PATIENCE_S
-            while self.armed and not self.stub.stub_has_room():
+            while self.is_armed and not self.stub.stub_has_room():
                 assert time.monotonic() < end_s
                 time.sleep(1e-3)
             self.edge(t_ns)
@@ -90,7 +90,7 @@ class XiWorld:
         return value
 
     @property
-    def armed(self) -> bool:
+    def is_armed(self) -> bool:
         return bool(self.stub.stub_acquiring())
 
     def close(self) -> None:

@@ -43,9 +43,9 @@ def test_what_ends_is_returned_and_what_it_raises_is_raised() -> None:
     def fail() -> None:
         raise EndedError
 
-    assert bounded.bounded(lambda: 7) == 7
+    assert bounded.run_bounded(lambda: 7) == 7
     with pytest.raises(EndedError):
-        bounded.bounded(fail)
+        bounded.run_bounded(fail)
     assert not left_behind()
 
 
@@ -55,7 +55,7 @@ def test_a_call_that_never_returns_is_given_up_with_its_name(never: threading.Ev
             never.wait()
 
     with pytest.raises(DeviceTimeout, match="camera: expected an end of the call `arm`") as raised:
-        bounded.bounded(hang)
+        bounded.run_bounded(hang)
     assert raised.value.device == "camera"
     assert left_behind()
     assert bounded.hangs("camera") == "arm"
@@ -89,7 +89,7 @@ def test_a_call_in_another_thread_of_the_work_is_given_up_too(never: threading.E
             never.wait()
 
     with pytest.raises(StorageError, match="views/top"):
-        bounded.bounded(lambda: workers.submit(write).result())
+        bounded.run_bounded(lambda: workers.submit(write).result())
 
 
 def test_what_takes_its_time_by_the_work_asked_is_waited_for() -> None:
@@ -128,10 +128,10 @@ def test_what_goes_on_is_waited_for_however_slow_it_is(monkeypatch: pytest.Monke
         return "read"
 
     if goes_on:
-        assert bounded.bounded(read) == "read"
+        assert bounded.run_bounded(read) == "read"
     else:
         with pytest.raises(StorageError, match="has not answered"):
-            bounded.bounded(read)
+            bounded.run_bounded(read)
 
 
 def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event) -> None:
@@ -140,7 +140,7 @@ def test_once_a_session_is_to_end_a_device_has_less_time(never: threading.Event)
             never.wait()
 
     with pytest.raises(DeviceTimeout, match="wait_settled"):
-        bounded.bounded(hang, stop=NOW)
+        bounded.run_bounded(hang, stop=NOW)
 
 
 def test_a_rescue_may_bring_a_call_back() -> None:
@@ -151,7 +151,7 @@ def test_a_rescue_may_bring_a_call_back() -> None:
             back.wait()
         return "came back"
 
-    assert bounded.bounded(hang, rescue=back.set) == "came back"
+    assert bounded.run_bounded(hang, rescue=back.set) == "came back"
     assert not left_behind()
 
 
@@ -164,7 +164,7 @@ def test_what_comes_after_all_is_passed_to_whoever_does_away_with_it(never: thre
         return "an opened camera"
 
     with pytest.raises(DeviceTimeout):
-        bounded.bounded(hang, unwanted=late.append)
+        bounded.run_bounded(hang, discard=late.append)
     never.set()
     cells.wait_until(lambda: late, "what came after all")
     assert late == ["an opened camera"]
@@ -187,7 +187,7 @@ def test_a_signal_ends_the_work_as_it_ends_who_waits_for_it() -> None:
     try:
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGUSR2)).start()
         with pytest.raises(EndedError):
-            bounded.bounded(work)
+            bounded.run_bounded(work)
     finally:
         signal.signal(signal.SIGUSR2, before)
     assert cleaned.is_set()

@@ -18,7 +18,7 @@ from coupole.kinematics import (
     move_duration_s,
     move_durations_s,
     nearest,
-    slowed,
+    slowed_arm,
     unreachable_reason,
     within_limits,
 )
@@ -120,7 +120,7 @@ def test_a_joint_angle_that_is_no_number_is_not_within_limits() -> None:
 
 
 def test_a_long_motion_takes_as_long_as_its_slowest_axis() -> None:
-    arm = slowed(KR10_R1100_SIXX, speed_fraction=0.1, acceleration_deg_s2=300.0, jerk_deg_s3=3000.0)
+    arm = slowed_arm(KR10_R1100_SIXX, speed_fraction=0.1, acceleration_deg_s2=300.0, jerk_deg_s3=3000.0)
     target = (60.0, -90.0, 90.0, 0.0, 90.0, 0.0)
     # 60 deg at 30 deg/s, and v/a + a/j to gain and to lose speed, half of it on the way
     assert move_duration_s(arm, HOME_DEG, target) == pytest.approx(60.0 / 30.0 + 30.0 / 300.0 + 0.1, abs=1e-6)
@@ -135,7 +135,7 @@ def test_a_motion_takes_as_long_as_ruckigs(seed: int) -> None:
     from ruckig import InputParameter, Ruckig, Trajectory
 
     random = np.random.default_rng(seed)
-    arm = slowed(
+    arm = slowed_arm(
         KR10_R1100_SIXX,
         speed_fraction=random.uniform(0.01, 1.0),
         acceleration_deg_s2=10 ** random.uniform(1, 4),

@@ -38,11 +38,11 @@ class MemoryFeatures:
     def first_of(self, *names: str) -> str | None:
         return next((name for name in names if self.has(name)), None)
 
-    def read(self, name: str) -> Value:
+    def read_value(self, name: str) -> Value:
         return self.values[self._key(name)]
 
     def number(self, name: str) -> float:
-        value = self.read(name)
+        value = self.read_value(name)
         assert not isinstance(value, str)
         return value
 
@@ -53,7 +53,7 @@ class MemoryFeatures:
         return SENSOR_PX[name]
 
     def entries(self, name: str) -> list[str]:
-        return self.choices.get(name, [str(self.read(name))])
+        return self.choices.get(name, [str(self.read_value(name))])
 
     def write(self, name: str, value: Value) -> None:
         self.written.append(name)
@@ -100,7 +100,7 @@ LEFT_AND_RIGHT: list[tuple[str, Value, Value, list[str]]] = [
 
 
 def up(camera: MemoryFeatures, **settings: Any) -> dict[str, str]:
-    return set_up(camera, Settings(**settings), triggered=True)
+    return set_up(camera, Settings(**settings), is_triggered=True)
 
 
 @pytest.mark.parametrize(("name", "left", "right", "entries"), LEFT_AND_RIGHT)

@@ -11,13 +11,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused
-from coupole.kinematics import move_duration_s, slowed
+from coupole.kinematics import move_duration_s, slowed_arm
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.watch import Tolerances, Watch
 from drivers.kuka.eki.wire import Status, StatusReader
 from sim.devices.kuka_kinematics import AXIS_SPEEDS_DEG_S
-from sim.devices.kuka_ptp import Motion, braked, point_to_point
+from sim.devices.kuka_ptp import Motion, braking_motion, point_to_point
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
 TOLERANCES = Tolerances(settle_deg=0.003, settle_deg_s=0.1, follow_deg=1.0, follow_cycles=3)
@@ -120,7 +120,7 @@ def test_an_endless_message_does_not_fill_the_memory() -> None:
 
 def watch() -> Watch:
     fresh = Watch(7, TOLERANCES)
-    fresh.ordered(1, None)
+    fresh.note_order(1, None)
     return fresh
 
 
@@ -135,7 +135,7 @@ def test_an_old_answer_does_not_settle_a_new_order() -> None:
     for n in range(5):
         judge.take(replace(STATUS, time_ms=20 * n))
     assert judge.settled_cycles > 0
-    judge.ordered(2, HOME_DEG)
+    judge.note_order(2, HOME_DEG)
     judge.take(replace(STATUS, time_ms=120))
     assert judge.moving
     assert judge.settled_cycles == 0
@@ -148,7 +148,7 @@ def test_what_was_said_before_a_question_was_taken_does_not_count() -> None:
     judge = watch()
     for n in range(5):
         judge.take(replace(STATUS, time_ms=20 * n))
-    judge.asked(2)
+    judge.note_command(2)
     judge.take(replace(STATUS, time_ms=100))
     assert judge.taken_ms is None
     judge.take(replace(STATUS, taken=2, time_ms=120))
@@ -165,7 +165,7 @@ def test_a_slow_creep_does_not_count_as_settled() -> None:
 
 def test_an_arm_that_ends_elsewhere_does_not_follow() -> None:
     judge = watch()
-    judge.ordered(2, (5.0, *HOME_DEG[1:]))
+    judge.note_order(2, (5.0, *HOME_DEG[1:]))
     for n in range(4):
         judge.take(replace(STATUS, taken=2, done=2, time_ms=20 * n))
     assert judge.fault is not None
@@ -204,7 +204,7 @@ def test_the_stand_ins_motion_lasts_as_long_as_preflight_says(
     assume(np.max(np.abs(np.subtract(target_deg, start_deg))) > 0.01)
     speeds = [share * v for v in AXIS_SPEEDS_DEG_S]
     motion = point_to_point(start_deg, target_deg, speeds, acceleration, 3000.0)
-    arm = slowed(KR10_R1100_SIXX, speed_fraction=share, acceleration_deg_s2=acceleration, jerk_deg_s3=3000.0)
+    arm = slowed_arm(KR10_R1100_SIXX, speed_fraction=share, acceleration_deg_s2=acceleration, jerk_deg_s3=3000.0)
     assert motion.duration_s == pytest.approx(move_duration_s(arm, start_deg, target_deg), rel=1e-6)
     assert np.allclose(motion.joints_deg(motion.duration_s), target_deg, atol=1e-6)
 
@@ -216,8 +216,8 @@ def test_braking_at_any_moment_ends_at_rest_on_the_way_within_the_limits(
     way_deg: float, when: float, again: float, harder: float
 ) -> None:
     motion = point_to_point((0.0, 0.0), (way_deg, way_deg / 3), (150.0, 150.0), 300.0, 3000.0)
-    once = braked(motion, when * motion.duration_s, harder * 300.0, harder * 3000.0)
-    twice = braked(once, again * once.duration_s, 300.0, 3000.0)
+    once = braking_motion(motion, when * motion.duration_s, harder * 300.0, harder * 3000.0)
+    twice = braking_motion(once, again * once.duration_s, 300.0, 3000.0)
     for brake in (once, twice):
         s, v, a = brake.state(brake.duration_s)
         assert -1e-9 <= s <= 1.0 + 1e-6 or brake is motion
@@ -245,7 +245,7 @@ def test_no_axis_turns_farther_after_a_stop_than_the_driver_says(
     speeds = [share * v for v in AXIS_SPEEDS_DEG_S]
     motion = point_to_point(start_deg, target_deg, speeds, acceleration, 3000.0)
     called_s = called * motion.duration_s
-    rest = braked(motion, called_s + delay_s, acceleration, 3000.0)
+    rest = braking_motion(motion, called_s + delay_s, acceleration, 3000.0)
     turned_deg = np.subtract(rest.joints_deg(rest.duration_s), motion.joints_deg(called_s))
     assert np.all(np.abs(turned_deg) <= farthest_stop_deg(speeds, acceleration, 3000.0, delay_s) + 1e-6)
 

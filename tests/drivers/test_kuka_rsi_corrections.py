@@ -15,7 +15,7 @@ from drivers.kuka.rsi import shared_state
 from drivers.kuka.rsi.corrections import Corrections
 from drivers.kuka.rsi.driver import Settings
 from drivers.kuka.rsi.limits import correction_violations
-from drivers.kuka.rsi.pose import Geometry, Pose, corrected, correction, flange_pose
+from drivers.kuka.rsi.pose import Geometry, Pose, corrected_pose, correction, flange_pose
 from drivers.kuka.rsi.trajectory import Motion
 
 HOME_DEG = (0.0, -90.0, 90.0, 0.0, 90.0, 0.0)
@@ -41,12 +41,12 @@ def test_a_correction_leads_from_one_pose_to_the_other(
 ) -> None:
     before, after = flange_pose(GEOMETRY, before_deg), flange_pose(GEOMETRY, after_deg)
     values = correction(before, after)
-    assert np.allclose(matrix(corrected(before, values)), matrix(after), atol=1e-6)
+    assert np.allclose(matrix(corrected_pose(before, values)), matrix(after), atol=1e-6)
 
 
 def test_a_correction_moves_in_base_axes_and_turns_about_them() -> None:
     home = flange_pose(GEOMETRY, HOME_DEG)
-    there = matrix(corrected(home, (1.0, 2.0, 3.0, 10.0, -20.0, 30.0)))
+    there = matrix(corrected_pose(home, (1.0, 2.0, 3.0, 10.0, -20.0, 30.0)))
     assert np.allclose(there[:3, 3], np.add(home.position_mm, (1.0, 2.0, 3.0)))
     assert np.allclose(there[:3, :3], rotation_from_abc(10.0, -20.0, 30.0) @ matrix(home)[:3, :3])
 
@@ -59,9 +59,9 @@ def test_roundings_of_relative_corrections_do_not_add_up(corrects: str) -> None:
     sum_deg = np.zeros(6)
     for cycle in range(1, 5001):
         values = corrections.to(tuple(angle + 1.03e-6 * cycle for angle in HOME_DEG))
-        corrections.taken()
+        corrections.note_applied()
         sum_deg += values
-        place = corrected(place, values)
+        place = corrected_pose(place, values)
     target_deg = np.array(HOME_DEG) + 1.03e-6 * 5000
     if corrects == "axes":
         assert np.allclose(HOME_DEG + sum_deg, target_deg, atol=1e-6)
@@ -74,7 +74,7 @@ def test_an_increment_that_was_not_applied_is_said_again_with_the_next() -> None
     corrections.begin(HOME_DEG)
     assert corrections.to((0.25, *HOME_DEG[1:]))[0] == 0.25
     assert corrections.to((0.25, *HOME_DEG[1:]))[0] == 0.25
-    corrections.taken()
+    corrections.note_applied()
     assert corrections.to((0.75, *HOME_DEG[1:]))[0] == 0.5
     assert corrections.hold() == (0.0,) * 6
 

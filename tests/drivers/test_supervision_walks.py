@@ -63,7 +63,7 @@ class Implementation:
         if before.thread in (ASKS, WATCHES):
             assert self.may_command() == ("Interrupted" if before.stop else "Held" if before.held else "")
         if what == "stands":
-            self.control.held.clear()
+            self.control.hold_pending.clear()
         elif what == "moves the arm":
             self.driver.write_looked(self.attention.begin())
             self.send(shared_state.MOVE)
@@ -118,7 +118,12 @@ class Implementation:
 
     def compare(self, what: str, now: State, lapses: int) -> None:
         control, session = self.control, self.session
-        found = (control.stop.is_set(), control.pause.is_set(), control.held.is_set(), control.halting.is_set())
+        found = (
+            control.stop.is_set(),
+            control.pause.is_set(),
+            control.hold_pending.is_set(),
+            control.halting.is_set(),
+        )
         assert found == (now.stop, now.pause, now.held, now.halting)
         if what in ANSWERS:
             assert session.motion.pursues == (now.arm == MOVES)

@@ -129,7 +129,7 @@ def test_authors_are_read_before_anything_is_written(made: MadeRun, tmp_path: Pa
 
 def test_a_run_that_is_being_acquired_is_left_alone(made: MadeRun, tmp_path: Path) -> None:
     options = ("--to", "rocrate", "--licence", CC_BY, "--author", AUTHOR, "--out", tmp_path / "crate")
-    with made.run.locked():
+    with made.run.hold_lock():
         ended = cells.here("export", made.run.folder, *options)
     assert ended.code == 2
     assert "is acquiring into this run" in ended.err

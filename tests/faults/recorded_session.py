@@ -52,8 +52,8 @@ def begin_view(recorder: RunRecorder, view: str) -> None:
 def take(recorder: RunRecorder, shot: str) -> None:
     """One frame that is proven, and one that is not and gives its slot back."""
     number = sum(shot.encode())
-    recorder.free(recorder.put(picture(number + 1000), 8000))
-    slot = recorder.put(picture(number), 8000)
+    recorder.free(recorder.store(picture(number + 1000), 8000))
+    slot = recorder.store(picture(number), 8000)
     led = LABELS.index(shot.partition("/")[2])
     recorder.prove(slot, ShotId.parse(shot), {"led": led, "step": 2, "t_trigger_ns": 3})
 

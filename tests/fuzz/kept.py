@@ -161,7 +161,7 @@ QUEUE = lines_of('{"halted": "", "entries": [{"id": "1", "by": "a", "entered": "
 def read_ledger(path: Path) -> None:
     from coupole.storage.ledger import Ledger
 
-    Ledger(path.parent, path.stem).read()
+    Ledger(path.parent, path.stem).read_history()
 
 
 def read_arm_faults(path: Path) -> None:

@@ -146,7 +146,7 @@ class Line:
     def write(self, data: bytes, deadline: Any, clears: int) -> None:
         pass
 
-    def read(self, deadline: Any, clears: int) -> bytes:
+    def read_bytes(self, deadline: Any, clears: int) -> bytes:
         for data in self._said:
             return data
         raise TimeoutError("nothing came")
@@ -196,8 +196,8 @@ class Wire:
     def __init__(self) -> None:
         self.sent = bytearray()
 
-    def listen(self, received: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
-        self.received, self.on_break = received, on_break
+    def listen(self, on_bytes: Callable[[bytes], None], on_break: Callable[[], None] | None = None) -> None:
+        self.received, self.on_break = on_bytes, on_break
 
     def send(self, data: bytes) -> bool:
         self.sent += data

@@ -11,12 +11,12 @@ from arms import KR10, KR10_R1100_SIXX
 from numpy.typing import NDArray
 
 from coupole.geometry import transform
-from coupole.kinematics import move_duration_s, move_durations_s, slowed
+from coupole.kinematics import move_duration_s, move_durations_s, slowed_arm
 from coupole.motion.bodies import Capsule
 from coupole.motion.collisions import CellBodies, Clearances, Surroundings
 from coupole.motion.path_planner import PathPlanner
 
-ARM = slowed(KR10_R1100_SIXX, speed_fraction=0.3, acceleration_deg_s2=300.0, jerk_deg_s3=3000.0)
+ARM = slowed_arm(KR10_R1100_SIXX, speed_fraction=0.3, acceleration_deg_s2=300.0, jerk_deg_s3=3000.0)
 HOME = np.array((0.0, -170.0, 150.0, 0.0, -70.0, 0.0))
 LEFT, RIGHT = (np.array((a1, -60.0, 60.0, 0.0, 60.0, 0.0)) for a1 in (-50.0, 50.0))
 WALL = ("wall", (550.0, -30.0, 0.0), (1100.0, 30.0, 1000.0))

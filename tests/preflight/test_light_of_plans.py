@@ -64,6 +64,6 @@ def test_what_the_ledger_says_counts_against_the_budget(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path, "shroud")
     ledger.enter(1.25, "earlier")
     ledger.enter(1.25, "later")
-    before = ledger.read().total_lux_h
+    before = ledger.read_history().total_lux_h
     refusal = only_refusal(checked(with_budget(4.0), leds=sphere(), dose_before_lux_h=before))
     assert "after 2.50 lux.h before; its budget is 4 lux.h" in refusal

@@ -132,7 +132,7 @@ class CheckedRecorder(MemoryRecorder):
         super().begin_view(view, *pose)
         self._before_view(view)
 
-    def put(self, frame: Frame, exposure_us: int) -> int:
+    def store(self, frame: Frame, exposure_us: int) -> int:
         slot = len(self._frames)
         self._frames.append((frame.frame_id, frame.timestamp_ns))
         return slot

@@ -25,7 +25,7 @@ VIEWS = ("a", "b", "c")
 
 def archived(run: Path) -> list[str]:
     """Views of a run that are archived."""
-    return [path.stem for path in sorted((run / "views").glob("*.h5")) if frame_file.read_layout(path).archived]
+    return [path.stem for path in sorted((run / "views").glob("*.h5")) if frame_file.read_layout(path).is_archived]
 
 
 def assert_frames_are_there(made: MadeRun) -> None:

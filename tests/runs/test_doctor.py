@@ -11,7 +11,7 @@ import pytest
 from places import REPO
 
 from coupole.commands.doctor import advice_of, words_of
-from drivers.kuka.rsi.jitter import judged
+from drivers.kuka.rsi.jitter import jitter_of
 
 RIG = Path("rig.yaml")
 
@@ -33,8 +33,8 @@ def test_an_arm_that_is_not_answered_in_cycles_has_nothing_to_measure() -> None:
 
 
 def test_one_late_answer_of_fifteen_thousand_is_a_cycle_that_does_not_hold() -> None:
-    good = judged([100.0] * 14_999 + [3999.0], 4, realtime=True)
-    late = judged([100.0] * 14_999 + [math.inf], 4, realtime=True)
+    good = jitter_of([100.0] * 14_999 + [3999.0], 4, realtime=True)
+    late = jitter_of([100.0] * 14_999 + [math.inf], 4, realtime=True)
     assert (good.holds, late.holds) == (True, False)
     assert late.late_share == pytest.approx(1 / 15_000)
     assert (late.max_us, late.p99_us) == (4000.0, 100.0)
@@ -52,8 +52,8 @@ def test_one_late_answer_of_fifteen_thousand_is_a_cycle_that_does_not_hold() -> 
 def test_the_advice_names_the_cycle_the_right_or_the_other_driver(
     at_4: float, at_12: float | None, realtime: bool, expected: str
 ) -> None:
-    found = [judged([at_4], 4, realtime=realtime)]
+    found = [jitter_of([at_4], 4, realtime=realtime)]
     if at_12 is not None:
-        found.append(judged([at_12], 12, realtime=realtime))
+        found.append(jitter_of([at_12], 12, realtime=realtime))
     assert expected in advice_of(found, RIG)
     assert "real-time priority" in words_of(found[0]) or not realtime

@@ -52,7 +52,7 @@ class RealCell:
 
     @property
     def history(self) -> History:
-        return Ledger(Path(self.cell.rig_data["ledger"]), "relief").read()
+        return Ledger(Path(self.cell.rig_data["ledger"]), "relief").read_history()
 
     @property
     def entered_lux_h(self) -> float:

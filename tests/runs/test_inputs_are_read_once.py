@@ -37,7 +37,9 @@ def without_blanks(text: str) -> str:
 
 
 def told(run: Path) -> list[str]:
-    return [one for e in journal.read(run / "journal.jsonl") if isinstance(e, InputsChanged) for one in e.files]
+    return [
+        one for e in journal.read_events(run / "journal.jsonl") if isinstance(e, InputsChanged) for one in e.files
+    ]
 
 
 def test_a_plan_edited_while_acquire_asks_to_begin_is_run_and_kept_as_it_was_checked(tmp_path: Path) -> None:

@@ -74,10 +74,10 @@ def assert_refused_and_resumable(cell: CellFolder, ended: cells.Ended) -> None:
     assert f"coupole dose {cell.plan_data['object']['id']} --budget" in ended.document["error"]
     run = Path(ended.document["run"])
     ledger = ledger_of(cell)
-    allowed = ledger.read().budget_lux_h
+    allowed = ledger.read_history().budget_lux_h
     assert allowed is not None
-    assert ledger.read().total_lux_h <= allowed
-    assert ledger.read().unsettled_lux_h == 0
+    assert ledger.read_history().total_lux_h <= allowed
+    assert ledger.read_history().unsettled_lux_h == 0
     ledger.set_budget(allowed + 10.0, "A. Keeper", "the run may be ended")
     resumed = cell.acquire("--resume", run)
     assert resumed.code == 0, resumed.err
@@ -166,7 +166,7 @@ def test_two_cells_at_once_give_one_object_no_more_than_its_budget(tmp_path: Pat
         running = [cell.start_acquire() for cell, _ in both]
         codes = [cells.finish(process).code for process in running]
         true = sum(float(true_dose_lux_h(cell, world).max()) for cell, world in both)
-        history = Ledger(tmp_path / "ledger", "relief").read()
+        history = Ledger(tmp_path / "ledger", "relief").read_history()
     assert 3 in codes
     assert set(codes) <= {0, 3}
     assert 0.7 * budget < true <= budget * (1 + QUARTZ)

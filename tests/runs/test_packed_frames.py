@@ -80,12 +80,12 @@ def test_packed_frames_are_exported(made: MadeRun, tmp_path: Path) -> None:
 
 def test_a_frame_that_has_more_bits_is_not_packed_and_not_cut(tmp_path: Path) -> None:
     path = tmp_path / "view.h5"
-    create(path, 2, FORMAT, {**METADATA, "title": "view"}, packed=True)
+    create(path, 2, FORMAT, {**METADATA, "title": "view"}, is_packed=True)
     writer = ViewWriter(path, {})
     pixels = noisy_frame(1, FORMAT)
     pixels[0, 0] = 4096
     with pytest.raises(StorageError, match=r"cannot be packed: .* 12 bits, found a bit above them in 4096"):
-        writer.put(pixels, frame_id=1, camera_ns=1, exposure_us=8000)
+        writer.store(pixels, frame_id=1, camera_ns=1, exposure_us=8000)
     writer.close()
 
 

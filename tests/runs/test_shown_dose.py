@@ -46,7 +46,7 @@ def printed_lux_h(ended: cells.Ended) -> None:
 def assert_all_say_the_same(cell: CellFolder, world: World, ended: cells.Ended) -> None:
     """The figures of a session that has ended, and of the run that it leaves."""
     run = cell.run_folder
-    ledger = Ledger(Path(cell.rig_data["ledger"]), "relief").read().of_run(run.name).total_lux_h
+    ledger = Ledger(Path(cell.rig_data["ledger"]), "relief").read_history().of_run(run.name).total_lux_h
     journal = cells.here("status", run, "--json").document["dose_lux_h"]
     wait_for_the_dark(world)
     true = float(true_dose_lux_h(cell, world).max())
@@ -160,7 +160,7 @@ def test_interrupted_killed_and_resumed_all_tell_the_same(lasting: tuple[CellFol
     cells.finish(killed)
     wait_for_the_dark(world)
     world.ask("reset_robot")
-    ledger = Ledger(Path(cell.rig_data["ledger"]), "relief").read().of_run(run.name)
+    ledger = Ledger(Path(cell.rig_data["ledger"]), "relief").read_history().of_run(run.name)
     assert ledger.unsettled_lux_h > 0
     status = cells.here("status", run, "--json").document
     assert status["dose_lux_h"] == pytest.approx(ledger.total_lux_h, abs=ROUNDING)

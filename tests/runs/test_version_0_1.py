@@ -47,7 +47,7 @@ def test_a_frame_of_its_run_that_was_changed_is_found(run: Path) -> None:
 
 
 def test_the_end_of_a_pause_in_its_journal_is_no_session(run: Path) -> None:
-    tags = [event.event for event in journal.read(run / "journal.jsonl")]
+    tags = [event.event for event in journal.read_events(run / "journal.jsonl")]
     assert tags[0] == "start"
     assert "resume" not in tags
     assert tags.count("continue") == 1

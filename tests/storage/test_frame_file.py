@@ -118,7 +118,7 @@ def test_after_a_sync_the_file_says_of_each_frame_what_it_is_though_it_was_never
     path = tmp_path / "top.h5"
     create(path, 3, FORMAT, METADATA)
     writer = ViewWriter(path, {})
-    slot = writer.put(frame(1), frame_id=1, camera_ns=1, exposure_us=8000)
+    slot = writer.store(frame(1), frame_id=1, camera_ns=1, exposure_us=8000)
     writer.prove(slot, "top/led0007/e0", led=7)
     writer.sync()
     record = frame_file.read_frames(path)[slot]
@@ -139,7 +139,7 @@ def test_frames_written_after_reopening_overwrite_nothing_proven(tmp_path: Path)
     path = tmp_path / "top.h5"
     write_view(path, proven=2, stored=0)
     writer = ViewWriter(path, {"top/led0001/e0": 1})
-    slots = {writer.put(frame(50 + k), frame_id=k, camera_ns=k, exposure_us=8000) for k in range(5)}
+    slots = {writer.store(frame(50 + k), frame_id=k, camera_ns=k, exposure_us=8000) for k in range(5)}
     writer.close()
     assert slots == {0, 2, 3, 4, 5}
     assert np.array_equal(frame_file.read_frame(path, frame_file.read_layout(path), 1), frame(1))
@@ -169,18 +169,18 @@ def test_a_frame_behind_the_end_of_a_file_is_refused(tmp_path: Path) -> None:
 def test_a_freed_slot_is_used_again(tmp_path: Path) -> None:
     create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
-    slot = writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
+    slot = writer.store(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     writer.free(slot)
-    assert writer.put(frame(1), frame_id=2, camera_ns=2, exposure_us=8000) == slot
+    assert writer.store(frame(1), frame_id=2, camera_ns=2, exposure_us=8000) == slot
     writer.close()
 
 
 def test_more_frames_than_slots_are_an_error_that_says_so(tmp_path: Path) -> None:
     create(tmp_path / "top.h5", 1, FORMAT, METADATA)
     writer = ViewWriter(tmp_path / "top.h5", {})
-    writer.put(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
+    writer.store(frame(0), frame_id=1, camera_ns=1, exposure_us=8000)
     with pytest.raises(StorageError, match="no slot is free"):
-        writer.put(frame(1), frame_id=2, camera_ns=2, exposure_us=8000)
+        writer.store(frame(1), frame_id=2, camera_ns=2, exposure_us=8000)
     writer.close()
 
 

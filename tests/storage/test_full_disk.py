@@ -63,7 +63,7 @@ def test_the_space_of_a_view_is_its_own_though_the_disk_fills_up(small_disk: Pat
     fill(small_disk, 0)
     writer = ViewWriter(small_disk / "top.h5", {})
     for number in range(SLOTS):
-        writer.put(frame(number), frame_id=number, camera_ns=number, exposure_us=8000)
+        writer.store(frame(number), frame_id=number, camera_ns=number, exposure_us=8000)
     writer.sync()
     writer.close()
 
@@ -93,7 +93,7 @@ def test_lines_that_found_the_disk_full_never_count_and_later_ones_are_whole(sma
     diary.write(SessionStopped(outcome="done"))
     diary.commit()
     diary.close()
-    assert [event.event for event in journal.read(path)] == ["journal", "stop"]
+    assert [event.event for event in journal.read_events(path)] == ["journal", "stop"]
 
 
 def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_a_journal_over_a_limit_of_the_system_leaves_no_half_line(tmp_path: Path
     )
     assert done.stdout.startswith("StorageError ")
     assert "Raise the limit (`ulimit -f`)" in done.stdout
-    assert [event.event for event in journal.read(path)] == ["journal", "start"]
+    assert [event.event for event in journal.read_events(path)] == ["journal", "start"]
     assert path.read_bytes().endswith(b"\n")
 
 

@@ -41,7 +41,7 @@ def written(path: Path, events: Sequence[Event]) -> None:
 
 
 def tags(path: Path) -> list[str]:
-    return [event.event for event in journal.read(path)]
+    return [event.event for event in journal.read_events(path)]
 
 
 def test_lines_reach_the_file_with_the_commit_and_not_before(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_lines_reach_the_file_with_the_commit_and_not_before(tmp_path: Path) -> 
     diary.write(FRAME)
     assert path.read_bytes() == b""
     diary.commit()
-    assert FRAME in list(journal.read(path))
+    assert FRAME in list(journal.read_events(path))
     diary.close()
 
 
@@ -118,7 +118,7 @@ def test_a_tail_of_what_a_disk_gives_for_lost_sectors_is_passed_over(
     assert tags(path) == ["journal", "start", "frame"]
     written(path, [SessionResumed(), FRAME])
     assert tags(path) == ["journal", "start", "frame", "resume", "frame"]
-    assert journal.tail(path, 10**6) == list(journal.read(path))
+    assert journal.tail(path, 10**6) == list(journal.read_events(path))
 
 
 def test_a_line_whose_first_sectors_are_lost_is_passed_over_and_the_next_is_read(tmp_path: Path) -> None:
@@ -145,14 +145,14 @@ def test_a_whole_line_that_is_no_event_is_refused_with_its_number(tmp_path: Path
     with path.open("a") as file:
         file.write(line + "\n")
     with pytest.raises(StorageError, match="line 3 is not an event"):
-        list(journal.read(path))
+        list(journal.read_events(path))
 
 
 def test_a_journal_of_a_later_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     path.write_text('{"event":"journal","t":"","version":3}\n')
     with pytest.raises(StorageError, match="version 3"):
-        list(journal.read(path))
+        list(journal.read_events(path))
 
 
 def test_of_a_journal_of_version_1_the_end_of_a_pause_is_told_from_a_resumed_session(tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_of_a_journal_of_version_1_the_end_of_a_pause_is_told_from_a_resumed_ses
     ]
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert journal.version(path) == 1
-    found = list(journal.read(path))
+    found = list(journal.read_events(path))
     assert list(map(type, found)) == [SessionStarted, Paused, Continued, SessionResumed]
     assert [event.t for event in found] == [line["t"] for line in lines]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from coupole.storage.journal import Follower, Journal, read
+from coupole.storage.journal import Follower, Journal, read_events
 from coupole.storage.journal_events import Paused, ViewBegun
 
 
@@ -24,4 +24,4 @@ def test_each_event_is_told_once_and_none_before_its_line_is_whole(tmp_path: Pat
     found += follower.news()
     assert isinstance(found[-1], Paused)
     assert follower.news() == []
-    assert found == list(read(path))
+    assert found == list(read_events(path))

@@ -28,12 +28,12 @@ def lines(ledger: Ledger) -> list[dict[str, Any]]:
 def test_what_was_planned_counts_until_what_was_given_is_known(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path, "shroud")
     first, second = ledger.plan("one", 3.0, None), ledger.plan("one", 2.0, None)
-    assert ledger.read().total_lux_h == 5.0
+    assert ledger.read_history().total_lux_h == 5.0
     ledger.correct(first, 2.5, None)
-    history = ledger.read()
+    history = ledger.read_history()
     assert (history.total_lux_h, history.unsettled_lux_h) == (4.5, 2.0)
     ledger.correct(second, 2.25, None)
-    assert (ledger.read().total_lux_h, ledger.read().unsettled_lux_h) == (4.75, 0.0)
+    assert (ledger.read_history().total_lux_h, ledger.read_history().unsettled_lux_h) == (4.75, 0.0)
 
 
 def test_light_is_summed_for_each_object_and_run(tmp_path: Path) -> None:
@@ -41,14 +41,14 @@ def test_light_is_summed_for_each_object_and_run(tmp_path: Path) -> None:
     ledger.correct(ledger.plan("one", 1.7, None), 1.7, None)
     ledger.enter(0.4, "photographed in 2019")
     Ledger(tmp_path, "other").enter(9.0, "elsewhere")
-    history = ledger.read()
+    history = ledger.read_history()
     assert history.total_lux_h == pytest.approx(2.1)
     assert history.runs == ["one", "by hand"]
     assert history.of_run("one").total_lux_h == 1.7
 
 
 def test_an_object_without_a_ledger_has_received_nothing(tmp_path: Path) -> None:
-    assert Ledger(tmp_path, "shroud").read().total_lux_h == 0.0
+    assert Ledger(tmp_path, "shroud").read_history().total_lux_h == 0.0
     assert list(tmp_path.iterdir()) == []
 
 
@@ -56,7 +56,7 @@ def test_damage_is_summed_where_it_is_known_and_the_rest_is_told(tmp_path: Path)
     ledger = Ledger(tmp_path, "shroud")
     ledger.correct(ledger.plan("one", 2.0, 0.004), 1.0, 0.002)
     ledger.enter(7.0, "daylight")
-    history = ledger.read()
+    history = ledger.read_history()
     assert (history.damage_wh_m2, history.of_unknown_spectrum_lux_h) == (0.002, 7.0)
 
 
@@ -67,7 +67,7 @@ def test_a_torn_or_damaged_line_hides_no_other_and_is_told(tmp_path: Path, tail:
     with ledger.path.open("ab") as file:
         file.write(tail)
     ledger.enter(2.0, "after")
-    history = ledger.read()
+    history = ledger.read_history()
     assert (history.total_lux_h, history.unreadable) == (3.0, 1)
 
 
@@ -77,7 +77,7 @@ def test_a_line_whose_dose_is_none_is_told_and_not_summed(tmp_path: Path, dose: 
     ledger.enter(1.0, "before")
     with ledger.path.open("a") as file:
         file.write(f'{{"t":"","event":"dose","run":"x","dose_lux_h":{dose}}}\n')
-    history = ledger.read()
+    history = ledger.read_history()
     assert (history.total_lux_h, history.unreadable) == (1.0, 1)
     assert math.isfinite(history.total_lux_h)
 
@@ -86,7 +86,7 @@ def test_a_correction_whose_plan_is_damaged_counts_by_itself(tmp_path: Path) -> 
     ledger = Ledger(tmp_path, "shroud")
     ledger.correct(ledger.plan("one", 3.0, None), 2.0, None)
     ledger.path.write_text("damaged\n" + ledger.path.read_text().splitlines()[1] + "\n")
-    assert ledger.read().total_lux_h == 2.0
+    assert ledger.read_history().total_lux_h == 2.0
 
 
 def _plan_and_correct(folder: Path, name: str) -> None:
@@ -102,7 +102,7 @@ def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
     for writer in writers:
         writer.join(cells.PATIENCE_S)
         assert writer.exitcode == 0
-    history = Ledger(tmp_path, "shroud").read()
+    history = Ledger(tmp_path, "shroud").read_history()
     assert history.total_lux_h == 2 * EACH
     assert len(history.entries) == 2 * EACH
     assert history.unreadable == 0
@@ -155,14 +155,14 @@ def test_entries_in_the_place_of_version_0_1_count_once(tmp_path: Path) -> None:
     (old / "shroud.jsonl").write_text(OLD)
     ledger = Ledger(new, "shroud", old)
     ledger.enter(1.0, "here")
-    assert ledger.read().total_lux_h == 2.5
+    assert ledger.read_history().total_lux_h == 2.5
     with ledger.path.open("a") as file:
         file.write(OLD)  # as someone does who copies the old file's lines
-    assert ledger.read().total_lux_h == 2.5
-    assert Ledger(old, "shroud", old).read().total_lux_h == 1.5
+    assert ledger.read_history().total_lux_h == 2.5
+    assert Ledger(old, "shroud", old).read_history().total_lux_h == 1.5
     linked = tmp_path / "linked"
     linked.symlink_to(old)
-    assert Ledger(linked, "shroud", old).read().total_lux_h == 1.5
+    assert Ledger(linked, "shroud", old).read_history().total_lux_h == 1.5
 
 
 def test_the_rig_names_the_place_or_else_it_is_in_the_users_data_folder(

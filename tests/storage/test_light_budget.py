@@ -39,7 +39,7 @@ def test_a_plan_beyond_the_budget_is_not_entered(tmp_path: Path) -> None:
         DoseBudgetReached, match=r"object shroud: .*its budget of 1 lux\.h\. If it may receive more"
     ):
         give(ledger, 0.01)
-    assert ledger.read().total_lux_h == 1.0
+    assert ledger.read_history().total_lux_h == 1.0
 
 
 def test_light_entered_by_hand_meanwhile_counts_for_the_next_burst(tmp_path: Path) -> None:
@@ -79,21 +79,21 @@ def test_the_first_budget_of_a_plan_becomes_the_objects_and_holds_for_plans_with
     with pytest.raises(DoseBudgetReached):
         give(Ledger(tmp_path, "shroud"), 0.7)
     give(Ledger(tmp_path, "shroud"), 0.1, 5.0)
-    (noted,) = Ledger(tmp_path, "shroud").read().budgets
+    (noted,) = Ledger(tmp_path, "shroud").read_history().budgets
     assert (noted.dose_lux_h, noted.name) == (1.0, "an operator")
     assert "a plan" in noted.reason
 
 
 def test_an_object_without_any_budget_has_no_limit(tmp_path: Path) -> None:
     give(Ledger(tmp_path, "shroud"), 1e6)
-    assert Ledger(tmp_path, "shroud").read().allowed_lux_h(None) is None
+    assert Ledger(tmp_path, "shroud").read_history().allowed_lux_h(None) is None
 
 
 def test_a_budget_is_raised_and_lowered_by_a_named_person_and_its_history_stays(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path, "shroud")
     for lux_h, name in (1.0, "A. Keeper"), (3.0, "B. Curator"), (2.0, "A. Keeper"):
         ledger.set_budget(lux_h, name, "as agreed")
-    history = Ledger(tmp_path, "shroud").read()
+    history = Ledger(tmp_path, "shroud").read_history()
     assert history.budget_lux_h == 2.0
     assert [(one.dose_lux_h, one.name) for one in history.budgets] == [
         (1.0, "A. Keeper"),
@@ -131,7 +131,7 @@ def test_of_two_sessions_and_a_person_who_enter_at_once_the_sum_never_exceeds_th
     for session in sessions:
         session.join(cells.PATIENCE_S)
         assert session.exitcode == 0
-    history = ledger.read()
+    history = ledger.read_history()
     total = 0.0
     for line in map(json.loads, ledger.path.read_text().splitlines()):
         given = {"given": 0.1, "dose": 0.05}.get(line["event"], 0.0)
@@ -167,7 +167,7 @@ def test_what_others_entered_while_it_waited_for_the_lock_counts(tmp_path: Path)
         held.write(LightEntered(dose_lux_h=0.5, note="studio").model_dump_json().encode() + b"\n")
     session.join()
     assert len(ended) == 1
-    assert ledger.read().total_lux_h == 0.5
+    assert ledger.read_history().total_lux_h == 0.5
 
 
 # -- what others write is read without reading all of it anew -----------------------------------------------------
@@ -178,11 +178,11 @@ def test_a_ledger_that_grows_is_read_on_and_says_what_one_read_anew_says(tmp_pat
     assert reader.newest().total_lux_h == 0
     for number in range(5):
         plan = writer.plan("a run", 2.0, 0.1)
-        assert reader.newest() == Ledger(tmp_path, "shroud").read()
+        assert reader.newest() == Ledger(tmp_path, "shroud").read_history()
         writer.correct(plan, 1.0, 0.05)
         writer.set_budget(100.0 + number, "A. Keeper")
         writer.warn_above(number)
-        assert reader.newest() == Ledger(tmp_path, "shroud").read()
+        assert reader.newest() == Ledger(tmp_path, "shroud").read_history()
 
 
 def test_half_a_line_is_read_when_it_is_whole(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_a_ledger_that_somebody_edits_is_read_anew(tmp_path: Path, how: str) -> 
         other.replace(ledger.path)
     else:
         ledger.path.write_text(first if how == "shortened" else text.replace("1.0", "7.0"))
-    assert ledger.newest() == Ledger(tmp_path, "shroud").read()
+    assert ledger.newest() == Ledger(tmp_path, "shroud").read_history()
 
 
 def _removed(path: Path) -> None:

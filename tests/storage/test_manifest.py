@@ -42,7 +42,7 @@ def test_coreutils_find_every_file_as_the_manifest_lists_it(made: MadeRun) -> No
     checked = sha256sum(made.run.folder)
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
     on_disk = {str(path.relative_to(made.run.folder)) for path in made.run.folder.rglob("*") if path.is_file()}
-    assert set(manifest.read(made.run.folder)) == on_disk - {manifest.NAME}
+    assert set(manifest.read_checksums(made.run.folder)) == on_disk - {manifest.NAME}
 
 
 @pytest.mark.parametrize(
@@ -81,15 +81,15 @@ def test_a_slow_disk_that_answers_is_waited_for(made: MadeRun, monkeypatch: pyte
 
     monkeypatch.setattr(manifest, "_synced_sha256", slowly)
     conclude(made.run, make_console(quiet=True))
-    assert {"views/side.h5", "views/top.h5"} <= set(manifest.read(made.run.folder))
+    assert {"views/side.h5", "views/top.h5"} <= set(manifest.read_checksums(made.run.folder))
 
 
 def test_a_session_takes_out_what_it_writes_and_keeps_complete_views(tmp_path: Path) -> None:
     made = make_run(tmp_path, shots=2, missing=("side/led0001/e0",))
     conclude(made.run, make_console(quiet=True))
-    assert "views/side.h5" not in manifest.read(made.run.folder)
+    assert "views/side.h5" not in manifest.read_checksums(made.run.folder)
     open_for_session(made.run)
-    left = set(manifest.read(made.run.folder))
+    left = set(manifest.read_checksums(made.run.folder))
     assert "views/top.h5" in left
     assert {"run.json", "README.txt", "inputs/plan.yaml", "inputs/rig.yaml"} <= left
     assert not {"journal.jsonl", "report.html", "views/side.h5"} & left
@@ -101,7 +101,7 @@ def test_large_views_are_left_to_verify_which_enters_them_on_request(
 ) -> None:
     monkeypatch.setattr("coupole.acquisition.conclusion.MOST_HASHED_BYTES", 1000)
     conclude(made.run, make_console(quiet=True))
-    assert "views/top.h5" not in manifest.read(made.run.folder)
+    assert "views/top.h5" not in manifest.read_checksums(made.run.folder)
     assert cells.here("verify", made.run.folder, "--json").document["unlisted"] == [
         "views/side.h5",
         "views/top.h5",
@@ -109,7 +109,10 @@ def test_large_views_are_left_to_verify_which_enters_them_on_request(
     assert cells.here("verify", made.run.folder, "--manifest").code == 0
     for view in ("top", "side"):
         path = made.run.view_path(view)
-        assert manifest.read(made.run.folder)[f"views/{view}.h5"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert (
+            manifest.read_checksums(made.run.folder)[f"views/{view}.h5"]
+            == hashlib.sha256(path.read_bytes()).hexdigest()
+        )
 
 
 def test_archived_views_and_a_new_report_are_entered_again(made: MadeRun) -> None:
@@ -117,21 +120,21 @@ def test_archived_views_and_a_new_report_are_entered_again(made: MadeRun) -> Non
     archive_run(made.run, codec_of("lz4"), keep=True)
     renew_report(made.run)
     assert sha256sum(made.run.folder).returncode == 0
-    assert manifest.unlisted(made.run.folder) == []
+    assert manifest.unlisted_files(made.run.folder) == []
 
 
 def test_while_a_session_writes_a_new_report_is_not_entered(made: MadeRun) -> None:
-    with made.run.locked():
+    with made.run.hold_lock():
         open_for_session(made.run)
         renew_report(made.run)
-    assert "report.html" not in manifest.read(made.run.folder)
+    assert "report.html" not in manifest.read_checksums(made.run.folder)
 
 
 def test_a_line_that_is_none_is_refused_with_its_number(made: MadeRun) -> None:
     with (made.run.folder / manifest.NAME).open("a") as file:
         file.write("no checksum\n")
     with pytest.raises(StorageError, match=r"manifest.sha256: line \d+ is not"):
-        manifest.read(made.run.folder)
+        manifest.read_checksums(made.run.folder)
 
 
 def test_a_run_without_a_manifest_is_verified(made: MadeRun) -> None:

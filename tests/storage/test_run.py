@@ -78,7 +78,7 @@ def test_verify_finds_a_missing_shot(finished: Run) -> None:
 
 def test_verify_finds_a_shot_that_stands_in_two_slots(finished: Run) -> None:
     writer = ViewWriter(finished.view_path("top"), {f"top/led{k:04d}/e0": k for k in range(3)})
-    slot = writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000)
+    slot = writer.store(frame(9), frame_id=200, camera_ns=9, exposure_us=8000)
     writer.prove(slot, "top/led0001/e0")
     writer.close()
     assert verify(finished).bad == ["views/top.h5: top/led0001/e0 is in 2 slots"]
@@ -89,7 +89,7 @@ def test_what_a_crash_left_in_the_frame_table_alone_is_missing_and_not_bad(finis
     lines = finished.journal_path.read_text().splitlines(keepends=True)
     finished.journal_path.write_text("".join(line for line in lines if "led0001" not in line))
     writer = ViewWriter(finished.view_path("top"), {f"top/led{k:04d}/e0": k for k in range(3)})
-    writer.prove(writer.put(frame(9), frame_id=200, camera_ns=9, exposure_us=8000), "top/led0001/e0")
+    writer.prove(writer.store(frame(9), frame_id=200, camera_ns=9, exposure_us=8000), "top/led0001/e0")
     writer.close()
     found = verify(finished)
     assert (found.bad, found.missing) == ([], ["top/led0001/e0"])

@@ -66,7 +66,7 @@ def test_a_failure_is_a_fault_and_the_reason(run: Run) -> None:
 
 def test_the_lock_tells_a_session_that_runs_from_one_that_was_killed(run: Run) -> None:
     assert told(run, [SessionStarted()]).state == "interrupted"
-    with run.locked():
+    with run.hold_lock():
         assert (status(run).state, status(run).go_on) == ("running", "")
         assert told(run, [SessionStarted(), Paused()]).state == "paused"
     assert "it was killed, or the power failed" in status(run).reason
@@ -75,7 +75,7 @@ def test_the_lock_tells_a_session_that_runs_from_one_that_was_killed(run: Run) -
 
 def test_a_look_at_the_lock_does_not_keep_a_session_out(run: Run) -> None:
     assert not run.in_use
-    with run.locked():
+    with run.hold_lock():
         assert run.in_use
     assert not run.in_use
 

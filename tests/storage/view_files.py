@@ -34,7 +34,9 @@ def write_view(path: Path, proven: int = 3, stored: int = 1, of: FrameFormat = F
     checksums = {}
     try:
         for number in range(proven + stored):
-            slot = writer.put(frame(number, of), frame_id=100 + number, camera_ns=1000 * number, exposure_us=8000)
+            slot = writer.store(
+                frame(number, of), frame_id=100 + number, camera_ns=1000 * number, exposure_us=8000
+            )
             if number < proven:
                 shot = f"{path.stem}/led{number:04d}/e0"
                 checksums[shot] = writer.prove(slot, shot, led=number, step=number, t_trigger_ns=number)

@@ -39,11 +39,11 @@ class HoldLostError(Exception):
 class BenchArm:
     """One arm at a time does one thing: a path, or a motion by hand."""
 
-    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None, works: Works) -> None:
-        self._cell, self._opened, self._works = cell, opened, works
-        self._faults = faults_of(cell, opened.identities["robot"])
+    def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None, works: Works) -> None:
+        self._cell, self._opened, self._works = cell, opened_cell, works
+        self._faults = faults_of(cell, opened_cell.identities["robot"])
         self._paths = ArmPaths(cell, job)
-        self._switch = EnablingSwitch(opened.ledbox, must_exist=cell.rig.console.enabling_switch)
+        self._switch = EnablingSwitch(opened_cell.ledbox, must_exist=cell.rig.console.enabling_switch)
         self._shown: dict[str, ShownPath] = {}
         self._numbers = itertools.count(1)
         self._planning = threading.Lock()
@@ -71,13 +71,13 @@ class BenchArm:
             "heard_s_ago": round((self._opened.clock.now_ns() - arm.t_ns) / 1e9, 3),
         }
 
-    def plan_path(self, asked: PathAsked) -> dict[str, Any]:
+    def plan_path(self, request: PathAsked) -> dict[str, Any]:
         """A path from where the arm stands. Raises InputError if it moves, or there is none."""
         state = self._opened.robot.measured()
         if state.moving:
             raise InputError("the arm moves: a path is planned from where it stands")
         with self._planning:
-            path = self._paths.plan(str(next(self._numbers)), asked.to, np.array(state.joints_deg))
+            path = self._paths.plan(str(next(self._numbers)), request.to, np.array(state.joints_deg))
             self._shown[path.id] = path
             for old in list(self._shown)[:-_KEPT_PATHS]:
                 del self._shown[old]
@@ -101,21 +101,21 @@ class BenchArm:
         self._works.begin(work, stops)
         return work.figures()
 
-    def jog(self, asked: JogAsked, stops: int) -> dict[str, Any]:
+    def jog(self, request: JogAsked, stops: int) -> dict[str, Any]:
         """Begin a motion by hand, or renew it; `stops` of the works when it was asked. Raises
         InputError if it must not be."""
         consoles = self._cell.rig.console.at_the_cell
-        if asked.at not in consoles:
+        if request.at not in consoles:
             raise InputError(
-                f"from: the arm is moved by hand only from a console at the cell; {asked.at!r} is not in "
+                f"from: the arm is moved by hand only from a console at the cell; {request.at!r} is not in "
                 f"`console: at_the_cell:` of {self._cell.document.path}"
             )
-        if asked.hold is not None:
-            return self._renew(asked)
+        if request.hold is not None:
+            return self._renew(request)
         self.refuse_motion()
         self._switch.refuse_released()
-        hold = _Hold(next(self._numbers), asked)
-        about = {"hold": hold.number, "axis": asked.axis, "direction": asked.direction}
+        hold = _Hold(next(self._numbers), request)
+        about = {"hold": hold.number, "axis": request.axis, "direction": request.direction}
         work = Work("jog", about, lambda control: self._go_on(hold, control))
         self._works.begin(work, stops)
         self._hold, hold.work = hold, work
@@ -125,11 +125,11 @@ class BenchArm:
         """The plan's job in this cell. Raises InputError if its object is not the bench's."""
         return self._paths.job_of(plan)
 
-    def _renew(self, asked: JogAsked) -> dict[str, Any]:
+    def _renew(self, request: JogAsked) -> dict[str, Any]:
         hold = self._hold
-        if hold is None or hold.number != asked.hold:
-            raise InputError(f"hold: {asked.hold} has ended; let the button go and press it anew")
-        if (asked.axis, asked.direction) == (hold.asked.axis, hold.asked.direction):
+        if hold is None or hold.number != request.hold:
+            raise InputError(f"hold: {request.hold} has ended; let the button go and press it anew")
+        if (request.axis, request.direction) == (hold.asked.axis, hold.asked.direction):
             hold.renew()
         else:
             hold.let_go()
@@ -147,7 +147,7 @@ class BenchArm:
     def _follow(self, path: ShownPath, control: Control) -> dict[str, Any]:
         supervisor = ArmSupervisor(self._cell.rig, path.motion, self._opened, control)
         try:
-            with self._switch.held() as check, self._stopped_at_the_end():
+            with self._switch.release_check() as check, self._stopped_at_the_end():
                 supervisor.begin_here()
                 supervisor.go(path.visit, meanwhile=check)
         except ReleasedError as end:
@@ -161,7 +161,7 @@ class BenchArm:
 
         camera, jog = rig.flange_from_camera.matrix(), hold.asked
         try:
-            with self._switch.held() as check, self._stopped_at_the_end():
+            with self._switch.release_check() as check, self._stopped_at_the_end():
 
                 def go_on() -> None:
                     hold.check()
@@ -193,8 +193,8 @@ class BenchArm:
 class _Hold:
     """A button that is held."""
 
-    def __init__(self, number: int, asked: JogAsked) -> None:
-        self.number, self.asked = number, asked
+    def __init__(self, number: int, request: JogAsked) -> None:
+        self.number, self.asked = number, request
         self.work: Work | None = None
         self._ended = ""
         self.renew()

@@ -48,7 +48,7 @@ def ask_bench(
         raise InputError(f"{rig}: its bench does not answer: {error}") from error
 
 
-def obeyed(answer: dict[str, Any]) -> dict[str, Any]:
+def checked_answer(answer: dict[str, Any]) -> dict[str, Any]:
     """The same answer. Raises InputError, with the exit code of the error that it says, if it was not obeyed."""
     if "error" in answer:
         error = InputError(answer["error"])

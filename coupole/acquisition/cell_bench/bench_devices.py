@@ -25,8 +25,8 @@ _ASKED_EVERY_S = 2.0
 class BenchDevices:
     """State of the three devices, as far as it is known."""
 
-    def __init__(self, cell: Cell, opened: OpenedCell) -> None:
-        self._cell, self._opened = cell, opened
+    def __init__(self, cell: Cell, opened_cell: OpenedCell) -> None:
+        self._cell, self._opened = cell, opened_cell
         self._links = {kind: self._link(kind) for kind in DEVICES}
         self._errors: dict[str, dict[str, str]] = {}
         self._tested: dict[str, dict[str, Any]] = {}
@@ -64,19 +64,19 @@ class BenchDevices:
         try:
             with self.in_use:
                 outcome["report"] = dict(test())
-            self.heard(kind)
+            self.note_answer(kind)
         except DeviceError as error:
-            self.failed(error)
+            self.note_error(error)
             outcome |= {"passed": False, "report": {"error": str(error)}}
         self._tested[kind] = outcome
         return {"device": kind, **outcome}
 
-    def heard(self, *kinds: str) -> None:
+    def note_answer(self, *kinds: str) -> None:
         """These devices have just answered."""
         for kind in kinds:
             self._heard_s[kind] = time.monotonic()
 
-    def failed(self, error: DeviceError) -> None:
+    def note_error(self, error: DeviceError) -> None:
         """Keep the last error of each device."""
         for kind, name in _NAMES.items():
             if error.device == name:
@@ -92,9 +92,9 @@ class BenchDevices:
             temperatures_c = [self._opened.ledbox.board_temperature_c(int(board)) for board in some]
             self._box_c = max((c for c in temperatures_c if c is not None), default=None)
             if self._box_c is not None:
-                self.heard("ledbox")
+                self.note_answer("ledbox")
         except DeviceError as error:
-            self.failed(error)
+            self.note_error(error)
         finally:
             self.in_use.release()
 

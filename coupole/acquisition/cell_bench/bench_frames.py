@@ -35,9 +35,9 @@ class BenchFrames:
     """Takes one picture at a time; the last ones lie in a folder that only this user can enter."""
 
     def __init__(
-        self, cell: Cell, opened: OpenedCell, job: Job | None, devices: BenchDevices, works: Works
+        self, cell: Cell, opened_cell: OpenedCell, job: Job | None, devices: BenchDevices, works: Works
     ) -> None:
-        self._cell, self._opened, self._devices = cell, opened, devices
+        self._cell, self._opened, self._devices = cell, opened_cell, devices
         self._job, self._works = job, works
         self._lux = lux_of_leds(cell, job)
         self.begin_counting()
@@ -47,27 +47,27 @@ class BenchFrames:
         shutil.rmtree(self._folder, ignore_errors=True)  # of a bench that was killed
         self._folder.mkdir(mode=0o700)
 
-    def frame(self, asked: FrameAsked, stops: int) -> dict[str, Any]:
+    def frame(self, request: FrameAsked, stops: int) -> dict[str, Any]:
         """Expose under each light in turn, and add up; after a stop nothing more is lit: `stops` of the works when
         it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
-        self._refuse_what_there_is_not(asked)
-        if asked.stops not in (None, stops):
+        self._refuse_what_there_is_not(request)
+        if request.stops not in (None, stops):
             raise InputError("frame: the bench was stopped since; look at its state, and ask anew")
         with self._devices.in_use:
             before_lux_h = self._shots.given_lux_h
-            shot = self._exposed(asked, stops)
-            self._devices.heard("ledbox", "camera")
+            shot = self._expose_lights(request, stops)
+            self._devices.note_answer("ledbox", "camera")
             self._last = shot
             self._number += 1
             number, given_lux_h = self._number, float((self._shots.given_lux_h - before_lux_h).max())
-        coding, marks = shot.coding, asked.marks
+        coding, marks = shot.coding, request.marks
         jpeg = look(
             shot.raw,
             coding,
-            asked.width_px,
+            request.width_px,
             saturation="saturation" in marks,
             focus="focus" in marks,
-            gains=asked.gains,
+            gains=request.gains,
         )
         return {
             "number": number,
@@ -77,19 +77,19 @@ class BenchFrames:
             "picture": str(self._keep(f"{number}.jpg", jpeg)),
             "raw": str(self._keep_raw(number, shot.raw)),
             **vars(figures(shot.raw, coding)),
-            "region": self._figures_of(shot, asked.region) if asked.region else None,
+            "region": self._figures_of(shot, request.region) if request.region else None,
             "dose_lux_h": given_lux_h,
         }
 
-    def loupe(self, asked: LoupeAsked) -> dict[str, Any]:
+    def loupe(self, request: LoupeAsked) -> dict[str, Any]:
         """A region of the last picture, pixel by pixel, without another exposure. Raises InputError."""
         shot, number = self._last, self._number
         if shot is None:
             raise InputError("loupe: expected a `frame` before it")
-        if max(asked.region[2:]) > _MOST_LOUPE_PX:
+        if max(request.region[2:]) > _MOST_LOUPE_PX:
             raise InputError(f"region: expected at most {_MOST_LOUPE_PX} x {_MOST_LOUPE_PX} px")
-        region, at_px = _region(shot, asked.region)
-        picture = self._keep("loupe.png", loupe(region, shot.coding, asked.gains))
+        region, at_px = _region(shot, request.region)
+        picture = self._keep("loupe.png", loupe(region, shot.coding, request.gains))
         height_px, width_px = region.shape
         return {"number": number, "region": [*at_px, width_px, height_px], "picture": str(picture)}
 
@@ -119,14 +119,14 @@ class BenchFrames:
         self._settle()
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _exposed(self, asked: FrameAsked, stops: int) -> Shot:
-        lights = [(led, 0) for led in asked.lights] + [(NO_LED, panel) for panel in asked.panels]
+    def _expose_lights(self, request: FrameAsked, stops: int) -> Shot:
+        lights = [(led, 0) for led in request.lights] + [(NO_LED, panel) for panel in request.panels]
         shots = []
         try:
             for led, panel in lights or [(NO_LED, 0)]:
                 if self._works.stops != stops or self._opened.made_safe:
                     raise InputError("frame: it was stopped before its last light")
-                shots.append(self._shots.take(led, asked.exposure_us, asked.gain_db, panel))
+                shots.append(self._shots.take(led, request.exposure_us, request.gain_db, panel))
                 self._shots.rest()
         except DeviceError:
             with contextlib.suppress(DeviceError):
@@ -145,18 +145,18 @@ class BenchFrames:
         pixels, _ = _region(shot, region)
         return {**vars(figures(pixels, shot.coding)), "white_point": white_point(pixels, shot.coding)}
 
-    def _refuse_what_there_is_not(self, asked: FrameAsked) -> None:
+    def _refuse_what_there_is_not(self, request: FrameAsked) -> None:
         leds, panels = set(self._cell.leds.ids.tolist()), self._opened.ledbox.panel_count
-        if strange := [led for led in asked.lights if led not in leds]:
+        if strange := [led for led in request.lights if led not in leds]:
             raise InputError(f"lights: expected LEDs of the dome, found {strange[0]}")
-        if strange := [panel for panel in asked.panels if not 1 <= panel <= panels]:
+        if strange := [panel for panel in request.panels if not 1 <= panel <= panels]:
             raise InputError(f"panels: expected numbers from 1 to {panels}, found {strange[0]}")
         longest_us = longest_exposure_us(self._cell.rig)
-        if asked.exposure_us > longest_us:
-            raise InputError(f"exposure_us: expected at most {longest_us}, found {asked.exposure_us}")
+        if request.exposure_us > longest_us:
+            raise InputError(f"exposure_us: expected at most {longest_us}, found {request.exposure_us}")
         sensor = self._cell.rig.sensor
-        if asked.region:
-            _within(asked.region, sensor.width_px, sensor.height_px)
+        if request.region:
+            _within(request.region, sensor.width_px, sensor.height_px)
 
     def _keep(self, name: str, content: bytes) -> Path:
         path = self._folder / name

@@ -64,13 +64,13 @@ _BEGIN = (SelfTestAsked, DriveAsked, JogAsked, FrameAsked, MeterAsked)
 class BenchService:
     """Answers requests; each is called in a thread of its own."""
 
-    def __init__(self, cell: Cell, opened: OpenedCell, job: Job | None) -> None:
-        self._cell, self._opened, self._job = cell, opened, job
+    def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None) -> None:
+        self._cell, self._opened, self._job = cell, opened_cell, job
         self.works = Works()
         self.closing = threading.Event()
-        self._devices = BenchDevices(cell, opened)
-        self._arm = BenchArm(cell, opened, job, self.works)
-        self._frames = BenchFrames(cell, opened, job, self._devices, self.works)
+        self._devices = BenchDevices(cell, opened_cell)
+        self._arm = BenchArm(cell, opened_cell, job, self.works)
+        self._frames = BenchFrames(cell, opened_cell, job, self._devices, self.works)
         self._ending = False
         self._asked_s = time.monotonic()
 
@@ -86,21 +86,21 @@ class BenchService:
             self._asked_s = time.monotonic()
         return time.monotonic() - self._asked_s
 
-    def answer(self, line: bytes, gone: Gone) -> dict[str, Any]:
+    def answer(self, line: bytes, is_gone: Gone) -> dict[str, Any]:
         """The answer to a request; an `error` with its `kind` where it was not obeyed. Nothing moves or shines for
-        who is `gone`."""
+        who is `is_gone`."""
         stops = self.works.stops
         try:
             request = read_request(line)
             self._asked_s = time.monotonic()
             if self._ending or self.closing.is_set():
                 raise InputError("the bench is closing")
-            if isinstance(request, _BEGIN) and gone():
+            if isinstance(request, _BEGIN) and is_gone():
                 raise InputError("whoever asked has gone: not begun")
             return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
-                self._devices.failed(error)
+                self._devices.note_error(error)
             return {
                 "version": VERSION,
                 "error": str(error),
@@ -188,12 +188,12 @@ class BenchService:
         try:
             arm = self._arm.state()
         except DeviceError as error:
-            self._devices.failed(error)
+            self._devices.note_error(error)
         plan_object = self._job.plan.object if self._job else None
         return {
             "rig": str(self._cell.document.path.resolve()),
             "pid": os.getpid(),
-            "simulated": self._opened.simulated,
+            "simulated": self._opened.is_simulated,
             "object": plan_object.id if plan_object else None,
             "devices": self._devices.state(arm["heard_s_ago"] if arm else None),
             "arm": arm,
@@ -213,13 +213,15 @@ class BenchService:
 
 
 @contextmanager
-def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: bool) -> Iterator[BenchService]:
+def bench_of(
+    job_or_cell: Job | Cell, console: Console, control: Control, *, confirm: bool
+) -> Iterator[BenchService]:
     """A bench that holds the cell's devices while the context lasts, and then makes all safe; signals are obeyed.
 
     With a job its object lies on the support. Raises InputError if somebody uses the cell already, DeviceError.
     """
-    job = what if isinstance(what, Job) else None
-    cell = what.cell if isinstance(what, Job) else what
+    job = job_or_cell if isinstance(job_or_cell, Job) else None
+    cell = job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell
     if is_in_use(cell):
         raise InputError(
             f"{cell.document.path}: another process has this cell's devices open (acquire, live, meter, bench, "
@@ -239,14 +241,16 @@ def bench_of(what: Job | Cell, console: Console, control: Control, *, confirm: b
                     faults_of(cell, opened_cell.identities["robot"]).note("; ".join(opened_cell.trouble), "bench")
 
 
-def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool) -> None:
+def serve_bench(
+    job_or_cell: Job | Cell, console: Console, *, confirm: bool, leave_after_s: float, as_json: bool
+) -> None:
     """Hold the cell's devices until `close` is asked, a signal comes, or nobody has asked for a while.
 
     Raises InputError, DeviceError, Interrupted (SIGTERM, SIGHUP, or the process did not run for a while).
     """
     control = Control()
-    path = bench_socket(what.cell if isinstance(what, Job) else what)
-    with bench_of(what, console, control, confirm=confirm) as service, contextlib.ExitStack() as stack:
+    path = bench_socket(job_or_cell.cell if isinstance(job_or_cell, Job) else job_or_cell)
+    with bench_of(job_or_cell, console, control, confirm=confirm) as service, contextlib.ExitStack() as stack:
         try:
             stack.enter_context(UserSocket(path, service.answer))
         except OSError as error:
@@ -269,4 +273,4 @@ def serve_bench(what: Job | Cell, console: Console, *, confirm: bool, leave_afte
                 break
         service.closing.set()
     if control.stop.is_set() and not control.stopped_by_hand:
-        raise control.interrupted()
+        raise control.interruption()

@@ -48,7 +48,7 @@ class EnablingSwitch:
             )
 
     @contextmanager
-    def held(self) -> Iterator[Callable[[], None]]:
+    def release_check(self) -> Iterator[Callable[[], None]]:
         """Give a function that raises ReleasedError unless the switch is held, while the context lasts. It is to
         be called all the time while the arm moves. Another thread asks the box, but not for a caller that hangs:
         or else the box's watchdog would hear that thread in the caller's place."""

@@ -55,7 +55,7 @@ def jog_step(
     Raises InputError that says why there is none: a limit, a contact, or a posture near a singularity.
     """
     if axis.startswith("A"):
-        there_deg = _turned(arm, here_deg, int(axis[1]) - 1, direction)
+        there_deg = _step_target_deg(arm, here_deg, int(axis[1]) - 1, direction)
     else:
         there_deg = _along(arm, flange_from_camera, here_deg, axis, direction)
     there_deg = _clear_part(bodies, here_deg, there_deg)
@@ -72,7 +72,7 @@ def greatest_speed_mm_s(arm: Arm, bodies: CellBodies, from_deg: Joints, to_deg: 
     return float(np.radians(turn_deg / line_s) @ bodies.reach_mm)
 
 
-def _turned(arm: Arm, here_deg: Joints, axis: int, direction: int) -> Joints:
+def _step_target_deg(arm: Arm, here_deg: Joints, axis: int, direction: int) -> Joints:
     low, high = arm.limits_deg[axis]
     room_deg = high - here_deg[axis] if direction > 0 else here_deg[axis] - low
     if room_deg < _LEAST_DEG:

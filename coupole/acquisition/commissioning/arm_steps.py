@@ -75,7 +75,7 @@ def axes(bench: Bench) -> None:
     for axis in range(6):
         change_deg = bench.clear_change(_visible_change(bench, home_deg, axis))
         bench.ask_before(
-            f"A{axis + 1} turns by {change_deg[axis]:+.1f} deg. {_described(bench, home_deg, change_deg)}"
+            f"A{axis + 1} turns by {change_deg[axis]:+.1f} deg. {_motion_text(bench, home_deg, change_deg)}"
         )
         before_deg = bench.joints_deg()
         turned_deg = bench.go_to(before_deg + change_deg) - before_deg
@@ -84,7 +84,8 @@ def axes(bench: Bench) -> None:
         others_deg = np.delete(off_deg, axis).max()
         right &= findings.at_most(f"A{axis + 1}: turn of the other axes", others_deg, _OTHERS_DEG, "deg")
         is_as_described = bench.ask_whether(
-            f"A{axis + 1} was turned by {turned_deg[axis]:+.2f} deg. {_described(bench, before_deg, turned_deg)} "
+            f"A{axis + 1} was turned by {turned_deg[axis]:+.2f} deg. "
+            f"{_motion_text(bench, before_deg, turned_deg)} "
             "Did you see just that?"
         )
         if not (right and is_as_described):
@@ -154,7 +155,7 @@ def _stopped_once(bench: Bench, shares: NDArray[np.float64]) -> tuple[NDArray[np
             state = robot.measured()
             if not samples or state.t_ns > samples[-1][0]:
                 samples.append((state.t_ns, np.array(state.joints_deg)))
-            if state.fault or deadline.expired:
+            if state.fault or deadline.has_expired:
                 robot.stop()
                 raise StepFailedError(f"the arm did not go where it was sent: {state.fault or 'too slow'}")
             bench.pause(_POLL_S)
@@ -180,7 +181,7 @@ def _at_rest(bench: Bench) -> NDArray[np.float64]:
     """The axes [6] once they have not turned for a while. Raises StepFailedError if they go on."""
     deadline = Deadline(bench.opened.clock, _LONGEST_STOP_S)
     last_deg = bench.joints_deg()
-    while not deadline.expired:
+    while not deadline.has_expired:
         bench.opened.clock.sleep(_STILL_S)
         now_deg = bench.joints_deg()
         if np.abs(now_deg - last_deg).max() <= _STILL_DEG:
@@ -199,7 +200,7 @@ def _visible_change(bench: Bench, home_deg: NDArray[np.float64], axis: int) -> N
     return change_deg
 
 
-def _described(bench: Bench, from_deg: NDArray[np.float64], change_deg: NDArray[np.float64]) -> str:
+def _motion_text(bench: Bench, from_deg: NDArray[np.float64], change_deg: NDArray[np.float64]) -> str:
     support = bench.cell.rig.support.base_from_support.matrix()
     return described_motion(
         support, _base_from_camera(bench, from_deg), _base_from_camera(bench, from_deg + change_deg)

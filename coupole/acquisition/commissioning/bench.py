@@ -31,15 +31,15 @@ class Person(Protocol):
         """Tell whether the person saw what is described."""
         ...
 
-    def measures(self, what: str, question: str) -> float | None:
-        """A length by ruler, mm; None if it was not measured. `what` is the question's name."""
+    def measures(self, quantity: str, question: str) -> float | None:
+        """A length by ruler, mm; None if it was not measured. `quantity` is the question's name."""
         ...
 
-    def told(self, message: str) -> None:
+    def tell(self, message: str) -> None:
         """A message without an answer."""
         ...
 
-    def hold_enabling_switch(self, *, held: bool) -> None:
+    def hold_enabling_switch(self, *, is_held: bool) -> None:
         """Asks for the enabling switch to be held, or released; returns at once."""
         ...
 
@@ -66,16 +66,16 @@ class Findings:
     remedy: str = ""
     """Remedy if a limit is missed or an answer is no."""
 
-    def at_most(self, what: str, found: float, limit: float, unit: str) -> bool:
+    def at_most(self, quantity: str, figure: float, limit: float, unit: str) -> bool:
         """Note a figure and its limit; returns whether it is met. A figure that is not finite misses it."""
-        finite_figure = float(found) if np.isfinite(found) else 1e9
+        finite_figure = float(figure) if np.isfinite(figure) else 1e9
         self.limits.append(
-            Limit(what=what, found=round(finite_figure, 6), limit=round(float(limit), 6), unit=unit)
+            Limit(what=quantity, found=round(finite_figure, 6), limit=round(float(limit), 6), unit=unit)
         )
         return self.limits[-1].is_met
 
     @property
-    def passed(self) -> bool:
+    def has_passed(self) -> bool:
         """True if all is well so far."""
         return all(entry.is_met for entry in self.limits) and all(entry.yes for entry in self.answers)
 
@@ -99,7 +99,7 @@ class Bench:
     board: Path | None = None
     """The file that describes the board on the support; None: the one of docs/how-to/commission-a-cell.md."""
 
-    def each(self, what: str, numbers: Iterable[int]) -> Iterator[int]:
+    def iterate(self, label: str, numbers: Iterable[int]) -> Iterator[int]:
         """One after the other, shown as a bar. Raises Interrupted between two of them after the operator's
         stop."""
         all_numbers = list(numbers)
@@ -107,7 +107,7 @@ class Bench:
             for k, number in enumerate(all_numbers):
                 self.control.go_on()
                 yield number
-                say(what, k + 1, len(all_numbers))
+                say(label, k + 1, len(all_numbers))
 
     def ask_before(self, announcement: str) -> None:
         """Raises Interrupted unless the person agrees."""
@@ -123,10 +123,10 @@ class Bench:
         self.findings.answers.append(Answer(question=question, yes=yes))
         return yes
 
-    def measured(self, what: str, question: str) -> float:
+    def measured_mm(self, quantity: str, question: str) -> float:
         """A length that the person measures, mm; it is noted. Raises StepFailedError if it was not measured."""
         self.control.go_on()
-        found_mm = self.person.measures(what, question)
+        found_mm = self.person.measures(quantity, question)
         if found_mm is None:
             raise StepFailedError(f"not measured: {question}. Repeat the step with ruler and tape at hand")
         self.findings.remarks.append(f"measured: {question}: {found_mm:g} mm")

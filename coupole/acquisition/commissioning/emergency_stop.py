@@ -47,7 +47,7 @@ def emergency_stop(bench: Bench) -> None:
     further_deg = float(np.abs(_last_known_deg(bench, rested_deg) - rested_deg).max())
     findings.at_most("turn of the axes at rest", further_deg, _STILL_DEG, "deg")
     bench.ask_whether("Did the arm stop at once, and has it stood still since?")
-    bench.person.told("Release the emergency stop, acknowledge it, reset the robot program, start it anew.")
+    bench.person.tell("Release the emergency stop, acknowledge it, reset the robot program, start it anew.")
 
 
 def _moved_until_pressed(bench: Bench) -> np.ndarray:
@@ -59,7 +59,7 @@ def _moved_until_pressed(bench: Bench) -> np.ndarray:
     change_deg = bench.clear_change(change_deg)
     deadline, out = Deadline(clock, _PRESSED_WITHIN_S), False
     is_asked = False
-    while not deadline.expired:
+    while not deadline.has_expired:
         out = not out
         bench.pause(_POLL_S)
         try:
@@ -87,7 +87,7 @@ def _last_known_deg(bench: Bench, before_deg: np.ndarray) -> np.ndarray:
     deadline = Deadline(bench.opened.clock, _WATCHED_S)
     last_deg = before_deg
     with contextlib.suppress(DeviceError):
-        while not deadline.expired:
+        while not deadline.has_expired:
             state: ArmState = bench.opened.robot.measured()
             now_deg = np.array(state.joints_deg)
             bench.opened.clock.sleep(0.1)

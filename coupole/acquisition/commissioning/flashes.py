@@ -95,7 +95,7 @@ def wait_for_end(bench: Bench, duration_s: float) -> None:
     box = table_box(bench.opened.ledbox)
     deadline = Deadline(bench.opened.clock, 2.0 * duration_s + _FRAME_S)
     while box.running():
-        if deadline.expired:
+        if deadline.has_expired:
             raise DeviceTimeout(
                 "led box",
                 expected=f"a table of {duration_s:.3f} s to end within {deadline.seconds:.1f} s",

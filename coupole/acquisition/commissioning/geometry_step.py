@@ -57,10 +57,10 @@ def geometry(bench: Bench) -> None:
         "the arm standing as it stands now and its drives off. The board lies flat on the support, in the "
         "camera's view."
     )
-    place_mm = np.array([bench.measured(*question) for question in _BOARD])
+    place_mm = np.array([bench.measured_mm(*question) for question in _BOARD])
     _measure_bodies(bench)
     _ask_for_volumes(bench)
-    if not bench.findings.passed:
+    if not bench.findings.has_passed:
         return
     _sight(bench, board, place_mm)
 
@@ -75,7 +75,7 @@ _BOARD = (
 def _measure_bodies(bench: Bench) -> None:
     """The ruler against the bodies of the rig, where they stand now."""
     findings, rig = bench.findings, bench.cell.rig
-    over_mm = bench.measured(
+    over_mm = bench.measured_mm(
         "tool_over_support_mm",
         "plumb distance from the disk's surface up to the lowest point of all that the flange carries (camera, "
         "lens, cables)",
@@ -95,15 +95,15 @@ def _measure_bodies(bench: Bench) -> None:
             width_mm,
         ),
     ):
-        sticks_out_mm = bench.measured(name, question) - rig_mm
+        sticks_out_mm = bench.measured_mm(name, question) - rig_mm
         findings.at_most(f"{name}: beyond the bodies of `tool`", sticks_out_mm, MOST_BEYOND_MM, "mm")
-    diameter_mm = bench.measured("support_diameter_mm", "diameter of the disk")
+    diameter_mm = bench.measured_mm("support_diameter_mm", "diameter of the disk")
     findings.at_most(
         "diameter of the disk, beyond the rig's", diameter_mm - rig.support.diameter_mm, MOST_ROUGH_MM, "mm"
     )
     centre_mm = rig.support.base_from_support.matrix()[:3, 3]
     radius_mm = float(np.linalg.norm(bench.cell.leds.positions_mm - centre_mm, axis=1).min())
-    nearest_mm = bench.measured("dome_radius_mm", "from the disk's centre to the LED that is nearest to it")
+    nearest_mm = bench.measured_mm("dome_radius_mm", "from the disk's centre to the LED that is nearest to it")
     findings.at_most("room inside the dome that only the rig has", radius_mm - nearest_mm, MOST_ROUGH_MM, "mm")
 
 
@@ -112,7 +112,7 @@ def _ask_for_volumes(bench: Bench) -> None:
     volumes = bench.cell.rig.keep_out
     for volume in volumes:
         bench.ask_whether(
-            f"{_described(volume)}. Does it enclose, by your ruler, what it is there for, where the arm reaches?"
+            f"{_volume_text(volume)}. Does it enclose, by your ruler, what it is there for, where the arm reaches?"
         )
     names = ", ".join(volume.name for volume in volumes) or "none"
     bench.ask_whether(
@@ -121,7 +121,7 @@ def _ask_for_volumes(bench: Bench) -> None:
     )
 
 
-def _described(volume: KeepOut) -> str:
+def _volume_text(volume: KeepOut) -> str:
     if isinstance(volume, KeepOutBox):
         ranges = ", ".join(
             f"{axis} from {low:g} to {high:g}"
@@ -165,12 +165,12 @@ def _sight(bench: Bench, board: Board, place_mm: Floats) -> None:
     leds = [led, *(other_led for other_led in leds if other_led != led)]
     middle_mm = board.points_mm.mean(axis=0)
     intrinsics = nominal_intrinsics(rig)
-    sights = [_sighted(bench, board, home_deg, exposure_us, leds)]
+    sights = [_first_sight(bench, board, home_deg, exposure_us, leds)]
     camera_from_board = _first_pose(sights[0], intrinsics)
     seen_mm = camera_from_board[:3, :3] @ sights[0].board_mm.mean(axis=0) + camera_from_board[:3, 3]
     for joints_deg in _postures_about(bench, home_deg, seen_mm):
         bench.ask_before(f"Sight {len(sights) + 1}. {_motion(rig, home_deg, joints_deg)}")
-        sights.append(_sighted(bench, board, bench.go_to(joints_deg), exposure_us, leds))
+        sights.append(_first_sight(bench, board, bench.go_to(joints_deg), exposure_us, leds))
         bench.go_to(home_deg)
     start = sights[0].support_from_camera @ camera_from_board
     deviation = deviations(sights, intrinsics, middle_mm, place_mm, start)
@@ -228,7 +228,7 @@ def _has_room(bench: Bench, home_deg: Floats, posture_deg: Floats) -> bool:
     return bool(within and near and bench.bodies.is_clear(home_deg, posture_deg))
 
 
-def _sighted(bench: Bench, board: Board, joints_deg: Floats, exposure_us: int, leds: Sequence[int]) -> Sight:
+def _first_sight(bench: Bench, board: Board, joints_deg: Floats, exposure_us: int, leds: Sequence[int]) -> Sight:
     """The board under the first LED that shows it. Raises StepFailedError if none does."""
     rig, why = bench.cell.rig, ""
     arm_camera(bench, exposure_us, hardware=bench.opened.ledbox.runs_tables)

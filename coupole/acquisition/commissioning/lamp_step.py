@@ -54,7 +54,7 @@ def lamps(bench: Bench) -> None:
     )
     metered_ids = table.ids[np.unique(np.linspace(0, len(table.ids) - 1, _METERED).astype(int))]
     exposure_us, _ = good_exposure_us(bench, metered_ids.tolist())
-    pictures = _photographed(bench, exposure_us)
+    pictures = _take_pictures(bench, exposure_us)
     findings.remarks.append(f"{len(pictures.ids)} LEDs at {exposure_us} us")
     _judge_currents(bench, pictures)
     dark = _dark_leds(pictures)
@@ -66,7 +66,9 @@ def lamps(bench: Bench) -> None:
             "matte ball, then repeat"
         )
     rows = table.rows(pictures.ids[lit])
-    off_deg, spread_found = deviations_deg(pictures.pictures[lit], light_vectors(bench, table)[rows], bench.each)
+    off_deg, spread_found = deviations_deg(
+        pictures.pictures[lit], light_vectors(bench, table)[rows], bench.iterate
+    )
     if spread_found < _LEAST_SPREAD:
         raise StepFailedError(
             f"what the camera sees is too flat to tell directions of light ({spread_found:.3f}; "
@@ -89,13 +91,13 @@ def light_vectors(bench: Bench, table: LedTable) -> NDArray[np.float64]:
     return vectors
 
 
-def _photographed(bench: Bench, exposure_us: int) -> Pictures:
+def _take_pictures(bench: Bench, exposure_us: int) -> Pictures:
     arm_camera(bench, exposure_us, hardware=bench.opened.ledbox.runs_tables)
     darks = [photograph(bench, NO_LED, exposure_us)[0] for _ in range(2)]
     dark = (darks[0] + darks[1]) / 2.0
     noise_dn = float(np.std(darks[0] - darks[1]))
     pictures, currents_ma, open_leds = [], [], []
-    for led in bench.each("LEDs", bench.cell.leds.ids.tolist()):
+    for led in bench.iterate("LEDs", bench.cell.leds.ids.tolist()):
         picture, record = photograph(bench, led, exposure_us)
         pictures.append((picture - dark).ravel()[:: max(1, dark.size // (4 * _MOST_PIXELS))])
         currents_ma.append(record.led_current_ma)
@@ -114,25 +116,27 @@ def _photographed(bench: Bench, exposure_us: int) -> Pictures:
     )
 
 
-def _judge_currents(bench: Bench, seen: Pictures) -> None:
+def _judge_currents(bench: Bench, pictures: Pictures) -> None:
     findings = bench.findings
-    for led in seen.open_leds:
+    for led in pictures.open_leds:
         findings.at_most(f"LED {led}: steps in which it drew no current", 1, 0, "")
-    findings.at_most("LEDs that draw no current", len(seen.open_leds), 0, "")
-    if np.isnan(seen.currents_ma).all():
+    findings.at_most("LEDs that draw no current", len(pictures.open_leds), 0, "")
+    if np.isnan(pictures.currents_ma).all():
         findings.remarks.append("the box measures no currents")
         return
-    usual_ma = float(np.nanmedian(seen.currents_ma))
-    weak = seen.ids[(seen.currents_ma < _LEAST_CURRENT_SHARE * usual_ma) & ~np.isin(seen.ids, seen.open_leds)]
+    usual_ma = float(np.nanmedian(pictures.currents_ma))
+    weak = pictures.ids[
+        (pictures.currents_ma < _LEAST_CURRENT_SHARE * usual_ma) & ~np.isin(pictures.ids, pictures.open_leds)
+    ]
     findings.at_most(f"LEDs that draw less than half of {usual_ma:.0f} mA", len(weak), 0, "")
     if len(weak):
         findings.remarks.append(f"they are LEDs {', '.join(map(str, weak))}")
 
 
-def _dark_leds(seen: Pictures) -> list[int]:
-    means_dn = seen.pictures.mean(axis=1)
-    least_dn = max(_LEAST_SIGNAL_SIGMA * seen.noise_dn, _LEAST_SIGNAL_SHARE * float(np.median(means_dn)))
-    dark_ids: list[int] = seen.ids[means_dn < least_dn].tolist()
+def _dark_leds(pictures: Pictures) -> list[int]:
+    means_dn = pictures.pictures.mean(axis=1)
+    least_dn = max(_LEAST_SIGNAL_SIGMA * pictures.noise_dn, _LEAST_SIGNAL_SHARE * float(np.median(means_dn)))
+    dark_ids: list[int] = pictures.ids[means_dn < least_dn].tolist()
     return dark_ids
 
 

@@ -34,7 +34,7 @@ Each = Callable[[str, Iterable[int]], Iterable[int]]
 
 
 def deviations_deg(
-    pictures: Floats, lights: Floats, each: Each = lambda _, numbers: numbers
+    pictures: Floats, lights: Floats, iterate: Each = lambda _, numbers: numbers
 ) -> tuple[Floats, float]:
     """Angles [leds] between the directions that pictures [leds, pixels] show and `lights` [leds, 3]; and how well
     the object in view tells directions: the ratio of the smallest to the largest singular value of its normals.
@@ -48,14 +48,14 @@ def deviations_deg(
     angles_deg = np.zeros(len(lights))
     for turn in range(_ROUNDS):
         normals = Normals(pictures, lights, lit, good)
-        for led in each(f"directions, round {turn + 1} of at most {_ROUNDS}", range(len(lights))):
+        for led in iterate(f"directions, round {turn + 1} of at most {_ROUNDS}", range(len(lights))):
             angles_deg[led] = _angle_deg(_direction(pictures[led], normals.without(led), lit[led]), lights[led])
         # The worst only: one wrong LED bends the normals by which its neighbours are judged.
         worst = np.where(good, angles_deg, 0.0).argmax()
         if angles_deg[worst] <= MOST_DEVIATION_DEG or good.sum() <= FEWEST_LEDS:
             break
         good = good & (angles_deg < max(MOST_DEVIATION_DEG, 0.7 * angles_deg[worst]))
-    singular_values = np.linalg.svd(Normals(pictures, lights, lit, good).all(), compute_uv=False)
+    singular_values = np.linalg.svd(Normals(pictures, lights, lit, good).from_all_lights(), compute_uv=False)
     return angles_deg, float(singular_values[-1] / max(singular_values[0], 1e-12))
 
 
@@ -72,7 +72,7 @@ class Normals:
         sides = (weights * pictures).T @ lights
         self._solved = np.einsum("pij,pj->ip", self._inverses, sides)
 
-    def all(self) -> Floats:
+    def from_all_lights(self) -> Floats:
         """Return the normals from all good lights."""
         return np.where(self._counts < _FEWEST_LIGHTS, 0.0, self._solved)
 

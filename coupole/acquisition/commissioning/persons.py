@@ -20,14 +20,14 @@ class PersonAtTerminal:
     def confirms(self, question: str) -> bool:
         return ask(question)
 
-    def measures(self, what: str, question: str) -> float | None:
+    def measures(self, quantity: str, question: str) -> float | None:
         return ask_number(f"Measure, in mm: {question}:")
 
-    def told(self, message: str) -> None:
+    def tell(self, message: str) -> None:
         alarm(message)
 
-    def hold_enabling_switch(self, *, held: bool) -> None:
-        alarm("HOLD the enabling switch at the cell now." if held else "RELEASE the enabling switch now.")
+    def hold_enabling_switch(self, *, is_held: bool) -> None:
+        alarm("HOLD the enabling switch at the cell now." if is_held else "RELEASE the enabling switch now.")
 
     def press_emergency_stop(self) -> None:
         alarm("PRESS THE EMERGENCY STOP NOW, while the arm moves.")
@@ -47,17 +47,17 @@ class SimulatedPerson:
         self._console.print(f"{question} (not asked: simulated)", markup=False)
         return True
 
-    def measures(self, what: str, question: str) -> float | None:
+    def measures(self, quantity: str, question: str) -> float | None:
         """Measure with a ruler that the simulated cell has: it knows nothing of the rig."""
-        length_mm = load_class(WORLD)(self._endpoints).ask("ruler").get(what)
+        length_mm = load_class(WORLD)(self._endpoints).ask("ruler").get(quantity)
         self._console.print(f"{question}: {length_mm} mm (measured in the simulation)", markup=False)
         return length_mm if length_mm is None else float(length_mm)
 
-    def told(self, message: str) -> None:
+    def tell(self, message: str) -> None:
         self._console.print(message, markup=False)
 
-    def hold_enabling_switch(self, *, held: bool) -> None:
-        load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "enabling_switch", "held": held})
+    def hold_enabling_switch(self, *, is_held: bool) -> None:
+        load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "enabling_switch", "held": is_held})
 
     def press_emergency_stop(self) -> None:
         load_class(WORLD)(self._endpoints).ask("fault", fault={"kind": "emergency_stop"})

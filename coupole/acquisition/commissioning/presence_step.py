@@ -31,17 +31,17 @@ def presence(bench: Bench) -> None:
     bench.ask_before("Step presence: nothing moves. Do not hold the enabling switch at the cell yet.")
     findings.at_most("switches that are held although nobody holds them", int(bool(box.presence())), 0, "")
     for is_held, state in ((True, "held"), (False, "released"), (True, "held"), (False, "released")):
-        if not findings.passed:
+        if not findings.has_passed:
             return
-        bench.person.hold_enabling_switch(held=is_held)
-        is_seen = _seen(bench, held=is_held)
+        bench.person.hold_enabling_switch(is_held=is_held)
+        is_seen = _is_switch_seen(bench, is_held=is_held)
         findings.at_most(f"the switch was not seen to be {state} within {_WITHIN_S:g} s", int(not is_seen), 0, "")
 
 
-def _seen(bench: Bench, *, held: bool) -> bool:
+def _is_switch_seen(bench: Bench, *, is_held: bool) -> bool:
     deadline = Deadline(bench.opened.clock, _WITHIN_S)
-    while bench.opened.ledbox.presence() is not held:
-        if deadline.expired:
+    while bench.opened.ledbox.presence() is not is_held:
+        if deadline.has_expired:
             return False
         bench.pause(_POLL_S)
     return True

@@ -25,7 +25,7 @@ from coupole.acquisition.observer import Control
 from coupole.acquisition.opened_cell import OpenedCell, open_cell
 from coupole.acquisition.operator import identity_printer
 from coupole.acquisition.signals import obeyed_by
-from coupole.bounded import bounded
+from coupole.bounded import run_bounded
 from coupole.errors import CommissioningFailed, DeviceError, InputError
 from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import bodies_of
@@ -94,7 +94,7 @@ def commission(
         faults_of(cell, opened_cell.identities["robot"]).refuse(cell.document.path)
         record = _record_so_far(cell, console)  # of this controller, wherever it was reached before
         bench = replace(
-            bounded(lambda: _bench(slow, opened_cell, bodies, person_at(opened_cell), control)),
+            run_bounded(lambda: _bench(slow, opened_cell, bodies, person_at(opened_cell), control)),
             bars=lambda: step_bars(console),
             board=board,
         )
@@ -106,8 +106,8 @@ def commission(
                 if due:
                     bench.ask_before(_BEGIN)
                 for step in due:
-                    do = partial(_done, step, bench, cell, name)
-                    result, failure = bounded(do, stop=control.stop, rescue=opened_cell.make_safe)
+                    do = partial(_run_step, step, bench, cell, name)
+                    result, failure = run_bounded(do, stop=control.stop, rescue=opened_cell.make_safe)
                     record = record.with_result(result)
                     write_commissioning(cell, record)
                     commissioning_page.write(record_path(cell), record)
@@ -142,8 +142,8 @@ def shortcomings(result: StepResult) -> list[str]:
     return [*sentences, *([result.failure] if result.failure else [])]
 
 
-def _bench(cell: Cell, opened: OpenedCell, bodies: CellBodies, person: Person, control: Control) -> Bench:
-    return Bench(cell, opened, bodies, greatest_speeds_deg_s(cell.rig), person, control)
+def _bench(cell: Cell, opened_cell: OpenedCell, bodies: CellBodies, person: Person, control: Control) -> Bench:
+    return Bench(cell, opened_cell, bodies, greatest_speeds_deg_s(cell.rig), person, control)
 
 
 def _record_so_far(cell: Cell, console: Console) -> CommissioningRecord:
@@ -160,16 +160,16 @@ def _record_so_far(cell: Cell, console: Console) -> CommissioningRecord:
     return record
 
 
-def _due(cell: Cell, record: CommissioningRecord, opened: OpenedCell) -> list[Step]:
+def _due(cell: Cell, record: CommissioningRecord, opened_cell: OpenedCell) -> list[Step]:
     results = {step: record.result(step) for step in STEPS}
     return [
         step
         for step, result in results.items()
-        if result is None or not result.passed or outdated(cell, result, opened.identities)
+        if result is None or not result.passed or outdated(cell, result, opened_cell.identities)
     ]
 
 
-def _done(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
+def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
     """Do one step; returns its result, and the error of a device that ended it."""
     findings = bench.findings = Findings()
     failure, error = "", None

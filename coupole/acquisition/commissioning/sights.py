@@ -49,14 +49,16 @@ def deviations(
     """`middle_mm` [3] of the board in its own frame, `expected_mm` [3] in the support's; `start` is a first
     `support_from_board`."""
     sees = _Model(sights, intrinsics)
-    free = _fitted(lambda x: sees.residuals_mm(_moved(start, x), np.zeros(3)), 6)
-    support_from_board = _moved(start, free)
+    free = _least_squares_fit(lambda x: sees.residuals_mm(_pose_after(start, x), np.zeros(3)), 6)
+    support_from_board = _pose_after(start, free)
     off_mm = support_from_board[:3, :3] @ middle_mm + support_from_board[:3, 3] - expected_mm
     # If the camera alone is wrong, the board lies flat where it was measured; how it is turned there is not known.
     flat = _laid_flat(support_from_board, middle_mm, expected_mm)
-    shift_and_turn = _fitted(lambda x: sees.residuals_mm(_turned(flat, expected_mm, x[3]), x[:3]), 4)
+    shift_and_turn = _least_squares_fit(
+        lambda x: sees.residuals_mm(_pose_turned_about(flat, expected_mm, x[3]), x[:3]), 4
+    )
     left_free = sees.residuals_mm(support_from_board, np.zeros(3))
-    left_shifted = sees.residuals_mm(_turned(flat, expected_mm, shift_and_turn[3]), shift_and_turn[:3])
+    left_shifted = sees.residuals_mm(_pose_turned_about(flat, expected_mm, shift_and_turn[3]), shift_and_turn[:3])
     ends = np.cumsum([2 * len(sight.pixels) for sight in sights])[:-1]
     worst_mm = max(float(np.sqrt(2.0 * np.mean(part**2))) for part in np.split(left_free, ends))
     return Deviations(
@@ -84,13 +86,13 @@ class _Model:
         return np.concatenate(residuals)
 
 
-def _fitted(residuals: Callable[[Floats], Floats], count: int) -> Floats:
+def _least_squares_fit(residuals: Callable[[Floats], Floats], count: int) -> Floats:
     from scipy.optimize import least_squares
 
     return np.asarray(least_squares(residuals, np.zeros(count), x_scale="jac").x, dtype=np.float64)
 
 
-def _moved(start: Transform, change: Floats) -> Transform:
+def _pose_after(start: Transform, change: Floats) -> Transform:
     from scipy.spatial.transform import Rotation
 
     pose = start.copy()
@@ -110,7 +112,7 @@ def _laid_flat(support_from_board: Transform, middle_mm: Floats, at_mm: Floats) 
     return pose
 
 
-def _turned(flat: Transform, about_mm: Floats, angle_rad: float) -> Transform:
+def _pose_turned_about(flat: Transform, about_mm: Floats, angle_rad: float) -> Transform:
     turn = np.eye(4)
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     turn[:2, :2] = [[cosine, -sine], [sine, cosine]]

@@ -101,7 +101,7 @@ def find_leds(
         replace(
             about,
             temperature_c=temperature_range_c(collection.lit_records),
-            begun=max(run.created for run in runs),
+            begun=max(run.created_at for run in runs),
         ),
         tuple(collection.inputs),
         np.stack(collection.joints_deg),

@@ -94,7 +94,7 @@ def _in_channel(
     if channel == "green":
         return list(accepted_sightings)
     return [
-        in_channel(board, sources.images[number].read(), channel, sighting)
+        in_channel(board, sources.images[number].read_picture(), channel, sighting)
         for number, sighting in zip(board_images.image_numbers, accepted_sightings, strict=True)
     ]
 

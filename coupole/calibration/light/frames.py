@@ -132,7 +132,7 @@ def open_light_frames(paths: Sequence[Path]) -> LightFrames:
     if common is None or not frames:
         raise InputError(f"{', '.join(map(str, paths))}: no proven frame; acquire the plan first")
     pattern, black_dn, white_dn, gain_db, focal_px, about = common
-    about = replace(about, begun=max(Run(path).created for path in paths))
+    about = replace(about, begun=max(Run(path).created_at for path in paths))
     return LightFrames(tuple(frames), pattern, black_dn, white_dn, about, focal_px, tuple(inputs), gain_db)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from coupole.acquisition.cell_bench.bench_client import ask_bench, bench_socket, obeyed
+from coupole.acquisition.cell_bench.bench_client import ask_bench, bench_socket, checked_answer
 from coupole.acquisition.runtime_folder import named_after
 from coupole.console.cell.acquisitions import Acquisitions
 from coupole.console.plans.plan_files import PlanFiles
@@ -144,7 +144,7 @@ class Bench:
         """Send a command to the bench and return its answer. Raises InputError with its words where it did not
         obey."""
         self._acted_s = self._now_s()
-        return obeyed(ask_bench(self._cell, command, **fields))
+        return checked_answer(ask_bench(self._cell, command, **fields))
 
     def views(self) -> list[str]:
         """Names of the plan's views. Raises InputError."""
@@ -169,7 +169,7 @@ class Bench:
         task, trouble = self._running, []
         self._closing = why or "closed"
         try:
-            trouble = list(obeyed(ask_bench(self._cell, "close"))["trouble"])
+            trouble = list(checked_answer(ask_bench(self._cell, "close"))["trouble"])
         except InputError:
             if task is not None:
                 task.stop()
@@ -197,7 +197,7 @@ class Bench:
             return
         self._asked_s = now_s
         try:
-            state = obeyed(ask_bench(self._cell, "state")) if bench_socket(self._cell).exists() else None
+            state = checked_answer(ask_bench(self._cell, "state")) if bench_socket(self._cell).exists() else None
         except CoupoleError:
             state = None
         if not self._closing and (state is not None or self._running is None):

@@ -89,7 +89,7 @@ class _Followed:
             begin = {**asked, "now": True}
             self._entry = call(self._cell, "POST", "/api/v1/queue", begin, given_up=self._control.stop.is_set)
         except GivenUp:
-            raise self._control.interrupted() from None
+            raise self._control.interruption() from None
         except InputError as error:
             rig, plan = self._cell.document.path, asked.get("plan") or f"--resume {asked['resume']}"
             raise InputError(
@@ -151,7 +151,7 @@ class _Followed:
             except (NotServed, NoAnswer) as error:
                 run = self._run or "RUN"
                 if self._state() is None and self._control.stop.is_set():
-                    raise self._control.interrupted() from None
+                    raise self._control.interruption() from None
                 if self._state() is None:
                     raise DeviceLost(
                         "console",
@@ -168,7 +168,7 @@ class _Followed:
                 self._show_progress()
             except InputError:
                 if self._control.stop.is_set():
-                    raise self._control.interrupted() from None
+                    raise self._control.interruption() from None
                 raise
             time.sleep(_LOOK_EVERY_S)
 

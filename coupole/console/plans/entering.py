@@ -151,10 +151,10 @@ class Entering:
         at_work = at_work_of(self._acquisitions.state, self._cell.rig.frame_bytes)
 
         def received_lux_h(name: str) -> float:
-            return ledger_of(self._cell, name).read().total_lux_h
+            return ledger_of(self._cell, name).read_history().total_lux_h
 
         def budget_lux_h(name: str) -> float | None:
-            return ledger_of(self._cell, name).read().budget_lux_h
+            return ledger_of(self._cell, name).read_history().budget_lux_h
 
         now = too_much_light(self._queue.waiting, received_lux_h, at_work, budget_lux_h)
         refusals = too_much_light(entries, received_lux_h, at_work, budget_lux_h)

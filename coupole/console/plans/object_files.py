@@ -53,7 +53,7 @@ class ObjectFiles:
 
     def history(self, object_id: str) -> History:
         """All light on it. Raises InputError, StorageError."""
-        return ledger_of(self._cell, object_id).read()
+        return ledger_of(self._cell, object_id).read_history()
 
     def similar(self, object_id: str) -> list[str]:
         """Others whose ids are nearly the same."""

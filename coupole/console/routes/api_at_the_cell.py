@@ -80,7 +80,7 @@ def _add_loan(app: FastAPI, service: Service) -> None:
 
 def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
     def document(ledger: Ledger) -> dict[str, Any]:
-        return dose_table.document(ledger, ledger.read(), similar_ids(ledger.folder, ledger.object_id))
+        return dose_table.document(ledger, ledger.read_history(), similar_ids(ledger.folder, ledger.object_id))
 
     @app.get("/api/v1/objects/{thing}/light", responses=REFUSALS)
     def light(thing: Text) -> dict[str, Any]:

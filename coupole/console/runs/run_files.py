@@ -228,7 +228,7 @@ class RunFiles:
             proven = sum(count for count, _ in run_status.views.values())
             thumbnail = _typical(run) if proven else ""
             is_archived = bool(proven) and all(
-                frame_file.read_layout(run.view_path(view)).archived for view in run.about["views"]
+                frame_file.read_layout(run.view_path(view)).is_archived for view in run.about["views"]
             )
         except (CoupoleError, KeyError, OSError) as error:
             return RunRow(name, "damaged", "", "", str(error), False, 0, 0, 0, False, "", "")
@@ -239,7 +239,7 @@ class RunFiles:
             object=run.about.get("object") or "",
             created=run.about["created"],
             operator=str(run.about.get("operator", "")),
-            simulated=run.simulated,
+            simulated=run.is_simulated,
             proven=proven,
             frames=sum(count for _, count in run_status.views.values()),
             bytes=sum(path.stat().st_blocks * 512 for path in views),
@@ -268,7 +268,7 @@ class RunFiles:
 def _typical(run: Run) -> str:
     """A proven shot with light from the middle of a run's first view; empty without one."""
     lit: list[ShotId] = []
-    for event in journal.read(run.journal_path):
+    for event in journal.read_events(run.journal_path):
         if isinstance(event, FrameProven) and event.shot.is_shot and isinstance(event.shot.light, Led):
             if lit and event.shot.view != lit[0].view:
                 break

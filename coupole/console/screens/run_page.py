@@ -75,7 +75,7 @@ def build(visit: Visit, name: str) -> None:
 
 def _read(service: Service, name: str) -> _Known:
     run = service.runs.run(name)
-    events = [(event.t, words) for event in journal.read(run.journal_path) if (words := words_of(event))]
+    events = [(event.t, words) for event in journal.read_events(run.journal_path) if (words := words_of(event))]
     row = service.runs.row(name)
     return _Known(run, row, service.runs.status(name), led_places(service.sheets, name), events[::-1])
 

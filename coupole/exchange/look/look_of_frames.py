@@ -119,14 +119,14 @@ def _about(run: Run, frames: LightFrames, views: list[dict[str, Any]]) -> dict[s
         "tile_px": TILE_PX,
         "views": views,
         "fit": "principal components",
-        "simulated": run.simulated,
+        "simulated": run.is_simulated,
         "software": {run.about["software"]["name"]: run.about["software"]["version"]},
         "origin_mm": [0.0, 0.0, 0.0],
         "step_mm": 1.0,
         "irradiance": 1.0,
         "unit": "of the camera's range",
         "told": {
-            "Run": f"{run.folder.name}, {'simulated' if run.simulated else 'measured'}",
+            "Run": f"{run.folder.name}, {'simulated' if run.is_simulated else 'measured'}",
             "Frames": f"{wide} x {high}, {frames.pattern}, without their darks"
             + (
                 ""

@@ -78,7 +78,7 @@ def refine_runs(request: RefineRequest, out: Path, say: Said) -> dict[str, Any]:
     about = {**_about(refinement, runs, names, leds, request), "seconds": round(time.monotonic() - begun_s, 3)}
     try:
         make_folder(out)
-        any_simulated = any(measured_run.run.simulated for measured_run in runs)
+        any_simulated = any(measured_run.run.is_simulated for measured_run in runs)
         digest = sha256(runs[0].mesh_path)
         complete(out / MESH, partial(_write_mesh, refinement, runs[0]))
         complete(
@@ -154,7 +154,7 @@ def _about(
     return {
         "schema": SCHEMA,
         "software": {name: version(name) for name in ("coupole", "numpy", "numba", "scipy")},
-        "simulated": any(measured_run.run.simulated for measured_run in runs),
+        "simulated": any(measured_run.run.is_simulated for measured_run in runs),
         "inputs": {m.run.folder.name: dict(m.frames.inputs) for m in runs},
         "mesh_sha256": sha256(runs[0].mesh_path),
         "leds": list(leds),

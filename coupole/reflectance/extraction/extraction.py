@@ -168,7 +168,7 @@ def _hidden_by_cell(work: ViewPass) -> Callable[[NDArray[np.int64]], NDArray[np.
 def _write_head(file: h5py.File, work: ViewPass, surface: SeenSurface) -> None:
     measured_run, view, leds = work.measured_run, work.view, work.leds
     file.attrs["channels"] = "".join(measured_run.channels)
-    file.attrs["simulated"] = measured_run.run.simulated
+    file.attrs["simulated"] = measured_run.run.is_simulated
     file.attrs["frame"] = "base of the robot"
     file.attrs["led_u_mm"] = measured_run.led_u_mm  # of each coordinate of an LED's place
     u_lateral_mm = view.pointing.u_lateral_mm(measured_run.lens, view.base_from_camera, work.facets.centres_mm)

@@ -202,7 +202,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         (lens.focal_length_mm, lens.focus_distance_mm, lens.f_number),
         base_from_support,
         _drift(by_kind.get("drift")),
-        run.simulated and _direct_light_alone(files.cell.rig),
+        run.is_simulated and _direct_light_alone(files.cell.rig),
         prior,
         _u_signal(by_kind),
     )

@@ -26,7 +26,7 @@ from drivers.camera.aravis.settings import Settings
 from drivers.camera.aravis.stream import Pool, Stream
 from drivers.camera.genicam_image import frame_format, pixel_format, readout_us, set_up
 from drivers.camera.genicam_trigger import counts, frame_id_range, set_exposure, since
-from drivers.camera.misuse import misused
+from drivers.camera.misuse import misuse_error
 from drivers.camera.pixel_formats import widen
 
 __all__ = ["AravisCamera", "Settings"]
@@ -74,7 +74,7 @@ class AravisCamera:
             self._features.execute("AcquisitionStop")
         if self._is_gige:
             self._set_packets()
-        self._state = set_up(self._features, self._settings, triggered=True)
+        self._state = set_up(self._features, self._settings, is_triggered=True)
 
     def _set_packets(self) -> None:
         library, handle, size = self._library, self._handle, self._settings.packet_size
@@ -109,7 +109,7 @@ class AravisCamera:
 
     def _text(self, *names: str) -> str:
         name = self._features.first_of(*names)
-        return str(self._features.read(name)) if name else "unknown"
+        return str(self._features.read_value(name)) if name else "unknown"
 
     def self_test(self) -> Mapping[str, str]:
         """Raises DeviceError if the camera does not answer."""
@@ -123,14 +123,14 @@ class AravisCamera:
         ):
             name = self._features.first_of(*names)
             if name is not None:
-                report[quantity] = str(self._features.read(name))
+                report[quantity] = str(self._features.read_value(name))
         return report
 
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._stream is not None:
-            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
+            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
         self._check_link()
         set_exposure(self._features, self._settings, exposure)
         self._exposure = exposure
@@ -146,7 +146,7 @@ class AravisCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise misused(self._name, "configure() before arm()", "no exposure is set")
+            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._check_link()
         self._allocate(max(buffers, self._settings.buffers))
@@ -223,7 +223,7 @@ class AravisCamera:
 
     def trigger(self) -> None:
         if self._stream is None or self._exposure.hardware_trigger:
-            raise misused(
+            raise misuse_error(
                 self._name, "a camera armed for the software trigger", "it is disarmed, or armed for the cable"
             )
         self._check_link()
@@ -251,11 +251,11 @@ class AravisCamera:
     def _statistics(self, stream: Stream) -> CameraStatistics:
         exposures, over_triggers = counts(self._features, self._settings)
         statistics = stream.statistics()
-        overflows = max(0, statistics.skipped - statistics.failed) if statistics.underruns else 0
+        overflows = max(0, statistics.skipped_ids - statistics.incomplete_images) if statistics.underruns else 0
         return CameraStatistics(
             since(exposures, self._counted_before[0]),
-            statistics.completed,
-            statistics.skipped - overflows,
+            statistics.complete_images,
+            statistics.skipped_ids - overflows,
             since(over_triggers, self._counted_before[1]),
             overflows,
         )
@@ -266,10 +266,10 @@ class AravisCamera:
         if self._lost.is_set() or not self._handle:
             raise self._link_lost("its control channel is gone" if self._handle else "it was closed")
 
-    def _link_lost(self, happened: str) -> DeviceLost:
+    def _link_lost(self, observation: str) -> DeviceLost:
         return DeviceLost(
             self._name,
             expected="control of the camera",
-            happened=happened,
+            happened=observation,
             remedy="Check cable and power, and that no other program uses the camera; then resume the run.",
         )

@@ -35,7 +35,7 @@ class Features:
         """The first of these features that the camera has."""
         return next((name for name in names if self.has(name)), None)
 
-    def read(self, name: str) -> Value:
+    def read_value(self, name: str) -> Value:
         """Raises DeviceRefused if the camera has no such feature, or the feature holds no value."""
         with self._lock:
             match self._kind(name):
@@ -53,7 +53,7 @@ class Features:
 
     def number(self, name: str) -> float:
         """The value of an integer or float feature."""
-        value = self.read(name)
+        value = self.read_value(name)
         if isinstance(value, str):
             self._refuse(f"a number in `{name}`", f"it holds {value!r}")
         return value
@@ -71,7 +71,7 @@ class Features:
             getattr(self, f"_write_{kind}")(name, value)
             if kind == "command":
                 return
-            read_back = self.read(name)
+            read_back = self.read_value(name)
         if not alike(read_back, value):
             self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {read_back!r}")
 
@@ -168,10 +168,10 @@ class Features:
             self._device, f"an answer about the feature `{name}`", whole, self._handle, name.encode(), *arguments
         )
 
-    def _refuse(self, expected: str, happened: str) -> NoReturn:
+    def _refuse(self, expectation: str, observation: str) -> NoReturn:
         raise DeviceRefused(
             self._device,
-            expected=expected,
-            happened=happened,
+            expected=expectation,
+            happened=observation,
             remedy="Correct the camera's settings in the rig (`arv-tool-0.8 features` lists what a camera has).",
         )

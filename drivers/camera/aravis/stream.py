@@ -79,11 +79,11 @@ class Taken:
 class StreamStatistics:
     """Counts of frames and packets of one acquisition, as known to the host."""
 
-    completed: int = 0
+    complete_images: int = 0
     """Images that arrived complete."""
-    failed: int = 0
+    incomplete_images: int = 0
     """Images that arrived with packets missing."""
-    skipped: int = 0
+    skipped_ids: int = 0
     """Frame ids without a complete image, including those of `failed`."""
     underruns: int = 0
     """Times that libaravis found no free buffer; several may concern one frame."""

@@ -26,7 +26,7 @@ from drivers.camera.gentl.features import Features
 from drivers.camera.gentl.image import copy_pixels, timestamp_ns
 from drivers.camera.gentl.producer import Gaps, open_camera, optional_int, reporting, when_incomplete
 from drivers.camera.gentl.settings import Settings
-from drivers.camera.misuse import misused
+from drivers.camera.misuse import misuse_error
 from drivers.fair_lock import FairLock
 
 _A_LOOK_S = 1e-4
@@ -63,7 +63,7 @@ class GenTLCamera:
             )
             self._acquirer.timeout_period_on_update_event_data_call = 0
             self._stop_what_runs()
-            self._state = set_up(self._features, settings, triggered=not settings.free_running)
+            self._state = set_up(self._features, settings, is_triggered=not settings.free_running)
             self.id_modulus = frame_id_range(self._features, gige=self._info["tl_type"] == "GEV")
         except BaseException:
             self.close()
@@ -99,13 +99,13 @@ class GenTLCamera:
         """Raises DeviceError if the camera does not answer."""
         names = ("DeviceTemperature", "PixelFormat", "Width", "Height", "PayloadSize")
         with self._lock:
-            return {name: str(self._features.read(name)) for name in names if self._features.has(name)}
+            return {name: str(self._features.read_value(name)) for name in names if self._features.has(name)}
 
     # -- exposure -----------------------------------------------------------------------------------------
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._armed.is_set():
-            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
+            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
         with self._lock:
             if not self._settings.free_running:
                 self._expect_trigger()
@@ -132,7 +132,7 @@ class GenTLCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise misused(self._name, "configure() before arm()", "no exposure is set")
+            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         buffer_count = max(buffers, self._settings.buffers, self._acquirer.min_num_buffers)
         slots = min(buffer_count, _IN_HAND)
@@ -194,7 +194,9 @@ class GenTLCamera:
 
     def trigger(self) -> None:
         if self._settings.free_running or self._exposure is None or self._exposure.hardware_trigger:
-            raise misused(self._name, "hardware_trigger=False", "a software trigger while something else triggers")
+            raise misuse_error(
+                self._name, "hardware_trigger=False", "a software trigger while something else triggers"
+            )
         with self._lock:
             self._features.write("TriggerSoftware", True)
 

@@ -42,32 +42,32 @@ class Features:
         try:
             return bool(self._nodes.has_node(name) and self._genapi.is_available(self._nodes.get_node(name).node))
         except self._errors as error:
-            self._failed(f"to learn whether it has `{name}`", error)
+            self._raise_failure(f"to learn whether it has `{name}`", error)
 
     def expect_answer(self) -> None:
         """Query the camera itself, not the cache. Raises DeviceLost."""
         try:
             self._node("Width").get_value(ignore_cache=True)
         except self._errors as error:
-            self._gone("the camera to answer", error)
+            self._raise_lost("the camera to answer", error)
 
     def first_of(self, *names: str) -> str | None:
         """The first of these features that the camera has."""
         return next((name for name in names if self.has(name)), None)
 
-    def read(self, name: str) -> Value:
+    def read_value(self, name: str) -> Value:
         node = self._node(name)
         if self._kind(node) not in _TYPES or self._kind(node) == "ICommand":
             self._refuse(f"`{name}` to hold a value", f"it is a {self._kind(node)[1:].lower()}")
         try:
             value: Value = node.value
         except self._errors as error:
-            self._failed(f"a value of `{name}`", error)
+            self._raise_failure(f"a value of `{name}`", error)
         return value
 
     def number(self, name: str) -> float:
         """The value of an integer or float feature."""
-        value = self.read(name)
+        value = self.read_value(name)
         if isinstance(value, str):
             self._refuse(f"a number in `{name}`", f"it holds {value!r}")
         return value
@@ -80,7 +80,7 @@ class Features:
         try:
             return float(node.min), float(node.max)
         except self._errors as error:
-            self._failed(f"the bounds of `{name}`", error)
+            self._raise_failure(f"the bounds of `{name}`", error)
 
     def largest(self, name: str) -> int:
         """Greatest value of an integer feature, in its steps."""
@@ -95,7 +95,7 @@ class Features:
         try:
             return [str(entry.symbolic) for entry in node.entries if self._genapi.is_available(entry.node)]
         except self._errors as error:
-            self._failed(f"the entries of `{name}`", error)
+            self._raise_failure(f"the entries of `{name}`", error)
 
     def write(self, name: str, value: Value) -> None:
         """Set a feature and read it back; `True` runs a command."""
@@ -108,7 +108,7 @@ class Features:
             node.value = value
             read_back = node.value
         except self._errors as error:
-            self._failed(f"`{name}` to take {value!r}", error)
+            self._raise_failure(f"`{name}` to take {value!r}", error)
         if not alike(read_back, value):
             self._refuse(f"`{name}` to hold {value!r} once it is set", f"it holds {read_back!r}")
 
@@ -146,24 +146,24 @@ class Features:
         if self._kind(node) == "IInteger" and node.inc > 1 and (value - node.min) % node.inc:
             self._refuse(f"{node.min} plus a multiple of {node.inc} for `{name}`", f"{value:.10g} was given")
 
-    def _failed(self, expected: str, error: Exception) -> NoReturn:
+    def _raise_failure(self, expectation: str, error: Exception) -> NoReturn:
         """Raise DeviceLost if the camera does not answer, DeviceRefused for any other error."""
         if isinstance(error, self._silence):
-            self._gone(expected, error)
-        self._refuse(expected, str(error))
+            self._raise_lost(expectation, error)
+        self._refuse(expectation, str(error))
 
-    def _gone(self, expected: str, error: Exception) -> NoReturn:
+    def _raise_lost(self, expectation: str, error: Exception) -> NoReturn:
         raise DeviceLost(
             self._device,
-            expected=expected,
+            expected=expectation,
             happened=str(error),
             remedy="Check cable and power, then resume the run.",
         ) from error
 
-    def _refuse(self, expected: str, happened: str) -> NoReturn:
+    def _refuse(self, expectation: str, observation: str) -> NoReturn:
         raise DeviceRefused(
             self._device,
-            expected=expected,
-            happened=happened,
+            expected=expectation,
+            happened=observation,
             remedy="Correct the camera's settings in the rig; the maker's viewer shows its features.",
         )

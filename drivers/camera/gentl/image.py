@@ -17,7 +17,7 @@ _PLAIN_IMAGE = 1
 
 
 def copy_pixels(
-    buffer: Any, memory: NDArray[np.uint8], promised: FrameFormat, wire: PixelFormat, device: str
+    buffer: Any, memory: NDArray[np.uint8], expected_format: FrameFormat, wire: PixelFormat, device: str
 ) -> NDArray[np.uint16]:
     """A buffer's image as 16-bit pixels [height_px, width_px] in `memory` [frame_bytes].
 
@@ -25,8 +25,8 @@ def copy_pixels(
     """
     expectations = {
         "payload_type": _PLAIN_IMAGE,
-        "height": promised.height_px,
-        "width": promised.width_px,
+        "height": expected_format.height_px,
+        "width": expected_format.width_px,
         "pixel_format": wire.code,
         "padding_x": 0,
     }
@@ -40,14 +40,14 @@ def copy_pixels(
                 remedy="Set the camera up in the rig so that it sends plain images of one size and format.",
             )
     offset = optional_int(buffer, "image_offset") or 0
-    wire_bytes = wire.wire_bytes(promised.height_px * promised.width_px)
+    wire_bytes = wire.wire_bytes(expected_format.height_px * expected_format.width_px)
     data = np.frombuffer(buffer.raw_buffer, np.uint8, wire_bytes, offset)
     pixels = memory.view(np.uint16)
     if wire.packing == "two bytes":
         pixels[:] = data.view("<u2")
     else:
         widen(pixels, data, wire)
-    return pixels.reshape(promised.height_px, promised.width_px)
+    return pixels.reshape(expected_format.height_px, expected_format.width_px)
 
 
 def timestamp_ns(buffer: Any, camera: Any, device: str) -> int:

@@ -24,11 +24,11 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         import genicam.gentl
         from harvesters.core import Harvester
     except ImportError as error:
-        raise _lost(
+        raise _loss(
             name, "the packages harvesters and genicam", str(error), "Install the extra `gentl`."
         ) from error
     if not settings.producer.is_file():
-        raise _lost(name, f"a GenTL producer {settings.producer}", "there is no such file", "Correct the rig.")
+        raise _loss(name, f"a GenTL producer {settings.producer}", "there is no such file", "Correct the rig.")
     harvester = Harvester(logger=_LOG)
     handler = signal.getsignal(signal.SIGINT)
     try:
@@ -46,7 +46,7 @@ def open_camera(settings: Settings) -> tuple[Any, Any, dict[str, str]]:
         ]
         if len(fitting) != 1:
             device_list = ", ".join(f"{device['model']} {device['serial']}" for _, device in devices) or "none"
-            raise _lost(
+            raise _loss(
                 name,
                 "exactly one camera of that model and serial number",
                 f"{len(fitting)} of the producer's fit; it finds: {device_list}",
@@ -92,7 +92,7 @@ def _opening_failed(name: str, error: Exception) -> DeviceError:
             happened=f"it is in use ({error})",
             remedy="Close the other program.",
         )
-    return _lost(name, "the camera to open", str(error))
+    return _loss(name, "the camera to open", str(error))
 
 
 def _describe(device: Any) -> dict[str, str]:
@@ -109,14 +109,14 @@ def _describe(device: Any) -> dict[str, str]:
     return {key: text(attribute) for key, attribute in names.items()} | {"tl_type": text("tl_type")}
 
 
-def _lost(
-    name: str, expected: str, happened: str, remedy: str = "Check cable and power, then resume the run."
+def _loss(
+    name: str, expectation: str, observation: str, remedy: str = "Check cable and power, then resume the run."
 ) -> DeviceLost:
-    return DeviceLost(name, expected=expected, happened=happened, remedy=remedy)
+    return DeviceLost(name, expected=expectation, happened=observation, remedy=remedy)
 
 
 @contextlib.contextmanager
-def reporting(name: str, expected: str) -> Iterator[None]:
+def reporting(name: str, expectation: str) -> Iterator[None]:
     """Translate errors of the producer or of GenApi to DeviceLost, with their text."""
     import genicam.genapi
     import genicam.gentl
@@ -124,15 +124,15 @@ def reporting(name: str, expected: str) -> Iterator[None]:
     try:
         yield
     except (genicam.genapi.GenericException, genicam.gentl.GenericException) as error:
-        raise _lost(name, expected, str(error)) from error
+        raise _loss(name, expectation, str(error)) from error
 
 
-def optional_int(module: Any, what: str) -> int | None:
+def optional_int(module: Any, attribute: str) -> int | None:
     """Value of an optional property; None if the producer does not provide it."""
     import genicam.gentl
 
     try:
-        value = getattr(module, what)
+        value = getattr(module, attribute)
     except genicam.gentl.GenericException:
         return None
     return int(value)

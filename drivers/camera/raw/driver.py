@@ -29,7 +29,7 @@ from coupole.clock import Clock
 from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.camera.frame_pool import FramePool
-from drivers.camera.misuse import misused
+from drivers.camera.misuse import misuse_error
 from drivers.camera.raw.exif import Exif
 from drivers.camera.raw.order import Order, file_number
 from drivers.camera.raw.picture import RawPicture, read_picture
@@ -90,7 +90,7 @@ class RawFiles:
                 remedy="Make it, or correct `folder` in the rig.",
             )
         self._order = Order(settings.folder, settings.suffixes, settings.last_number, settings.device)
-        self._sample = self._read(settings.sample or self._newest())
+        self._sample = self._read_picture(settings.sample or self._newest())
         self._last_taken: Exif | None = None
         self.id_modulus = (1, settings.last_number)
         self.delivery_s = settings.patience_s
@@ -108,7 +108,7 @@ class RawFiles:
             )
         return max(files, key=lambda path: path.stat().st_mtime_ns)
 
-    def _read(self, path: Path) -> RawPicture:
+    def _read_picture(self, path: Path) -> RawPicture:
         try:
             return read_picture(path, self._settings.black_dn)
         except (OSError, ValueError) as error:
@@ -142,7 +142,7 @@ class RawFiles:
     def configure(self, exposure: Exposure) -> FrameFormat:
         """The exposure is set on the camera by hand; each picture is checked for it."""
         if self._armed.is_set():
-            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
+            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
         if exposure.gain_db:
             raise DeviceRefused(
                 self._name,
@@ -169,7 +169,7 @@ class RawFiles:
     def arm(self, buffers: int) -> None:
         """Files already in the folder do not belong to this burst. `buffers` is not used: files wait on disk."""
         if self._format is None:
-            raise misused(self._name, "configure() before arm()", "no exposure is set")
+            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._order.begin()
         self._last_taken = None
@@ -196,7 +196,7 @@ class RawFiles:
         if slot is None:
             return None
         try:
-            picture = self._read(path)
+            picture = self._read_picture(path)
             self._check(path, picture)
         except BaseException:
             slot.release()
@@ -237,7 +237,7 @@ class RawFiles:
 
     def trigger(self) -> None:
         if self._exposure is None or self._exposure.hardware_trigger:
-            raise misused(
+            raise misuse_error(
                 self._name, "hardware_trigger=False", "a software trigger while the box releases the shutter"
             )
         command = self._settings.release_command
@@ -280,10 +280,10 @@ class RawFiles:
 
     # -- errors -------------------------------------------------------------------------------------------
 
-    def _bad_picture(self, path: Path, expected: str, happened: str) -> DeviceFault:
+    def _bad_picture(self, path: Path, expectation: str, observation: str) -> DeviceFault:
         return DeviceFault(
             self._name,
-            expected=f"{expected} in {path.name}",
-            happened=happened,
+            expected=f"{expectation} in {path.name}",
+            happened=observation,
             remedy="Set the camera to manual, let no other program write to the folder, then resume the run.",
         )

@@ -63,11 +63,11 @@ def _main_tags(path: Path) -> Mapping[str, Any]:
         raise ValueError(f"it is no TIFF that can be read, as CR2, NEF, ARW and DNG files are: {error}") from error
 
 
-def _taken_ns(taken: str, subseconds: str) -> int:
+def _taken_ns(capture_time: str, subseconds: str) -> int:
     try:
-        seconds = datetime.strptime(taken, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        seconds = datetime.strptime(capture_time, "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
     except ValueError as error:
-        raise ValueError(f"it has no capture time (tag DateTimeOriginal holds {taken!r})") from error
+        raise ValueError(f"it has no capture time (tag DateTimeOriginal holds {capture_time!r})") from error
     if subseconds and not (subseconds.isascii() and subseconds.isdigit()):
         raise ValueError(f"its fraction of a second is no number (tag SubSecTimeOriginal holds {subseconds!r})")
     return int(seconds.timestamp()) * 1_000_000_000 + int(subseconds[:6].ljust(6, "0")) * 1000

@@ -65,13 +65,13 @@ class XiDevice:
             )
         self._check(code, f"XIMEA camera {serial} to open" if serial else "the XIMEA camera to open")
 
-    def _check(self, code: int, expected: str) -> None:
+    def _check(self, code: int, expectation: str) -> None:
         if code == OK:
             return
         kind: type[DeviceError] = DeviceLost if code in GONE else DeviceRefused
         raise kind(
             self.name,
-            expected=expected,
+            expected=expectation,
             happened=f"xiAPI answered {code_name(code)} ({code})",
             remedy="Check cable and power, then resume the run."
             if code in GONE
@@ -80,23 +80,23 @@ class XiDevice:
 
     # -- parameters ---------------------------------------------------------------------------------------
 
-    def _read(self, parameter: str, value: Any) -> int:
+    def _get_parameter(self, parameter: str, value: Any) -> int:
         with self._lock:
             get = self._library.xiGetParamInt if isinstance(value, ctypes.c_int) else self._library.xiGetParamFloat
             code: int = get(self._handle, parameter.encode(), value)
         return code
 
     def has(self, parameter: str) -> bool:
-        return self._read(parameter, ctypes.c_int()) not in ABSENT
+        return self._get_parameter(parameter, ctypes.c_int()) not in ABSENT
 
     def whole(self, parameter: str) -> int:
         value = ctypes.c_int()
-        self._check(self._read(parameter, value), f"a value of `{parameter}`")
+        self._check(self._get_parameter(parameter, value), f"a value of `{parameter}`")
         return value.value
 
     def number(self, parameter: str) -> float:
         value = ctypes.c_float()
-        self._check(self._read(parameter, value), f"a value of `{parameter}`")
+        self._check(self._get_parameter(parameter, value), f"a value of `{parameter}`")
         return value.value
 
     def text(self, parameter: str) -> str:
@@ -131,7 +131,7 @@ class XiDevice:
         ends = []
         for info, unknown in ((":min", -math.inf), (":max", math.inf)):
             value = ctypes.c_float()
-            code = self._read(parameter + info, value)
+            code = self._get_parameter(parameter + info, value)
             if code not in ABSENT:
                 self._check(code, f"a value of `{parameter}{info}`")
             ends.append(unknown if code in ABSENT else value.value)

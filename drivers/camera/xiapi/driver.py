@@ -27,7 +27,7 @@ from coupole.clock import Clock
 from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused
 from drivers.camera.frame_pool import FramePool, Slot
-from drivers.camera.misuse import misused
+from drivers.camera.misuse import misuse_error
 from drivers.camera.xiapi.device import XiDevice
 from drivers.camera.xiapi.library import (
     API_SKIPPED,
@@ -185,7 +185,7 @@ class XiCamera:
 
     def configure(self, exposure: Exposure) -> FrameFormat:
         if self._armed.is_set():
-            raise misused(self._name, "a disarmed camera", "configure() was called while it is armed")
+            raise misuse_error(self._name, "a disarmed camera", "configure() was called while it is armed")
         device, settings = self._device, self._settings
         edge = TRIGGER_RISING if settings.trigger_edge == "rising" else TRIGGER_FALLING
         device.set("trigger_source", edge if exposure.hardware_trigger else TRIGGER_SOFTWARE)
@@ -241,7 +241,7 @@ class XiCamera:
 
     def arm(self, buffers: int) -> None:
         if self._format is None:
-            raise misused(self._name, "configure() before arm()", "no exposure is set")
+            raise misuse_error(self._name, "configure() before arm()", "no exposure is set")
         self.disarm()
         self._check_presence()
         buffer_count = max(buffers, self._settings.buffers)
@@ -323,7 +323,7 @@ class XiCamera:
 
     def trigger(self) -> None:
         if self._by_edges:  # xiAPI would expose a frame all the same (python-microscope/vendor-issues, issue 3)
-            raise misused(self._name, "hardware_trigger=False", "a software trigger while edges trigger")
+            raise misuse_error(self._name, "hardware_trigger=False", "a software trigger while edges trigger")
         self._device.set("trigger_software", 1)
 
     def statistics(self) -> CameraStatistics:
@@ -368,11 +368,11 @@ class XiCamera:
 
     # -- errors -------------------------------------------------------------------------------------------
 
-    def _unexpected_image(self, expected: str, happened: str) -> DeviceRefused:
+    def _unexpected_image(self, expectation: str, observation: str) -> DeviceRefused:
         return DeviceRefused(
             self._name,
-            expected=f"images with {expected}",
-            happened=f"one came with {happened}",
+            expected=f"images with {expectation}",
+            happened=f"one came with {observation}",
             remedy="Make both agree in the rig (`region`, `black_dn`, `timestamps`, `parameters`).",
         )
 

@@ -106,9 +106,9 @@ class State:
 
     def set(self, parameter: str, value: int | float, entry: str = "") -> None:
         """Set a parameter, unless it holds the value already; raises DeviceRefused if it then holds another."""
-        if self._held(parameter, value) != value:
+        if self._present_value(parameter, value) != value:
             self._device.set(parameter, value)
-        read_back = self._held(parameter, value)
+        read_back = self._present_value(parameter, value)
         if read_back != value:
             raise DeviceRefused(
                 self._device.name,
@@ -118,7 +118,7 @@ class State:
             )
         self.held[f"{parameter}[{entry}]" if entry else parameter] = f"{read_back:g}"
 
-    def _held(self, parameter: str, value: int | float) -> float:
+    def _present_value(self, parameter: str, value: int | float) -> float:
         return self._device.number(parameter) if isinstance(value, float) else self._device.whole(parameter)
 
     def note(self, *parameters: str) -> None:

@@ -28,7 +28,7 @@ from drivers.arm_motion import (
     farthest_stop_deg,
     longest_stop_s,
     overtaken,
-    refused,
+    refusal,
 )
 from drivers.kuka.eki import wire
 from drivers.kuka.eki.link import Link, connect
@@ -113,7 +113,7 @@ class KukaEki:
         self._raise_fault()
         status = self._status()
         if status.override_percent <= 0:
-            raise refused("an override above 0 %", "the controller's program override is at 0 %")
+            raise refusal("an override above 0 %", "the controller's program override is at 0 %")
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         slower = self.settings.velocity_percent() / percent
         move_s = move_duration_s(self.arm, status.joints_deg, target_deg) * slower + self._stop_s()
@@ -129,24 +129,26 @@ class KukaEki:
         order = watch.order
         with self._sending:
             with self._link.changed:  # only statuses sent after the controller has taken ASK count
-                watch.asked(self._number + 1)
+                watch.note_command(self._number + 1)
             self._send(wire.ASK)
         self._wait_taken()
         settle_s = settings.settle_cycles * settings.status_ms / 1e3
         limit_s = 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0
 
-        def settled() -> bool:
+        def is_settled() -> bool:
             if watch.order != order:
                 raise overtaken()
             self._look()
-            if watch.lapsed and not watch.moving:
+            if watch.has_lapsed and not watch.moving:
                 raise ArmUnattended(self._attention.longest_gap_s())
             return watch.taken_ms is not None and watch.settled_cycles >= settings.settle_cycles
 
-        self._wait(settled, limit_s, "the arm at its target and still")
+        self._wait(is_settled, limit_s, "the arm at its target and still")
         dwell_ends_ms = self._status().time_ms + 1e3 * settings.dwell_s
         self._wait(
-            lambda: self._status().time_ms >= dwell_ends_ms and settled(), limit_s, "the arm still after the dwell"
+            lambda: self._status().time_ms >= dwell_ends_ms and is_settled(),
+            limit_s,
+            "the arm still after the dwell",
         )
         return self.measured()
 
@@ -164,7 +166,7 @@ class KukaEki:
                 moving=self._watch.moving,
                 fault=fault.text if fault else "",
                 condition=_condition(status),
-                unattended_s=self._attention.longest_gap_s() if self._watch.lapsed else 0.0,
+                unattended_s=self._attention.longest_gap_s() if self._watch.has_lapsed else 0.0,
             )
 
     def stop(self) -> None:
@@ -230,7 +232,7 @@ class KukaEki:
         """Return a speed in percent of the controller's own speeds. Raises DeviceRefused below its slowest."""
         percent = int(round(speed * self.settings.velocity_percent(), 6))
         if percent < 1:
-            raise refused(
+            raise refusal(
                 "at least 1 % of the controller's speeds, its slowest",
                 f"{speed:.3g} of the {self.settings.velocity_percent()} % of the rig is less",
             )
@@ -239,7 +241,7 @@ class KukaEki:
     def _order(self, verb: int, target_deg: Six | None, percent: int | None = None) -> None:
         """Send a STOP or a MOVE; `_sending` must be held."""
         with self._link.changed:
-            self._watch.ordered(self._number + 1, target_deg)
+            self._watch.note_order(self._number + 1, target_deg)
         self._send(verb, target_deg, percent)
 
     def _look(self) -> None:
@@ -280,11 +282,11 @@ class KukaEki:
     def _wait_taken(self) -> None:
         watch, patience_s = self._watch, 2.0 * self.settings.link_timeout_s  # a lost link is noticed before that
 
-        def taken() -> bool:
+        def is_taken() -> bool:
             self._look()
             return watch.link_lost or watch.taken_ms is not None
 
-        self._link.wait_for(taken, patience_s)
+        self._link.wait_for(is_taken, patience_s)
         if watch.taken_ms is None and not watch.link_lost:
             raise DeviceTimeout(
                 "robot",
@@ -293,15 +295,15 @@ class KukaEki:
                 remedy="See the controller's messages: its submit interpreter must run",
             )
 
-    def _wait(self, done: Callable[[], bool], limit_s: float, expected: str, *, faults: bool = True) -> None:
-        """Wait until `done`. Raises a fault once the arm is at rest, or DeviceTimeout when more than `limit_s` of
-        the controller's time have passed since it took the last command."""
+    def _wait(self, is_done: Callable[[], bool], limit_s: float, expectation: str, *, faults: bool = True) -> None:
+        """Wait until `is_done`. Raises a fault once the arm is at rest, or DeviceTimeout when more than `limit_s`
+        of the controller's time have passed since it took the last command."""
         watch = self._watch
 
         def outcome() -> str:
             if watch.link_lost or (watch.fault and not watch.moving):
                 return "fault"
-            if watch.fault is None and done():
+            if watch.fault is None and is_done():
                 return "done"
             return "overdue" if watch.overdue(limit_s) else ""
 
@@ -311,7 +313,7 @@ class KukaEki:
         if how == "overdue":
             raise DeviceTimeout(
                 "robot",
-                expected=f"{expected} within {limit_s:.1f} s",
+                expected=f"{expectation} within {limit_s:.1f} s",
                 happened=f"axes measured at {np.round(self._status().joints_deg, 3).tolist()} deg",
                 remedy="See the controller's messages; a motion may wait for an enabling switch or a condition",
             )

@@ -84,7 +84,7 @@ class Link:
         self.changed = threading.Condition()
         """Condition to be held while the watch is read or changed."""
         self._closing = False
-        self._thread = threading.Thread(target=self._read, name="kuka-eki", daemon=True)
+        self._thread = threading.Thread(target=self._read_statuses, name="kuka-eki", daemon=True)
         self._thread.start()
 
     def send(self, command: Command) -> None:
@@ -120,7 +120,7 @@ class Link:
         self._thread.join()
         self._link.close()
 
-    def _read(self) -> None:
+    def _read_statuses(self) -> None:
         silence, message_count = Silence(), 1
         while not self._closing:
             try:

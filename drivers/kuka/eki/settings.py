@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coupole.kinematics import Arm, slowed
+from coupole.kinematics import Arm, slowed_arm
 from drivers.senders import refuse_anybody
 
 
@@ -77,7 +77,7 @@ class Settings(BaseModel):
 
     def arm(self) -> Arm:
         """The arm with the speeds that this driver uses; preflight computes durations with it."""
-        return slowed(
+        return slowed_arm(
             self.arm_model,
             speed_fraction=self.velocity_percent() / 100.0,
             acceleration_deg_s2=self.acceleration_percent() / 100.0 * self.full_acceleration_deg_s2,

@@ -55,7 +55,7 @@ class Watch:
         self._asked = self._astray_cycles = 0
 
     @property
-    def lapsed(self) -> bool:
+    def has_lapsed(self) -> bool:
         """The last order was ended by the controller, because nobody watched it."""
         return self.status is not None and self.status.lapsed == self.order != 0
 
@@ -67,13 +67,13 @@ class Watch:
         waiting = self.fault is None and self.status.done != self.order
         return waiting or self.status.moving or self.speed_deg_s > self._tolerances.settle_deg_s
 
-    def ordered(self, number: int, target_deg: Six | None) -> None:
+    def note_order(self, number: int, target_deg: Six | None) -> None:
         """A STOP (without target) or a MOVE is about to be sent."""
         self.order = number
         self._rest_deg = target_deg
-        self.asked(number)
+        self.note_command(number)
 
-    def asked(self, number: int) -> None:
+    def note_command(self, number: int) -> None:
         """A command of any kind is about to be sent: only statuses from after it was taken count."""
         self._asked, self.taken_ms = number, None
         self.settled_cycles = self._astray_cycles = 0
@@ -106,7 +106,7 @@ class Watch:
         if self.moving:
             self.settled_cycles = self._astray_cycles = 0
             return
-        if self._rest_deg is None or self.lapsed:
+        if self._rest_deg is None or self.has_lapsed:
             self._rest_deg = status.joints_deg
         error_deg = max(map(abs, map(float.__sub__, status.joints_deg, self._rest_deg)))
         is_settled = known_speed and error_deg <= self._tolerances.settle_deg

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from drivers.kuka.rsi.pose import Geometry, corrected, correction, flange_pose
+from drivers.kuka.rsi.pose import Geometry, corrected_pose, correction, flange_pose
 
 Six = tuple[float, ...]
 
@@ -35,7 +35,7 @@ class Corrections:
         """The correction from one place to another."""
         self._moved: Callable[[Any, Six], Any] = _axes_moved
         if corrects == "pose":
-            self.place, self.between, self._moved = partial(flange_pose, geometry), correction, corrected
+            self.place, self.between, self._moved = partial(flange_pose, geometry), correction, corrected_pose
         self._from: Any = None
         """The place from which the next correction counts."""
         self._last = self._applied = _NOTHING
@@ -48,7 +48,7 @@ class Corrections:
         self._from = self.led_to = self.place(start_deg)
         self._last = self._applied = _NOTHING
 
-    def taken(self) -> None:
+    def note_applied(self) -> None:
         """The controller has applied the last correction."""
         self._applied = self._last
         if self._relative:

@@ -55,9 +55,9 @@ class CycleMeter:
             return ""
         arrived_ms = (now_ns - self._begun_ns) / 1e6 / self._cycles
         self._begun_ns, self._cycles = now_ns, 0
-        return self._judged(arrived_ms if self._declared_ms is None else self._declared_ms)
+        return self._judge_cycle(arrived_ms if self._declared_ms is None else self._declared_ms)
 
-    def _judged(self, cycle_ms: float) -> str:
+    def _judge_cycle(self, cycle_ms: float) -> str:
         first = not self.measured_ns
         ratio = cycle_ms / self._cycle_ms
         wrong = ratio < _FASTEST

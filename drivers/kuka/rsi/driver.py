@@ -33,7 +33,7 @@ from drivers.arm_motion import (
     checked_target,
     longest_stop_s,
     overtaken,
-    refused,
+    refusal,
     wait_for,
 )
 from drivers.kuka.rsi import shared_state
@@ -120,7 +120,7 @@ class KukaRsi:
         if violations := correction_violations(
             self.settings, self.arm, state.start_deg, on_the_way_deg, target_deg
         ):
-            raise refused("a motion within the limits of corrections", violations)
+            raise refusal("a motion within the limits of corrections", violations)
         # If the arm is moving it brakes first, which lengthens the motion by up to twice the braking time.
         motion_s = move_duration_s(self.arm, state.measured_deg, target_deg) / speed + self._stop_s()
         with self._sending:
@@ -136,9 +136,9 @@ class KukaRsi:
         settings = self.settings
         settle_s = settings.settle_cycles * settings.cycle_ms / 1e3
         deadline = Deadline(self._clock, 1.5 * self._motion_s + settle_s + settings.dwell_s + 1.0)
-        self._wait(lambda state: self._settled(state, command), deadline, "the arm at its target and still")
+        self._wait(lambda state: self._is_settled(state, command), deadline, "the arm at its target and still")
         self._clock.sleep(settings.dwell_s)
-        self._wait(lambda state: self._settled(state, command), deadline, "the arm still after the dwell")
+        self._wait(lambda state: self._is_settled(state, command), deadline, "the arm still after the dwell")
         return self.measured()
 
     def measured(self) -> ArmState:
@@ -251,13 +251,18 @@ class KukaRsi:
         self._process.wait()
 
     def _wait(
-        self, done: Callable[[shared_state.State], bool], deadline: Deadline, expected: str, *, faults: bool = True
+        self,
+        is_done: Callable[[shared_state.State], bool],
+        deadline: Deadline,
+        expectation: str,
+        *,
+        faults: bool = True,
     ) -> None:
         wait_for(
             self._state,
-            done,
+            is_done,
             deadline,
-            expected,
+            expectation,
             check=self._raise_fault if faults else None,
             pause=lambda: self._clock.sleep(_POLL_S, LOOK_S),
             describe=lambda state: (
@@ -267,7 +272,7 @@ class KukaRsi:
             remedy="See the controller's messages; its override must be at 100 %",
         )
 
-    def _settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
+    def _is_settled(self, state: shared_state.State, command: shared_state.Command) -> bool:
         if self._command is not command:
             raise overtaken()
         if state.lapses != self._lapses:

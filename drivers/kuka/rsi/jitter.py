@@ -97,7 +97,7 @@ class StandInController:
 
 
 @contextmanager
-def asked(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
+def answering_session(settings: Settings) -> Iterator[tuple[StandInController, bool]]:
     """The driver's process in a session with a controller here, and True if it runs under SCHED_FIFO. Of the
     settings, address, controller and limits of lateness are this session's own."""
     port = free_port()
@@ -139,7 +139,7 @@ def above_the_loop() -> Iterator[None]:
         os.sched_setscheduler(0, *before)
 
 
-def measured(settings: Settings, seconds: float, tell: Callable[[float], object] = lambda _: None) -> Jitter:
+def measure_jitter(settings: Settings, seconds: float, tell: Callable[[float], object] = lambda _: None) -> Jitter:
     """Ask for so long, in the settings' cycle; `tell` is called with the seconds that are done.
 
     Raises DeviceError if the answering process cannot be started.
@@ -147,15 +147,15 @@ def measured(settings: Settings, seconds: float, tell: Callable[[float], object]
     cycle_s = settings.cycle_ms / 1e3
     cycles = max(1, round(seconds / cycle_s))
     chunk = max(1, round(_TOLD_EVERY_S / cycle_s))
-    with asked(settings) as (controller, realtime):
+    with answering_session(settings) as (controller, realtime):
         for cycle in range(0, cycles, chunk):
             with above_the_loop():
                 controller.ask(min(chunk, cycles - cycle))
             tell(min(cycles, cycle + chunk) * cycle_s)
-    return judged(controller.latencies_us, settings.cycle_ms, realtime=realtime)
+    return jitter_of(controller.latencies_us, settings.cycle_ms, realtime=realtime)
 
 
-def judged(latencies_us: list[float], cycle_ms: int, *, realtime: bool) -> Jitter:
+def jitter_of(latencies_us: list[float], cycle_ms: int, *, realtime: bool) -> Jitter:
     """Figures of these latencies; late ones are infinite."""
     waited_us = np.minimum(latencies_us, 1e3 * cycle_ms)
     p50, p99, p99_99 = (float(np.quantile(waited_us, share)) for share in (0.5, 0.99, 0.9999))

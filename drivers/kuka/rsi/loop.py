@@ -32,14 +32,14 @@ _MOST_STOP_ANSWERS = 50
 """A controller that goes on after so many has no stop element in its configuration."""
 
 
-def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, config: Config) -> None:
+def serve(link: socket.socket, shared_block: shared_state.Block, parent_pid: int, config: Config) -> None:
     """Answer packets until the command LEAVE or the parent's death; before returning, bring the arm to rest and
     end the controller's program."""
     # SO_RCVTIMEO costs nothing per packet; a Python socket time-out costs a poll() before every call.
     link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@qq", 0, int(_TICK_S * 1e6)))
     realtime = int(become_realtime())
     session = RsiSession(config, time.monotonic_ns())
-    shared.write_state(session.state(realtime))
+    shared_block.write_state(session.state(realtime))
     _drop_backlog(link)
     leaving, look_ns, looked_ns = Leaving(session, config), 0, 0
     controller = None
@@ -50,13 +50,13 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
         except BlockingIOError:
             idle = True
         now_ns = time.monotonic_ns()
-        shared.write_ran(now_ns)
-        if shared.command_number() != session.command:
-            command = shared.read_command()
+        shared_block.write_ran(now_ns)
+        if shared_block.command_number() != session.command:
+            command = shared_block.read_command()
             session.obey(command)
             if command.verb == shared_state.LEAVE:
                 leaving.begin()
-        looked_ns = max(looked_ns, shared.looked_ns())  # never backwards, also if a beat is half written
+        looked_ns = max(looked_ns, shared_block.looked_ns())  # never backwards, also if a beat is half written
         session.attend(now_ns - looked_ns)
         late, answer = session.late, None
         if not idle and (controller not in (None, address) or config.controller not in ("", address[0])):
@@ -79,7 +79,7 @@ def serve(link: socket.socket, shared: shared_state.Block, parent_pid: int, conf
                 session.leave()
                 leaving.begin()
         leaving.look(now_ns)
-        shared.write_state(session.state(realtime))
+        shared_block.write_state(session.state(realtime))
 
 
 class Leaving:

@@ -66,7 +66,7 @@ def flange_pose(arm: Geometry, joints_deg: Six) -> Pose:
 
 def correction(before: Pose, after: Pose) -> Six:
     """X, Y, Z in mm and A, B, C in degrees that lead from `before` to `after`; where B is +-90, C is 0."""
-    r = _product(after.rotation, _transposed(before.rotation))
+    r = _product(after.rotation, _transpose(before.rotation))
     cos_b = hypot(r[0], r[3])
     b = atan2(-r[6], cos_b)
     a, c = (atan2(r[3], r[0]), atan2(r[7], r[8])) if cos_b > _GIMBAL_LOCK else (atan2(-r[1], r[4]), 0.0)
@@ -74,7 +74,7 @@ def correction(before: Pose, after: Pose) -> Six:
     return x1 - x0, y1 - y0, z1 - z0, degrees(a), degrees(b), degrees(c)
 
 
-def corrected(before: Pose, values: Six) -> Pose:
+def corrected_pose(before: Pose, values: Six) -> Pose:
     """The pose after a correction of X, Y, Z in mm and A, B, C in degrees."""
     x, y, z, a_deg, b_deg, c_deg = values
     x0, y0, z0 = before.position_mm
@@ -98,5 +98,5 @@ def _product(a: Rotation, b: Rotation) -> Rotation:
     )
 
 
-def _transposed(r: Rotation) -> Rotation:
+def _transpose(r: Rotation) -> Rotation:
     return r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]

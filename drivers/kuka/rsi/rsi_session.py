@@ -105,7 +105,7 @@ class RsiSession:
         self._bounds = StepBounds(
             config.corrects, config.cycle_s, config.velocity_deg_s, config.acceleration_deg_s2, config.geometry
         )
-        self._witness = self._new_witness(simulated=False)
+        self._witness = self._new_witness(is_simulated=False)
         self._cycle = CycleMeter(config.cycle_s, None)
         self._counts_delay = False
         """True if the session's first packet had a delay counter."""
@@ -181,7 +181,7 @@ class RsiSession:
         # Packets lost on the network also raise the delay counter, but do not concern the answer before them.
         was_applied = rose == 0 or rose < cycles
         if was_applied:
-            self._corrections.taken()
+            self._corrections.note_applied()
         strays = self._witness.strays(packet.joints_deg)
         self._watch(packet, strays=strays)
         self._held_in_row = self._held_in_row + 1 if rose or strays else 0
@@ -189,13 +189,15 @@ class RsiSession:
         advances = was_applied and not strays
         if not advances:  # repeat the last answer instead of advancing ahead of the arm
             if self._held_in_row >= _HALTED_PACKETS:
-                self.motion.halted()
+                self.motion.note_halt()
                 self._bounds.at_rest()
         elif not self.motion.step():
             self._bounds.at_rest()
             self.fail(shared_state.NO_TRAJECTORY, "no trajectory within the limits leads to the target")
         self._last_answer = (
-            None if self._silent() else self._formed(packet, now_ns, advances=advances, rested=was_standing)
+            None
+            if self._silent()
+            else self._answer_to(packet, now_ns, advances=advances, was_at_rest=was_standing)
         )
         self.answers += self._last_answer is not None
         return self._last_answer
@@ -204,23 +206,23 @@ class RsiSession:
         """Tell whether this packet's corrections still count from the session's start, as far as can be seen; else
         nothing is answered."""
         self.behind = False
-        if reason := self._witness.broken(packet, now_ns):
+        if reason := self._witness.break_reason(packet, now_ns):
             self.fail(shared_state.RESTARTED, reason)
         else:
             self.behind = self._witness.waits(packet, now_ns)
         return not reason and not self.behind
 
-    def _formed(self, packet: Packet, now_ns: int, *, advances: bool, rested: bool) -> bytes | None:
+    def _answer_to(self, packet: Packet, now_ns: int, *, advances: bool, was_at_rest: bool) -> bytes | None:
         """The answer, or None if it would break the bounds: the controller then ends the session by itself. Once
-        the arm is at rest after a fault, its corrections cause no further motion. `rested`: the axes were at rest
-        in the answer before."""
+        the arm is at rest after a fault, its corrections cause no further motion. `was_at_rest`: the axes were at
+        rest in the answer before."""
         holds = self.motion.phase == shared_state.STANDING and self.fault != shared_state.NO_FAULT
         values = self._corrections.hold() if holds else self._corrections.to(self.motion.commanded_deg)
         violation = self._bounds.violation(self._corrections.step(values), advances=advances and not holds)
         if violation := violation or self._witness.violation(packet, self._corrections.led_to, now_ns):
             self.fail(shared_state.OUT_OF_BOUNDS, f"an answer was withheld: {violation}")
             return None
-        ends = self._leaves and rested and self.fault == shared_state.NO_FAULT and bool(self._config.stop_tag)
+        ends = self._leaves and was_at_rest and self.fault == shared_state.NO_FAULT and bool(self._config.stop_tag)
         self.stop_answers += ends
         return (self._stop_template if ends else self._template) % (*values, packet.ipoc)
 
@@ -292,14 +294,14 @@ class RsiSession:
         self._controller, self._counts_delay = controller, packet.delay is not None
         # Only a simulated controller may say how long its cycle is.
         declared_s = config.declared_cycle_s if b"simulated" in controller else None
-        self._witness = self._new_witness(simulated=b"simulated" in controller)
+        self._witness = self._new_witness(is_simulated=b"simulated" in controller)
         self._cycle = CycleMeter(config.cycle_s, declared_s)
         self._start_deg = self._measured_deg = packet.joints_deg
         self._corrections.begin(packet.joints_deg)
         self.motion.stand_at(packet.joints_deg)
 
-    def _new_witness(self, *, simulated: bool) -> ArmWitness:
-        """`simulated`: the world waits for answers, or for its machine; the clock says nothing of silences."""
+    def _new_witness(self, *, is_simulated: bool) -> ArmWitness:
+        """`is_simulated`: the world waits for answers, or for its machine; the clock says nothing of silences."""
         config = self._config
         return ArmWitness(
             self._corrections.place,
@@ -309,12 +311,12 @@ class RsiSession:
             lag_s=config.follow_lag_s,
             cycle_s=config.cycle_s,
             counts_in_a_row=config.delay_counts == "consecutive",
-            unaccounted_s=0.0 if simulated else config.unaccounted_s,
+            unaccounted_s=0.0 if is_simulated else config.unaccounted_s,
         )
 
-    def _in_sequence(self, ipoc: int, advance: int, seen: int) -> bool:
+    def _in_sequence(self, ipoc: int, advance: int, packet_hash: int) -> bool:
         """True for a packet that continues the session. Others, twice, old or of another session, change nothing;
-        a run of others ends the session. `seen`: the packet's hash."""
+        a run of others ends the session. `packet_hash`: the packet's hash."""
         step = self._cycle.ipoc_step
         if step:
             continues = 0 < advance <= _GAP_STEPS * step and advance % step == 0
@@ -324,7 +326,7 @@ class RsiSession:
             if not 0 < self._ipoc_step <= advance:
                 self._ipoc_step = advance  # the smallest so far: a packet may have been lost on the network
             self._astray_run = 0
-        elif seen in self._remembered:
+        elif packet_hash in self._remembered:
             self.astray += 1
         else:
             self._astray(ipoc, advance, self._ipoc_step or 1)

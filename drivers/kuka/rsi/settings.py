@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
-from coupole.kinematics import Arm, SphericalWrist, slowed, structure_of
+from coupole.kinematics import Arm, SphericalWrist, slowed_arm, structure_of
 from coupole.supervision import ATTENTION_S
 from drivers.arm_motion import farthest_stop_deg
 from drivers.kuka.rsi.corrections import TAGS
@@ -122,7 +122,7 @@ class Settings(BaseModel):
 
     def arm(self) -> Arm:
         """The arm with the speeds that this driver uses; preflight computes durations with it."""
-        return slowed(
+        return slowed_arm(
             self.arm_model,
             speed_fraction=self.speed_fraction,
             acceleration_deg_s2=self.acceleration_deg_s2,

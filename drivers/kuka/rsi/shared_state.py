@@ -98,7 +98,7 @@ class Block:
         self._write(_COMMAND_AT, _COMMAND.pack(command.number, command.verb, *command.target_deg, command.speed))
 
     def read_command(self) -> Command:
-        number, verb, *target, speed = self._read(_COMMAND_AT, _COMMAND)
+        number, verb, *target, speed = self._read_record(_COMMAND_AT, _COMMAND)
         return Command(number, verb, tuple(target), speed)
 
     def command_number(self) -> int:
@@ -137,7 +137,7 @@ class Block:
         )
 
     def read_state(self) -> State:
-        fields = self._read(_STATE_AT, _STATE)
+        fields = self._read_record(_STATE_AT, _STATE)
         joints_end = _WORDS + 24
         joints = (fields[at : at + 6] for at in range(_WORDS, joints_end, 6))
         texts = (text.rstrip(b"\0") for text in fields[joints_end:])
@@ -156,7 +156,7 @@ class Block:
         self._memory[at + _SEQUENCE.size : at + _SEQUENCE.size + len(record)] = record
         _SEQUENCE.pack_into(self._memory, at, (sequence | 1) + 1)
 
-    def _read(self, at: int, layout: struct.Struct) -> tuple[Any, ...]:
+    def _read_record(self, at: int, layout: struct.Struct) -> tuple[Any, ...]:
         """Raises TimeoutError if the writer died in the middle of a record."""
         give_up = time.monotonic() + _TORN_S
         while time.monotonic() < give_up:

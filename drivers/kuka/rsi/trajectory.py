@@ -46,7 +46,7 @@ class Motion:
         self.phase, self.commanded_deg, self.velocity_deg_s = shared_state.STANDING, joints_deg, (0.0,) * 6
         self._next_target_deg = None
 
-    def halted(self) -> None:
+    def note_halt(self) -> None:
         """The arm has halted although its axes were commanded to move: continue from rest."""
         self.velocity_deg_s = (0.0,) * 6
         self._input.current_velocity = self._input.current_acceleration = [0.0]

@@ -40,7 +40,7 @@ class ArmWitness:
 
     def __init__(
         self,
-        reported: Callable[[Six], Any],
+        place_at: Callable[[Six], Any],
         between: Callable[[Any, Any], Six],
         *,
         follow: Six,
@@ -50,10 +50,10 @@ class ArmWitness:
         counts_in_a_row: bool,
         unaccounted_s: float,
     ) -> None:
-        """`reported` gives the place at reported axes, `between` what leads from one place to another; `follow`
+        """`place_at` gives the place at reported axes, `between` what leads from one place to another; `follow`
         and `step` are how far the arm may be from where it was led, and one cycle's step. `counts_in_a_row`: the
         counter of late answers falls to 0 at one in time. `unaccounted_s`: see the module; 0: never."""
-        self._reported, self._between = reported, between
+        self._reported, self._between = place_at, between
         self._follow = follow
         self._follow_and_step: Six = tuple(map(float.__add__, follow, step))
         self._cycle_s, self._in_a_row, self._unaccounted_s = cycle_s, counts_in_a_row, unaccounted_s
@@ -63,7 +63,7 @@ class ArmWitness:
         """The last answered packet."""
         self._last_ns = self._step = self._answered = self._waits = 0
 
-    def broken(self, packet: Packet, now_ns: int) -> str:
+    def break_reason(self, packet: Packet, now_ns: int) -> str:
         """Return why, by this packet, corrections may no longer count from where they did; "" if it proves that
         they do."""
         last = self._last
@@ -119,7 +119,7 @@ class ArmWitness:
     def violation(self, packet: Packet, place: Any, now_ns: int) -> str:
         """Return why an answer to `packet` that leads to `place` must not be sent; else "", and the answer is
         taken as sent."""
-        if why := self.broken(packet, now_ns):
+        if why := self.break_reason(packet, now_ns):
             return why
         arm = self._reported(packet.joints_deg)
         before = self._led[-1] if self._led else arm

@@ -20,7 +20,7 @@ from sim.scene.scene import build_scene
 
 BOARD = Charuco(7, 5)
 PITCH_UM = 22.0
-LENS = Lens.focused(
+LENS = Lens.at_focus(
     1024,
     768,
     pixel_pitch_um=PITCH_UM,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import Transform
-from sim.render.lens import Lens, distorted
+from sim.render.lens import Lens, distorted_points
 from sim.scene.scene import Scene, build_scene
 from sim.scene.surface import Material, Surface
 
@@ -65,7 +65,7 @@ def rays(lens: Lens, base_from_camera: Transform) -> NDArray[np.float64]:
 
         blocks = kron(identity(seen[..., 0].size), np.ones((2, 2)))
         solved = least_squares(
-            lambda xy: (distorted(xy.reshape(seen.shape), lens.distortion) - seen).ravel(),
+            lambda xy: (distorted_points(xy.reshape(seen.shape), lens.distortion) - seen).ravel(),
             seen.ravel(),
             jac_sparsity=blocks,
             xtol=1e-15,

@@ -47,7 +47,9 @@ def ours(
     shadows = Shadows(Obstacles(scene.corners_mm), led_mm[None], 1 << 20)
     places = shadows.places(view.sides)
     emitter = square(led_mm, TOWARDS, side_mm=7.0, flux_lm=FLUX_LM)
-    radiance = led_radiance(view, scene.materials, scene.tables, emitter, "lambertian", places, shadows.reached(0))
+    radiance = led_radiance(
+        view, scene.materials, scene.tables, emitter, "lambertian", places, shadows.reached_bits(0)
+    )
     return view.sides >> 1, view, radiance
 
 

@@ -19,7 +19,7 @@ from sim.optics.objective import Objective, defocus_px
 from sim.optics.panels import Panel
 from sim.optics.photographer import Photographer
 from sim.render.emitter import irradiance, square
-from sim.render.lens import Lens, distorted, sight
+from sim.render.lens import Lens, distorted_points, sight
 
 SIZE = (192, 256)
 FLAT, CURVED = (sight(Lens(SIZE[1], SIZE[0], 400.0, d)) for d in ((0.0,) * 5, BENT))
@@ -55,7 +55,9 @@ def test_an_led_is_seen_where_its_centre_is_projected(through) -> None:  # type:
         assert lamp is not None
         image = filled(lamp)
         at = [float((image * grid).sum() / image.sum()) for grid in np.indices(SIZE)]
-        expected = distorted(np.array([x, y]) / 1000.0, through.lens.distortion) * 400.0 + through.lens.centre_px
+        expected = (
+            distorted_points(np.array([x, y]) / 1000.0, through.lens.distortion) * 400.0 + through.lens.centre_px
+        )
         assert at[::-1] == pytest.approx(list(expected), abs=0.01)
 
 

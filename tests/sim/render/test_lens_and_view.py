@@ -11,7 +11,7 @@ from scenes import BENT, camera_above, quad, scene_of
 from coupole.errors import InputError
 from sim.optics.objective import Objective, vignetting
 from sim.render.camera_view import Viewer, slopes
-from sim.render.lens import Lens, distorted, sight
+from sim.render.lens import Lens, distorted_points, sight
 from sim.scene.scene import build_scene
 from sim.scene.surface import Material, Surface
 
@@ -45,7 +45,7 @@ def test_undoing_distortion_and_distorting_again_leads_back_to_the_pixel(x: floa
     assert shift is not None
     col, row = int(x), int(y)
     place = (np.array([col, row]) - lens.centre_px) / lens.focal_px
-    assert distorted(place + shift[:, row, col], BENT) == pytest.approx(place, abs=1e-7)
+    assert distorted_points(place + shift[:, row, col], BENT) == pytest.approx(place, abs=1e-7)
 
 
 def test_a_lens_that_folds_its_image_is_refused() -> None:

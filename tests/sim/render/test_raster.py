@@ -101,7 +101,7 @@ def test_an_empty_scene_is_seen_as_nothing() -> None:
 
 
 def test_samples_of_a_pixel_lie_within_it() -> None:
-    fine = ids(quad((0.0, 0, 0), 50.0), LENS.supersampled(4), camera_above(200.0))
+    fine = ids(quad((0.0, 0, 0), 50.0), LENS.with_supersampling(4), camera_above(200.0))
     share = (fine >= 0).reshape(120, 4, 160, 4).mean(axis=(1, 3))
     # 100 mm at 200 mm and 200 pixels of focal length: 100 pixels, from 29.5 to 129.5 of pixels' centres.
     assert share.sum() == pytest.approx(100.0 * 100.0)
@@ -118,7 +118,7 @@ def test_an_edge_along_the_pixels_grows_in_as_many_steps_as_a_pixel_has_samples(
     for step in range(28):
         edge_mm = step / 27.0  # 1 mm at 200 mm is a pixel
         corners = quad((50.0 + edge_mm, 0, 0) if across else (0, 50.0 + edge_mm, 0), 50.0)
-        fine = ids(corners, lens.supersampled(samples), camera_above(200.0)) >= 0
+        fine = ids(corners, lens.with_supersampling(samples), camera_above(200.0)) >= 0
         shares.append(fine.sum() / (40 * samples**2))
     steps = np.unique(np.round(np.abs(np.diff(shares)), 6))
     assert steps == pytest.approx([0.0, 1.0 / samples**2])

@@ -15,7 +15,7 @@ LIGHT = np.array([[0.0, 0.0, 1000.0], [600.0, 0.0, 300.0], [0.0, -500.0, 200.0]]
 
 def lit(shadows: Shadows, sides: NDArray[np.int64], led: int) -> NDArray[np.bool_]:
     places = shadows.places(sides)
-    bits = shadows.reached(led)
+    bits = shadows.reached_bits(led)
     reached: NDArray[np.bool_] = ((bits[places >> 3] >> (places & 7)) & 1).astype(bool)
     return reached
 

@@ -14,7 +14,7 @@ from sim.devices.kuka_settings import Settings as KukaSettings
 from sim.optics.objective import Objective, vignetting
 from sim.render.camera_view import Viewer
 from sim.render.emitter import irradiance, square
-from sim.render.lens import Lens, distorted, sight
+from sim.render.lens import Lens, distorted_points, sight
 from sim.scene.scene import build_scene
 from sim.scene.surface import Material, Surface
 from sim.scene.things import CharucoBoard, Sample
@@ -56,27 +56,29 @@ def rendered_pixels(places_mm: np.ndarray, lens: Lens) -> np.ndarray:
 @pytest.mark.parametrize("strange", [ODD, LensStranger(stop_shift_mm=(6.0, -4.0)), LensStranger()])
 def test_points_are_seen_where_opencv_projects_them(strange: LensStranger) -> None:
     plain = PLAIN if strange != LensStranger(stop_shift_mm=(6.0, -4.0)) else Lens(160, 120, 200.0)
-    lens = strange.disturbed(plain, OVER_MM)
+    lens = strange.disturbed_lens(plain, OVER_MM)
     x, y = np.meshgrid([-95.0, -40.0, 50.0, 90.0], [-70.0, 10.0, 65.0])
     places = np.stack([x.ravel(), y.ravel(), np.full(x.size, OVER_MM)], axis=1)
     assert rendered_pixels(places, lens) == pytest.approx(opencv_pixels(places, lens), abs=0.06)
     xy = places[:, :2] / OVER_MM
     if not any(lens.off_axis):
-        seen = distorted(xy, lens.distortion) * lens.focal_px + lens.centre_px
+        seen = distorted_points(xy, lens.distortion) * lens.focal_px + lens.centre_px
         assert seen == pytest.approx(opencv_pixels(places, lens), abs=1e-9)
     assert lens.centre_px[0] - 79.5 == pytest.approx(strange.stop_shift_mm[0] / OVER_MM * 200.0)
 
 
 def test_distortion_stays_on_the_lens_s_axis_when_the_stop_is_off_it() -> None:
-    lens = LensStranger(stop_shift_mm=(6.0, 0.0)).disturbed(Lens(160, 120, 200.0, (-0.1, 0, 0, 0, 0)), OVER_MM)
+    lens = LensStranger(stop_shift_mm=(6.0, 0.0)).disturbed_lens(
+        Lens(160, 120, 200.0, (-0.1, 0, 0, 0, 0)), OVER_MM
+    )
     middle = np.array([[-lens.off_axis[0], 0.0]])
-    assert distorted(middle, lens.terms) == pytest.approx(middle)
+    assert distorted_points(middle, lens.terms) == pytest.approx(middle)
     at = middle + np.array([0.2, 0.1])
-    assert distorted(at, lens.terms) - middle == pytest.approx(np.array([[0.2, 0.1]]) * (1 - 0.1 * 0.05))
+    assert distorted_points(at, lens.terms) - middle == pytest.approx(np.array([[0.2, 0.1]]) * (1 - 0.1 * 0.05))
     seen = sight(lens)
     assert seen.shift is not None
     ray = (np.array([130, 20]) - lens.centre_px) / lens.focal_px + seen.shift[:, 20, 130]
-    assert distorted(ray, lens.terms) * 200.0 + lens.centre_px == pytest.approx([130, 20], abs=1e-4)
+    assert distorted_points(ray, lens.terms) * 200.0 + lens.centre_px == pytest.approx([130, 20], abs=1e-4)
 
 
 def test_a_decentred_stop_moves_the_rim_s_shadow() -> None:
@@ -92,15 +94,15 @@ def test_a_decentred_stop_moves_the_rim_s_shadow() -> None:
 
 def test_a_focus_group_slides_with_the_camera_s_tilt() -> None:
     breathes = LensStranger(breathing=2e-3)
-    assert breathes.breathed(PLAIN, 1.0).focal_px == 200.0
-    assert breathes.breathed(PLAIN, 0.0).focal_px == pytest.approx(200.4)
+    assert breathes.with_breathing(PLAIN, 1.0).focal_px == 200.0
+    assert breathes.with_breathing(PLAIN, 0.0).focal_px == pytest.approx(200.4)
 
 
 def test_coma_spreads_to_one_side_and_keeps_the_light() -> None:
     image = np.zeros((81, 101, 1), np.float32)
     image[20, 80] = 1.0
     strange = LensStranger(coma_px=20.0, coma_deg=90.0)
-    out = strange.blurred(image)[..., 0]
+    out = strange.with_coma(image)[..., 0]
     rows, columns = np.indices(out.shape)
     length = 20.0 * (30**2 + 20**2) / (50**2 + 40**2)
     assert np.average(columns, weights=out) == pytest.approx(80.0, abs=0.05)
@@ -130,7 +132,7 @@ def test_a_lobe_that_does_not_begin_at_the_normal_is_refused() -> None:
 
 def test_dies_are_tilted_by_as_much_as_said_and_stay_where_they_are() -> None:
     normals = np.tile([0.6, 0.0, 0.8], (2000, 1))
-    tilted = LightStranger(die_tilt_deg=2.0).tilted(normals, np.arange(2000))
+    tilted = LightStranger(die_tilt_deg=2.0).tilted_normals(normals, np.arange(2000))
     off_deg = np.degrees(np.arccos(np.sum(tilted * normals, axis=1)))
     assert np.sqrt(np.mean(off_deg**2)) == pytest.approx(2.0 * np.sqrt(2.0), rel=0.05)
 
@@ -149,7 +151,9 @@ def test_a_bent_board_is_a_cylinder() -> None:
     board = CharucoBoard(kind="charuco_board")
     flat, bent = (
         board.surface(),
-        TargetStranger(board_bend_um=50.0, board_bend_deg=90.0).disturbed("charuco_board", board.surface()),
+        TargetStranger(board_bend_um=50.0, board_bend_deg=90.0).disturbed_surface(
+            "charuco_board", board.surface()
+        ),
     )
     rise = (bent.corners_mm - flat.corners_mm)[..., 2]
     top = flat.corners_mm[..., 2] > 2.0
@@ -160,7 +164,7 @@ def test_a_bent_board_is_a_cylinder() -> None:
 
 def test_a_stained_tile_is_dark_at_the_stain_and_glossy_by_its_lobe() -> None:
     strange = TargetStranger(tile_lobe=0.03, tile_stain=0.04)
-    made = strange.disturbed("spectralon_tile", Sample(kind="spectralon_tile").surface())
+    made = strange.disturbed_surface("spectralon_tile", Sample(kind="spectralon_tile").surface())
     assert made.tint is not None
     middle = made.corners_mm.mean(axis=1)
     darkest = middle[np.argmin(made.tint[:, 0])]

@@ -42,7 +42,7 @@ def test_time_goes_on_when_the_world_has_ended(tmp_path: Path, end: str) -> None
             world.stdin.close()
         else:
             world.kill()
-        wait_until(lambda: deadline.expired, "the end of the wait")
+        wait_until(lambda: deadline.has_expired, "the end of the wait")
         assert not clock.alive
         before_ns = clock.now_ns()
         clock.sleep(0.2)

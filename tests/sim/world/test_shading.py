@@ -25,19 +25,19 @@ def told(cell: CellFolder, *, dry_run: bool = False, **settings: object) -> Conf
 def test_pixels_are_shaded_with_blur_and_interreflection_if_a_rig_does_not_say(cell: CellFolder) -> None:
     world = told(cell, detail=DETAIL)
     assert world.settings.shading == "pixel"
-    assert world.photographed.blur is True
+    assert world.rendered_camera.blur is True
     assert world.settings.light_between_surfaces == InterreflectionConfig()
 
 
 def test_flat_shading_has_neither(cell: CellFolder) -> None:
     world = told(cell, shading="flat")
-    assert world.photographed.blur is False
+    assert world.rendered_camera.blur is False
     assert world.settings.light_between_surfaces is None
 
 
 def test_what_a_rig_says_of_blur_and_interreflection_holds(cell: CellFolder) -> None:
     world = told(cell, shading="flat", camera={"blur": True}, interreflection={"bounces": 2})
-    assert world.photographed.blur is True
+    assert world.rendered_camera.blur is True
     assert world.settings.light_between_surfaces == InterreflectionConfig(bounces=2)
 
 
@@ -48,7 +48,7 @@ def test_interreflection_can_be_switched_off(cell: CellFolder) -> None:
 def test_a_dry_run_is_flat_whatever_the_rig_says(cell: CellFolder) -> None:
     world = told(cell, dry_run=True, shading="pixel", detail=DETAIL, interreflection={"bounces": 8})
     assert (world.settings.shading, world.settings.detail) == ("flat", ())
-    assert world.photographed.blur is False
+    assert world.rendered_camera.blur is False
     assert world.settings.light_between_surfaces is None
 
 

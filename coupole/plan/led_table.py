@@ -57,13 +57,13 @@ def read_led_table(path: Path, files: InputFiles | None = None) -> LedTable:
     try:
         if (size_bytes := path.stat().st_size if path not in files else 0) > _MOST_BYTES:
             raise InputError(f"{path}: expected an LED table of at most {_MOST_BYTES} bytes, found {size_bytes}")
-        return _parsed(files.read_bytes(path).decode("utf-8"), str(path))
+        return _parse_table(files.read_bytes(path).decode("utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError([Problem(str(path), 0, 0, "", f"cannot read the LED table: {error}")]) from error
 
 
 @lru_cache(maxsize=4)
-def _parsed(text: str, path: str) -> LedTable:
+def _parse_table(text: str, path: str) -> LedTable:
     """Return the table of this text, whose arrays cannot be written; a session reads its dome several times."""
     problems: list[Problem] = []
     rows: list[list[float]] = []

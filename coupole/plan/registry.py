@@ -62,7 +62,7 @@ ROBOT_STAND_INS = {
     "drivers.ur:UrRobot": StandIn("ur", ("model",)),
 }
 """Stand-ins for the included robot drivers; all choose a free address."""
-ANSWER_JITTER = {"drivers.kuka.rsi:KukaRsi": "drivers.kuka.rsi.jitter:measured"}
+ANSWER_JITTER = {"drivers.kuka.rsi:KukaRsi": "drivers.kuka.rsi.jitter:measure_jitter"}
 """Measures how soon the driver answers its controller; of drivers that must in every cycle."""
 ARMS_OF_DRIVERS = {"drivers.kuka.rsi:KukaRsi": "kr10_r1100_sixx", "drivers.kuka.eki:KukaEki": "kr10_r1100_sixx"}
 """The default arm (in `configs/robots`) of each driver."""

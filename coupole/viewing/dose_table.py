@@ -10,7 +10,7 @@ from rich.table import Table
 
 from coupole.appearance.spectra.damage import B_PER_NM
 from coupole.storage.ledger import Ledger
-from coupole.storage.ledger_lines import History
+from coupole.storage.ledger_lines import Entry, History
 
 NOT_KNOWN = "not known"
 NO_BUDGET = "  it has no light budget: `coupole dose {} --budget LUX_H --name NAME` gives it one"
@@ -66,7 +66,18 @@ def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, A
         "unreadable_lines": history.unreadable,
         "damage_b_per_nm": B_PER_NM,
         "runs": {run: _sums(history.of_run(run)) for run in history.runs},
-        "entries": [vars(entry) for entry in history.entries if entry.note],
+        "entries": [_entry(entry) for entry in history.entries if entry.note],
+    }
+
+
+def _entry(entry: Entry) -> dict[str, Any]:
+    return {
+        "t": entry.t,
+        "run": entry.run,
+        "dose_lux_h": entry.dose_lux_h,
+        "damage_wh_m2": entry.damage_wh_m2,
+        "note": entry.note,
+        "settled": entry.is_settled,
     }
 
 

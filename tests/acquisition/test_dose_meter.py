@@ -61,7 +61,7 @@ def ledger_of_its_own(job: Job) -> Iterator[None]:
 
 
 def meter(job: Job, recorder: Recorder | None = None, **cell: Any) -> DoseMeter:
-    opened = SimpleNamespace(**{"simulated": False, "lights_confirmed": True, **cell})
+    opened = SimpleNamespace(**{"is_simulated": False, "lights_confirmed": True, **cell})
     return DoseMeter(job, opened, recorder or Recorder())  # type: ignore[arg-type]
 
 
@@ -197,8 +197,8 @@ def test_a_simulated_cell_enters_nothing_and_asks_the_budget_all_the_same(
     limited = job.plan.object.model_copy(update={"dose_budget_lux_h": 5.0})
     poor = replace(job, plan=job.plan.model_copy(update={"object": limited}))
     with pytest.raises(DoseBudgetReached):
-        meter(poor, simulated=simulated).begin(burst)
-    found = meter(job, simulated=simulated)
+        meter(poor, is_simulated=simulated).begin(burst)
+    found = meter(job, is_simulated=simulated)
     found.begin(burst)
     assert (total(job) == 5.0) is simulated
 
@@ -234,7 +234,7 @@ def test_light_that_comes_by_hand_between_two_bursts_is_asked_for_before_the_sec
 ) -> None:
     dose = foreseen(job, burst)
     ledger_of(job.cell, "relief").set_budget(3 * dose, "A. Keeper")
-    found = meter(job, simulated=simulated)
+    found = meter(job, is_simulated=simulated)
     found.begin(burst)
     end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     ledger_of(job.cell, "relief").enter(1.5 * dose, "studio")
@@ -248,7 +248,7 @@ def test_light_that_comes_by_hand_during_a_burst_of_the_host_is_asked_for_before
 ) -> None:
     dose = foreseen(job, burst)
     ledger_of(job.cell, "relief").set_budget(1.5 * dose, "A. Keeper")
-    found, steps = meter(job, simulated=simulated), lit(burst)
+    found, steps = meter(job, is_simulated=simulated), lit(burst)
     by_host = replace(burst, hardware=False)
     found.begin(by_host)
     found.ask_again(by_host, int(steps[-1]))
@@ -284,7 +284,7 @@ def test_a_burst_that_nobody_could_count_counts_as_planned_in_what_is_told(job: 
 
 def foreseen(job: Job, burst: Burst) -> float:
     """What the burst gives."""
-    found = meter(job, simulated=True)
+    found = meter(job, is_simulated=True)
     found.begin(burst)
     end(found, burst, log_of(burst, len(burst.table)), table_ran_s=burst.duration_s, panel_s=0.0)
     return found.lux_h

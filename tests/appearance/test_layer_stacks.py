@@ -80,7 +80,7 @@ def test_one_layer_is_the_same_in_two_parts() -> None:
     paint = BINDER.two_flux(BINDER.matt(0.3), 3.0, 15.0, 0.1)
     paints = BINDER.two_flux(BINDER.two_flux(BINDER.matt(0.3), 3.0, 15.0, 0.06), 3.0, 15.0, 0.04)
 
-    for name in ("diffuse", "directed", "mirror"):
+    for name in ("diffuse", "directional", "mirror"):
         assert getattr(parts, name) == pytest.approx(getattr(whole, name), abs=1e-9)
     assert paints.diffuse == pytest.approx(paint.diffuse, abs=1e-12)
 

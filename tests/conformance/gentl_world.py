@@ -146,7 +146,7 @@ class GenTLWorld:
 
     @property
     def is_armed(self) -> bool:
-        return bool(self._ask("armed"))
+        return bool(self._ask("is_armed"))
 
     def close(self) -> None:
         self._drivers.close()

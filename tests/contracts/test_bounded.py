@@ -231,7 +231,7 @@ def take():
         print("takes", flush=True)
         for _ in range(12):
             time.sleep(0.05)
-bounded.bounded(take, rescue=lambda: print("given up"))
+bounded.run_bounded(take, rescue=lambda: print("given up"))
 """
 
 

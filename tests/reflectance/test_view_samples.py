@@ -78,13 +78,13 @@ def by_formula(
         weights.append(time_s if np.isnan(variance) else 1 / variance)
     if not means:
         return np.nan, np.nan
-    (place,), (axis,) = work.measured.leds.of(np.array([led]))
+    (place,), (axis,) = work.measured_run.leds.of(np.array([led]))
     way = place - work.facets.centres_mm[triangle]
     distance = np.linalg.norm(way)
     leaving, arriving = -way @ axis / distance, way @ work.facets.normals[triangle] / distance
-    lit = leaving ** (2 if work.measured.emission == "paper" else 1) / (np.pi * (distance * 1e-3) ** 2)
+    lit = leaving ** (2 if work.measured_run.emission == "paper" else 1) / (np.pi * (distance * 1e-3) ** 2)
     mean = np.average(means, weights=weights)
-    power = work.measured.power_of(work.view.by_led[led][0])[channel]
+    power = work.measured_run.power_of(work.view.by_led[led][0])[channel]
     u = np.nan if np.isnan(noise[0]) else np.sum(weights) ** -0.5 / mean
     return mean / (power * lit * arriving), u
 
@@ -116,7 +116,7 @@ def test_samples_are_those_of_the_formula_within_a_step_of_their_halves(
 
 def test_a_sample_that_no_half_can_hold_is_none() -> None:
     work, _, _ = view_of([(4000.0,)], np.random.default_rng(1), "paper", NOISE)
-    work.measured.power_of = lambda frame: np.array([1e-3, 0.0, np.nan])  # type: ignore[attr-defined]
+    work.measured_run.power_of = lambda frame: np.array([1e-3, 0.0, np.nan])  # type: ignore[attr-defined]
     (some,) = work.samples(lambda part, pool: np.zeros((1, TRIANGLES), np.uint8), 1)
     assert np.isnan(some.f).all()
     assert np.isnan(some.u_own).all()

@@ -144,7 +144,7 @@ for threads in (1, 2, 8):
     shadows = Shadows(Obstacles(scene.corners_mm), light, 1 << 20)
     places = shadows.places(view.sides)
     lamp = square(light[0], -light[0], side_mm=7.0, flux_lm=1800.0)
-    lit = led_radiance(view, scene.materials, scene.tables, lamp, "lambertian", places, shadows.reached(0))
+    lit = led_radiance(view, scene.materials, scene.tables, lamp, "lambertian", places, shadows.reached_bits(0))
     digest = hashlib.sha256(view.site.tobytes() + view.sides.tobytes() + lit.tobytes())
     print(digest.hexdigest(), lit.max() > 0)
 """

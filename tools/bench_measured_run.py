@@ -110,7 +110,7 @@ def _lens(by: Any, width_px: int) -> dict[str, float]:
 def _keep(recorder: Any, pixels: NDArray[np.uint16], number: int, shot: Any, led: int | None) -> None:
     from coupole.devices import Frame
 
-    slot = recorder.put(Frame(number, 1000 * number, pixels), EXPOSURE_US)
+    slot = recorder.store(Frame(number, 1000 * number, pixels), EXPOSURE_US)
     recorder.prove(
         slot, shot, {"led": 65535 if led is None else led, "step": number, "t_trigger_ns": 1000 * number}
     )

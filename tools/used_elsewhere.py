@@ -10,7 +10,7 @@ the exception: what tests do to stand-ins, and what they see of them.
 _.doctor, _.archive, _.sim  # COMMANDS of coupole/commands/cli.py
 _.TextLineBox  # named in rigs, as drivers are
 _.MemoryCamera  # named in rigs
-_.export_scan, _.Stills  # named in coupole/plan/registry.py
+_.export_scan, _.Stills, _.measure_jitter  # named in coupole/plan/registry.py
 _._do_limits, _._do_memory, _._do_trigger, _._do_statistics, _._do_disarm  # CameraServer, by the message's verb
 _._write_command, _._write_enumeration, _._write_string, _._write_boolean  # Features, by the node's kind
 _._write_integer, _._write_float  # the same

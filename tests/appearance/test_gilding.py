@@ -14,7 +14,6 @@ from coupole.appearance.optics import effective_medium, fresnel, indices
 from coupole.appearance.optics.thin_film import Film, stack_power
 from coupole.appearance.spectra import light
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
-from coupole.errors import InputError
 
 GOLD = indices.gold()
 BOLE = typical.bole()
@@ -160,12 +159,3 @@ def test_a_sheets_internal_reflectance_equals_a_plain_quadrature() -> None:
 
     assert sheet.internal_reflectance[band] == pytest.approx(reflected, abs=1e-5)
     assert sheet.internal_transmittance[band] == pytest.approx(passed, abs=1e-5)
-
-
-def test_cracks_and_holes_overlap_by_chance() -> None:
-    assert gilding.bare_share_of(0.1, 20.0, 5.0) == pytest.approx(1.0 - 0.9 * 0.9)
-
-
-def test_cracks_wider_than_the_leaf_are_refused() -> None:
-    with pytest.raises(InputError, match="cracks"):
-        gilding.bare_share_of(0.0, 500.0, 5.0)

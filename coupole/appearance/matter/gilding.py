@@ -44,13 +44,6 @@ def leaf_index(
     return effective_medium.maxwell_garnett(metal, filling, holes_share, depolarisation)
 
 
-def bare_share_of(holes: float, crack_width_um: float, crack_length_mm_per_mm2: float) -> float:
-    """Share of the surface left bare by holes (share of area) and cracks of burnishing, which overlap at
-    random."""
-    cracks = within("cracks", crack_width_um * 1e-3 * crack_length_mm_per_mm2, 0.0, 1.0)
-    return float(1.0 - (1.0 - within("holes", holes, 0.0, 1.0)) * (1.0 - cracks))
-
-
 def gilt(
     index: Complex,
     thickness_nm: float,

@@ -100,7 +100,7 @@ def _moves(scene: Scene) -> _Moves | None:
         steps = [lambda fixed, when=when: fixed.at(when) for when in times]
         return _Moves(steps, scene.film.frames_per_s, f"{times[0].isoformat()} to {times[-1].isoformat()}")
     if scene.turntable is not None:
-        turns = [lambda fixed, angle=angle: fixed.turned(angle) for angle in scene.turntable.angles_deg()]
+        turns = [lambda fixed, angle=angle: fixed.turned_about_z(angle) for angle in scene.turntable.angles_deg()]
         return _Moves(turns, scene.turntable.frames_per_s, f"turned by {scene.turntable.degrees:g} degrees")
     return None
 

@@ -32,6 +32,21 @@ def shipped_cell(folder: Path, **world: Any) -> CellFolder:
     return cell
 
 
+Made = tuple[CellFolder, Path, dict[str, Any]]
+"""A cell with its run, the result's folder, and what the command said."""
+
+
+def glossy_result(folder: Path) -> Made:
+    """Acquire a run of the glossy relief, and make its result."""
+    material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
+    cell = shipped_cell(folder, material=material)
+    assert cell.acquire().code == 0
+    out = cell.folder / "result"
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", out, "--json")
+    assert ended.code == 0, ended.err
+    return cell, out, ended.document
+
+
 def walter(normals: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
     """[..., 3] reflectance of the relief: Walter et al. 2007, Smith's G of each direction, Schlick's F."""
     half = light + view

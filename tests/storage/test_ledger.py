@@ -210,6 +210,7 @@ def test_light_given_elsewhere_is_entered_by_hand_and_shown(cell: CellFolder) ->
     assert shown["of_unknown_spectrum_lux_h"] == 120
     assert shown["runs"]["by hand"]["dose_lux_h"] == 120
     assert [entry["note"] for entry in shown["entries"]] == ["photographed in 2019"]
+    assert set(shown["entries"][0]) == {"t", "run", "dose_lux_h", "damage_wh_m2", "note", "settled"}
     table = dose(cell, "relief").err
     assert "120.000" in table
     assert "not known" in table

@@ -1,8 +1,8 @@
 """Every wait ends: a call that never returns is given up, told, and left behind.
 
 A library may hang in a call, a network disk may be dead: no thread that waits in there can be ended, by a signal
-as little as by another thread. So whoever may hang is a thread that nobody needs (`bounded`), and each call of a
-device or a disk notes that it is under way (`under_way`), which costs a microsecond and hands nothing over. The
+as little as by another thread. So whoever may hang is a thread that nobody needs (`run_bounded`), and each call of
+a device or a disk notes that it is under way (`under_way`), which costs a microsecond and hands nothing over. The
 waiting side looks at these notes and gives up a call that is under way for longer than its work asks plus
 
 ==================  =========================================
@@ -235,7 +235,7 @@ NOW.set()
 
 
 def on_disk(label: str, do: Callable[[], T], work_s: float = 0.0, *, stop: threading.Event | None = None) -> T:
-    """`bounded`, for work with files."""
+    """`run_bounded`, for work with files."""
 
     def work() -> T:
         with under_way(DISK, label, work_s):
@@ -271,7 +271,7 @@ class Workers:
             del task, future, do, arguments  # they may hold a frame's memory
 
     def end(self) -> None:
-        """Wait until all is done, and end the threads: within a `bounded` call, if their work may hang."""
+        """Wait until all is done, and end the threads: within a `run_bounded` call, if their work may hang."""
         threads = self._threads
         self.end_soon()
         for thread in threads:

@@ -89,7 +89,7 @@ class _Aligned:
     edge_rows: NDArray[np.int64]
     """Rows of the log whose step sent an edge."""
     candidate_rows: NDArray[np.int64]
-    """[frames] row of `edged` by the first candidate, or a negative code for no step."""
+    """[frames] row of `edge_rows` by the first candidate, or a negative code for no step."""
     agrees: NDArray[np.bool_]
     """[frames] all candidates give the same row or code."""
 

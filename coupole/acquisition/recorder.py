@@ -29,7 +29,7 @@ _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
 
 
 class Recorder(Protocol):
-    """The recorder that the sequencer needs. `put` may be called from several threads, all else from one."""
+    """The recorder that the sequencer needs. `store` may be called from several threads, all else from one."""
 
     name: str
     """Purpose of the light, in the object's dose ledger: the run's name, or `meter`."""

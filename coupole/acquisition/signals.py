@@ -2,7 +2,8 @@
 
 Outside a session they raise `SignalReceived` in the main thread. In a session (`obeyed_by`) they are obeyed at
 once from a thread of their own, whatever the main thread waits for, and the main thread learns of it from
-`Control`. While a cell is made safe (`held`) they do nothing, so that a second Ctrl-C does not cut it short.
+`Control`. While a cell is made safe (`drop_signals`) they do nothing, so that a second Ctrl-C does not cut it
+short.
 
 Ctrl-Z (SIGTSTP) makes the cell safe before the process stops. SIGSTOP cannot be heard, nor a machine that falls
 asleep: when the process runs again, the session is held, and a person is asked (`Control.hold`).

@@ -79,7 +79,7 @@ def moved_transforms(a_from_b: Floats, steps: Floats) -> Floats:
 
 
 def between(a_from_b: Floats, other_transforms: Floats) -> Floats:
-    """The step [..., 6] (mm, rad) that `moved` needs from the first transforms to the others."""
+    """The step [..., 6] (mm, rad) that `moved_transforms` needs from the first transforms to the others."""
     turn = np.swapaxes(a_from_b[..., :3, :3], -1, -2) @ other_transforms[..., :3, :3]
     return np.concatenate([other_transforms[..., :3, 3] - a_from_b[..., :3, 3], rotation_vector(turn)], axis=-1)
 

@@ -73,7 +73,7 @@ class Ledger:
         return history_of([*self._former_lines(texts), *texts])
 
     def newest(self) -> History:
-        """The same as `read`, for who asks often: only lines that are new are read. Not to be changed."""
+        """The same as `read_history`, for who asks often: only lines that are new are read. Not to be changed."""
         self._reading = self._reading.with_new_lines(self.path)
         if self._former_folder is not None and (self._former_folder / self.path.name).exists():
             return self.read_history()

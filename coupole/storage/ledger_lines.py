@@ -213,7 +213,7 @@ class Reading:
     """Part of a ledger that has been read; others go on writing it."""
 
     def __init__(self, *, only_grows: bool = False) -> None:
-        """`only_grows`: once lines were read, the file must keep them, and must be text; `renewed` raises
+        """`only_grows`: once lines were read, the file must keep them, and must be text; `with_new_lines` raises
         StorageError otherwise."""
         self.history = History()
         self._only_grows = only_grows

@@ -39,8 +39,8 @@ WRITERS = 3
 
 
 class ViewWriter:
-    """Writes one view's file. `put` may be called from several threads; all other methods from one thread, `sync`
-    possibly from another one."""
+    """Writes one view's file. `store` may be called from several threads; all other methods from one thread,
+    `sync` possibly from another one."""
 
     def __init__(self, path: Path, proven_slots: dict[str, int]) -> None:
         """Open a file that `create` made. `proven_slots` (shot id to slot) are kept; all other slots are free.

@@ -25,7 +25,8 @@ class CallEnded(DeviceError):
 
 
 class Link(Protocol):
-    """Transports bytes. `write` and `read` belong to one thread at a time, `device_clear` to any at any moment.
+    """Transports bytes. `write` and `read_bytes` belong to one thread at a time, `device_clear` to any at any
+    moment.
 
     Both raise TimeoutError when the deadline passes, ConnectionError when the link is lost, and Cleared if
     `clears` is no longer the link's own: then a device clear came after the exchange had begun.

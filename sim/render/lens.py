@@ -42,7 +42,7 @@ class Lens:
     focal_px: float
     distortion: Distortion = NO_DISTORTION
     samples: int = 1
-    """Subdivision of a sensor pixel along each side: 1, except for a lens that is `supersampled`."""
+    """Subdivision of a sensor pixel along each side: 1, except for a lens `with_supersampling`."""
     off_axis: tuple[float, float] = (0.0, 0.0)
     """Principal point less image centre, over the focal length; distortion stays centred on the image."""
 
@@ -67,8 +67,8 @@ class Lens:
 
     @property
     def terms(self) -> NDArray[np.float64]:
-        """Terms for `bend` and `distorted`: those of the distortion, and for a lens with more than Brown's also
-        its centre."""
+        """Terms for `bend` and `distorted_points`: those of the distortion, and for a lens with more than Brown's
+        also its centre."""
         if len(self.distortion) == 5 and not any(self.off_axis):
             return np.array(self.distortion)
         more = (0.0,) * (12 - len(self.distortion))

@@ -44,7 +44,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Coat:
-    """A rough sheet, ready for `layered`."""
+    """A rough sheet, ready for `layered_brdf`."""
 
     sheet: Sheet
     roughness: float

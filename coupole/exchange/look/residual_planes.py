@@ -176,7 +176,7 @@ def _missed_energy(
     scaled_planes: Floats,
     rows: NDArray[np.int64],
 ) -> tuple[float, float]:
-    """`missed` and `energy` of `ResidualPlanes`, of some rows of the view's file, under distant lights."""
+    """`missed_energy` and `energy` of `ResidualPlanes`, of some rows of the view's file, under distant lights."""
     assert FIT.over is not None
     samples = result.view_samples(view, slice(None), np.zeros(len(view.leds), np.bool_))
     half = _half_sphere(_DIRECTIONS // 2)

@@ -46,7 +46,7 @@ class Given:
     vertices_mm: Floats
     """[n, 3] those that triangles use, base frame."""
     triangles: NDArray[np.uint32]
-    """[m, 3] `renumbered`."""
+    """[m, 3] as `renumbered_triangles` gives them."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def renumbered_triangles(triangles: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def welded_vertices(corners_mm: Floats, triangles: NDArray[np.uint32]) -> Floats:
-    """[n, 3] vertices of triangles that are `renumbered`, whose corners [m, 3, 3] are known."""
+    """[n, 3] vertices of triangles of `renumbered_triangles`, whose corners [m, 3, 3] are known."""
     vertices = np.zeros((int(triangles.max()) + 1, 3))
     vertices[triangles] = corners_mm
     return vertices

@@ -59,7 +59,7 @@ class Matches:
     expected_blocks: Floats
     """[n, 2] block of the other view at which it should."""
     covariance: Floats
-    """[n, 2, 2] of `found`, blocks squared, from noise and texture."""
+    """[n, 2, 2] of `matched_blocks`, blocks squared, from noise and texture."""
     shifts_mm: Floats
     """[n, 3] from where the reference puts the spot to where the other does."""
 

@@ -84,7 +84,7 @@ class StreamStatistics:
     incomplete_images: int = 0
     """Images that arrived with packets missing."""
     skipped_ids: int = 0
-    """Frame ids without a complete image, including those of `failed`."""
+    """Frame ids without a complete image, including those of `incomplete_images`."""
     underruns: int = 0
     """Times that libaravis found no free buffer; several may concern one frame."""
 

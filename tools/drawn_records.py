@@ -56,14 +56,22 @@ class Scale:
     sensor: SensorModel = SHIPPED_SENSOR
 
 
-def draw_records(folder: Path, seed: int, scale: Scale | None = None) -> tuple[Path, ...]:
-    """Write records with errors of this seed to a new folder; their paths."""
+class _NoErrors(np.random.Generator):
+    """Draws that are all 0."""
+
+    def standard_normal(self, size: Any = None, *_: Any, **__: Any) -> Any:
+        return np.zeros(() if size is None else size)
+
+
+def draw_records(folder: Path, seed: int | None, scale: Scale | None = None) -> tuple[Path, ...]:
+    """Write records with errors of this seed to a new folder, or the truth for None, with the same stated
+    uncertainties; their paths."""
     folder.mkdir(parents=True)
     scale = scale or Scale()
     for kind in KEPT:
         for path in SHIPPED.glob(f"{kind}.*"):
             shutil.copy(path, folder)
-    random = np.random.default_rng((seed, 77))
+    random = _NoErrors(np.random.PCG64()) if seed is None else np.random.default_rng((seed, 77))
     _set_sensor(folder, scale)
     _draw_hand_eye(folder, random, scale)
     _draw_leds(folder, random, scale)

@@ -17,9 +17,9 @@ def formats(incomplete: str) -> list[tuple[str, str]]:
 
 def fits(incomplete: str) -> list[tuple[str, str]]:
     """Fits of `coupole reflectance relight --fit`, with what they are."""
-    from coupole.reflectance.fits import FITS, RELIT
+    from coupole.reflectance.fits import FITS, RELIT, TEXELS
 
-    titles = {name: fit.title for name, fit in FITS.items()}
+    titles = {name: fit.title for name, fit in FITS.items()} | {TEXELS: "GGX of single pixels"}
     return [(name, titles.get(name, "of clusters")) for name in RELIT if name.startswith(incomplete)]
 
 

@@ -21,6 +21,7 @@ from coupole.commands.reflectance_options import (
     PicturesWithoutRecords,
     SamplesOfRuns,
     SchedulerOption,
+    TexelsOption,
     Workers,
     bytes_of,
 )
@@ -67,6 +68,7 @@ def from_runs_or_pictures(
     workers: Workers,
     without: PicturesWithoutRecords,
     leave_out: LeaveOutOption = "",
+    texels: TexelsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fit normals and materials to proven frames of runs, or to pictures under known distant lights; check them.
@@ -80,6 +82,7 @@ def from_runs_or_pictures(
         if out is None:
             raise InputError("--out: expected the folder of the result")
         _refuse_mixed(runs or [], samples, without)
+        _refuse_texels(texels, runs or [], without)
         left_out = _numbers(leave_out)
         with step_bars(console) as say:
             if without.uncalibrated and runs:
@@ -88,7 +91,7 @@ def from_runs_or_pictures(
                 outcome = _of_pictures(without.pictures, without, left_out, out, say)
             else:
                 request = replace(samples.request(runs or [], left_out), memory_bytes=workers.memory_bytes)
-                outcome = _of_runs(request, out, workers.scheduler, say)
+                outcome = _of_runs(request, out, workers.scheduler, say, with_texels=texels is not None)
     except CoupoleError as error:
         fail_with(error, as_json=as_json)
         raise
@@ -127,6 +130,15 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
         raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
 
 
+def _refuse_texels(texels: str | None, runs: list[Path], without: PicturesWithoutRecords) -> None:
+    if texels is None:
+        return
+    if texels != "auto":
+        raise InputError(f"--texels: expected auto, each view's own pixels; got {texels!r}")
+    if not runs or without.uncalibrated:
+        raise InputError("--texels: is for calibrated runs; pixels of pictures are fitted one by one anyway")
+
+
 def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path, say: Said) -> Made:
     from coupole.reflectance import uncalibrated
     from coupole.reflectance.picture_job import fit_pictures
@@ -144,11 +156,15 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
 
 
-def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said) -> Made:
+def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, *, with_texels: bool) -> Made:
     from coupole.reflectance.run_job import reflectance_of
     from coupole.viewing import run_reflectance_page
 
     about = reflectance_of(request, out, scheduler=scheduler, say=say)
+    if with_texels:
+        from coupole.reflectance.texels.texel_job import add_texels
+
+        about |= {"texels": add_texels(request, out, scheduler=scheduler, say=say)}
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 

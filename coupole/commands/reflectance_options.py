@@ -108,6 +108,18 @@ LeaveOutOption = Annotated[
 ]
 
 
+TexelsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--texels",
+        metavar="auto",
+        help="Add materials of single pixels of each view, for detail that is finer than the mesh's triangles: "
+        "normal, kd, ks and roughness of each, with uncertainty.",
+        show_default=False,
+    ),
+]
+
+
 @dataclass(frozen=True)
 class SamplesOfRuns:
     """Options by which samples of reflectance are taken from frames of runs."""

@@ -88,9 +88,9 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         autocompletion=fits,
-        help="Fit of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters or harmonics; by"
-        " default the fit with the smallest error in the check (with --uncertainty: of ggx and"
-        " ggx_normal).",
+        help="Fit of a result of runs: ggx, ggx_normal, sh, rbf, ggx_rbf, clusters, harmonics or texels; by"
+        " default the fit with the smallest error in the check (with --uncertainty: of ggx,"
+        " ggx_normal and texels).",
     ),
 ]
 UncertaintyOption = Annotated[

@@ -42,7 +42,7 @@ def opened(
 
     if (result / run_result.OBJECT).exists():
         if uncertain:
-            fit = fit or run_relighting.best_fit(run_result.RunResult(result), fits.MATERIALS)
+            fit = fit or run_relighting.best_with_texels(run_result.RunResult(result), fits.MATERIALS)
             relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
         return _of_runs(result, view, fit, camera, samples)
     options = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))

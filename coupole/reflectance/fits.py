@@ -109,9 +109,11 @@ SLICES = _fits_by_name(
 FITS: dict[str, MaterialFit | ViewFit] = {**MATERIALS, **SLICES}
 CLUSTERED, PAIR_HARMONICS = "clusters", "harmonics"
 """Names of what `coupole reflectance cluster` adds: materials of clusters, and harmonics of both directions."""
-ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS)
+TEXELS = "texels"
+"""Name of what `--texels` adds: materials of single pixels of each view."""
+ANYWHERE = (*MATERIALS, CLUSTERED, PAIR_HARMONICS, TEXELS)
 """Fits that hold from everywhere."""
-RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS)
+RELIT = (*FITS, CLUSTERED, PAIR_HARMONICS, TEXELS)
 """All that `--fit` of `coupole reflectance relight` takes."""
 
 

@@ -16,10 +16,7 @@ from coupole.reflectance.kernel_arrays import assign, assign_rows
 from coupole.reflectance.lanes import LANES, if_less, lanes, larger, load_row, root, store, total
 from coupole.reflectance.normal_fit import (
     _MOST_STEPS,
-    _USUAL_ALPHA,
-    _USUAL_KS,
     CAUCHY,
-    SPREAD_KS,
     _least_cosine,
     _move,
     _solve,
@@ -57,7 +54,8 @@ def pack(roots, good, lights, half, views, view_of, packs):  # type: ignore[no-u
 @numba.njit(cache=True, nogil=True)
 def fit_packs(packs, views, unknowns, prior, stiffness, usual, settled_share):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt from `unknowns` in place, until a step gains less than `settled_share` of the cost; cost
-    and weighted rms, as `fit_from` gives them."""
+    and weighted rms, as `fit_from` gives them. `usual` holds ks and roughness: two logarithms, and the weights
+    (1 over the variance) with which they count."""
     scale = CAUCHY * math.exp(0.5 * unknowns[3])
     rows = np.empty((len(packs) * (UNKNOWNS + 1), LANES))
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -102,13 +100,13 @@ def _equations(packs, unknowns, prior, stiffness, usual, scale, rows, matrix, ri
     right[1] -= stiffness * (t2[0] * off0 + t2[1] * off1 + t2[2] * off2)
     matrix[0, 0] += stiffness
     matrix[1, 1] += stiffness
-    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / SPREAD_KS, unknowns[5] - _USUAL_ALPHA
-    right[3] -= usual * more_ks / SPREAD_KS
-    right[4] -= usual * more_alpha
-    matrix[3, 3] += usual / SPREAD_KS**2
-    matrix[4, 4] += usual
     cost += stiffness * (off0 * off0 + off1 * off1 + off2 * off2)
-    return cost + usual * (more_alpha * more_alpha + more_ks * more_ks), rms
+    for k in range(2):
+        more, weight = unknowns[4 + k] - usual[k], usual[2 + k]
+        right[3 + k] -= weight * more
+        matrix[3 + k, 3 + k] += weight
+        cost += weight * more * more
+    return cost, rms
 
 
 @numba.njit(cache=True, nogil=True)

@@ -62,18 +62,22 @@ class MaterialUncertainty:
 def groups_of(samples: TriangleSamples, middle_mm: Floats) -> NDArray[np.int64]:
     """[samples] numbers of groups of neighbouring LEDs of each view: those that are nearest to some that are
     spread evenly, as seen from the object's middle."""
-    ways = samples.led_mm - middle_mm
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    group = np.empty(len(ways), np.int64)
+    group = np.empty(len(samples.led_mm), np.int64)
     for view in np.unique(samples.view_of):
         view_samples = np.flatnonzero(samples.view_of == view)
-        centres, nearest = [0], np.full(len(view_samples), -np.inf)
-        for _ in range(min(GROUPS, len(view_samples))):
-            nearest = np.maximum(nearest, ways[view_samples] @ ways[view_samples[centres[-1]]])
-            centres.append(int(np.argmin(nearest)))
-        group[view_samples] = (
-            np.argmax(ways[view_samples] @ ways[view_samples[centres[:-1]]].T, axis=1) + GROUPS * view
-        )
+        group[view_samples] = groups_of_leds(samples.led_mm[view_samples], middle_mm) + GROUPS * view
+    return group
+
+
+def groups_of_leds(led_mm: Floats, middle_mm: Floats) -> NDArray[np.int64]:
+    """[leds] numbers of groups of neighbouring LEDs [leds, 3] of one view, from 0."""
+    ways = led_mm - middle_mm
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    centres, nearest = [0], np.full(len(ways), -np.inf)
+    for _ in range(min(GROUPS, len(ways))):
+        nearest = np.maximum(nearest, ways @ ways[centres[-1]])
+        centres.append(int(np.argmin(nearest)))
+    group: NDArray[np.int64] = np.argmax(ways @ ways[centres[:-1]].T, axis=1)
     return group
 
 
@@ -145,7 +149,7 @@ def _fill(  # type: ignore[no-untyped-def]
             good, roots, lights, half, views,
         )  # fmt: skip
         bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
-        _sums(
+        add_scores(
             roots[:n],
             good[:n],
             lights,
@@ -176,7 +180,7 @@ def _fill(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _sums(roots, good, lights, half, views, view_of, group, normal, grey, bread, meat):  # type: ignore[no-untyped-def]
+def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, bread, meat):  # type: ignore[no-untyped-def]
     """Derivatives of the scores of samples in the order of their groups, and the scores' variance."""
     scale = CAUCHY * math.sqrt(grey[0])
     t1, t2 = tangents(normal[0], normal[1], normal[2])

@@ -29,11 +29,11 @@ _LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 CAUCHY = 0.05
 """Scale of the weights, as a share of sqrt(kd)."""
-_USUAL_KS, SPREAD_KS, _USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
+USUAL_KS, SPREAD_KS, USUAL_ALPHA = math.log(0.04), 2.0, math.log(0.3)
 """Logarithms, for materials in 1/sr: a dielectric's ks within a factor of 7, alpha within one of 3."""
 _MOST_STEPS = 40
 _SETTLED = 1e-5
-_LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
+LEAST_ALPHA, _MOST_ALPHA = 0.02, 1.0
 _FEWEST = 6
 """Samples that a pixel needs."""
 _BLOCK = 2000
@@ -265,7 +265,7 @@ def _move(unknowns, step, trial):  # type: ignore[no-untyped-def]
     trial[3] = unknowns[3] + min(1.0, max(-1.0, step[2]))
     trial[4] = unknowns[4] + min(2.0, max(-2.0, step[3]))
     log_alpha = unknowns[5] + min(0.7, max(-0.7, step[4]))
-    trial[5] = min(math.log(_MOST_ALPHA), max(math.log(_LEAST_ALPHA), log_alpha))
+    trial[5] = min(math.log(_MOST_ALPHA), max(math.log(LEAST_ALPHA), log_alpha))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -275,7 +275,7 @@ def _cost(roots, used_samples, lights, half, views, view_of, unknowns, prior, st
     kd, ks, alpha = math.exp(unknowns[3]), math.exp(unknowns[4]), math.exp(unknowns[5])
     to_view = views[:, 0] * n0 + views[:, 1] * n1 + views[:, 2] * n2
     cost = stiffness * ((n0 - prior[0]) ** 2 + (n1 - prior[1]) ** 2 + (n2 - prior[2]) ** 2)
-    cost += usual * ((unknowns[5] - _USUAL_ALPHA) ** 2 + ((unknowns[4] - _USUAL_KS) / SPREAD_KS) ** 2)
+    cost += usual * ((unknowns[5] - USUAL_ALPHA) ** 2 + ((unknowns[4] - USUAL_KS) / SPREAD_KS) ** 2)
     squares, weights = 0.0, 0.0
     for number in range(len(used_samples)):
         light = used_samples[number]
@@ -310,7 +310,7 @@ def _equations(  # type: ignore[no-untyped-def]
     right[0] = -stiffness * (t1[0] * d0 + t1[1] * d1 + t1[2] * d2)
     right[1] = -stiffness * (t2[0] * d0 + t2[1] * d1 + t2[2] * d2)
     matrix[0, 0] = matrix[1, 1] = stiffness
-    more_ks, more_alpha = (unknowns[4] - _USUAL_KS) / SPREAD_KS, unknowns[5] - _USUAL_ALPHA
+    more_ks, more_alpha = (unknowns[4] - USUAL_KS) / SPREAD_KS, unknowns[5] - USUAL_ALPHA
     cost += usual * (more_alpha * more_alpha + more_ks * more_ks)
     right[3], right[4] = -usual * more_ks / SPREAD_KS, -usual * more_alpha
     matrix[3, 3], matrix[4, 4] = usual / SPREAD_KS**2, usual

@@ -6,19 +6,19 @@ import dataclasses
 from collections.abc import Sequence
 
 import h5py
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.reflectance.fits import MATERIALS
-from coupole.reflectance.ggx import UNKNOWNS, tangents
+from coupole.reflectance.fits import MATERIALS, TEXELS
+from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.new_light.light_kinds import AnyLight
-from coupole.reflectance.new_light.shading import Picture, coats_of
-from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, materials_of
-from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.new_light.shading import Picture
+from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, Texels, materials_of
+from coupole.reflectance.run_result import RunResult, whole_covariances
 from coupole.reflectance.run_result_files import refuse_without_uncertainty
-from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.reflectance.texels.pixel_file import texel_uncertainty
+from coupole.reflectance.triangle_fit import TriangleMaterials, turned_normals
 
 Floats = NDArray[np.float64]
 _LONGEST_STEP = 0.02
@@ -39,24 +39,21 @@ def uncertainty_of_picture(
     eleven times as long as the picture alone. Raises InputError for a fit that has no covariance.
     """
     refuse_uncertain(scene.result, scene.fit)
-    materials = materials_of(scene.result, scene.fit, scene.surface)
-    covariance, wider, common = _uncertain(scene)
+    materials, covariance, wider, common = _uncertain_texels(scene) if scene.fit == TEXELS else _uncertain(scene)
     scales, vectors = np.linalg.eigh(np.nan_to_num(covariance))
     roots = vectors * np.sqrt(np.maximum(scales, 0.0))[:, None]
     count = 2 * UNKNOWNS + 1
 
     def picture(reflecting: TriangleMaterials, number: int, into: Picture | None = None) -> Picture:
-        scene_picture = dataclasses.replace(scene, reflecting=coats_of(reflecting)).picture(
-            lights, samples, into=into
-        )
+        scene_picture = scene.with_materials(reflecting).picture(lights, samples, into=into)
         say(number + 1, count)
         return scene_picture
 
     straight = picture(materials, 0)
     step_pictures = np.empty_like(straight), np.empty_like(straight)
-    triangle_of_pixel = scene.surface.triangle_of_pixel
+    of_pixel = scene.material_of_pixel
     # -1, for nothing, takes the last
-    square = (straight * np.append(common, 0.0)[triangle_of_pixel][..., None]) ** 2
+    square = (straight * np.append(common, 0.0)[of_pixel][..., None]) ** 2
     for part in range(UNKNOWNS):
         deviation = roots[:, :, part]
         shorter = _LONGEST_STEP / np.maximum(np.abs(deviation[:, _NOT_LINEAR]).max(axis=1), _LONGEST_STEP)
@@ -68,33 +65,48 @@ def uncertainty_of_picture(
             )
             for sign, into in zip((-1.0, 1.0), step_pictures, strict=True)
         )
-        square += ((up - down) / (2.0 * np.append(shorter, 1.0)[triangle_of_pixel][..., None])) ** 2
-    has_covariance = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[triangle_of_pixel]
+        square += ((up - down) / (2.0 * np.append(shorter, 1.0)[of_pixel][..., None])) ** 2
+    has_covariance = np.append(np.isfinite(covariance).all(axis=(1, 2)), True)[of_pixel]
     u_picture = np.where(has_covariance[..., None] | (straight == 0.0), np.sqrt(square), np.nan)
     return u_picture.astype(np.float32)
 
 
 def refuse_uncertain(result: RunResult, fit: str) -> None:
     """Raise InputError if the uncertainty of pictures by this fit is not known."""
+    if fit == TEXELS:
+        return
     if fit not in MATERIALS:
-        raise InputError(f"--uncertainty: {fit} has none; choose --fit {' or '.join(MATERIALS)}")
+        raise InputError(f"--uncertainty: {fit} has none; choose --fit {' or '.join((*MATERIALS, TEXELS))}")
     if not result.materials_path(fit).exists():
         raise InputError(f"{result.folder}: has no fit {fit}; `coupole reflectance fit {result.folder}` makes it")
     with h5py.File(result.materials_path(fit), "r") as file:
         refuse_without_uncertainty(result.materials_path(fit), file)
 
 
-def _uncertain(scene: RelitScene) -> tuple[Floats, Floats, Floats]:
-    """Return for the surface's triangles: covariance [n, 5, 5] of tilts and logarithms; [n, 2, channels]
-    uncertainty of each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n] that
-    all light from a triangle has."""
+Uncertain = tuple[TriangleMaterials, Floats, Floats, Floats]
+
+
+def _uncertain(scene: RelitScene) -> Uncertain:
+    """Return for the surface's triangles: materials; covariance [n, 5, 5] of tilts and logarithms; uncertainty
+    [n, 2, channels] of each channel's kd, and ks, as a multiple of that of their mean; relative uncertainty [n]
+    that all light from a triangle has."""
     places = np.searchsorted(scene.result.triangles, scene.surface.triangles)
     covariance = scene.result.material_covariances(scene.fit, places)
     of_means = np.sqrt(np.einsum("nii->ni", covariance)[:, 2:4, None])
     with h5py.File(scene.result.materials_path(scene.fit), "r") as file:
         of_channels = np.stack([file["u_kd"][()], file["u_ks"][()]], axis=1)[places]
         common = np.hypot(file["u_triangle"][()][places], file["u_shared"][()])
-    return covariance, np.nan_to_num(of_channels / np.maximum(of_means, 1e-12)), common
+    materials = materials_of(scene.result, scene.fit, scene.surface)
+    return materials, covariance, np.nan_to_num(of_channels / np.maximum(of_means, 1e-12)), common
+
+
+def _uncertain_texels(scene: RelitScene) -> Uncertain:
+    """Return the same for the picture's texels. Channels of a pixel are as uncertain as its own."""
+    assert isinstance(scene.reflecting, Texels)
+    texels, (u_pixel, u_shared) = scene.reflecting.materials, texel_uncertainty(scene.result, scene.views[0])
+    covariance = whole_covariances(scene.reflecting.covariance)
+    common = np.full(len(covariance), np.hypot(u_pixel, u_shared))
+    return texels, covariance, np.ones((len(covariance), 2, texels.kd.shape[1])), common
 
 
 def _stepped_materials(materials: TriangleMaterials, wider: Floats, step: Floats) -> TriangleMaterials:
@@ -102,21 +114,8 @@ def _stepped_materials(materials: TriangleMaterials, wider: Floats, step: Floats
     as its own uncertainty is `wider` [n, 2, channels] (of kd, of ks) than that of their mean."""
     return dataclasses.replace(
         materials,
-        normals=_tilted_normals(materials.normals, step[:, :2]),
+        normals=turned_normals(materials.normals, step[:, :2]),
         kd=materials.kd * (1.0 + step[:, 2:3] * wider[:, 0]),
         ks=materials.ks * (1.0 + step[:, 3:4] * wider[:, 1]),
         alpha=materials.alpha * np.exp(step[:, 4]),
     )
-
-
-@numba.njit(cache=True, nogil=True)
-def _tilted_normals(normals, tilts):  # type: ignore[no-untyped-def]
-    turned_normals = np.empty_like(normals)
-    for n in range(len(normals)):
-        t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
-        square = 0.0
-        for k in range(3):
-            turned_normals[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
-            square += turned_normals[n, k] ** 2
-        turned_normals[n] /= np.sqrt(square)
-    return turned_normals

@@ -64,16 +64,18 @@ class RunRequest:
     """Folder of COLMAP's, of one run: its poses hold instead of the records'."""
 
     @property
-    def sources(self) -> _Sources:
+    def sources(self) -> Sources:
         """Sources of the runs' geometry, by whole paths."""
         mesh, refined_path, poses = (
             path and path.resolve() for path in (self.mesh, self.refined_folder, self.poses)
         )
-        return _Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined_path, poses)
+        return Sources(mesh, tuple(path.resolve() for path in self.calibrations), refined_path, poses)
 
 
 @dataclass(frozen=True)
-class _Sources:
+class Sources:
+    """Files that give the runs' geometry, by whole paths."""
+
     mesh: Path | None
     records: tuple[Path, ...]
     refined_folder: Path | None
@@ -99,14 +101,10 @@ def reflectance_of(
 def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
     """The samples of all views. Raises as `reflectance_of`."""
     token = uuid4().hex
-    if request.poses is not None and (request.refined_folder is not None or len(request.runs) != 1):
-        raise InputError("--poses: expected one run, and no --refined; COLMAP's images are named after its views")
-    sources = request.sources
-    measured_runs = [_read_run(token, run, sources) for run in request.runs]
-    refuse_different(measured_runs)
+    measured_runs = read_runs(request, token)
     try:
         with workshop(scheduler) as shop:
-            begin(out, _settings(request, token, measured_runs))
+            begin(out, settings_of(request, token, measured_runs))
             first = measured_runs[0]
             complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
             shop.refuse_blind(out.resolve(), SETTINGS)
@@ -118,10 +116,20 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
     except OSError as error:
         raise disk_error(out, error) from error
     finally:
-        _forget()
+        forget()
 
 
-def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
+def read_runs(request: RunRequest, token: str) -> list[MeasuredRun]:
+    """Read the runs with their records. Raises as `reflectance_of`."""
+    if request.poses is not None and (request.refined_folder is not None or len(request.runs) != 1):
+        raise InputError("--poses: expected one run, and no --refined; COLMAP's images are named after its views")
+    measured_runs = [_read_run(token, run, request.sources) for run in request.runs]
+    refuse_different(measured_runs)
+    return measured_runs
+
+
+def settings_of(request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun]) -> dict[str, Any]:
+    """Return what a result of a request is begun with."""
     frames = [frame for m in measured_runs for view in m.views for frame in view.frames]
     leds = sorted({frame.led for frame in frames if frame.led is not None})
     left_out = list(request.left_out) or leds[HELD_OUT_FIRST::HELD_OUT_EVERY]
@@ -140,7 +148,7 @@ def _settings(request: RunRequest, token: str, measured_runs: Sequence[MeasuredR
         "emission": measured_runs[0].emission,
         "simulated": any(m.run.is_simulated for m in measured_runs),
         "channels": "".join(measured_runs[0].channels),
-        "view_names": [_name(measured_runs, m, view) for m in measured_runs for view in m.views],
+        "view_names": [view_file_name(measured_runs, m, view) for m in measured_runs for view in m.views],
     }
 
 
@@ -168,7 +176,10 @@ def _extract(
     left_out = tuple(read_settings(out)["left_out"])
     remaining_views = [
         _View(
-            run.resolve(), view.name, out / "samples" / f"{_name(measured_runs, measured_run, view)}.h5", left_out
+            run.resolve(),
+            view.name,
+            out / "samples" / f"{view_file_name(measured_runs, measured_run, view)}.h5",
+            left_out,
         )
         for run, measured_run in zip(request.runs, measured_runs, strict=True)
         for view in measured_run.views
@@ -188,18 +199,18 @@ def _extract(
     ):
         write_synced(run_view.path.with_suffix(".json"), json.dumps(summary))
         say("views", number, len(remaining_views))
-    shop.everywhere(_forget)
+    shop.everywhere(forget)
 
 
 def _extract_one(
     token: str,
-    sources: _Sources,
+    sources: Sources,
     threads: int | None,
     say: Said,
     task: _View,
 ) -> dict[str, Any]:
     """Write the files of a view's samples and frames for the check; what the report says of them."""
-    measured_run, geometry, radiometry = _prepare_run(token, task.run, sources)
+    measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
     view = next(view for view in measured_run.views if view.name == task.view)
     summary = extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
     frames = task.path.parents[1] / FRAMES / task.path.name
@@ -208,14 +219,14 @@ def _extract_one(
 
 
 @lru_cache(maxsize=1)
-def _prepare_run(token: str, run: Path, sources: _Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
+def prepare_run(token: str, run: Path, sources: Sources) -> tuple[MeasuredRun, Geometry, Radiometry]:
     """Return what all views of a run share, made once in each process and job (`token`)."""
     measured_run = _read_run(token, run, sources)
     return measured_run, geometry_of(measured_run), Radiometry(measured_run)
 
 
 @lru_cache(maxsize=16)
-def _read_run(token: str, run: Path, sources: _Sources) -> MeasuredRun:
+def _read_run(token: str, run: Path, sources: Sources) -> MeasuredRun:
     measured_run = _read_records(token, run, sources)
     if sources.poses is not None:
         return read_poses(sources.poses, measured_run).of(measured_run)
@@ -225,17 +236,17 @@ def _read_run(token: str, run: Path, sources: _Sources) -> MeasuredRun:
 
 
 @lru_cache(maxsize=16)
-def _read_records(_token: str, run: Path, sources: _Sources) -> MeasuredRun:
+def _read_records(_token: str, run: Path, sources: Sources) -> MeasuredRun:
     """Read a run by the records alone."""
     return read_measured_run(run, sources.mesh, sources.records)
 
 
-def _forget() -> None:
-    _prepare_run.cache_clear()
+def forget() -> None:
+    prepare_run.cache_clear()
     _read_run.cache_clear()
     _read_records.cache_clear()
 
 
-def _name(measured_runs: Sequence[MeasuredRun], measured_run: MeasuredRun, view: MeasuredView) -> str:
+def view_file_name(measured_runs: Sequence[MeasuredRun], measured_run: MeasuredRun, view: MeasuredView) -> str:
     """Return the name of a view's files: its own, with its run's before where there are several."""
     return view.name if len(measured_runs) == 1 else f"{measured_run.run.folder.name}-{view.name}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from coupole.reflectance.fits import (
     MATERIALS,
     PAIR_HARMONICS,
     RELIT,
+    TEXELS,
     ViewFit,
 )
 from coupole.reflectance.lanes import LANES
@@ -46,6 +48,8 @@ from coupole.reflectance.new_light.shading import (
 from coupole.reflectance.new_light.shadow_edges import trace_beam
 from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
+from coupole.reflectance.texels.gathered import gather
+from coupole.reflectance.texels.pixel_file import read_texel_errors, read_view_texels
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
 Say = Callable[[int, int], None]
@@ -83,18 +87,45 @@ class Pairs:
 
 
 @dataclass(frozen=True)
+class Texels:
+    """Materials of the picture's own pixels; roughness is 0 where there is none."""
+
+    materials: TriangleMaterials
+    covariance: NDArray[np.floating]
+    """[n, 15] as files have it."""
+    of_pixel: NDArray[np.int32]
+    """[h, w] which of them; -1 where no surface is seen."""
+
+    @cached_property
+    def coats(self) -> Coats:
+        """Materials as they are shaded."""
+        return coats_of(self.materials)
+
+
+@dataclass(frozen=True)
 class RelitScene:
     """A picture's surface and what it is made of; any lights can be put on it."""
 
     result: RunResult
     fit: str
     surface: Surface
-    reflecting: Coats | Slices | Pairs
-    """Reflectance of the surface's triangles."""
+    reflecting: Coats | Slices | Pairs | Texels
+    """Reflectance of the surface's triangles, or of its pixels."""
     views: tuple[ViewSamples, ...]
     """Views in the order in which LEDs are looked for."""
     mesh: PacketMesh
     """Mesh that throws shadows."""
+
+    @property
+    def material_of_pixel(self) -> NDArray[np.int32]:
+        """[h, w] place of a pixel's material among those of the scene; -1 where no surface is seen."""
+        return self.reflecting.of_pixel if isinstance(self.reflecting, Texels) else self.surface.triangle_of_pixel
+
+    def with_materials(self, materials: TriangleMaterials) -> RelitScene:
+        """The same scene of other materials, of triangles or of texels."""
+        if isinstance(self.reflecting, Texels):
+            return replace(self, reflecting=replace(self.reflecting, materials=materials))
+        return replace(self, reflecting=coats_of(materials))
 
     def picture(
         self,
@@ -122,7 +153,13 @@ class RelitScene:
             self._by_materials(picture, lighting, self.reflecting, max(1, samples // MIRROR_SHARE), say)
         return picture
 
-    def _by_materials(self, picture: Picture, lighting: Lighting, coats: Coats, lobe_rays: int, say: Say) -> None:
+    def _by_materials(
+        self, picture: Picture, lighting: Lighting, reflecting: Coats | Texels, lobe_rays: int, say: Say
+    ) -> None:
+        if isinstance(reflecting, Texels):
+            surface, coats = self.surface.by_texels(reflecting.of_pixel), reflecting.coats
+        else:
+            surface, coats = self.surface, reflecting
         work = len(lighting.beams) + len(lighting.emitters)
         codes = np.zeros((LANES, *self.surface.triangle_of_pixel.shape), np.uint8)
         count = 0
@@ -133,11 +170,11 @@ class RelitScene:
                 count += 1
                 say(count, work)
             if alone:
-                add_beam(picture, self.surface, coats, codes[0], beams[0])
+                add_beam(picture, surface, coats, codes[0], beams[0])
             else:
-                add_beams(picture, self.surface, coats, codes, beams, lobe_rays)
+                add_beams(picture, surface, coats, codes, beams, lobe_rays)
         for number, emitter in enumerate(lighting.emitters):
-            add_mirrored(picture, self.surface, coats, self.mesh, emitter, lobe_rays)
+            add_mirrored(picture, surface, coats, self.mesh, emitter, lobe_rays)
             say(len(lighting.beams) + number + 1, work)
 
     def _by_values(self, picture: Picture, lighting: Lighting, reflecting: Slices | Pairs, say: Say) -> None:
@@ -190,10 +227,12 @@ def scene_of_view(result: RunResult, view: str | None = None, fit: str | None = 
         raise InputError(f"--view: expected one of {', '.join(names)}; got {view!r}")
     _refuse_unknown(fit)
     pictured_view = result.views[0 if view is None else names.index(view)]
-    name = fit or best_fit(result)
+    name = fit or best_with_texels(result)
     surface = surface_of_view(result, pictured_view)
     order = (pictured_view, *(run_view for run_view in result.views if run_view is not pictured_view))
     mesh = PacketMesh(result.corners_mm, compact=False)
+    if name == TEXELS:
+        return RelitScene(result, name, surface, _texels_of(result, pictured_view, surface), order, mesh)
     known_fit = FITS.get(name)
     if not isinstance(known_fit, ViewFit):
         return RelitScene(result, name, surface, _from_anywhere(result, name, surface), order, mesh)
@@ -213,10 +252,40 @@ def scene_from(result: RunResult, camera: FreeCamera, fit: str | None = None) ->
         raise InputError(
             f"--fit: {fit} holds for the view that it was fitted to; with --from expected {', '.join(ANYWHERE)}"
         )
-    name = fit or best_fit(result, MATERIALS)
+    name = fit or best_with_texels(result, MATERIALS)
     mesh = PacketMesh(result.corners_mm, compact=False)
     surface = surface_from(result, mesh, camera)
+    if name == TEXELS:
+        return RelitScene(result, name, surface, _gathered_texels(result, surface), result.views, mesh)
     return RelitScene(result, name, surface, _from_anywhere(result, name, surface), result.views, mesh)
+
+
+def best_with_texels(result: RunResult, among: Collection[str] = FITS) -> str:
+    """Texels where they missed less than the best fit of triangles, in the same pixels; else that one `among`."""
+    texel_errors = read_texel_errors(result.folder)
+    known_mae = {name: mae for name, mae in texel_errors.items() if mae is not None}
+    best = min(known_mae, key=known_mae.__getitem__, default=None)
+    return TEXELS if best == TEXELS else best_fit(result, among)
+
+
+def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels:
+    texels = read_view_texels(result, view)
+    of_pixel = np.where(surface.triangle_of_pixel < 0, np.int32(-1), np.int32(0))
+    of_pixel.reshape(-1)[texels.pixels] = np.arange(1, len(texels.pixels) + 1)
+    values = (texels.normals, texels.kd, texels.ks, texels.alpha, texels.covariance)
+    normals, kd, ks, alpha, covariance = (
+        np.concatenate([np.zeros_like(rows[:1]), rows]).astype(np.float64) for rows in values
+    )
+    return Texels(TriangleMaterials(normals, kd, ks, alpha, np.zeros_like(alpha)), covariance, of_pixel)
+
+
+def _gathered_texels(result: RunResult, surface: Surface) -> Texels:
+    """Texels of a picture from anywhere: a material for each of its pixels."""
+    seen = surface.triangle_of_pixel >= 0
+    gathered = gather(result, surface.places_mm[seen])
+    of_pixel = np.full(seen.shape, -1, np.int32)
+    of_pixel[seen] = np.arange(np.count_nonzero(seen))
+    return Texels(gathered.materials, gathered.covariance, of_pixel)
 
 
 def _refuse_unknown(fit: str | None) -> None:

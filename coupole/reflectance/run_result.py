@@ -284,11 +284,7 @@ class RunResult:
     def material_covariances(self, name: str, block: Block = slice(None)) -> NDArray[np.float64]:
         """[n, 5, 5] of a fit by its name in `MATERIALS`, as `material_uncertainty.covariances` gives them."""
         with h5py.File(self.materials_path(name), "r") as file:
-            lower = _read_rows(file["covariance"], block)
-        covariances = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
-        covariances[:, *LOWER] = lower
-        covariances[:, *LOWER[::-1]] = lower
-        return covariances
+            return whole_covariances(_read_rows(file["covariance"], block))
 
     @cached_property
     def clusters(self) -> Clusters:
@@ -303,6 +299,14 @@ class RunResult:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:
                 raise InputError(f"{path}: an earlier version made it; make the result anew")
             return np.asarray(file["coefficients"][rows], np.float32)
+
+
+def whole_covariances(lower: NDArray[np.floating]) -> NDArray[np.float64]:
+    """[n, 5, 5] of their lower halves [n, 15], row by row."""
+    covariances = np.empty((len(lower), UNKNOWNS, UNKNOWNS))
+    covariances[:, *LOWER] = lower
+    covariances[:, *LOWER[::-1]] = lower
+    return covariances
 
 
 def _read_rows(data: h5py.Dataset, block: Block) -> NDArray[np.float64]:

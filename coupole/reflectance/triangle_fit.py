@@ -18,11 +18,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.ggx import lobe
+from coupole.reflectance.ggx import lobe, tangents
 from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign
 from coupole.reflectance.lanes import LANES
-from coupole.reflectance.normal_fit import colours_from
+from coupole.reflectance.normal_fit import SPREAD_KS, USUAL_ALPHA, USUAL_KS, colours_from
 
 Floats = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ FEWEST = 24
 USUAL = 0.1
 """Weight of the usual roughness and ks beside that of a sample, which can be some 6: it decides where no sample is
 near a highlight. Without it one triangle in thousands shone five times as bright as white between the LEDs."""
+_USUAL_MATERIAL = (USUAL_KS, USUAL_ALPHA, USUAL / SPREAD_KS**2, USUAL)
+"""The same as `ggx_fit.fit_packs` has it."""
 MOST_KS = 1.0
 """No more light than there is."""
 _STARTS = (0.08, 0.2, 0.45)
@@ -183,7 +185,7 @@ def _fit_part(values, led_mm, view_of, cameras_mm, centres_mm, normals, stiffnes
             continue
         start = _best_start(roots[:n], good[:n], lights, half, views, view_of, normal, normal_stiffness, packs)
         count = pack(roots[:n], good[:n], lights, half, views, view_of, packs)
-        _, rms = fit_packs(packs[:count], views, start, normal, normal_stiffness, USUAL, _SETTLED)
+        _, rms = fit_packs(packs[:count], views, start, normal, normal_stiffness, _USUAL_MATERIAL, _SETTLED)
         assign(parameters[triangle, :3], start[:3] if free else normal)
         parameters[triangle, 3], parameters[triangle, 4] = math.exp(start[5]), rms
         kd, ks = parameters[triangle, 5 : 5 + channels], parameters[triangle, 5 + channels :]
@@ -254,7 +256,7 @@ def _best_start(roots, good, lights, half, views, view_of, normal, stiffness, pa
     for alpha in _STARTS:
         assign(unknowns[:3], normal)
         unknowns[3], unknowns[4], unknowns[5] = math.log(kd), math.log(_FIRST_KS * kd), math.log(alpha)
-        cost, _ = fit_packs(packs[:count], views, unknowns, normal, stiffness, USUAL, _CHOSEN)
+        cost, _ = fit_packs(packs[:count], views, unknowns, normal, stiffness, _USUAL_MATERIAL, _CHOSEN)
         if cost < best:
             best = cost
             assign(best_unknowns, unknowns)
@@ -308,3 +310,17 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, mode
                 modelled_values[triangle, sample, channel] = max(nl, 0.0) * (
                     kd[triangle, channel] + ks[triangle, channel] * shine
                 )
+
+
+@numba.njit(cache=True, nogil=True)
+def turned_normals(normals, tilts):  # type: ignore[no-untyped-def]
+    """Unit normals [n, 3] after tilts [n, 2] along their tangents."""
+    turned = np.empty_like(normals)
+    for n in range(len(normals)):
+        t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
+        square = 0.0
+        for k in range(3):
+            turned[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
+            square += turned[n, k] ** 2
+        turned[n] /= np.sqrt(square)
+    return turned

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,10 @@ import cells
 import numpy as np
 import trimesh
 from cells import CellFolder
+
+sys.path.insert(0, str(cells.REPO / "tools"))
+
+from drawn_records import draw_records  # noqa: E402
 
 RECORDS = cells.REPO / "configs/calibrations"
 DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3
@@ -67,3 +72,21 @@ def walter(normals: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarr
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+DETAIL = ({"period_mm": 2.4, "texture": 0.8}, {"period_mm": 6.0, "slope_deg": 6.0})
+"""Waves of paint and of bumps that the mesh, with triangles of 1 mm, does not have."""
+
+
+def detailed_result(folder: Path) -> Made:
+    """Acquire a run of the relief with `DETAIL`, and make its result with texels, with records that are exact."""
+    material = {"diffuse": DIFFUSE, "f0": F0, "roughness": ROUGHNESS}
+    cell = shipped_cell(folder, material=material, shading="pixel", detail=list(DETAIL))
+    assert cell.acquire().code == 0
+    out, records = cell.folder / "result", cell.folder / "records"
+    draw_records(records, None)
+    ended = cells.here(
+        "reflectance", cell.run_folder, "--calibrations", records, "--out", out, "--texels", "auto", "--json"
+    )
+    assert ended.code == 0, ended.err
+    return cell, out, ended.document

@@ -87,6 +87,63 @@ def fill_samples(first, lists, response, darks, shots, lamps, centres_mm, normal
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def fill_pixels(first_entry, entry_ends, lists, response, darks, shots, lamps, places_mm, codes, direct, values):  # type: ignore[no-untyped-def]
+    """Fill `values` [pixels, leds], bits of float16, with S / (P E/Phi) of single pixels, 1/sr: f times the cosine
+    of incidence, whatever the normal is; higher by what the mean of their square roots loses by noise.
+
+    The pixels are those of the lists from the `first_entry` on, up to `entry_ends` [b, channels] of each of b
+    triangles; `places_mm` [pixels, 3] is what they see, `codes` [b, 8] says where light has reached the triangle,
+    `direct` [b, leds, channels] how much of its light came straight from the LED. For the others see
+    `fill_samples`.
+    """
+    bits, straight = np.empty(8, np.uint16), np.empty((1, 8), np.float32)
+    pixel = first_entry
+    for row in range(len(codes)):
+        for channel in range(entry_ends.shape[1]):
+            end = entry_ends[row, channel]
+            if REACHED not in codes[row]:
+                pixel = end
+                continue
+            off = absolute(load_row(codes, row) - np.float32(REACHED))
+            for led in range(values.shape[1]):
+                straight[0, led] = direct[row, led, channel]
+            share = if_less(off, np.float32(0.5), load_row(straight, 0), _NAN) / load_row(lamps.powers, channel)
+            while pixel < end:
+                signal, u_signal = _signal(pixel, pixel + 1, channel, lists, response, darks, shots)
+                signal = signal + absolute(signal) * _lost_by_root(u_signal)
+                value = signal * share * _per_normal_irradiance(places_mm[pixel - first_entry], lamps)
+                store_halves(if_less(absolute(value), np.float32(MOST_F), value, _NAN), bits)
+                for led in range(values.shape[1]):
+                    values[pixel - first_entry, led] = bits[led]
+                pixel += 1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lost_by_root(u_signal):  # type: ignore[no-untyped-def]
+    """Share of a signal that brings back what the mean of its square root has lost: u^2 / 4 to second order, less
+    where noise is as large as the signal; 0 if noise is not known."""
+    half, none = np.float32(0.5), np.float32(0.0)
+    smaller = if_less(u_signal, half, u_signal * u_signal, half * u_signal)
+    return np.float32(0.25) * if_less(u_signal, np.float32(1e6), smaller, none)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _per_normal_irradiance(place_mm, lamps):  # type: ignore[no-untyped-def]
+    """1 over E / Phi of the lamps on a surface that faces them."""
+    square, leaving = lanes(np.float32(0.0)), lanes(np.float32(0.0))
+    for k in range(3):
+        way = load_row(lamps.centres_mm, k) - np.float32(place_mm[k])
+        square = square + way * way
+        leaving = leaving - way * load_row(lamps.axes, k)
+    leaving = larger(leaving, np.float32(0.0))
+    distance = root(square)
+    lit = _SQUARE_MM * leaving / (square * distance)
+    if lamps.paper:
+        lit = lit * leaving / distance
+    return np.float32(1.0) / lit
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _per_irradiance(centre_mm, normal, lamps):  # type: ignore[no-untyped-def]
     """1 over cos_i E / Phi (`lit_by` of lamp_sight) of the lamps."""
     square, leaving, arriving = lanes(np.float32(0.0)), lanes(np.float32(0.0)), lanes(np.float32(0.0))

@@ -8,8 +8,9 @@ triangle stands for the paper's prefilter of 0.1 degree: neighbouring LEDs are d
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -68,21 +69,31 @@ class ViewPass:
 
     def samples(self, codes_of: Callable[[slice, Executor], NDArray[np.uint8]], threads: int) -> Iterator[Samples]:
         """All samples; `codes_of` gives the codes of some LEDs [leds, triangles], with the threads of a pool."""
-        parts = [slice(n, min(n + self.together, len(self.leds))) for n in range(0, len(self.leds), self.together)]
-        by_led = list(self.view.by_led.values())
-        frames = [list(chain.from_iterable(by_led[part])) for part in parts]
         count = len(self.facets.centres_mm)
         blocks = [slice(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
-        self.reader.prepare(self.view.frames)
-        in_order, most = list(chain.from_iterable(frames)), max(map(len, frames))
-        ring = FrameRing(in_order, self.measured_run.frames.size_px, most)
-        with ThreadPoolExecutor(threads) as pool, ring:
-            for part, part_frames in zip(parts, frames, strict=True):
+        batches = self.batches()
+        with ThreadPoolExecutor(threads) as pool, closing(batches):
+            for part in self.parts:
                 codes = codes_of(part, pool)
-                slots = [ring.take() for _ in part_frames]
-                shots, lamps = self._shots(part_frames, ring.pixels, slots), self._lamps(part)
+                shots, lamps = next(batches)
                 work = (pool.submit(self._block, part, rows, shots, lamps, codes[:, rows]) for rows in blocks)
                 yield from _in_order(work, _AHEAD * threads)
+
+    @property
+    def parts(self) -> list[slice]:
+        """Places in the view's LEDs whose frames are worked on together, one part after the other."""
+        return [slice(n, min(n + self.together, len(self.leds))) for n in range(0, len(self.leds), self.together)]
+
+    def batches(self) -> Generator[tuple[Shots, Lamps]]:
+        """Frames and LEDs of each of the `parts`; memory of a batch's frames is used again after it."""
+        by_led = list(self.view.by_led.values())
+        frames = [list(chain.from_iterable(by_led[part])) for part in self.parts]
+        self.reader.prepare(self.view.frames)
+        in_order, most = list(chain.from_iterable(frames)), max(map(len, frames))
+        with FrameRing(in_order, self.measured_run.frames.size_px, most) as ring:
+            for part, part_frames in zip(self.parts, frames, strict=True):
+                slots = [ring.take() for _ in part_frames]
+                yield self._shots(part_frames, ring.pixels, slots), self._lamps(part)
                 ring.give_back(slots)
 
     def _shots(self, frames: list[LightFrame], pixels: NDArray[np.uint16], slots: list[int]) -> Shots:

@@ -17,6 +17,7 @@ from functools import cached_property
 import h5py
 import numba
 import numpy as np
+from numpy.polynomial.polynomial import polyval2d
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
@@ -57,6 +58,20 @@ class Surface:
         """[triangles] of their planes from the origin, along the normals."""
         offsets: Floats = np.einsum("tk,tk->t", self.centres_mm, self.normals)
         return offsets
+
+    def by_texels(self, texel_of_pixel: NDArray[np.int32]) -> Surface:
+        """The same for shading by texels, whose numbers [h, w], -1 for none, stand in the place of triangles'."""
+        seen = texel_of_pixel >= 0
+        triangle = np.zeros(int(texel_of_pixel.max(initial=-1)) + 1, np.int64)
+        triangle[texel_of_pixel[seen]] = self.triangle_of_pixel[seen]
+        return Surface(
+            texel_of_pixel,
+            self.places_mm,
+            self.camera_mm,
+            self.triangles[triangle],
+            self.centres_mm[triangle],
+            self.normals[triangle],
+        )
 
 
 @dataclass(frozen=True)
@@ -161,12 +176,22 @@ def _aim_camera(result: RunResult, camera: FreeCamera) -> tuple[Floats, float]:
     return base_from_camera, 0.5 * float(np.min(np.array([width, height]) / reach))
 
 
-def _directions(
-    triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
-) -> tuple[Floats, Floats, Floats] | None:
-    """Return what turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
-    coefficients of column^i row^j, [3, 3] rows: axes of the directions' frame, the last forward. None for too few
-    triangles."""
+@dataclass(frozen=True)
+class _Centres:
+    """Triangles' centres as a picture shows them."""
+
+    pixels: Floats
+    """[n, 2] column and row: means of the pixels that see a triangle."""
+    tangents: Floats
+    """[n, 2] of their directions, in `frame`."""
+    weights: Floats
+    """[n] square roots of the numbers of pixels."""
+    frame: Floats
+    """[3, 3] rows: axes of the directions' frame, the last forward."""
+
+
+def _seen_centres(triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats) -> _Centres | None:
+    """Return the centres that a picture shows; None for too few."""
     row, column = np.nonzero(triangle_of_pixel >= 0)
     triangle = triangle_of_pixel[row, column]
     count = np.bincount(triangle, minlength=len(centres_mm)).astype(np.float64)
@@ -182,21 +207,53 @@ def _directions(
     right /= np.linalg.norm(right)
     frame = np.stack([right, np.cross(forward, right), forward])
     local = ways @ frame.T
-    tangents = local[:, :2] / local[:, 2:]
-    middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
-    scale = np.maximum(0.5 * float(np.ptp(pixels, axis=0).max()), 1.0)
-    x, y = ((pixels - middle) / scale).T
+    return _Centres(pixels, local[:, :2] / local[:, 2:], np.sqrt(count[in_view]), frame)
+
+
+def _directions(
+    triangle_of_pixel: NDArray[np.int32], centres_mm: Floats, camera_mm: Floats
+) -> tuple[Floats, Floats, Floats] | None:
+    """Return what turns a pixel into its direction: [3] middle column and row and the scale of both, [6, 6, 2]
+    coefficients of column^i row^j, [3, 3] rows: axes of the directions' frame, the last forward. None for too few
+    triangles."""
+    centres = _seen_centres(triangle_of_pixel, centres_mm, camera_mm)
+    if centres is None:
+        return None
+    return *_polynomial(centres.pixels, centres.tangents, centres.weights), centres.frame
+
+
+def pixels_of_places(surface: Surface, places_mm: NDArray[np.floating]) -> Floats | None:
+    """[n, 2] column and row at which a measured view shows places [n, 3], whether or not something hides them; NaN
+    behind the camera. None if the view shows too few triangles."""
+    centres = _seen_centres(surface.triangle_of_pixel, surface.centres_mm, surface.camera_mm)
+    if centres is None:
+        return None
+    scale, coefficients = _polynomial(centres.tangents, centres.pixels, centres.weights)
+    local = (places_mm - surface.camera_mm) @ centres.frame.T
+    ahead = local[:, 2:] > 0.0
+    tangents = np.where(ahead, local[:, :2] / np.where(ahead, local[:, 2:], 1.0), np.nan)
+    x, y = ((tangents - scale[:2]) / scale[2]).T
+    pixels: Floats = polyval2d(x, y, coefficients).T
+    return pixels
+
+
+def _polynomial(given: Floats, wanted: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Fit [n, 2] `wanted` by polynomials of [n, 2] `given`: middle of these and their scale [3], coefficients
+    [6, 6, 2] of x^i y^j. Triangles that are seen in part are left out."""
+    middle = 0.5 * (given.min(axis=0) + given.max(axis=0))
+    scale = max(0.5 * float(np.ptp(given, axis=0).max()), 1e-9)
+    x, y = ((given - middle) / scale).T
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     design = np.stack([x**i * y**j for i, j in powers], axis=1)
-    weight = np.sqrt(count[in_view])
+    weight = weights
     for _ in range(2):
-        fitted_coefficients = np.linalg.lstsq(design * weight[:, None], tangents * weight[:, None], rcond=None)[0]
-        off = np.linalg.norm(design @ fitted_coefficients - tangents, axis=1)
-        weight = np.where(off <= _OUTLIER * np.median(off), np.sqrt(count[in_view]), 0.0)
+        fitted_coefficients = np.linalg.lstsq(design * weight[:, None], wanted * weight[:, None], rcond=None)[0]
+        off = np.linalg.norm(design @ fitted_coefficients - wanted, axis=1)
+        weight = np.where(off <= _OUTLIER * np.median(off), weights, 0.0)
     coefficients = np.zeros((_DEGREE + 1, _DEGREE + 1, 2))
     for (i, j), pair in zip(powers, fitted_coefficients, strict=True):
         coefficients[i, j] = pair
-    return np.append(middle, scale), coefficients, frame
+    return np.append(middle, scale), coefficients
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -1,0 +1,1 @@
+"""Materials of single pixels, finer than the mesh's triangles."""

@@ -1,0 +1,170 @@
+"""Materials of places on the object, gathered from the pixels of all views that show them.
+
+A place is looked up in each view by its direction. Between the four pixels around it, materials are interpolated
+(normals as vectors, the others as logarithms); views are weighted by how certain each is of what it shows.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.reflectance.new_light.pictured_surface import Surface, pixels_of_places, surface_of_view
+from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, texels_path
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+Floats = NDArray[np.float64]
+
+_REACH = 3.0
+"""Largest distance of a place from what a pixel at its side sees, over the median distance of neighbouring pixels:
+farther away, the pixel sees something in front of it."""
+_VARIANCES = (0, 2, 5, 9, 14)
+"""Places of the variances in the lower half of a covariance."""
+_BLOCK, _PART = 1 << 20, 1 << 15
+"""Places that are looked up together, and by a thread in one go."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Materials of n places; roughness is 0 where no view shows a place."""
+
+    materials: TriangleMaterials
+    covariance: NDArray[np.float32]
+    """[n, 15] as files have it; views are taken as independent."""
+
+
+@dataclass(frozen=True)
+class _View:
+    texels: ViewTexels
+    surface: Surface
+    texel_of_pixel: NDArray[np.int32]
+    """[h, w] -1 for none."""
+    step_mm: float
+    """Median distance of what neighbouring pixels see."""
+
+
+def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
+    """Gather materials of places [n, 3] of the base frame. Raises InputError if no view has texels."""
+    refuse_without_texels(result)
+    views = list(_views_with_texels(result))
+    count, channels = len(places_mm), result.channels
+    normals, logs = np.zeros((count, 3)), np.zeros((count, 2 * channels + 1))
+    information = np.zeros((count, len(_VARIANCES)))
+    for view in views:
+        for first in range(0, count, _BLOCK):
+            part = slice(first, min(first + _BLOCK, count))
+            _add_view(view, places_mm[part], normals[part], logs[part], information[part])
+    known = information[:, 0] > 0.0
+    weights = np.where(known[:, None], information, 1.0)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    logs /= _by_columns(weights[:, 2:], channels)
+    values = np.where(known[:, None], np.exp(logs), 0.0)
+    covariance = np.zeros((count, 15), np.float32)
+    covariance[:, _VARIANCES] = np.where(known[:, None], 1.0 / weights, 0.0)
+    materials = TriangleMaterials(
+        normals, values[:, :channels], values[:, channels:-1], values[:, -1], np.zeros(count)
+    )
+    return Gathered(materials, covariance)
+
+
+def _views_with_texels(result: RunResult) -> Iterator[_View]:
+    for view in result.views:
+        if texels_path(result, view).exists():
+            yield _open_view(result, view)
+
+
+def _open_view(result: RunResult, view: ViewSamples) -> _View:
+    texels, surface = read_view_texels(result, view), surface_of_view(result, view)
+    texel_of_pixel = np.full(surface.triangle_of_pixel.shape, -1, np.int32)
+    texel_of_pixel.reshape(-1)[texels.pixels] = np.arange(len(texels.pixels))
+    steps = np.linalg.norm(surface.places_mm[:, 1:] - surface.places_mm[:, :-1], axis=2)
+    return _View(texels, surface, texel_of_pixel, float(np.nanmedian(steps)))
+
+
+def _by_columns(of_unknowns: Floats, channels: int) -> Floats:
+    """[n, 2 channels + 1] of what is said of kd, ks and alpha [n, 3]."""
+    return np.repeat(of_unknowns, [channels, channels, 1], axis=1)
+
+
+def _add_view(
+    view: _View, places_mm: NDArray[np.floating], normals: Floats, logs: Floats, information: Floats
+) -> None:
+    """Add what a view shows of places [n, 3], times its weights, to sums."""
+    pixels = pixels_of_places(view.surface, places_mm)
+    if pixels is None:
+        return
+    texels = view.texels
+
+    def look(first: int) -> None:
+        part = slice(first, first + _PART)
+        _look_up(
+            pixels[part], places_mm[part], view.texel_of_pixel, view.surface.places_mm, _REACH * view.step_mm,
+            texels.normals, texels.kd, texels.ks, texels.alpha, texels.covariance, normals[part], logs[part],
+            information[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(look, range(0, len(places_mm), _PART)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look_up(  # type: ignore[no-untyped-def]
+    pixels, places_mm, texel_of_pixel, seen_mm, reach_mm, texel_normals, kd, ks, alpha, covariance, normals, logs,
+    information
+):  # fmt: skip
+    (height, width), channels = texel_of_pixel.shape, kd.shape[1]
+    means, variances = np.empty(4 + 2 * channels), np.empty(5)
+    for n in range(len(places_mm)):
+        x, y = pixels[n, 0], pixels[n, 1]
+        if not (x > -1.0 and y > -1.0 and x < width and y < height):
+            continue
+        left, top, weights = int(math.floor(x)), int(math.floor(y)), 0.0
+        means[:], variances[:] = 0.0, 0.0
+        for corner in range(4):
+            column, row = left + corner % 2, top + corner // 2
+            if column < 0 or row < 0 or column >= width or row >= height or texel_of_pixel[row, column] < 0:
+                continue
+            square = 0.0
+            for k in range(3):
+                square += (seen_mm[row, column, k] - places_mm[n, k]) ** 2
+            if not square < reach_mm * reach_mm:
+                continue
+            texel = texel_of_pixel[row, column]
+            weight = (1.0 - abs(x - column)) * (1.0 - abs(y - row))
+            weights += weight
+            for k in range(3):
+                means[k] += weight * texel_normals[texel, k]
+            for channel in range(channels):
+                means[3 + channel] += weight * math.log(kd[texel, channel])
+                means[3 + channels + channel] += weight * math.log(ks[texel, channel])
+            means[3 + 2 * channels] += weight * math.log(alpha[texel])
+            for unknown in range(5):
+                variances[unknown] += weight * covariance[texel, unknown * (unknown + 3) // 2]
+        if weights < 0.5:
+            continue
+        for unknown in range(5):
+            variances[unknown] = weights / max(variances[unknown], 1e-8 * weights)
+            information[n, unknown] += variances[unknown]
+        for k in range(3):
+            normals[n, k] += 0.5 * (variances[0] + variances[1]) * means[k] / weights
+        for number in range(2 * channels + 1):
+            own = variances[2 + min(number // channels, 2)]
+            logs[n, number] += own * means[3 + number] / weights
+
+
+def refuse_without_texels(result: RunResult) -> None:
+    """Raise InputError if no view has texels."""
+    if not any(texels_path(result, view).exists() for view in result.views):
+        raise InputError(
+            f"{result.folder}: has no texels; `coupole reflectance from RUN --out {result.folder} --texels auto` "
+            "makes them"
+        )

@@ -1,0 +1,43 @@
+"""Colours between the pixels of a Bayer pattern, from what single pixels show of their own channel.
+
+Detail of surfaces is above all light and dark, alike in all channels, and each pixel has it; colours change less
+from pixel to pixel. So a channel that a pixel does not have is its own deviation from its triangle, plus the mean
+difference of the channels around it. Its own channel stays as it was fitted.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Singles = NDArray[np.float32]
+
+_SPREAD_PX = 2.5
+"""Standard deviation of the weights of neighbours: stripes of five pixels are nearly gone from a mean, so that the
+channels' places in them are not taken for colours."""
+_LEAST_WEIGHT = 1e-3
+_MOST_CHANGE = 1.0
+"""Largest difference of channels' logarithms that is believed; fits that failed are farther apart."""
+
+
+def all_channels(
+    deviation: Singles, channel: NDArray[np.int8], fitted: NDArray[np.bool_], channels: int
+) -> Singles:
+    """[h, w, channels] of deviations [h, w] that pixels of a `channel` [h, w] show; 0 where none is fitted."""
+    if channels == 1:
+        return np.where(fitted, deviation, np.float32(0.0))[..., None]
+    means = []
+    for number in range(channels):
+        here = fitted & (channel == number)
+        weight = cv2.GaussianBlur(here.astype(np.float32), (0, 0), _SPREAD_PX)
+        total = cv2.GaussianBlur(np.where(here, deviation, np.float32(0.0)), (0, 0), _SPREAD_PX)
+        means.append(np.where(weight > _LEAST_WEIGHT, total / np.maximum(weight, _LEAST_WEIGHT), np.nan))
+    colour = np.stack(means, axis=-1)
+    has_all = fitted & np.isfinite(colour).all(axis=-1)
+    own = np.take_along_axis(colour, channel[..., None].astype(np.int64), axis=-1)
+    change = np.clip(np.where(has_all[..., None], colour - own, np.float32(0.0)), -_MOST_CHANGE, _MOST_CHANGE)
+    result: Singles = np.where(fitted[..., None], deviation[..., None] + change, np.float32(0.0)).astype(
+        np.float32
+    )
+    return result

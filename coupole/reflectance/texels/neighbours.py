@@ -1,0 +1,152 @@
+"""What neighbours say of a pixel: its material lies about that of its triangle, and that one about those beside
+it, as far as all around it do.
+
+In a window the spread of materials is that of the surface and that of the fits; what the fits' covariances do
+not explain is the surface's (empirical Bayes: Morris, Parametric empirical Bayes inference, 1983). Where the
+surface is plain little is left, and pixels become as their triangles are; where it has detail they stay as they
+were fitted. The same holds for ks and roughness of triangles, which few samples near a highlight say badly; kd and
+normal follow by their covariance with them.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import UNKNOWNS, tangents
+from coupole.reflectance.kernel_arrays import assign_rows
+from coupole.reflectance.new_light.pictured_surface import in_strips
+from coupole.reflectance.run_result import LOWER
+
+Singles = NDArray[np.float32]
+
+WINDOW_PX = 17
+"""Side of the window: some hundred pixels of each channel say how the surface varies."""
+_ALIKE_PX = 5
+"""Side of the window in which covariances are averaged: eight groups of LEDs alone say little of one."""
+_LEAST = 1e-6
+"""Least variance of the surface, so that no triangle is taken for exact."""
+_FREE = 100.0
+"""Variance of what is not drawn anywhere."""
+VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]
+"""Places of the variances in the lower half of a covariance."""
+TRIANGLES_AROUND = 64
+"""Triangles of a window that say how ks and roughness vary from one to the other."""
+_MOST_STEP = 1.0
+"""Largest step of a triangle: a fit that failed has no straight way to where it should have ended."""
+_OUTLIER = 9.0
+"""Square of the largest deviation, over the window's mean square, that counts in full."""
+
+
+def lower_half(covariance: NDArray[np.float64]) -> Singles:
+    """[..., 15] of [..., 5, 5], row by row."""
+    return covariance[..., *LOWER].astype(np.float32)
+
+
+def settle(deviation: Singles, covariance: Singles, fitted: NDArray[np.bool_], centre_covariance: Singles) -> None:
+    """Draw the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms) towards 0 as far
+    as their neighbours say, and set their covariances [h, w, 15, lower half row by row] to what is left; in place.
+    Only pixels that are `fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of what they
+    are drawn to."""
+    covariance[...] = _mean_around(covariance, fitted, _ALIKE_PX)
+    square = deviation**2
+    np.minimum(square, np.float32(_OUTLIER) * _mean_around(square, fitted, WINDOW_PX), out=square)
+    surface = _surface(square, covariance[..., VARIANCES], fitted, WINDOW_PX)
+    _draw_rows(deviation, covariance, surface, fitted, centre_covariance)
+
+
+def settle_triangles(logs: Singles, covariance: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+    """Return the steps [h, w, 5] by which materials of triangles change, seen pixel by pixel, when ks and
+    roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as those around say; set the
+    covariances [h, w, 15] to what is left, in place."""
+    weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
+    middle = _mean_around(weight * logs, fitted, side_px) / np.maximum(
+        _mean_around(weight, fitted, side_px), _LEAST
+    )
+    deviation = np.zeros((*fitted.shape, UNKNOWNS), np.float32)
+    deviation[..., 3:] = logs - middle
+    surface = np.full(deviation.shape, _FREE, np.float32)
+    around = _mean_around(deviation[..., 3:] ** 2, fitted, side_px)
+    square = np.minimum(deviation[..., 3:] ** 2, np.float32(_OUTLIER) * around)
+    surface[..., 3:] = _surface(square, covariance[..., VARIANCES[3:]], fitted, side_px)
+    before, of_middle = deviation.copy(), np.zeros_like(covariance)
+    of_middle[..., VARIANCES[3:]] = 1.0 / (
+        np.maximum(_mean_around(weight, fitted, side_px), _LEAST) * TRIANGLES_AROUND
+    )
+    _draw_rows(deviation, covariance, surface, fitted, of_middle)
+    step: Singles = np.clip(deviation - before, -_MOST_STEP, _MOST_STEP)
+    return step
+
+
+def _surface(square: Singles, own: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+    """[h, w, k] variances of the surface: mean squares in a window, without those of the fits."""
+    return np.maximum(_mean_around(square - own, fitted, side_px), _LEAST).astype(np.float32)
+
+
+def _draw_rows(
+    deviation: Singles, covariance: Singles, surface: Singles, fitted: NDArray[np.bool_], centre: Singles
+) -> None:
+    in_strips(
+        len(fitted),
+        lambda rows: _draw(deviation[rows], covariance[rows], surface[rows], fitted[rows], centre[rows]),
+    )
+
+
+def _mean_around(values: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+    """[h, w, k] mean over the fitted pixels of a window; what is not fitted may be NaN."""
+    weight = cv2.boxFilter(fitted.astype(np.float32), -1, (side_px, side_px), normalize=False)
+    means = np.empty_like(values)
+    for k in range(values.shape[-1]):
+        plane = np.where(fitted, values[..., k], np.float32(0.0))
+        means[..., k] = cv2.boxFilter(plane, -1, (side_px, side_px), normalize=False)
+    result: Singles = (means / np.maximum(weight, 1.0)[..., None]).astype(np.float32)
+    return result
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw(deviation, covariance, surface, fitted, centre):  # type: ignore[no-untyped-def]
+    """A pixel's deviation and covariance, given the `surface`'s variances about 0: Kalman's; and what 0 may itself
+    be off, as far as the pixel was drawn to it."""
+    own, both = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    rest, shared = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    before = np.empty(UNKNOWNS)
+    for row in range(fitted.shape[0]):
+        for column in range(fitted.shape[1]):
+            if not fitted[row, column]:
+                continue
+            place = 0
+            for i in range(UNKNOWNS):
+                before[i] = deviation[row, column, i]
+                for j in range(i + 1):
+                    own[i, j] = own[j, i] = covariance[row, column, place]
+                    shared[i, j] = shared[j, i] = centre[row, column, place]
+                    place += 1
+            assign_rows(both, own)
+            for i in range(UNKNOWNS):
+                both[i, i] += surface[row, column, i]
+            inverse = np.linalg.inv(both)
+            weighted = inverse @ before
+            for i in range(UNKNOWNS):
+                for j in range(UNKNOWNS):
+                    rest[i, j] = (1.0 if i == j else 0.0) - surface[row, column, i] * inverse[i, j]
+            assign_rows(both, rest @ shared @ rest.T)
+            place = 0
+            for i in range(UNKNOWNS):
+                deviation[row, column, i] = surface[row, column, i] * weighted[i]
+                for j in range(i + 1):
+                    covariance[row, column, place] = rest[i, j] * surface[row, column, j] + both[i, j]
+                    place += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def tilts_from(normals, prior, tilts):  # type: ignore[no-untyped-def]
+    """Fill `tilts` [n, 2] with those of normals [n, 3] from others, along the tangents of the first."""
+    for n in range(len(normals)):
+        t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
+        first, second = 0.0, 0.0
+        for k in range(3):
+            first -= t1[k] * prior[n, k]
+            second -= t2[k] * prior[n, k]
+        tilts[n, 0], tilts[n, 1] = first, second

@@ -1,0 +1,162 @@
+"""Materials of single pixels: normal, kd, ks and alpha of each, with the material of its triangle as prior.
+
+The fit is that of triangles (`coupole.reflectance.ggx_fit`), of one view and one channel, and begins at the
+triangle's material. The prior is weak here: how much neighbours say of a pixel is found afterwards, from all of
+them (`coupole.reflectance.texels.neighbours`).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import UNKNOWNS, lobe
+from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
+from coupole.reflectance.kernel_arrays import assign, assign_rows
+from coupole.reflectance.lanes import LANES
+from coupole.reflectance.material_uncertainty import add_scores
+from coupole.reflectance.triangle_fit import FEWEST, between, towards
+
+Floats = NDArray[np.float64]
+
+TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
+"""Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha about those of
+its triangle: wider than any that was seen, so that they decide where the samples say nothing."""
+LEAST_KS = 1e-3
+"""Least ks of a prior, as a share of kd."""
+_SETTLED = 1e-4
+_PART = 512
+
+
+@dataclass(frozen=True)
+class Lights:
+    """LEDs that a view's pixels are fitted to, in the order of their groups."""
+
+    columns: NDArray[np.int64]
+    """[leds] places in the pixels' values."""
+    places_mm: Floats
+    """[leds, 3]"""
+    group: NDArray[np.int64]
+    """[leds] numbers of groups of neighbours, rising: errors are alike in them."""
+    camera_mm: Floats
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Materials about which those of n pixels lie: those of their triangles, in the pixels' channels."""
+
+    normals: Floats
+    """[n, 3]"""
+    kd: Floats
+    ks: Floats
+    alpha: Floats
+
+
+@dataclass(frozen=True)
+class PixelMaterials:
+    """Materials of n pixels in their own channels; NaN where there were too few samples."""
+
+    normals: Floats
+    """[n, 3]"""
+    logs: Floats
+    """[n, 3] logarithms of kd, ks and alpha."""
+    covariance: Floats
+    """[n, 5, 5] of tilts and logarithms, as those of triangles."""
+
+
+def fit_pixels(
+    values: NDArray[np.float16], places_mm: NDArray[np.float32], lights: Lights, prior: Prior, threads: int | None
+) -> PixelMaterials:
+    """Fit n pixels to their values [n, LEDs of the view]."""
+    count = len(values)
+    normals, logs = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    covariance = np.full((count, UNKNOWNS, UNKNOWNS), np.nan)
+
+    def fit(first: int) -> None:
+        part = slice(first, min(first + _PART, count))
+        pixel_values = np.ascontiguousarray(values[part][:, lights.columns].astype(np.float32))
+        _fit_part(
+            pixel_values, places_mm[part], lights.places_mm, lights.group, lights.camera_mm, prior.normals[part],
+            prior.kd[part], prior.ks[part], prior.alpha[part], normals[part], logs[part], covariance[part],
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(threads or len(os.sched_getaffinity(0))) as pool:
+        list(pool.map(fit, range(0, count, _PART)))
+    return PixelMaterials(normals, logs, covariance)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fit_part(  # type: ignore[no-untyped-def]
+    values, places_mm, led_mm, group, camera_mm, prior_normals, prior_kd, prior_ks, prior_alpha, normals, logs,
+    covariance
+):  # fmt: skip
+    count, leds = values.shape
+    lights, half, views = np.empty((leds, 3)), np.empty((leds, 3)), np.empty((1, 3))
+    only_view = np.zeros(leds, np.int64)
+    good, roots = np.empty(leds, np.int64), np.empty(leds)
+    packs, place = np.empty((leds // LANES + 1, ROWS, LANES)), np.empty(3)
+    unknowns, grey = np.empty(6), np.empty(3)
+    stiffness = 1.0 / TILT**2
+    for pixel in range(count):
+        normal = prior_normals[pixel]
+        if not prior_alpha[pixel] > 0.0:
+            continue
+        for k in range(3):
+            place[k] = places_mm[pixel, k]
+        towards(place, camera_mm, views[0])
+        used = 0
+        for led in range(leds):
+            if not np.isfinite(values[pixel, led]):
+                continue
+            towards(place, led_mm[led], lights[led])
+            between(lights[led], views[0], half[led])
+            good[used], roots[used] = led, math.sqrt(max(values[pixel, led], 0.0))
+            used += 1
+        if used < FEWEST:
+            continue
+        assign(unknowns[:3], normal)
+        _begin(unknowns, roots[:used], good[:used], lights, half, views[0], prior_kd[pixel], prior_ks[pixel],
+               prior_alpha[pixel])  # fmt: skip
+        filled = pack(roots[:used], good[:used], lights, half, views, only_view, packs)
+        usual = (unknowns[4], unknowns[5], 1.0 / LOG_KS**2, 1.0 / LOG_ALPHA**2)
+        fit_packs(packs[:filled], views, unknowns, normal, stiffness, usual, _SETTLED)
+        assign(normals[pixel], unknowns[:3])
+        assign(logs[pixel], unknowns[3:])
+        for k in range(3):
+            grey[k] = math.exp(unknowns[3 + k])
+        grey[1] = max(grey[1], LEAST_KS * grey[0])
+        bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
+        add_scores(
+            roots[:used], good[:used], lights, half, views, only_view, group, unknowns[:3], grey, bread, meat
+        )
+        for k, weight in enumerate((stiffness, stiffness, 1e-2, usual[2], usual[3])):
+            bread[k, k] += weight
+            meat[k, k] += weight
+        inverse = np.linalg.inv(bread)
+        assign_rows(covariance[pixel], inverse @ meat @ inverse.T)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _begin(unknowns, roots, good, lights, half, view, kd, ks, alpha):  # type: ignore[no-untyped-def]
+    """Set the start: the prior's material, as bright as the samples say."""
+    both, square = 0.0, 0.0
+    n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
+    nv = max(n0 * view[0] + n1 * view[1] + n2 * view[2], 0.05)
+    for number in range(len(good)):
+        light, middle = lights[good[number]], half[good[number]]
+        nl = n0 * light[0] + n1 * light[1] + n2 * light[2]
+        if nl <= 0.05:
+            continue
+        nh = n0 * middle[0] + n1 * middle[1] + n2 * middle[2]
+        model = nl * (kd + ks * lobe(nl, nv, nh, alpha)[0])
+        both += roots[number] * math.sqrt(model)
+        square += model
+    ratio = max(both / square, 0.03) if square > 0.0 else 1.0
+    unknowns[3] = math.log(kd) + 2.0 * math.log(ratio)
+    unknowns[4], unknowns[5] = math.log(max(ks, LEAST_KS * kd)), math.log(alpha)

@@ -1,0 +1,138 @@
+"""Values of a view's single pixels under all its LEDs, block by block of triangles.
+
+A block's values are all in memory: each pixel's fit sees every LED. Frames are read once for each block, so that a
+larger memory means fewer readings, not another result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.extraction.extraction import Geometry
+from coupole.reflectance.extraction.measured_run import MeasuredRun, MeasuredView
+from coupole.reflectance.extraction.radiance import Radiometry, SignalReader
+from coupole.reflectance.extraction.sample_codes import AWAY
+from coupole.reflectance.extraction.sample_kernel import NO_VALUE, fill_pixels
+from coupole.reflectance.extraction.seen_surface import SeenSurface
+from coupole.reflectance.extraction.view_samples import ViewPass
+from coupole.reflectance.lanes import LANES
+from coupole.reflectance.new_light.pictured_surface import surface_of_view
+from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples
+
+_TRIANGLES = 512
+"""Triangles whose pixels a thread fills in one go."""
+
+
+@dataclass(frozen=True)
+class PixelBlock:
+    """Pixels of some triangles of a view, in the order of triangles and channels."""
+
+    pixels: NDArray[np.int32]
+    """[n] places in a frame, row by row."""
+    triangle: NDArray[np.int64]
+    """[n] row of the view's file of samples."""
+    channel: NDArray[np.int64]
+    """[n]"""
+    places_mm: NDArray[np.float32]
+    """[n, 3] what they see, base frame."""
+    values: NDArray[np.float16]
+    """[n, leds] f times the cosine of incidence, 1/sr, as their square roots shall be used (`fill_pixels`); NaN
+    where there is none: clipped, in shadow."""
+
+
+class PixelReader:
+    """A view's pixels, ready for its frames; `samples` is its file in a result whose fits are there."""
+
+    def __init__(
+        self,
+        measured_run: MeasuredRun,
+        geometry: Geometry,
+        radiometry: Radiometry,
+        view: MeasuredView,
+        result: RunResult,
+        samples: ViewSamples,
+    ) -> None:
+        surface = surface_of_view(result, samples)
+        self._samples = samples
+        self.triangle_of_pixel = surface.triangle_of_pixel
+        """[h, w] row of the view's file of what a pixel sees; -1 for none."""
+        self._places_mm = surface.places_mm.reshape(-1, 3)
+        self._reader = SignalReader(radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles))
+        self._pass = ViewPass(measured_run, view, geometry.of(samples.triangles), self._reader)
+        self._response = self._reader.response._replace(least_dn=np.float32(-np.inf))
+        """Dark pixels count as others: to leave out those that noise has made darker would make all brighter."""
+
+    @property
+    def count(self) -> int:
+        """Number of the pixels."""
+        return len(self._reader.lists.places)
+
+    def blocks(self, memory_bytes: int) -> list[slice]:
+        """Rows of the view's file whose pixels' values fit into a memory."""
+        starts = self._reader.lists.starts[:: self._reader.pixels.shape[1]]
+        pixel_bytes = 2 * len(self._samples.leds)
+        most = max(int(memory_bytes // pixel_bytes), int(np.diff(starts).max(initial=1)))
+        rows, first = [], 0
+        while first < len(starts) - 1:
+            end = max(int(np.searchsorted(starts, starts[first] + most, side="right")) - 1, first + 1)
+            rows.append(slice(first, end))
+            first = end
+        return rows
+
+    def read(self, rows: slice, threads: int) -> PixelBlock:
+        """Read all frames, for the pixels of some rows. Raises StorageError for a damaged frame."""
+        lists, channels = self._reader.lists, self._reader.pixels.shape[1]
+        first, end = (int(lists.starts[row * channels]) for row in (rows.start, rows.stop))
+        counts = self._reader.pixels[rows]
+        triangle = np.repeat(np.arange(rows.start, rows.stop), counts.sum(axis=1))
+        channel = np.repeat(np.tile(np.arange(channels), len(counts)), counts.ravel())
+        pixels = lists.places[first:end]
+        values = np.full((end - first, len(self._samples.leds)), NO_VALUE, np.uint16)
+        places_mm = self._places_mm[pixels]
+        with ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
+            batches = self._pass.batches()
+            for part, batch in zip(self._pass.parts, batches, strict=True):
+                codes, direct = _light_of(file, rows, part, channels)
+                blocks = _parts_of(rows)
+
+                def fill(
+                    some: slice,
+                    part: slice = part,
+                    batch: tuple[Any, Any] = batch,
+                    codes: NDArray[np.uint8] = codes,
+                    direct: NDArray[np.float32] = direct,
+                ) -> None:
+                    begin = int(lists.starts[some.start * channels])
+                    ends = lists.starts[some.start * channels + 1 : some.stop * channels + 1]
+                    of_rows = slice(some.start - rows.start, some.stop - rows.start)
+                    of_pixels = slice(begin - first, int(ends[-1]) - first)
+                    fill_pixels(
+                        begin, ends.reshape(-1, channels), lists, self._response, self._reader.darks, *batch,
+                        places_mm[of_pixels], codes[of_rows], direct[of_rows], values[of_pixels, part],
+                    )  # fmt: skip
+
+                list(pool.map(fill, blocks))
+        return PixelBlock(pixels, triangle, channel, places_mm, values.view(np.float16))
+
+
+def _parts_of(rows: slice) -> Iterator[slice]:
+    for first in range(rows.start, rows.stop, _TRIANGLES):
+        yield slice(first, min(first + _TRIANGLES, rows.stop))
+
+
+def _light_of(
+    file: h5py.File, rows: slice, part: slice, channels: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Codes [b, 8] of some triangles and LEDs, and the share [b, leds, channels] of light that came straight."""
+    codes = np.full((rows.stop - rows.start, LANES), AWAY, np.uint8)
+    codes[:, : part.stop - part.start] = file["codes"][rows, part]
+    if INTER_REFLECTION not in file:
+        return codes, np.ones((len(codes), part.stop - part.start, channels), np.float32)
+    return codes, np.float32(1.0) - file[INTER_REFLECTION][rows, part].astype(np.float32)

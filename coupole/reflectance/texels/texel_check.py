@@ -1,0 +1,86 @@
+"""Errors of texels, and of triangles beside them, in pictures of LEDs that were kept for the check.
+
+Pictures are made as `coupole reflectance relight --led` makes them, and compared with the frames pixel by pixel,
+where both have a value: light from surface to surface is taken off the frames, as off the samples.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.block_work import Said, silent
+from coupole.reflectance.fits import FITS, TEXELS
+from coupole.reflectance.new_light.light_kinds import LedLight
+from coupole.reflectance.run_check import PEAK_QUANTILE
+from coupole.reflectance.run_pictures import read_check_frames
+from coupole.reflectance.run_relighting import best_fit, scene_of_view
+from coupole.reflectance.run_result import FRAMES, RunResult, ViewSamples
+from coupole.reflectance.texels.pixel_file import ABOUT, FOLDER, read_view_texels
+from coupole.storage.durable import write_synced
+
+SCHEMA = "coupole-texels/1"
+Singles = NDArray[np.float32]
+
+
+def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
+    """Compare pictures by texels, and by the best fit of triangles, with those of the LEDs that were left out;
+    write and return `texels/texels.json`."""
+    other = best_fit(result, FITS)
+    misses: dict[str, list[NDArray[np.float64]]] = {TEXELS: [], other: []}
+    measured_parts: list[Singles] = []
+    for number, view in enumerate(result.views, start=1):
+        for measured, pictures in _pictures(result, view, (TEXELS, other)):
+            both = np.isfinite(measured) & np.logical_and.reduce([picture > 0.0 for picture in pictures.values()])
+            measured_parts.append(measured[both])
+            for name, picture in pictures.items():
+                off = (picture - measured)[both]
+                misses[name].append(np.array([np.abs(off).sum(), np.square(off).sum(), off.size]))
+        say("check of texels", number, len(result.views))
+    values = np.concatenate(measured_parts) if measured_parts else np.empty(0, np.float32)
+    peak = float(np.quantile(values, PEAK_QUANTILE)) if len(values) else float("nan")
+    about = {
+        "schema": SCHEMA,
+        "pixels": {view.view: len(read_view_texels(result, view).pixels) for view in result.views},
+        "mae": {name: _mean(parts, 0) for name, parts in misses.items()},
+        "held_out_psnr_db": {name: _psnr_db(parts, peak) for name, parts in misses.items()},
+    }
+    write_synced(result.folder / FOLDER / ABOUT, json.dumps(about, indent=1) + "\n")
+    return about
+
+
+def _mean(parts: list[NDArray[np.float64]], column: int) -> float | None:
+    sums = np.sum(parts, axis=0) if parts else np.zeros(3)
+    return float(sums[column] / sums[2]) if sums[2] else None
+
+
+def _psnr_db(parts: list[NDArray[np.float64]], peak: float) -> float | None:
+    square = _mean(parts, 1)
+    return None if not square else float(10.0 * np.log10(peak**2 / square))
+
+
+def _pictures(
+    result: RunResult, view: ViewSamples, names: tuple[str, ...]
+) -> Iterator[tuple[Singles, dict[str, Singles]]]:
+    """For each LED that was kept for the check: the measured picture [h / 2, w / 2, channels] in shares of the
+    camera's range, and those that fits make."""
+    frames = read_check_frames(result, view)
+    scenes = {name: scene_of_view(result, view.view, name) for name in names}
+    with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
+        offsets = file["offsets"][()]
+    for number, led in enumerate(frames.leds):
+        direct = result.direct_shares(view, slice(0, len(view.triangles)), view.leds == led)[:, 0]
+        measured = frames.share[number].astype(np.float32) * frames.picture(direct)
+        made = {name: scene.picture([LedLight(number=int(led))]) for name, scene in scenes.items()}
+        yield measured, {name: _of_blocks(picture, offsets, measured.shape) for name, picture in made.items()}
+
+
+def _of_blocks(picture: Singles, offsets: NDArray[np.int64], shape: tuple[int, ...]) -> Singles:
+    """[h / 2, w / 2, channels] of the pixels that count in blocks of 2 x 2."""
+    parts = [picture[row::2, column::2, channel] for channel, (row, column) in enumerate(offsets)]
+    return np.stack([part[: shape[0], : shape[1]] for part in parts], axis=-1)

@@ -1,0 +1,116 @@
+"""Job that adds materials of single pixels to a result of runs, view by view, and compares them with pictures of
+LEDs that were kept for the check.
+
+Each view's texels are a file of their own, whole or not there; a job that was killed goes on with the first that
+is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from coupole.errors import InputError
+from coupole.reflectance.block_work import Said, Workshop, silent, workshop
+from coupole.reflectance.result_folder import SETTINGS, clear_remains, complete, read_settings
+from coupole.reflectance.run_job import (
+    RunRequest,
+    Sources,
+    forget,
+    prepare_run,
+    read_runs,
+    settings_of,
+    view_file_name,
+)
+from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.texels.pixel_file import texels_path, write_view_texels
+from coupole.reflectance.texels.pixel_values import PixelReader
+from coupole.reflectance.texels.texel_check import check_texels
+from coupole.reflectance.texels.view_texels import texels_of_view
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import make_folder
+from coupole.storage.run_json import RUN_JSON
+
+
+@dataclass(frozen=True)
+class _View:
+    """A block of the job: one view's texels, a file."""
+
+    run: Path
+    view: str
+    name: str
+    """Name of its files."""
+    out: Path
+    left_out: tuple[int, ...]
+    memory_bytes: int
+
+
+def add_texels(
+    request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent
+) -> dict[str, Any]:
+    """Make the texels that a whole result lacks, in the workers of a `scheduler` if one is named; returns what
+    `texels/texels.json` says.
+
+    Raises InputError: a result that is not whole or is that of another request, a scheduler that does not answer;
+    StorageError if a frame is damaged or the disk takes nothing.
+    """
+    token = uuid4().hex
+    measured_runs = read_runs(request, token)
+    settings = read_settings(out)
+    try:
+        if settings != json.loads(json.dumps(settings_of(request, token, measured_runs))):
+            raise InputError(f"{out}: is the result of other runs, records or settings than these")
+        result = RunResult(out.resolve())
+        result.refuse_unfinished(settings, fits=True)
+        tasks = [
+            _View(
+                run.resolve(), view.name, view_file_name(measured_runs, measured_run, view), out.resolve(),
+                tuple(settings["left_out"]), request.memory_bytes,
+            )
+            for run, measured_run in zip(request.runs, measured_runs, strict=True)
+            for view in measured_run.views
+        ]  # fmt: skip
+        paths = {run_view.path.stem: texels_path(result, run_view) for run_view in result.views}
+        make_folder(next(iter(paths.values())).parent)
+        with workshop(scheduler) as shop:
+            shop.refuse_blind(result.folder, SETTINGS)
+            clear_remains(out)
+            _fit(request.sources, token, [task for task in tasks if not paths[task.name].exists()], shop, say)
+        return check_texels(result, say)
+    except OSError as error:
+        raise disk_error(out, error) from error
+    finally:
+        forget()
+
+
+def _fit(sources: Sources, token: str, tasks: list[_View], shop: Workshop, say: Said) -> None:
+    for task in tasks:
+        shop.refuse_blind(task.run, RUN_JSON)
+    fit = partial(_texels_of_one, token, sources, shop.threads, shop.reporter(say))
+    for number, _ in enumerate(shop.map(fit, tasks), start=1):
+        say("texels", number, len(tasks))
+    shop.everywhere(forget)
+
+
+def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said, task: _View) -> None:
+    measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
+    view = next(view for view in measured_run.views if view.name == task.view)
+    result = RunResult(task.out)
+    samples = next(samples for samples in result.views if samples.path.stem == task.name)
+    reader = PixelReader(measured_run, geometry, radiometry, view, result, samples)
+    texels = texels_of_view(
+        result, samples, reader, task.left_out, task.memory_bytes,
+        threads or len(os.sched_getaffinity(0)), lambda done, of: say(f"texels of {task.view}", done, of),
+    )  # fmt: skip
+
+    def write(path: Path) -> None:
+        write_view_texels(
+            path, texels, samples.view, measured_run.frames.size_px, radiometry.u_pixel, result.u_shared
+        )
+
+    complete(texels_path(result, samples), write)

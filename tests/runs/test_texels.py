@@ -1,0 +1,270 @@
+"""`--texels`: detail that the mesh does not have, in pictures of other lights and from other places."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cells
+import numpy as np
+import pytest
+from dask_cluster import cluster
+from relief_cells import DETAIL, DIFFUSE, RECORDS, Made, detailed_result, glossy_result
+from scipy.ndimage import gaussian_filter
+
+from coupole.commands.common import records_named
+from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
+from coupole.reflectance.new_light.pictured_surface import FreeCamera, pixels_of_places, surface_of_view
+from coupole.reflectance.relit_uncertainty import uncertainty_of_picture
+from coupole.reflectance.run_job import RunRequest
+from coupole.reflectance.run_pictures import read_check_frames
+from coupole.reflectance.run_relighting import scene_from, scene_of_view
+from coupole.reflectance.run_result import RunResult, ViewSamples
+from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, texel_uncertainty
+from coupole.reflectance.texels.texel_job import add_texels
+from sim.scene.surface import Layer
+
+
+FOCUS_MM = 335.0
+FOCAL_PX = 35.0 * FOCUS_MM / (FOCUS_MM - 35.0) / 0.044
+"""Of a lens of 35 mm, focused there, with pixels of 44 um."""
+BLUR_PX = 35.0 / 8.0 * 35.0 / (FOCUS_MM - 35.0) / 0.044
+"""Diameter of the circle of confusion at f/8, for a departure of all of the distance."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return detailed_result(tmp_path_factory.mktemp("cell"))
+
+
+def request_of(made: Made) -> RunRequest:
+    return RunRequest((made[0].run_folder,), None, records_named([made[0].folder / "records"]))
+
+
+def truth_at(result: RunResult, places_mm: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Factor of the paint [n], and normals [n, 3] of the bumps, at places of the base frame: the rig's waves."""
+    waves = np.concatenate([Layer(**layer).waves() for layer in DETAIL])
+    vectors, phase, paint, height = waves[:, :3], *waves[:, 3:].T
+    base_from_support = result.base_from_support
+    local = (places_mm - base_from_support[:3, 3]) @ base_from_support[:3, :3]
+    angle = local @ vectors.T + phase
+    slope = -(np.sin(angle) * height) @ vectors @ base_from_support[:3, :3].T
+    bumpy = normals - slope + np.einsum("nk,nk->n", slope, normals)[:, None] * normals
+    return 1 + np.cos(angle) @ paint, bumpy / np.linalg.norm(bumpy, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the texels of a view see: places and normals [n, 3] of the mesh, triangles, paint and normals that are
+    there, means over a pixel and the circle of confusion; and pixels whose neighbours see the same triangle."""
+
+    places_mm: np.ndarray
+    normals: np.ndarray
+    triangle: np.ndarray
+    paint: np.ndarray
+    bumpy: np.ndarray
+    inner: np.ndarray
+
+
+def seen_by(result: RunResult, view: ViewSamples, texels: ViewTexels) -> Seen:
+    surface = surface_of_view(result, view)
+    row, column = np.divmod(texels.pixels, surface.triangle_of_pixel.shape[1])
+    place, triangle = (image[row, column] for image in (surface.places_mm, surface.triangle_of_pixel))
+    normals = surface.normals[triangle]
+    inner = np.ones(len(row), bool)
+    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        inner &= surface.triangle_of_pixel[row + down, column + right] == triangle
+    away = place - view.camera_mm
+    distance = np.linalg.norm(away, axis=1)
+    pixel_mm = distance / FOCAL_PX
+    steps = []
+    for axis in range(2):  # along the surface, one pixel to the right and one down
+        beside = surface.places_mm[row + axis, column + 1 - axis] - place
+        across = beside - np.einsum("nk,nk->n", beside, normals)[:, None] * normals
+        steps.append(
+            np.nan_to_num(across * (pixel_mm / np.maximum(np.linalg.norm(across, axis=1), 1e-9))[:, None])
+        )
+    blur_px = np.abs(distance - FOCUS_MM) / distance * BLUR_PX
+    random, paint, bumpy = np.random.default_rng(1), np.zeros(len(row)), np.zeros((len(row), 3))
+    for _ in range(32):
+        angle, radius = (
+            random.uniform(0, 2 * np.pi, len(row)),
+            np.sqrt(random.uniform(size=len(row))) * blur_px / 2,
+        )
+        x, y = random.uniform(-0.5, 0.5, (2, len(row))) + radius * np.stack([np.cos(angle), np.sin(angle)])
+        some = truth_at(result, place + x[:, None] * steps[0] + y[:, None] * steps[1], normals)
+        paint, bumpy = paint + some[0] / 32, bumpy + some[1] / 32
+    bumpy /= np.linalg.norm(bumpy, axis=1, keepdims=True)
+    return Seen(place.astype(float), normals, triangle, paint, bumpy, inner)
+
+
+def test_pictures_of_leds_that_no_fit_has_seen_are_better_than_by_triangles(made: Made) -> None:
+    texels = made[2]["texels"]
+    (other,) = set(texels["mae"]) - {TEXELS}
+    assert texels["held_out_psnr_db"][TEXELS] > texels["held_out_psnr_db"][other] + 3.0
+    assert texels["mae"][TEXELS] < 0.6 * texels["mae"][other]
+    assert made[2]["mae_of_noise"] < texels["mae"][TEXELS] < 2.5 * made[2]["mae_of_noise"]
+
+
+def test_paint_is_found_pixel_by_pixel_and_intervals_hold_most_of_it(made: Made) -> None:
+    """In the pixels' own channels, in all five parts of what is darker and lighter paint."""
+    result = RunResult(made[1])
+    for view in result.views:
+        texels = read_view_texels(result, view)
+        seen = seen_by(result, view, texels)
+        row, column = np.divmod(texels.pixels, 512)
+        channel = np.array([[1, 2], [0, 1]])[row % 2, column % 2]
+        kd = texels.kd[np.arange(len(row)), channel] * np.pi / np.array(DIFFUSE)[channel]
+        error = np.log(kd) - np.log(seen.paint)
+        u_kd = np.sqrt(texels.covariance[:, 5] + np.sum(np.square(texel_uncertainty(result, view))))
+        assert np.median(np.abs(error)) < 0.03 < 0.15 < np.std(np.log(seen.paint))
+        held = np.abs(error) < 1.96 * u_kd
+        assert 0.85 < held.mean() < 0.99
+        fifths = np.array_split(np.argsort(seen.paint), 5)
+        assert min(held[fifth].mean() for fifth in fifths) > 0.78
+
+
+def test_normals_show_bumps_that_the_mesh_does_not_have(made: Made) -> None:
+    result = RunResult(made[1])
+    view = result.views[1]
+    texels = read_view_texels(result, view)
+    seen = seen_by(result, view, texels)
+
+    def off_deg(normals: np.ndarray) -> float:
+        cosines = np.sum(normals * seen.bumpy, axis=1)[seen.inner]
+        return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1)))))
+
+    triangles = result.materials("ggx_normal", np.searchsorted(result.triangles, view.triangles)).normals
+    assert off_deg(texels.normals) < 0.4 * min(off_deg(seen.normals), off_deg(triangles[seen.triangle]))
+
+
+def test_fine_contrast_of_the_frames_is_kept(made: Made) -> None:
+    """Of paint that is finer than three triangles, under LEDs that were left out, texels keep 0.8."""
+    result = RunResult(made[1])
+    view = result.views[1]
+    frames = read_check_frames(result, view)
+    shares: dict[str, list[float]] = {TEXELS: [], "ggx_normal": []}
+    for number, led in enumerate(frames.leds):
+        measured = frames.share[number, ..., 1].astype(float)
+        known = np.isfinite(measured)
+        for name, of_fit in shares.items():
+            picture = scene_of_view(result, view.view, name).picture([LedLight(number=int(led))])[::2, ::2, 1]
+            both = gaussian_filter((known & (picture > 0)).astype(float), 2.0) > 0.999
+            fine, wanted = (
+                image - gaussian_filter(image, 2.0) for image in (picture.astype(float), np.nan_to_num(measured))
+            )
+            of_fit.append(float(np.sum((fine * wanted)[both]) / np.sum(wanted[both] ** 2)))
+    assert np.mean(shares[TEXELS]) > 0.9
+    assert np.mean(shares["ggx_normal"]) < 0.75
+
+
+def test_a_camera_anywhere_sees_what_a_measured_view_shows(made: Made) -> None:
+    """A free camera at a view's own place, under the same light: pixel by pixel nearly the view's picture."""
+    result = RunResult(made[1])
+    view = result.views[1]
+    light = [DistantLight(towards=(0.3, -0.5, 1.0))]
+    at_mm = np.linalg.inv(result.base_from_support) @ np.append(view.camera_mm, 1.0)
+    free = scene_from(result, FreeCamera(at_mm[:3], None, (400, 300)))
+    assert free.fit == TEXELS
+    picture = free.picture(light)
+    own = scene_of_view(result, view.view, TEXELS)
+    lit = (picture > 0.0).all(axis=2) & np.isfinite(free.surface.places_mm).all(axis=2)
+    pixels = pixels_of_places(own.surface, free.surface.places_mm[lit])
+    assert pixels is not None
+    column, row = np.round(pixels).astype(int).T
+    inside = (row >= 0) & (row < 384) & (column >= 0) & (column < 512)
+    there = own.picture(light)[row[inside], column[inside]]
+    shown = (there > 0.0).all(axis=1)
+    ratio = picture[lit][inside][shown] / there[shown]
+    assert len(ratio) > 5000
+    assert abs(np.median(ratio) - 1) < 0.01
+    assert np.median(np.abs(ratio - 1)) < 0.05
+
+
+def test_pictures_have_an_uncertainty(made: Made, tmp_path: Path) -> None:
+    picture, uncertain = tmp_path / "p.npy", tmp_path / "u.npy"
+    arguments = ("--direction", "0.3,-0.5,1", "--to", picture, "--uncertainty", uncertain, "--json")
+    ended = cells.here("reflectance", "relight", made[1], *arguments)
+    assert ended.code == 0, ended.err
+    assert ended.document["fit"] == TEXELS
+    values, u = np.load(picture), np.load(uncertain)
+    share = u[values > 0.0] / values[values > 0.0]
+    assert np.isfinite(share).all()
+    assert 0.005 < np.median(share) < 0.1
+
+
+def test_uncertainty_of_a_picture_is_that_of_its_texels(made: Made) -> None:
+    """Where the covariance is a hundred times as large, pictures are nearly ten times as uncertain."""
+    scene = scene_of_view(RunResult(made[1]), "top", TEXELS)
+    light = [DistantLight(towards=(0.0, 0.0, 1.0))]
+    once = uncertainty_of_picture(scene, light)
+    wider = replace(scene, reflecting=replace(scene.reflecting, covariance=100 * scene.reflecting.covariance))  # type: ignore[union-attr]
+    lit = scene.picture(light) > 0.0
+    ratio = np.median(uncertainty_of_picture(wider, light)[lit] / once[lit])
+    assert 8 < ratio <= 10.1
+
+
+def test_a_job_that_was_stopped_goes_on_and_ends_alike(made: Made, tmp_path: Path) -> None:
+    """Whatever the memory, and whoever does the work: the same bits."""
+    _, out, _ = made
+    copy = tmp_path / "result"
+    shutil.copytree(out, copy)
+    (copy / "texels/top.h5").unlink()
+    (copy / "texels/side.h5.killed.part").write_bytes(b"half")
+    kept = (copy / "texels/side.h5").read_bytes()
+    add_texels(replace(request_of(made), memory_bytes=200_000), copy)
+    assert (copy / "texels/side.h5").read_bytes() == kept
+    assert not list(copy.rglob("*.part"))
+    assert (copy / "texels/top.h5").read_bytes() == (out / "texels/top.h5").read_bytes()
+    shutil.rmtree(copy / "texels")
+    with cluster(tmp_path, 2) as (address, _):
+        add_texels(request_of(made), copy, scheduler=address)
+    for name in ("top.h5", "side.h5", "texels.json"):
+        assert (copy / "texels" / name).read_bytes() == (out / "texels" / name).read_bytes()
+
+
+def test_plain_materials_get_no_worse(tmp_path: Path) -> None:
+    cell, out, _ = glossy_result(tmp_path)
+    about = add_texels(RunRequest((cell.run_folder,), None, records_named([RECORDS])), out)
+    (other,) = set(about["mae"]) - {TEXELS}
+    assert about["mae"][TEXELS] < 1.03 * about["mae"][other]
+    assert about["held_out_psnr_db"][TEXELS] > about["held_out_psnr_db"][other] - 0.2
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--texels", "fine"), "--texels: expected auto"),
+        (("--texels", "auto", "--uncalibrated"), "--texels: is for calibrated runs"),
+    ],
+)
+def test_what_is_not_possible_is_refused(made: Made, tmp_path: Path, options: tuple[str, ...], told: str) -> None:
+    ended = cells.here("reflectance", made[0].run_folder, "--out", tmp_path / "out", *options)
+    assert ended.code == 2
+    assert told in ended.err
+
+
+def test_texels_of_other_settings_are_refused(made: Made, tmp_path: Path) -> None:
+    copy = tmp_path / "result"
+    shutil.copytree(made[1], copy)
+    settings = json.loads((copy / "settings.json").read_text())
+    (copy / "settings.json").write_text(json.dumps({**settings, "scan_noise_um": 31.0}))
+    ended = cells.here(
+        "reflectance", made[0].run_folder, "--calibrations", RECORDS, "--out", copy, "--texels", "auto"
+    )
+    assert ended.code == 2
+    assert "other input" in ended.err
+
+
+def test_without_texels_the_remedy_is_told(made: Made, tmp_path: Path) -> None:
+    copy = tmp_path / "result"
+    shutil.copytree(made[1], copy, ignore=shutil.ignore_patterns("texels"))
+    for more in ((), ("--from", "0,-200,300")):
+        ended = cells.here(
+            "reflectance", "relight", copy, "--fit", TEXELS, "--led", "0", "--to", tmp_path / "p.npy", *more
+        )
+        assert ended.code == 2
+        assert "--texels auto" in ended.err

@@ -64,7 +64,9 @@ def _bust() -> None:
     folder = ROOT / "configs" / "restorations"
     parts, hypotheses = folder / "bust-parts.yaml", folder / "bust.yaml"
     with tempfile.TemporaryDirectory() as out:
-        restoration = restore.read(folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet)
+        restoration = restore.checked_restoration(
+            folder / "bust.ply", parts, hypotheses, (), "mm", BUST_QUICK, _quiet
+        )
         show_all(restoration, render_all(restoration, Path(out), _quiet), Path(out), _quiet)
         picture = ROOT / "docs" / "pictures" / "gallery" / f"{BUST}.png"
         _smaller(Path(out) / "side-by-side-front.png", picture)

@@ -17,11 +17,12 @@ _._write_integer, _._write_float  # the same
 _.__getattr__  # drivers/kuka/rsi, drivers/ur: Python, for names that are imported on first use
 _.residual_rms_us, _.residual_max_us  # the report, coupole/viewing/report_facts.py
 _.white_at_us  # coupole/preflight/simulated_world.py, in the rig's settings
-_.adaptive, _.author  # ExportOptions.given, which lists all fields
+_.adaptive, _.author, _.refined  # ExportOptions.given_options, which lists all fields
 
 # ---- by files that are written from all fields ----
 _.acknowledged, _.joints_before_deg, _.joints_after_deg, _.table_s  # lines of the journal
 _.entered  # entries of the console's queue
+_.stored  # files of run.json
 
 # ---- by equality of the whole ----
 _.colour_index  # read_classes refuses a name with two of them

@@ -57,7 +57,7 @@ class CellSource:
 
     def _waits_for_a_viewer(self, studio: Studio, choice: Choice) -> bool:
         """True, after a moment, if an LED is chosen and nobody has a page open: then it is not lit."""
-        if choice.led is None or studio.watched:
+        if choice.led is None or studio.is_watched:
             studio.remark = self._meter.warning if self._meter else ""
             return False
         studio.remark = "no page is open: the light is off until one is"

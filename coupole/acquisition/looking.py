@@ -172,7 +172,7 @@ def _show_live(
             with LiveFigures(console) as figures:
                 while not studio.closing.is_set() and not control.stop.is_set():
                     refuse_overdue(began_s)
-                    figures.show(studio.shown)
+                    figures.show(studio.shown_frame)
                     if studio.remark != last_remark:
                         last_remark = studio.remark
                         console.print(last_remark or "a page is open", markup=False)

@@ -56,7 +56,7 @@ from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import copied_s
-from coupole.viewing.keys import obeyed
+from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
@@ -259,7 +259,7 @@ def _acquire(
         if remote.trouble:
             console.print(remote.trouble, markup=False)
         try:
-            with obeyed(keys) as keys_read, observer.showing(job.schedule.frames, len(job.schedule.views)):
+            with key_actions(keys) as keys_read, observer.showing(job.schedule.frames, len(job.schedule.views)):
                 if keys_read:
                     console.print("keys: p pauses after the burst, and goes on; q stops")
                 try:
@@ -385,7 +385,7 @@ def rehearse(job: Job, console: Console, *, speed: float, figures: dict[str, Any
                         view: {
                             "pictures": exposure.pictures,
                             "brightest": round(exposure.brightest, 4) if preflight.exposure_scale else None,
-                            "saturated": round(exposure.saturated, 6) if preflight.exposure_scale else None,
+                            "saturated": round(exposure.saturated_share, 6) if preflight.exposure_scale else None,
                             "verdict": exposure.verdict() if preflight.exposure_scale else "not known",
                         }
                         for view, exposure in recorder.exposures.items()

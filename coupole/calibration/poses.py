@@ -72,7 +72,7 @@ class ReportedPoses:
 
 def read_poses(path: Path) -> tuple[PoseFile, ReportedPoses]:
     """A pose file. Raises InputError with every problem of the file."""
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     file = document.validate(PoseFile)
     absurd = [
         document.problem(("poses", name), "expected finite numbers, and a quaternion that is not zero")

@@ -236,7 +236,7 @@ def read_record(path: Path, files: InputFiles | None = None) -> Record:
     """Read a record back, with the files beside it, from `files` if they are given. Raises InputError with all
     problems: wrong keys, an edited record, an invalid covariance."""
     files = InputFiles() if files is None else files
-    document = yamlfile.read(path, files)
+    document = yamlfile.read_document(path, files)
     record = document.validate(Record)
     plain = json.loads(record.model_dump_json())
     if content_sha256(plain) != record.sha256:

@@ -42,7 +42,7 @@ def bench(
     or when a client asks for it; the cell is then safe.
     """
     from coupole.acquisition.cell_bench.bench_service import serve_bench
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import Cell, read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
@@ -50,7 +50,7 @@ def bench(
     console = make_console(quiet=as_json)
     try:
         job_or_cell = read_job(object_of, rig) if object_of else read_cell(rig)
-        with borrowed(job_or_cell if isinstance(job_or_cell, Cell) else job_or_cell.cell, "bench"):
+        with borrowed_cell(job_or_cell if isinstance(job_or_cell, Cell) else job_or_cell.cell, "bench"):
             serve_bench(job_or_cell, console, confirm=not yes, leave_after_s=leave_after_s, as_json=as_json)
     except CoupoleError as error:
         fail(error, as_json=as_json)
@@ -79,7 +79,7 @@ def arm(
     from coupole.acquisition.cell_bench.bench_service import bench_of
     from coupole.acquisition.cell_marks import is_in_use
     from coupole.acquisition.observer import Control
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
@@ -91,12 +91,12 @@ def arm(
     try:
         cell = read_cell(rig)
         if is_in_use(cell):
-            answer = _driven(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
+            answer = _drive(partial(ask_bench, cell, say=_say), goal, control, yes=yes)
         else:
             lies = object_of or plan
             job_or_cell = read_job(lies, rig) if lies else cell
-            with borrowed(cell, "arm"), bench_of(job_or_cell, console, control, confirm=False) as service:
-                answer = _driven(service.ask, goal, control, yes=yes)
+            with borrowed_cell(cell, "arm"), bench_of(job_or_cell, console, control, confirm=False) as service:
+                answer = _drive(service.ask, goal, control, yes=yes)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -109,25 +109,25 @@ def _say(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-def _driven(asked: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
+def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> dict[str, Any]:
     """Plan, show, ask, drive; the work's figures when the arm has arrived."""
     from coupole.acquisition.cell_bench.bench_client import checked_answer
     from coupole.viewing.terminal import ask
 
-    path = checked_answer(asked("plan_path", to=goal))
+    path = checked_answer(send_request("plan_path", to=goal))
     steps = len(path["waypoints_deg"]) - 1
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
     if not yes and not ask("Drive the arm along this path?"):
         raise Interrupted("not driven: answer the question, or say `--yes`")
     try:
-        work = checked_answer(asked("drive", path=path["path"]))
+        work = checked_answer(send_request("drive", path=path["path"]))
         while work["state"] == "running":
             control.go_on()
             time.sleep(_LOOK_EVERY_S)
-            work = checked_answer(asked("state"))["work"]
+            work = checked_answer(send_request("state"))["work"]
     except BaseException:
         try:
-            asked("stop")
+            send_request("stop")
         except InputError as silent:
             _say(str(silent))
         raise

@@ -94,7 +94,7 @@ def sphere_brdf(
             from coupole.plan import yamlfile
             from coupole.storage.durable import write_synced
 
-            setup = yamlfile.read(sample).validate(fitting.SphereSample)
+            setup = yamlfile.read_document(sample).validate(fitting.SphereSample)
             pictures = [read_known(sample.parent / lit.path) for lit in setup.photographs]
             samples = fitting.samples_of(setup, pictures)
             table = fitting.table_of(samples)
@@ -113,20 +113,28 @@ def sphere_brdf(
 
 
 def _document(
-    found: Photographs, curve: Response, merged: Merged, out: Path, drawn: Path, *, is_linear: bool
+    photographs: Photographs,
+    curve: Response,
+    merged_picture: Merged,
+    out: Path,
+    response_picture: Path,
+    *,
+    is_linear: bool,
 ) -> dict[str, Any]:
     import numpy as np
 
-    is_finite = np.isfinite(merged.uncertainty)
+    is_finite = np.isfinite(merged_picture.uncertainty)
     steps = slice(0, None, 15)
     sigma = curve.uncertainty[steps]
     return {
         "picture": str(out),
-        "response_picture": str(drawn),
+        "response_picture": str(response_picture),
         "unit": "relative; 1 shows half of the largest value in one second",
         "photographs": [
             {"path": str(path), "exposure_s": float(time), "contradicting": float(off.mean())}
-            for path, time, off in zip(found.paths, found.exposure_s, merged.contradicting, strict=True)
+            for path, time, off in zip(
+                photographs.paths, photographs.exposure_s, merged_picture.contradicting, strict=True
+            )
         ],
         "used_response": "linear" if is_linear else "found",
         "departure_from_straight": curve.straightness(),
@@ -136,9 +144,9 @@ def _document(
             "ln_exposure": curve.log_exposure[steps].tolist(),
             "u_ln_exposure": np.where(np.isfinite(sigma), sigma, -1.0).tolist(),
         },
-        "saturated": float(merged.saturation_mask.any(axis=2).mean()),
-        "dark": float(merged.dark.any(axis=2).mean()),
-        "median_uncertainty": float(np.median(merged.uncertainty[is_finite])) if is_finite.any() else None,
+        "saturated": float(merged_picture.saturation_mask.any(axis=2).mean()),
+        "dark": float(merged_picture.dark.any(axis=2).mean()),
+        "median_uncertainty": float(np.median(merged_picture.uncertainty[is_finite])) if is_finite.any() else None,
     }
 
 

@@ -41,7 +41,7 @@ def calibrate_all(
     For a real cell it prints what must be on the support, and waits; a simulated one has its own object and
     scanner.
     """
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.viewing.terminal import make_console
@@ -58,20 +58,20 @@ def calibrate_all(
         console.print(f"{MESH}: skipped, as no --scan is given")
     repeatability, ask = Repeatability(repeatability_mm, repeatability_deg), not yes and not is_simulated
     campaign = Campaign(
-        rig, out, scan, repeatability, simulated=is_simulated, ask=ask, console=console, valid_days=valid_days
+        rig, out, scan, repeatability, is_simulated=is_simulated, ask=ask, console=console, valid_days=valid_days
     )
     try:
-        with borrowed(cell, "calibrate all"):
+        with borrowed_cell(cell, "calibrate all"):
             campaign.do_all(only or names)
     except CoupoleError as error:
-        fail(error, as_json=as_json, found={"records": campaign.found()})
+        fail(error, as_json=as_json, figures={"records": campaign.record_paths()})
         raise
     if as_json:
-        print(json.dumps({"records": campaign.found()}))
-    for kind, record in campaign.found().items():
+        print(json.dumps({"records": campaign.record_paths()}))
+    for kind, record in campaign.record_paths().items():
         console.print(f"[green]{kind}[/]: {record}")
     console.print(
-        f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.found())}"
+        f"To put them in force for all plans of {rig}, write there:\n{_for_a_rig(rig, campaign.record_paths())}"
     )
 
 

@@ -11,8 +11,8 @@ from coupole.calibration.colour.acceptance import COLOUR
 from coupole.commands.calibrate_light import (
     Runs,
     TargetCalibrations,
+    frames_with_poses,
     lens_of,
-    posed,
 )
 from coupole.commands.calibrating import Work, bar, calibration, emission_of, rig_of
 from coupole.errors import InputError
@@ -72,8 +72,12 @@ def colour(
 
     def work(console: Console, request: Request) -> Outcome:
         patches = read_chart(chart, [name.strip() for name in (without or "").split(",") if name.strip()])
-        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
-        whites = None if white is None else posed(open_light_frames([white]), known.hand_eye, known.rig, runs)
+        frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        whites = (
+            None
+            if white is None
+            else frames_with_poses(open_light_frames([white]), known.hand_eye, known.rig, runs)
+        )
         rig_path = known.rig or rig_of(runs[0])
         cell = read_cell(rig_path)
         by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)

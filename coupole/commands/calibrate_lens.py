@@ -46,7 +46,7 @@ def camera(
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
         sources, _, sightings = _look(paths, board, None, console)
-        return _drawn(camera_from(sightings, sources, model, request)[1])
+        return _outcome_with_drawing(camera_from(sightings, sources, model, request)[1])
 
     return work
 
@@ -123,16 +123,16 @@ def hand_eye(
             drawing = hand_eye_from(
                 sightings, sources, target, model, request, robot=noise, arm=arm, lens=earlier
             )[2]
-        return _drawn(drawing)
+        return _outcome_with_drawing(drawing)
 
     return work
 
 
-def _drawn(shown: Shown) -> Outcome:
+def _outcome_with_drawing(shown_lens: Shown) -> Outcome:
     from coupole.calibration.lens.drawing import draw_lens
     from coupole.calibration.report import Outcome
 
-    return Outcome(shown.record, partial(draw_lens, shown))
+    return Outcome(shown_lens.record, partial(draw_lens, shown_lens))
 
 
 def _refuse_unknown_model(model: str) -> None:
@@ -164,7 +164,7 @@ def _look(
     return sources, target, sightings
 
 
-def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierLens | None:
+def _earlier_lens(path: Path | None, sources: Sources, board_images: Found) -> EarlierLens | None:
     """The lens of a camera record, with its covariance. Raises InputError if the record does not hold for these
     images."""
     from coupole.calibration.earlier import read_earlier, refuse_same_images
@@ -173,7 +173,7 @@ def _earlier_lens(path: Path | None, sources: Sources, found: Found) -> EarlierL
 
     if path is None:
         return None
-    record = read_earlier(path, "camera", sources.about, found.size_px)
+    record = read_earlier(path, "camera", sources.about, board_images.size_px)
     refuse_same_images(path, record, sources.inputs)
     intrinsics, free = intrinsics_of(record)
     return EarlierLens(intrinsics, free, record.covariance_matrix)

@@ -103,7 +103,7 @@ def flat_field(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = posed(open_light_frames(runs), hand_eye, rig, runs)
+        frames = frames_with_poses(open_light_frames(runs), hand_eye, rig, runs)
         with bar(console, "views of the panel") as progress:
             return flat_field_outcome(
                 frames, request, dark_record, response_record, panel_mm, progress, hand_eye=hand_eye
@@ -123,7 +123,7 @@ def led_power(
     from coupole.calibration.light.led_power_records import led_power_outcome
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
         setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames of the tile") as progress:
             return led_power_outcome(frames, setting, request, progress)
@@ -148,7 +148,7 @@ def drift(
     from coupole.calibration.light.frames import open_light_frames
 
     def work(console: Console, request: Request) -> Outcome:
-        frames = posed(open_light_frames(runs), known.hand_eye, known.rig, runs)
+        frames = frames_with_poses(open_light_frames(runs), known.hand_eye, known.rig, runs)
         setting = _setting(frames, tile, known.rig or rig_of(runs[0]), known)
         with bar(console, "frames with the tile") as progress:
             return drift_outcome(frames, setting, led_power_record, request, progress)
@@ -159,7 +159,9 @@ def drift(
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]) -> LightFrames:
+def frames_with_poses(
+    frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: list[Path]
+) -> LightFrames:
     """Frames with poses by a hand-eye record and its axis zeros. Raises InputError for another record, or one of
     another focus, and for a rig without a model of the record's arm."""
     from coupole.calibration.posed_camera import read_posed_camera
@@ -171,7 +173,7 @@ def posed(frames: LightFrames, hand_eye: Path | None, rig: Path | None, runs: li
     return frames.seen_through(prior.flange_from_camera, arm_of(read_cell(rig or rig_of(runs[0])), hand_eye))
 
 
-def _setting(frames: LightFrames, tile: Path, rig: Path, known: TargetCalibrations) -> Setting:
+def _setting(frames: LightFrames, tile: Path, rig: Path, calibrations: TargetCalibrations) -> Setting:
     """Descriptions and calibrations that frames of a tile are read with. Raises InputError for invalid files."""
     from coupole.calibration.light.led_power_tile import Setting, calibrated_positions
     from coupole.calibration.light.spectralon import read_tile
@@ -180,16 +182,16 @@ def _setting(frames: LightFrames, tile: Path, rig: Path, known: TargetCalibratio
 
     cell = read_cell(rig)
     by_table = Positions(cell.leds.ids, cell.leds.positions_mm, cell.leds.normals)
-    files = (tile, rig, known.leds or cell.leds_path, known.hand_eye, known.camera)
+    files = (tile, rig, calibrations.leds or cell.leds_path, calibrations.hand_eye, calibrations.camera)
     return Setting(
         read_tile(tile),
         cell.rig.support.base_from_support.matrix(),
-        by_table if known.leds is None else calibrated_positions(known.leds),
-        lens_of(known.camera, frames),
-        known.dark_record,
-        known.response_record,
-        known.flat,
-        emission_of(known.emission),
+        by_table if calibrations.leds is None else calibrated_positions(calibrations.leds),
+        lens_of(calibrations.camera, frames),
+        calibrations.dark_record,
+        calibrations.response_record,
+        calibrations.flat,
+        emission_of(calibrations.emission),
         tuple(path for path in files if path is not None),
     )
 

@@ -16,7 +16,7 @@ import typer
 
 from coupole.calibration.acceptance import Allowed, parse_limits, words_of
 from coupole.commands.common import JsonOption, fail
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CalibrationRefused, CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def calibration(
     ]
 
     def command(work_with: Callable[..., Work]) -> Callable[..., None]:
-        flat = flattened(work_with)
+        flat = flatten_options(work_with)
 
         @wraps(flat)
         def run(*arguments: Any, **options: Any) -> None:
@@ -212,13 +212,13 @@ def _refuse_name(name: str | None) -> None:
 
 
 @contextmanager
-def bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+def bar(console: Console, step_name: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar; yields the function that advances it: done, total."""
     from rich.progress import Progress
 
     with Progress(console=console, disable=not console.is_terminal) as bars:
-        task = bars.add_task(what)
-        yield lambda done, total: bars.update(task, completed=done, total=total)
+        task = bars.add_task(step_name)
+        yield lambda count, total: bars.update(task, completed=count, total=total)
 
 
 def _show(console: Console, record: Record) -> None:

@@ -37,25 +37,25 @@ class Campaign:
         rig: Path,
         out: Path,
         scan: Path | None,
-        stated: Repeatability,
+        robot_noise: Repeatability,
         *,
-        simulated: bool,
+        is_simulated: bool,
         ask: bool,
         console: Console,
         valid_days: int | None = None,
     ) -> None:
         self._rig, self._out, self._console = rig.resolve(), out.resolve(), console
         self._days = {} if valid_days is None else {"valid_days": valid_days}
-        self._given_scan, self._stated = scan, stated
-        self._simulated, self._ask = simulated, ask
+        self._given_scan, self._stated = scan, robot_noise
+        self._simulated, self._ask = is_simulated, ask
         for folder in ("plans", "rigs", "runs"):
             (self._out / folder).mkdir(parents=True, exist_ok=True)
-        tile = TILE + (CERTIFICATE_OF_SIMULATED_TILE if simulated else "")
+        tile = TILE + (CERTIFICATE_OF_SIMULATED_TILE if is_simulated else "")
         for name, text in (("board.yaml", BOARD), ("tile.yaml", tile)):
             if not (self._out / name).exists():
                 (self._out / name).write_text(text, encoding="utf-8")
 
-    def found(self) -> dict[str, str]:
+    def record_paths(self) -> dict[str, str]:
         """Existing records, by kind."""
         kinds = [kind for step in STEPS for kind in step.records]
         return {kind: str(self._record(kind)) for kind in kinds if self._record(kind).is_file()}

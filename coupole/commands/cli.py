@@ -136,11 +136,11 @@ def main() -> None:
     text_outlet.keep_standard_places()
     raise_outside_sessions()
     with unheard_end():
-        code = _ended()
+        code = _exit_code_of_command()
     leave(code)
 
 
-def _ended() -> int:
+def _exit_code_of_command() -> int:
     """Run the command; its exit code."""
     try:
         code = app(standalone_mode=False)

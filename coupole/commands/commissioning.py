@@ -50,7 +50,7 @@ def commission(
     from coupole.acquisition.commissioning.persons import PersonAtTerminal, SimulatedPerson
     from coupole.acquisition.commissioning.session import commission as commission_cell
     from coupole.calibration.lens.board import read_board
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
     from coupole.preflight.commissioned import STEPS, record_path
@@ -67,23 +67,25 @@ def commission(
         raise InputError(f"--yes: {rig} is a real cell, where a person must see and answer; leave it out")
 
     try:
-        with borrowed(cell, f"commission, {name}"):
+        with borrowed_cell(cell, f"commission, {name}"):
             record = commission_cell(
                 cell,
                 console,
                 name=name,
                 only=step,
                 board=board,
-                person_at=lambda opened: (
-                    SimulatedPerson(console, opened.world_endpoints)
-                    if yes and opened.world_endpoints is not None
+                person_at=lambda opened_cell: (
+                    SimulatedPerson(console, opened_cell.world_endpoints)
+                    if yes and opened_cell.world_endpoints is not None
                     else PersonAtTerminal()
                 ),
             )
     except CoupoleError as error:
-        fail(error, as_json=as_json, found=None if isinstance(error, InputError) else _figures(cell))
+        fail(error, as_json=as_json, figures=None if isinstance(error, InputError) else _figures(cell))
         raise
-    remaining_steps = [entry for entry in STEPS if (result := record.result(entry)) is None or not result.passed]
+    remaining_steps = [
+        entry for entry in STEPS if (result := record.result(entry)) is None or not result.has_passed
+    ]
     console.print(f"record  {record_path(cell)}", markup=False)
     console.print(
         f"still to be done: {', '.join(remaining_steps)}" if remaining_steps else "the cell is commissioned",
@@ -100,6 +102,6 @@ def _figures(cell: Cell) -> dict[str, Any]:
     record = read_commissioning(cell)
     return {
         "record": str(record_path(cell)),
-        "passed": bool(record and record.passed),
-        "steps": {result.step: result.passed for result in (record.steps if record else ())},
+        "passed": bool(record and record.has_passed),
+        "steps": {result.step: result.has_passed for result in (record.steps if record else ())},
     }

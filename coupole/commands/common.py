@@ -61,13 +61,13 @@ def shipped_rig() -> Path:
     return Path(os.path.relpath(path)) if Path.cwd().is_relative_to(project) else path
 
 
-def plan_of(resumed: Path | None) -> Path:
+def plan_of(resumed_run: Path | None) -> Path:
     """The plan of a run that is resumed without naming it."""
     from coupole.storage.run import Run
 
-    if resumed is None:
+    if resumed_run is None:
         raise typer.BadParameter("expected the plan (YAML), or --resume with a run's folder")
-    return Run(resumed).plan_path
+    return Run(resumed_run).plan_path
 
 
 def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cell | None:
@@ -92,10 +92,10 @@ def served_cell(plan: Path | None, rig: Path | None, resume: Path | None) -> Cel
     return cell if is_served(cell) else None
 
 
-def person_named(name: str, who: str) -> str:
+def person_named(name: str, person_role: str) -> str:
     """A person's name as `--name` gives it, without blanks around it. Raises InputError: none, or no name."""
     if not (person := name.strip()):
-        raise InputError(f"--name: expected the name of {who}")
+        raise InputError(f"--name: expected the name of {person_role}")
     if len(person) > LONGEST_NAME:
         raise InputError(
             f"--name: expected a person's name of at most {LONGEST_NAME} characters; found {len(person)}"
@@ -103,11 +103,11 @@ def person_named(name: str, who: str) -> str:
     return person
 
 
-def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = None) -> None:
+def fail(error: CoupoleError, *, as_json: bool, figures: dict[str, Any] | None = None) -> None:
     """Print an error as JSON if `as_json`; the caller raises it afterwards."""
     if as_json:
         document = {
-            **(found or {}),
+            **(figures or {}),
             "error": str(error),
             "kind": type(error).__name__,
             "exit_code": error.exit_code,
@@ -115,12 +115,12 @@ def fail(error: CoupoleError, *, as_json: bool, found: dict[str, Any] | None = N
         print(json.dumps(document))
 
 
-def records_named(named: list[Path]) -> tuple[Path, ...]:
+def records_named(paths: list[Path]) -> tuple[Path, ...]:
     """Records, and those in folders that are named."""
     from coupole.calibration.record import SEAL
 
     records: list[Path] = []
-    for path in named:
+    for path in paths:
         if path.is_dir():
             files = sorted(path.glob("*.yaml"))
             records += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]

@@ -33,14 +33,14 @@ def compare(
             show_default=False,
         ),
     ] = None,
-    aligned: Annotated[
+    is_aligned: Annotated[
         bool, typer.Option("--aligned", help="Both are in one frame already: do not align them.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare two states: align them by what did not change, then mark significant changes of shape and colour."""
     from coupole.heritage.comparison.state_comparison import about
-    from coupole.heritage.comparison.state_comparison import compare as compared
+    from coupole.heritage.comparison.state_comparison import compare as compare_states
     from coupole.scan.scan import UNITS, new_scan_folder
     from coupole.viewing import comparison_page
     from coupole.viewing.terminal import make_console, step_bars
@@ -54,7 +54,7 @@ def compare(
         if out is not None and out.exists():
             raise InputError(f"--out {out}: exists already; name a new folder")
         with step_bars(console) as say:
-            changes = compared(before, after, unit, noise_mm, is_aligned=aligned, say=say)
+            changes = compare_states(before, after, unit, noise_mm, is_aligned=is_aligned, say=say)
             facts = about(changes)
             if out is not None:
                 say("drawing", 0, 1)

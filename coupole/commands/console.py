@@ -63,12 +63,12 @@ def serve(
     tls = (tls_certificate, tls_key) if tls_certificate and tls_key else None
     console = make_console(quiet=as_json)
 
-    def tell(found: dict[str, Any]) -> None:
+    def tell(service_facts: dict[str, Any]) -> None:
         if as_json:
-            print(json.dumps(found), flush=True)
-        console.print(f"console {found['url']}", markup=False)
-        if found["token"]:
-            console.print(f"sign in once as engineer with the token {found['token']}", markup=False)
+            print(json.dumps(service_facts), flush=True)
+        console.print(f"console {service_facts['url']}", markup=False)
+        if service_facts["token"]:
+            console.print(f"sign in once as engineer with the token {service_facts['token']}", markup=False)
 
     beside = rig.resolve().parent.parent / "plans"
     folder = plans or (beside if beside.is_dir() else rig.resolve().parent)
@@ -149,7 +149,7 @@ def queue(
         call(cell, "DELETE", f"/api/v1/queue/{take_out}")
     if move:
         call(cell, "POST", f"/api/v1/queue/{move}/move", {"before": before})
-    for request in _named(plan or [], resume or [], hold):
+    for request in _queue_requests(plan or [], resume or [], hold):
         with console.status("preflight ..."):
             call(cell, "POST", "/api/v1/queue", {**request, "before": before}, patience_s=PREFLIGHT_S)
     if go_on:
@@ -162,10 +162,10 @@ def queue(
         print(json.dumps(state))
 
 
-def _named(plans: list[Path], resumed: list[Path], hold: str) -> list[dict[str, str]]:
+def _queue_requests(plans: list[Path], resumed_runs: list[Path], hold: str) -> list[dict[str, str]]:
     """List what is to be entered, in order."""
     requests = [{"plan": str(path.resolve())} for path in plans] + [
-        {"resume": str(path.resolve())} for path in resumed
+        {"resume": str(path.resolve())} for path in resumed_runs
     ]
     return [*requests, *([{"hold": hold}] if hold else [])]
 

@@ -74,9 +74,9 @@ def words_of(jitter: Any) -> str:
     )
 
 
-def advice_of(found: list[Any], rig: Path) -> str:
-    """Say what to do; `found` is the rig's cycle, and the longer one where that was not held."""
-    first, last = found[0], found[-1]
+def advice_of(jitters: list[Any], rig: Path) -> str:
+    """Say what to do; `jitters` are of the rig's cycle, and of the longer one where that was not held."""
+    first, last = jitters[0], jitters[-1]
     if first.holds:
         return f"{rig}: this machine holds a cycle of {first.cycle_ms} ms, as far as was measured"
     why = f"{rig}: this machine cannot hold a cycle of {first.cycle_ms} ms: {100 * first.late_share:.3g} % of its "

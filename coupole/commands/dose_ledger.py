@@ -57,13 +57,15 @@ def dose(
         raise InputError("--budget and --name belong together (and --reason to them): how many lux hours, and who")
     cell = read_cell(rig) if rig else None
     ledger = ledger_of(cell, object_id) if cell else Ledger(users_ledger_folder(), object_id)
-    if add is not None and not _sent(cell, object_id, "light", {"dose_lux_h": add, "note": note.strip()}):
+    if add is not None and not _entered_by_console(
+        cell, object_id, "light", {"dose_lux_h": add, "note": note.strip()}
+    ):
         ledger.enter(add, note.strip())
-    if warn_above is not None and not _sent(cell, object_id, "warning", {"above_lux_h": warn_above}):
+    if warn_above is not None and not _entered_by_console(cell, object_id, "warning", {"above_lux_h": warn_above}):
         ledger.warn_above(warn_above)
     person = person_named(name, "who says so") if budget is not None else ""
     request = {"dose_lux_h": budget, "name": person, "reason": reason.strip()}
-    if budget is not None and not _sent(cell, object_id, "budget", request):
+    if budget is not None and not _entered_by_console(cell, object_id, "budget", request):
         ledger.set_budget(budget, person, reason)
     history, similar_objects = ledger.read_history(), similar_ids(ledger.folder, object_id)
     show_dose(make_console(quiet=as_json), ledger, history, similar_objects)
@@ -71,14 +73,14 @@ def dose(
         print(json.dumps(document(ledger, history, similar_objects)))
 
 
-def _sent(cell: Cell | None, object_id: str, what: str, asked: dict[str, Any]) -> bool:
+def _entered_by_console(cell: Cell | None, object_id: str, resource: str, body: dict[str, Any]) -> bool:
     """Tell whether the cell's console has entered it, and so knows who did; False if none is served. Raises
     InputError: it refuses."""
     from coupole.console.command_line.client import NotServed, call
 
     try:
         if cell is not None:
-            call(cell, "POST", f"/api/v1/objects/{object_id}/{what}", asked)
+            call(cell, "POST", f"/api/v1/objects/{object_id}/{resource}", body)
     except NotServed:
         return False
     return cell is not None

@@ -13,7 +13,7 @@ from coupole.commands.completion import formats, materials
 from coupole.exchange.formats import FORMATS, Source, formats_of
 
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
-_OF_MATERIALS = [name for name, one in FORMATS.items() if "triangle" in one.options]
+_OF_MATERIALS = [name for name, export_format in FORMATS.items() if "triangle" in export_format.options]
 _SHOWN = "How views are shown (relight, iiif)"
 
 ToOption = Annotated[
@@ -193,7 +193,7 @@ class ExportOptions:
     planes: PlanesOption = None
     base_url: BaseUrlOption = None
 
-    def given(self) -> dict[str, object]:
+    def given_options(self) -> dict[str, object]:
         """Options that were given, by their names on the command line without dashes before them."""
         return {
             name.replace("_", "-"): value

@@ -12,7 +12,7 @@ import typer
 
 from coupole.commands.common import JsonOption, fail, records_named
 from coupole.commands.export_options import ExportOptions, ToOption
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 from coupole.exchange.formats import Writer, format_named, refuse_others_options, source_of
 
@@ -66,7 +66,7 @@ class Found:
     """Difference of each view's file from its own pictures, rms, in steps of 8 bits."""
 
 
-@flattened
+@flatten_options
 def export(
     source: Annotated[Path, typer.Argument(help="Folder of a run or of a result.", show_default=False)],
     to: ToOption,
@@ -81,12 +81,12 @@ def export(
     from coupole.viewing.terminal import bytes_text, make_console
 
     folder = source if options.in_place else out or source / "export"
-    request = Asked(source, to, folder, overwrite, options.given())
+    request = Asked(source, to, folder, overwrite, options.given_options())
     console = make_console(quiet=as_json)
     try:
         if options.in_place and out is not None:
             raise InputError("--in-place writes into SOURCE: give it, or --out, not both")
-        summary = _written(request, console)
+        summary = _write_export(request, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -98,10 +98,10 @@ def export(
         print(json.dumps({**document, **({"misses_dn": summary.misses_dn} if summary.misses_dn else {})}))
 
 
-def _written(asked: Asked, console: Console) -> Found:
-    export_format = format_named(asked.to, source_of(asked.source))
-    _refuse_empty(asked)
-    refuse_others_options(export_format, list(asked.options))
+def _write_export(request: Asked, console: Console) -> Found:
+    export_format = format_named(request.to, source_of(request.source))
+    _refuse_empty(request)
+    refuse_others_options(export_format, list(request.options))
     writers = {
         Writer.FRAMES: _export_frames,
         Writer.VIEWS: _export_views,
@@ -109,97 +109,99 @@ def _written(asked: Asked, console: Console) -> Found:
         Writer.RESULT: _export_result,
         Writer.CRATE: _export_crate,
     }
-    return writers[export_format.writer](asked, console)
+    return writers[export_format.writer](request, console)
 
 
-def _refuse_empty(asked: Asked) -> None:
+def _refuse_empty(request: Asked) -> None:
     """Raise InputError for an option without a value."""
-    for name, value in asked.options.items():
+    for name, value in request.options.items():
         if value == "" or (isinstance(value, list) and "" in value):
             raise InputError(f"--{name}: is empty; give a value, or leave it out")
 
 
-def _refuse_unknown_planes(asked: Asked) -> None:
+def _refuse_unknown_planes(request: Asked) -> None:
     """Raise InputError for a basis or a number of planes that `relight` does not have."""
     from coupole.exchange.rti.relight_web import BASES, PLANES
 
-    basis, planes = asked.text("basis"), asked.options.get("planes")
+    basis, planes = request.text("basis"), request.options.get("planes")
     if basis is not None and basis not in BASES:
         raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {basis}")
     if planes is not None and (planes not in PLANES or basis in ("ptm", "hsh")):
         raise InputError(f"--planes {planes}: expected {' or '.join(map(str, PLANES))}, with bilinear or rbf")
 
 
-def _export_result(asked: Asked, console: Console) -> Found:
+def _export_result(request: Asked, console: Console) -> Found:
     from coupole.exchange.of_results.export_result import export_result
 
-    triangles, most_error = tuple(map(int, asked.texts("triangle"))), asked.options.get("adaptive")
-    with console.status(f"writing {asked.to}"):
+    triangles, most_error = tuple(map(int, request.texts("triangle"))), request.options.get("adaptive")
+    with console.status(f"writing {request.to}"):
         paths = export_result(
-            asked.source,
-            asked.to,
-            asked.out,
-            fit=asked.text("fit"),
+            request.source,
+            request.to,
+            request.out,
+            fit=request.text("fit"),
             triangles=triangles,
             most_error=most_error if isinstance(most_error, float) else None,
-            overwrite=asked.overwrite,
+            overwrite=request.overwrite,
         )
     return _sizes(paths)
 
 
-def _export_views(asked: Asked, console: Console) -> Found:
+def _export_views(request: Asked, console: Console) -> Found:
     from coupole.exchange.rti.export_views import HowShown, export_views
     from coupole.viewing.terminal import step_bars
 
-    _refuse_unknown_planes(asked)
-    options = {name.replace("-", "_"): asked.options.get(name) for name in ("basis", "planes", "base-url")}
+    _refuse_unknown_planes(request)
+    options = {name.replace("-", "_"): request.options.get(name) for name in ("basis", "planes", "base-url")}
     how = HowShown(**{name: value for name, value in options.items() if value is not None})  # type: ignore[arg-type]
-    views = asked.texts("views")
+    views = request.texts("views")
     with step_bars(console) as say:
-        files = export_views(asked.source, asked.to, asked.out, views, how, overwrite=asked.overwrite, say=say)
+        files = export_views(
+            request.source, request.to, request.out, views, how, overwrite=request.overwrite, say=say
+        )
     return replace(_sizes(files.paths), misses_dn=files.misses_dn)
 
 
-def _export_colmap(asked: Asked, console: Console) -> Found:
+def _export_colmap(request: Asked, console: Console) -> Found:
     from coupole.exchange.colmap import export_colmap
 
     return _sizes(
         _with_bars(
             console,
             lambda say: export_colmap(
-                asked.source,
-                asked.out,
-                records=asked.records,
-                refined_folder=asked.path("refined"),
-                overwrite=asked.overwrite,
+                request.source,
+                request.out,
+                records=request.records,
+                refined_folder=request.path("refined"),
+                overwrite=request.overwrite,
                 say=say,
             ),
         )
     )
 
 
-def _export_crate(asked: Asked, console: Console) -> Found:
+def _export_crate(request: Asked, console: Console) -> Found:
     from coupole.exchange.research_crate import CrateFacts, write_crate
 
     facts = CrateFacts(
-        asked.text("licence"),
-        tuple(asked.texts("author")),
-        asked.text("publisher"),
-        asked.text("name"),
-        asked.text("identifier"),
+        request.text("licence"),
+        tuple(request.texts("author")),
+        request.text("publisher"),
+        request.text("name"),
+        request.text("identifier"),
     )
-    in_place = "in-place" in asked.options
+    in_place = "in-place" in request.options
     return _sizes(
         _with_bars(
             console,
             lambda say: write_crate(
-                asked.source, asked.out, facts, in_place=in_place, overwrite=asked.overwrite, say=say
+                request.source, request.out, facts, in_place=in_place, overwrite=request.overwrite, say=say
             ),
         )
     )
 
 
-def _export_frames(asked: Asked, console: Console) -> Found:
+def _export_frames(request: Asked, console: Console) -> Found:
     from rich.progress import Progress
 
     from coupole.exchange.export import export_run
@@ -208,35 +210,35 @@ def _export_frames(asked: Asked, console: Console) -> Found:
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("export")
         files = export_run(
-            Run(asked.source),
-            asked.to,
-            asked.out,
-            views=asked.texts("views"),
-            shots=asked.texts("shots"),
-            colour=_colour_of(asked),
-            linear="linear" in asked.options,
-            overwrite=asked.overwrite,
-            progress=lambda done, total: bars.update(bar, completed=done, total=total),
+            Run(request.source),
+            request.to,
+            request.out,
+            views=request.texts("views"),
+            shots=request.texts("shots"),
+            colour=_colour_of(request),
+            linear="linear" in request.options,
+            overwrite=request.overwrite,
+            progress=lambda count, total: bars.update(bar, completed=count, total=total),
         )
     return Found(files.files, files.bytes)
 
 
-def _colour_of(asked: Asked) -> ColourWanted | None:
+def _colour_of(request: Asked) -> ColourWanted | None:
     """Raises InputError for options that do not go together."""
     from coupole.exchange.run_colour import ColourWanted
 
-    eye, sensor = "for-the-eye" in asked.options, asked.path("sensor-spectra")
-    if eye and asked.to != "tiff":
-        raise InputError(f"--for-the-eye: is for --to tiff; a {asked.to} with --sensor-spectra has its colours")
+    eye, sensor = "for-the-eye" in request.options, request.path("sensor-spectra")
+    if eye and request.to != "tiff":
+        raise InputError(f"--for-the-eye: is for --to tiff; a {request.to} with --sensor-spectra has its colours")
     if not eye:
-        asked.refuse(("linear",), "for --for-the-eye")
-        if asked.to == "tiff":
-            asked.refuse(("sensor-spectra", "led-spectrum"), "for --for-the-eye, or for --to dng")
+        request.refuse(("linear",), "for --for-the-eye")
+        if request.to == "tiff":
+            request.refuse(("sensor-spectra", "led-spectrum"), "for --for-the-eye, or for --to dng")
     if sensor is None:
-        if eye or "led-spectrum" in asked.options or "calibrations" in asked.options:
+        if eye or "led-spectrum" in request.options or "calibrations" in request.options:
             raise InputError("--sensor-spectra: expected a table of nm, red, green, blue, from the sensor's maker")
         return None
-    return ColourWanted(sensor, asked.path("led-spectrum"), asked.records)
+    return ColourWanted(sensor, request.path("led-spectrum"), request.records)
 
 
 def _with_bars(console: Console, write: Callable[[Callable[[str, int, int], None]], list[Path]]) -> list[Path]:

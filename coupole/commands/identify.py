@@ -12,7 +12,7 @@ import typer
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.export_options import LedsOption, SensorOption
 from coupole.commands.identify_spot import asked_spot, identify_spot
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class SpotOptions:
     led_spectrum: LedsOption = None
 
 
-@flattened
+@flatten_options
 def identify(
     spectra: SpectraArgument = None,
     *,
@@ -109,7 +109,7 @@ def identify(
                 print(json.dumps(document))
             return
         assert spectra is not None
-        findings = _found(console, spectra, library, classes, unit)
+        findings = _findings(console, spectra, library, classes, unit)
         page = None
         if report is not None:
             from coupole.viewing.identification_page import write
@@ -122,11 +122,11 @@ def identify(
     if page is not None:
         console.print(f"page: {page}", markup=False)
     if as_json:
-        documents = [_told(spectrum, finding, page) for spectrum, finding in findings]
+        documents = [_document_of(spectrum, finding, page) for spectrum, finding in findings]
         print(json.dumps(documents[0] if len(documents) == 1 else documents))
 
 
-def _found(
+def _findings(
     console: Console, paths: list[Path], library: Path, classes: Path | None, unit: Any
 ) -> list[tuple[LibrarySpectrum, Finding]]:
     from coupole.appearance.spectra.spectra_library import read_library
@@ -162,11 +162,11 @@ def _references(library: Path, classes: Path | None) -> References:
     return make_references(spectra, table)
 
 
-def _show(console: Console, found: list[Finding]) -> None:
+def _show(console: Console, findings: list[Finding]) -> None:
     from rich.table import Table
 
     table = Table("spectrum", "verdict", "class", "probability", "not in library", box=None)
-    for finding in found:
+    for finding in findings:
         rows = [
             (candidate.class_name, f"{candidate.probability:.0%}") for candidate in finding.candidates[:_SHOWN]
         ]
@@ -182,16 +182,16 @@ def _show(console: Console, found: list[Finding]) -> None:
                 f"{finding.not_in_library:.0%}" if first else "",
             )
     console.print(table)
-    for finding in found:
+    for finding in findings:
         console.print(f"{finding.name}: {'; '.join([finding.reason, *finding.remarks])}", markup=False)
-    rates = found[-1].rates
+    rates = findings[-1].rates
     console.print(
         f"the library's own spectra, each left out (95 %): first class right {rates.right}, match with a "
         f"wrong class {rates.false_matches}; with the class left out unknown {rates.unknown}"
     )
 
 
-def _told(spectrum: LibrarySpectrum, finding: Finding, page: Path | None) -> dict[str, Any]:
+def _document_of(spectrum: LibrarySpectrum, finding: Finding, page: Path | None) -> dict[str, Any]:
     evidence, rates = finding.evidence, finding.rates
     return {
         "name": finding.name,

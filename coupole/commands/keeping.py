@@ -82,8 +82,8 @@ def verify(
     with Progress(console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task("reading back")
 
-        def show(done: int, total: int) -> None:
-            bars.update(bar, completed=done, total=total)
+        def show(count: int, total: int) -> None:
+            bars.update(bar, completed=count, total=total)
 
         check = verify_run(folder, show)
         if with_manifest and not check.bad:
@@ -116,21 +116,28 @@ def verify(
         raise UnprovenError(f"{len(check.missing)} frames of the plan are missing; {goes_on}")
 
 
-def _show_verified(console: Console, run: Run, found: Verification) -> None:
+def _show_verified(console: Console, run: Run, verification: Verification) -> None:
     from rich.markup import escape
 
-    for problem in found.bad:
+    for problem in verification.bad:
         console.print("[red]bad:[/]", problem)
-    if found.missing:
-        console.print(f"[yellow]missing:[/] {len(found.missing)} frames, the first {found.missing[0]}")
-    if found.ok:
-        console.print(f"ok: {found.frames} frames, each exactly once, all checksums right; proof: {run.proof}")
-    if found.not_compared:
-        console.print(f"[yellow]not compared with the plan:[/] {escape(found.not_compared)}")
-    if found.listed_count and not found.bad:
-        console.print(f"{found.listed_count} files are as manifest.sha256 lists them")
-    if found.unlisted:
-        console.print(f"not listed there: {', '.join(found.unlisted[:5])}{' ...' if found.unlisted[5:] else ''}")
+    if verification.missing:
+        console.print(
+            f"[yellow]missing:[/] {len(verification.missing)} frames, the first {verification.missing[0]}"
+        )
+    if verification.ok:
+        console.print(
+            f"ok: {verification.frames} frames, each exactly once, all checksums right; proof: {run.proof}"
+        )
+    if verification.not_compared:
+        console.print(f"[yellow]not compared with the plan:[/] {escape(verification.not_compared)}")
+    if verification.listed_count and not verification.bad:
+        console.print(f"{verification.listed_count} files are as manifest.sha256 lists them")
+    if verification.unlisted:
+        console.print(
+            f"not listed there: {', '.join(verification.unlisted[:5])}"
+            f"{' ...' if verification.unlisted[5:] else ''}"
+        )
 
 
 def archive(
@@ -159,7 +166,9 @@ def archive(
                 codec_of(codec),
                 keep=keep,
                 partial=partial,
-                progress=lambda what, done, total: bars.update(bar, description=what, completed=done, total=total),
+                progress=lambda step_name, count, total: bars.update(
+                    bar, description=step_name, completed=count, total=total
+                ),
                 on_view=lambda view: console.print(
                     f"{view.view}: {view.frames} frames {view.ratio:.2f} times smaller, "
                     f"{bytes_text(view.freed_bytes)} freed"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coupole.commands.common import JsonOption, fail
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError, StorageError, reason
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class FilmSpectra:
         options = (self.over_black, self.over_white, self.black, self.white, self.opaque, self.thickness_um)
         return any(option is not None for option in options)
 
-    def listed(self) -> list[dict[str, Any]]:
+    def film_descriptions(self) -> list[dict[str, Any]]:
         """List them as `LayerGiven` has them. Raises InputError: a film without its ground, or too few."""
         films: list[dict[str, Any]] = []
         for film, ground, kind in ((self.over_black, self.black, "black"), (self.over_white, self.white, "white")):
@@ -84,7 +84,7 @@ class Instrument:
         return geometry
 
 
-@flattened
+@flatten_options
 def layer(
     samples: Annotated[
         Path | None,
@@ -118,12 +118,15 @@ def layer(
     console = make_console(quiet=as_json)
     try:
         if samples is None:
-            description, folder = _given(films.listed(), name or "paint", noise, instrument, bare_grounds), Path()
+            description, folder = (
+                _layer_description(films.film_descriptions(), name or "paint", noise, instrument, bare_grounds),
+                Path(),
+            )
         else:
             if films.are_named():
                 raise InputError(f"{samples}: names the films; leave out --over-black and the like")
             description, folder = read_films(samples)
-        document = _solved(description, folder, other_grinding, out)
+        document = _coefficients_document(description, folder, other_grinding, out)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -138,14 +141,16 @@ def read_films(path: Path) -> tuple[LayerGiven, Path]:
     from coupole.heritage.analysis.layer_samples import LayerGiven
     from coupole.plan import yamlfile
 
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     return document.validate(LayerGiven), path.parent
 
 
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _given(films: list[dict[str, Any]], name: str, noise: float, instrument: Instrument, bare: bool) -> LayerGiven:
+def _layer_description(
+    films: list[dict[str, Any]], name: str, noise: float, instrument: Instrument, bare: bool
+) -> LayerGiven:
     from coupole.heritage.analysis.layer_samples import LayerGiven
 
     return LayerGiven.model_validate(
@@ -160,24 +165,26 @@ def _given(films: list[dict[str, Any]], name: str, noise: float, instrument: Ins
     )
 
 
-def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | None) -> dict[str, Any]:
+def _coefficients_document(
+    layer: LayerGiven, folder: Path, other_paint_path: Path | None, out: Path | None
+) -> dict[str, Any]:
     from coupole.heritage.analysis import four_flux_fit, layer_fit, layer_model
     from coupole.heritage.analysis.layer_samples import paint_file, read_samples
 
-    samples = read_samples(given, folder)
-    fit = layer_fit.fit(samples.films, samples.face, given.noise)
+    samples = read_samples(layer, folder)
+    fit = layer_fit.fit(samples.films, samples.face, layer.noise)
     four = None
     if samples.directional is None:
-        model = layer_model.deserved_model(fit, samples.films, samples.face, given.noise)
+        model = layer_model.deserved_model(fit, samples.films, samples.face, layer.noise)
     else:
         black, white = samples.films
-        four = four_flux_fit.fit(black, white, samples.directional, samples.face, given.noise)
+        four = four_flux_fit.fit(black, white, samples.directional, samples.face, layer.noise)
         light, reflectances = samples.directional, (black.reflectance, white.reflectance)
         directional = light.over_black, light.over_white
-        model = layer_model.deserved_by_measurement(reflectances, directional, light.transmittance, given.noise)
-    paint = paint_file(given, samples, fit, four)
+        model = layer_model.deserved_by_measurement(reflectances, directional, light.transmittance, layer.noise)
+    paint = paint_file(layer, samples, fit, four)
     document: dict[str, Any] = {
-        "name": given.name,
+        "name": layer.name,
         "unit": paint.unit,
         "model": {
             "deserved": model.model,
@@ -204,37 +211,37 @@ def _solved(given: LayerGiven, folder: Path, other: Path | None, out: Path | Non
             "u_s_i": four.u_forward.tolist(),
             "u_s_j": four.u_backward.tolist(),
         }
-    if other is not None:
-        document["grains"] = _grains(paint, other)
+    if other_paint_path is not None:
+        document["grains"] = _grains(paint, other_paint_path)
     if out is not None:
         from coupole.appearance.matter.paint_file import ENDING, encode
         from coupole.viewing.layer_page import layer_page
 
-        stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in given.name)
+        stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in layer.name)
         files = {
             f"{stem}{ENDING}": encode(paint),
-            f"{stem}.html": layer_page(given, samples, fit, model, four),
+            f"{stem}.html": layer_page(layer, samples, fit, model, four),
         }
-        document["files"] = _written(out, files)
+        document["files"] = _write_files(out, files)
     return document
 
 
-def _misfit(found: Any) -> float | None:
+def _misfit(fit: Any) -> float | None:
     """Root mean square of residuals over what noise explains; None of two spectra, which leave none."""
-    freedom = found.spectra - 2
-    return None if freedom == 0 else float((found.chi2.mean() / freedom) ** 0.5)
+    freedom = fit.spectra - 2
+    return None if freedom == 0 else float((fit.chi2.mean() / freedom) ** 0.5)
 
 
-def _grains(paint: Any, other: Path) -> dict[str, Any]:
+def _grains(paint: Any, other_path: Path) -> dict[str, Any]:
     import numpy as np
 
     from coupole.appearance.matter.paint_file import read_paint
     from coupole.heritage.analysis.layer_model import grain_ratio
 
-    other_paint = read_paint(other)
+    other_paint = read_paint(other_path)
     if other_paint.unit != "per mm" or paint.unit != "per mm":
         raise InputError(
-            f"{other}: sizes of grains need K and S per mm of both grindings; found {other_paint.unit} and "
+            f"{other_path}: sizes of grains need K and S per mm of both grindings; found {other_paint.unit} and "
             f"{paint.unit}: give --thickness-um"
         )
     nm = other_paint.wavelengths_nm
@@ -251,7 +258,7 @@ def _grains(paint: Any, other: Path) -> dict[str, Any]:
     }
 
 
-def _written(folder: Path, files: dict[str, str]) -> list[str]:
+def _write_files(folder: Path, files: dict[str, str]) -> list[str]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, words in files.items():

@@ -110,14 +110,14 @@ def _colour_at(picture: NDArray[np.float64], place: str, option: str) -> NDArray
     return np.asarray(picture[rows, columns].mean(axis=(0, 1)))
 
 
-def _write(path: Path, found: Makie) -> None:
+def _write(path: Path, makie: Makie) -> None:
     import numpy as np
     from PIL import Image
 
     from coupole.exchange.srgb import srgb
     from coupole.storage.durable import write_synced
 
-    channels: Any = np.concatenate([srgb(found.residual), found.alpha[..., None]], axis=2)
+    channels: Any = np.concatenate([srgb(makie.residual), makie.alpha[..., None]], axis=2)
     buffer = io.BytesIO()
     Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(buffer, "PNG")
     write_synced(path, buffer.getvalue())

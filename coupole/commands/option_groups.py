@@ -11,7 +11,7 @@ from typing import Any, TypeVar, get_type_hints
 R = TypeVar("R")
 
 
-def flattened(command: Callable[..., R]) -> Callable[..., R]:
+def flatten_options(command: Callable[..., R]) -> Callable[..., R]:
     """The command with the fields of each parameter that is a dataclass in its place, as typer reads them.
 
     Fields are annotated as typer's parameters are, and have defaults. Their names are unique in the command.

@@ -48,7 +48,7 @@ def check(
         files = Files(plan or plan_of(resume), rig, resume, output)
         job, report = check_files(files, paths=not no_paths, measure=not no_disk_speed)
     except InputError as error:
-        fail(error, as_json=as_json, found={"ok": False, "refusals": []})
+        fail(error, as_json=as_json, figures={"ok": False, "refusals": []})
         raise
     show_preflight(console, report, name=job.plan.name, rig=job.cell.rig.name)
     show_views(console, report)
@@ -124,7 +124,7 @@ def simulate(
             out,
             frames,
             width_px=width,
-            progress=lambda done, total: bars.update(bar, completed=done, total=total),
+            progress=lambda count, total: bars.update(bar, completed=count, total=total),
         )
     if as_json:
         print(

@@ -10,7 +10,7 @@ import typer
 
 from coupole.commands.common import JsonOption, fail
 from coupole.commands.layer import Instrument
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError, StorageError, reason
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ _FEWER = 3
 """Numbers of paints shown: the chosen one, one less, two less."""
 
 
-@flattened
+@flatten_options
 def recipe(
     target: Annotated[Path, typer.Argument(help="Spectrum of the colour to match.", show_default=False)],
     palette: Annotated[
@@ -64,7 +64,7 @@ def recipe(
             raise InputError("--light: expected names of lights, such as D65,A; found none")
         geometry, seen_by = instrument.known_geometry(), _known_observer(observer)
         with console.status("mixing"):
-            search, matches = _found(
+            search, matches = _search_recipes(
                 target, palette, names, at_most, noise, face(instrument.binder_index, geometry), seen_by
             )
         document = _document(search, matches)
@@ -96,7 +96,7 @@ def _known_observer(name: str) -> Observer:
     return standard_observer
 
 
-def _found(
+def _search_recipes(
     target: Path,
     palette: list[Path],
     lights: list[str],
@@ -118,20 +118,20 @@ def _found(
     return search, [matches(search.target, mixture.reflectance, lights, observer) for mixture in search.recipes]
 
 
-def _document(found: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:
+def _document(search: Found, matches: Sequence[Sequence[Match]]) -> dict[str, Any]:
     return {
-        "verdict": found.verdict(),
-        "explained": found.is_explained,
-        "chosen": found.chosen_index + 1,
-        "noise": found.noise,
-        "bands": int(found.bands.sum()),
-        "told_within": {name: found.told_within(name) for name in found.best.shares},
-        "rivals": list(found.rivals),
-        "recipes": [_told(mixture, under) for mixture, under in zip(found.recipes, matches, strict=True)],
+        "verdict": search.verdict(),
+        "explained": search.is_explained,
+        "chosen": search.chosen_index + 1,
+        "noise": search.noise,
+        "bands": int(search.bands.sum()),
+        "told_within": {name: search.told_within(name) for name in search.best.shares},
+        "rivals": list(search.rivals),
+        "recipes": [_recipe_facts(mixture, under) for mixture, under in zip(search.recipes, matches, strict=True)],
     }
 
 
-def _told(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
+def _recipe_facts(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
     return {
         "paints": len(recipe.shares),
         "shares": recipe.shares,
@@ -145,20 +145,20 @@ def _told(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
     }
 
 
-def _write(path: Path, name: str, found: Found, matches: Sequence[Sequence[Match]]) -> None:
+def _write(path: Path, name: str, search: Found, matches: Sequence[Sequence[Match]]) -> None:
     from coupole.viewing.recipe_page import recipe_page
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(recipe_page(name, found, matches), encoding="utf-8")
+        path.write_text(recipe_page(name, search, matches), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{path}: {reason(error)}. Choose another folder, or free space.") from error
 
 
-def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> None:
+def _say(search: Found, matches: Sequence[Sequence[Match]], console: Console) -> None:
     from rich.table import Table
 
-    best = found.best
+    best = search.best
     from coupole.heritage.analysis.recipe_search import TOLD_WITHIN
 
     table = Table(
@@ -171,19 +171,19 @@ def _say(found: Found, matches: Sequence[Sequence[Match]], console: Console) -> 
         pad_edge=False,
     )
     for name, share in sorted(best.shares.items(), key=lambda item: -item[1]):
-        within = found.told_within(name)
+        within = search.told_within(name)
         words = "yes" if within <= TOLD_WITHIN else f"no, {100 * within:.0f} %"
         table.add_row(name, f"{100 * share:.1f} %", f"{100 * best.half_widths[name]:.1f} %", words)
     console.print(table)
-    for match in matches[found.chosen_index]:
+    for match in matches[search.chosen_index]:
         metamerism = f", special index of metamerism {match.metamerism:.2f}" if match.metamerism else ""
         console.print(f"under {match.light}: dE00 {match.delta_e00:.2f}{metamerism}", markup=False)
-    console.print(f"{found.verdict()}.", markup=False)
-    for rival in found.rivals[:_FEWER]:
+    console.print(f"{search.verdict()}.", markup=False)
+    for rival in search.rivals[:_FEWER]:
         shares = ", ".join(f"{100 * share:.0f} % {name}" for name, share in rival.items())
-        console.print(f"not told from it at a noise of {found.noise:g}: {shares}", markup=False)
-    for number in range(found.chosen_index - 1, max(-1, found.chosen_index - _FEWER), -1):
-        fewer = found.recipes[number]
+        console.print(f"not told from it at a noise of {search.noise:g}: {shares}", markup=False)
+    for number in range(search.chosen_index - 1, max(-1, search.chosen_index - _FEWER), -1):
+        fewer = search.recipes[number]
         words = ", ".join(f"{100 * share:.0f} % {name}" for name, share in fewer.shares.items())
         costs = ", ".join(f"{match.delta_e00:.2f} under {match.light}" for match in matches[number])
         console.print(f"with {number + 1}: {words}; dE00 {costs}", markup=False)

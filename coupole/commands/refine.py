@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from coupole.commands.common import JsonOption, MeshOption, RecordsOption, fail, records_named
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError
 
 
@@ -42,7 +42,7 @@ class StatedUncertainties:
     ] = 20.0
 
 
-@flattened
+@flatten_options
 def refine(
     runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder for the result.", show_default=False)],

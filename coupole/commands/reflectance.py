@@ -12,7 +12,7 @@ import typer
 
 from coupole.commands.common import JobOrStep, JsonOption, ResultArgument
 from coupole.commands.common import fail as fail_with
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.commands.refine import refine
 from coupole.commands.reflectance_options import (
     LeaveOutOption,
@@ -56,7 +56,7 @@ reflectance_app = typer.Typer(
 
 
 @reflectance_app.command(JOB)
-@flattened
+@flatten_options
 def from_runs_or_pictures(
     runs: Annotated[
         list[Path] | None,
@@ -85,7 +85,7 @@ def from_runs_or_pictures(
         _refuse_texels(texels, runs or [], without)
         left_out = _numbers(leave_out)
         with step_bars(console) as say:
-            if without.uncalibrated and runs:
+            if without.is_uncalibrated and runs:
                 outcome = _of_uncalibrated(runs[0], without.view, left_out, out, say)
             elif without.pictures is not None:
                 outcome = _of_pictures(without.pictures, without, left_out, out, say)
@@ -103,15 +103,17 @@ def from_runs_or_pictures(
         print(json.dumps({name: value for name, value in about.items() if name not in {"inputs", "runs"}}))
 
 
-def _of_pictures(pictures: Path, given: PicturesWithoutRecords, left_out: list[int], out: Path, say: Said) -> Made:
+def _of_pictures(
+    pictures: Path, options: PicturesWithoutRecords, left_out: list[int], out: Path, say: Said
+) -> Made:
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
     from coupole.viewing import reflectance_page
 
-    if given.lights is None:
+    if options.lights is None:
         raise InputError("--lights: expected the file of the lights' directions")
     picture_set = read_pictures(
-        pictures, given.lights, intensities=given.intensities, mask=given.mask, srgb=given.srgb
+        pictures, options.lights, intensities=options.intensities, mask=options.mask, srgb=options.srgb
     )
     about = fit_pictures(picture_set, out, left_out=left_out, say=say)
     return about, list(reflectance_page.remarks(about)), reflectance_page.write(out)
@@ -121,10 +123,10 @@ def _refuse_mixed(runs: list[Path], samples: SamplesOfRuns, without: PicturesWit
     """Raise InputError for options that do not go together."""
     if bool(runs) == (without.pictures is not None):
         raise InputError("expected runs, or --pictures with --lights; see coupole reflectance from --help")
-    is_uncalibrated = without.uncalibrated
+    is_uncalibrated = without.is_uncalibrated
     if (is_uncalibrated and (samples.calibrations or len(runs) != 1)) or (without.view and not is_uncalibrated):
         raise InputError("--uncalibrated: expected one run and no --calibrations; --view goes with it alone")
-    if (samples.refined or samples.poses) and (is_uncalibrated or without.pictures is not None):
+    if (samples.refined_folder or samples.poses) and (is_uncalibrated or without.pictures is not None):
         raise InputError("--refined, --poses: are for calibrated runs")
     if without.pictures is None and any((without.lights, without.srgb, without.intensities, without.mask)):
         raise InputError("--lights, --srgb, --intensities, --mask: go with --pictures alone, not with runs")
@@ -177,7 +179,7 @@ def _numbers(text: str) -> list[int]:
 
 
 @reflectance_app.command()
-@flattened
+@flatten_options
 def extract(
     runs: Annotated[list[Path], typer.Argument(help="Runs of one object.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder of the result.", show_default=False)],
@@ -200,7 +202,7 @@ def extract(
 
 
 @reflectance_app.command()
-@flattened
+@flatten_options
 def fit(
     result: ResultArgument,
     workers: Workers,

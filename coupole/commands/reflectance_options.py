@@ -129,7 +129,7 @@ class SamplesOfRuns:
     scan_noise_um: NoiseOption = 30.0
     support_reflectance: SupportOption = 0.0
     keep_inter_reflection: KeepOption = False
-    refined: RefinedOption = None
+    refined_folder: RefinedOption = None
     poses: PosesOption = None
 
     def request(self, runs: Sequence[Path], left_out: Sequence[int]) -> RunRequest:
@@ -139,7 +139,7 @@ class SamplesOfRuns:
         return RunRequest(
             tuple(runs), self.mesh, records_named(self.calibrations or []), tuple(left_out), self.scan_noise_um,
             support_reflectance=self.support_reflectance, keep_inter_reflection=self.keep_inter_reflection,
-            refined_folder=self.refined, poses=self.poses,
+            refined_folder=self.refined_folder, poses=self.poses,
         )  # fmt: skip
 
 
@@ -152,7 +152,7 @@ class PicturesWithoutRecords:
     srgb: SrgbOption = False
     intensities: IntensitiesOption = None
     mask: MaskOption = None
-    uncalibrated: UncalibratedOption = False
+    is_uncalibrated: UncalibratedOption = False
     view: ViewOption = None
 
 

@@ -72,7 +72,7 @@ def register(
     as_json: JsonOption = False,
 ) -> None:
     """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""
-    from coupole.scan.registration.registering import register as registered
+    from coupole.scan.registration.registering import register as register_scans
     from coupole.scan.registration.summary import about, remarks
     from coupole.scan.scan import new_scan_folder
     from coupole.viewing import registration_page
@@ -86,10 +86,10 @@ def register(
             raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
         levels_mm = _levels(levels)
         with new_scan_folder(out) as folder, step_bars(console) as say:
-            registration = registered(
+            registration = register_scans(
                 scans, unit, stand=stand, targets=targets, control=control, trust_poses=trust_poses, say=say
             )
-            mesh = None if no_mesh else _merged(registration, unit, mesh_mm, levels_mm, folder, say)
+            mesh = None if no_mesh else _merge_scans(registration, unit, mesh_mm, levels_mm, folder, say)
             document = about(registration, mesh)
             (folder / "registration.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
             say("drawing", 0, 1)
@@ -105,18 +105,18 @@ def register(
         print(json.dumps(document))
 
 
-def _unit(stated: str | None, scans: list[Path]) -> str:
+def _unit(stated_unit: str | None, scans: list[Path]) -> str:
     from coupole.scan.registration.text_scans import HEADED_SUFFIXES
     from coupole.scan.scan import UNITS
 
-    if stated is None:
+    if stated_unit is None:
         unclear = next((path for path in scans if path.suffix.lower() in HEADED_SUFFIXES), None)
         if unclear is not None:
             raise InputError(f"{unclear}: some scanners write it in m, others in mm: state --unit")
         return "mm"
-    if stated not in UNITS:
-        raise InputError(f"--unit {stated}: expected one of {', '.join(UNITS)}")
-    return stated
+    if stated_unit not in UNITS:
+        raise InputError(f"--unit {stated_unit}: expected one of {', '.join(UNITS)}")
+    return stated_unit
 
 
 def _stand(seen_from: str | None) -> Stand | None:
@@ -128,13 +128,13 @@ def _stand(seen_from: str | None) -> Stand | None:
     return stand
 
 
-def _merged(
-    found: Registered, unit: str, mesh_mm: float | None, levels_mm: list[float], folder: Path, say: Say
+def _merge_scans(
+    registration: Registered, unit: str, mesh_mm: float | None, levels_mm: list[float], folder: Path, say: Say
 ) -> Merged:
     from coupole.scan.registration.merging import default_cell_mm, merge
 
-    scans = [found.scans[k] for k in found.placed_numbers]
-    poses = [found.first_from_scan[k] for k in found.placed_numbers]
+    scans = [registration.scans[k] for k in registration.placed_numbers]
+    poses = [registration.first_from_scan[k] for k in registration.placed_numbers]
     return merge(scans, poses, unit, mesh_mm or default_cell_mm(scans), levels_mm, folder, say)
 
 

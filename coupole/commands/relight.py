@@ -12,9 +12,9 @@ import typer
 
 from coupole.commands.common import JsonOption, ResultArgument, fail
 from coupole.commands.completion import fits
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
-from coupole.commands.relit_result import Relit, opened
+from coupole.commands.relit_result import Relit, open_result
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ class Lighting:
     lights: LightsOption = None
     samples: SamplesOption = 256
 
-    def read(self) -> list[AnyLight]:
+    def read_lights(self) -> list[AnyLight]:
         """Raises InputError for a light that is none, and if there is none."""
         from coupole.reflectance.new_light import light_kinds as kinds
 
@@ -165,7 +165,7 @@ class MoreOutput:
     white: WhiteOption = None
 
 
-@flattened
+@flatten_options
 def relight(
     result: ResultArgument,
     to: ToOption,
@@ -181,12 +181,14 @@ def relight(
     console = make_console(quiet=as_json)
     try:
         _refuse_target(to, more, for_the_eye=colours.for_the_eye)
-        colour, lights = colours.read(), lighting.read()
+        colour, lights = colours.read_colour(), lighting.read_lights()
         camera = _camera(viewpoint)
         with step_bars(console) as bars:
             bars("read", 0, 1)
             uncertain = more.uncertainty is not None
-            relit = opened(result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain)
+            relit = open_result(
+                result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain
+            )
             if colour is not None:
                 document = write_relit_for_the_eye(relit, lights, to, colour, more.white, bars)
             else:
@@ -223,21 +225,25 @@ def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
         video_files.refuse_unknown(to)
 
 
-def _camera(asked: Viewpoint) -> FreeCamera | None:
+def _camera(viewpoint: Viewpoint) -> FreeCamera | None:
     import numpy as np
 
     from coupole.reflectance.new_light.light_kinds import place_of
     from coupole.reflectance.new_light.pictured_surface import FreeCamera
 
-    of_it = (("--look-at", asked.look_at), ("--size", asked.size), ("--field-of-view", asked.field_of_view))
-    if asked.from_ is None:
+    of_it = (
+        ("--look-at", viewpoint.look_at),
+        ("--size", viewpoint.size),
+        ("--field-of-view", viewpoint.field_of_view),
+    )
+    if viewpoint.from_ is None:
         for option, value in of_it:
             if value is not None:
                 raise InputError(f"{option}: belongs to a camera anywhere; give its place with --from")
         return None
-    aim = None if asked.look_at is None else np.array(place_of(asked.look_at, "--look-at"))
-    place = np.array(place_of(asked.from_, "--from"))
-    return FreeCamera(place, aim, _size_px(asked.size or "1024x768"), asked.field_of_view)
+    aim = None if viewpoint.look_at is None else np.array(place_of(viewpoint.look_at, "--look-at"))
+    place = np.array(place_of(viewpoint.from_, "--from"))
+    return FreeCamera(place, aim, _size_px(viewpoint.size or "1024x768"), viewpoint.field_of_view)
 
 
 def _size_px(text: str) -> tuple[int, int]:
@@ -261,7 +267,7 @@ def _write(
     if turn is None:
         from coupole.exchange.picture_files import write_picture
 
-        write_picture(to, relit.picture(lights, lambda done, of: bars("light", done, of)))
+        write_picture(to, relit.picture(lights, lambda count, of: bars("light", count, of)))
         return {"picture": str(to.resolve()), **relit.about}
     import numpy as np
 
@@ -270,7 +276,7 @@ def _write(
 
     def frame(number: int) -> NDArray[np.float32]:
         angle_deg = 360.0 * number / turn
-        return relit.picture([turn_light(light, angle_deg) for light in lights], lambda done, of: None)
+        return relit.picture([turn_light(light, angle_deg) for light in lights], lambda count, of: None)
 
     if white is None:
         numbers = sorted({number * turn // _LOOKED_AT for number in range(_LOOKED_AT)})
@@ -299,5 +305,5 @@ def _write_uncertainty(
     from coupole.exchange.picture_files import write_picture
 
     assert relit.uncertainty is not None
-    write_picture(to, relit.uncertainty(lights, lambda done, of: bars("uncertainty", done, of)))
+    write_picture(to, relit.uncertainty(lights, lambda count, of: bars("uncertainty", count, of)))
     return {"uncertainty": str(to.resolve())}

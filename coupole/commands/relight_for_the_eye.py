@@ -52,7 +52,7 @@ class EyeColours:
     led_spectrum: SpectrumOption = None
     colour_record: RecordOption = None
 
-    def read(self) -> CameraColour | None:
+    def read_colour(self) -> CameraColour | None:
         """Read it from a record, or from tables of spectra; None if no picture for the eye is wanted.
 
         Raises InputError for what does not go together, and as `camera_colour` and `colour_of_record`."""
@@ -97,7 +97,7 @@ def write_relit_for_the_eye(
         raise InputError(
             "--for-the-eye: an LED's picture is in the camera's range; expected lights of other kinds"
         )
-    linear = linear_colours(relit.picture(lights, lambda done, of: bars("light", done, of)), colour)
+    linear = linear_colours(relit.picture(lights, lambda count, of: bars("light", count, of)), colour)
     white = white or float(np.quantile(bright(linear), PEAK_QUANTILE)) or 1.0
     about = {**relit.about, "colour": colour.origin.partition("; white")[0], "white": white}
     write_for_the_eye(to, linear, white, about)

@@ -33,7 +33,7 @@ class Relit:
     """False of a camera with one channel."""
 
 
-def opened(
+def open_result(
     result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
 ) -> Relit:
     """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
@@ -66,8 +66,8 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
     else:
         scene = run_relighting.scene_from(folder, camera, fit)
 
-    def of_three(made: NDArray[np.float32]) -> NDArray[np.float32]:
-        return made if made.shape[2] == 3 else np.repeat(made, 3, axis=2)
+    def of_three(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        return picture if picture.shape[2] == 3 else np.repeat(picture, 3, axis=2)
 
     return Relit(
         lambda lights, say: of_three(scene.picture(lights, samples, say=say)),

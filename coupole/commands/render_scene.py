@@ -55,10 +55,10 @@ def render(
         with Progress(console=console, disable=not console.is_terminal) as bars:
             tasks: dict[str, TaskID] = {}
 
-            def show(name: str, done: int, total: int) -> None:
+            def show(name: str, count: int, total: int) -> None:
                 if name not in tasks:
                     tasks[name] = bars.add_task(name, total=total)
-                bars.update(tasks[name], completed=done)
+                bars.update(tasks[name], completed=count)
 
             summary = render_scene(document, settings, out, show)
     except InputError as error:
@@ -74,9 +74,9 @@ def render(
         console.print(f"{out / file_name}: white {camera['white_cd_m2']:.4g} cd/m2{_noise(camera)}, simulated")
 
 
-def _noise(seen: dict[str, Any]) -> str:
-    noise = seen.get("noise")
-    return "" if noise is None else f", noise {noise:.2g} with {seen['samples']} paths a pixel"
+def _noise(camera_summary: dict[str, Any]) -> str:
+    noise = camera_summary.get("noise")
+    return "" if noise is None else f", noise {noise:.2g} with {camera_summary['samples']} paths a pixel"
 
 
 def read_scene(path: Path) -> tuple[Document, Scene]:
@@ -84,7 +84,7 @@ def read_scene(path: Path) -> tuple[Document, Scene]:
     from coupole.appearance.render.scene_file import Scene, files
     from coupole.plan import yamlfile
 
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     scene = document.validate(Scene)
     missing = [
         document.problem(at, f"no such file: {document.resolve(file_name)}")

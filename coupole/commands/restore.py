@@ -81,7 +81,9 @@ def restore(
         if out.exists() and not out.is_dir():
             raise InputError(f"--out {out}: expected a folder, found a file; name another one")
         with step_bars(console) as say:
-            restoration = read(mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say)
+            restoration = checked_restoration(
+                mesh, parts, materials, hypothesis or (), unit, (samples, width, step), say
+            )
             pictures = render_all(restoration, out, say)
             result = show_all(restoration, pictures, out, say)
             _write_page(restoration_page, result, out)
@@ -94,13 +96,13 @@ def restore(
         _say(result, out, console)
 
 
-def read(
+def checked_restoration(
     mesh: Path,
     parts: Path,
     materials: Path,
     names: tuple[str, ...] | list[str],
     unit: str,
-    reduced: tuple[int | None, int | None, int | None],
+    reductions: tuple[int | None, int | None, int | None],
     say: Say,
 ) -> Restoration:
     """All that is asked for, checked. Raises InputError."""
@@ -109,7 +111,7 @@ def read(
     from coupole.heritage.restoration.restoring import Restoration
 
     document, materials_file = restoration_file.read_restoration(materials)
-    materials_file = restoration_file.reduced_file(materials_file, *reduced)
+    materials_file = restoration_file.reduced_file(materials_file, *reductions)
     hypotheses = restoration_file.chosen_hypotheses(document, materials_file, names)
     rules_document, rules = parts_file.read_parts(parts)
     say("reading the mesh", 0, 2)

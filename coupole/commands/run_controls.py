@@ -37,12 +37,12 @@ _PLAIN_LINE_EVERY_S = 5.0
 
 def pause(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """Pause a running acquisition after its burst; ends when lights are off and the arm is at rest."""
-    _say(_sent(run, "pause", until="paused"), as_json=as_json)
+    _say(_state_after(run, "pause", until="paused"), as_json=as_json)
 
 
 def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """Go on with a paused acquisition. (One that has ended goes on by `coupole acquire --resume RUN`.)"""
-    _say(_sent(run, "go-on"), as_json=as_json)
+    _say(_state_after(run, "go-on"), as_json=as_json)
 
 
 def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
@@ -51,7 +51,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
     Ends when its process has ended; exit code 4 if the journal says that the cell may not be safe. This is no
     emergency stop: that is the button at the cell.
     """
-    reply = _sent(run, "stop")  # before the imports that only its outcome wants
+    reply = _state_after(run, "stop")  # before the imports that only its outcome wants
 
     from coupole.storage.run import Run
     from coupole.storage.run_status import status
@@ -146,7 +146,7 @@ def running_run(run: Path | None) -> State:
     return states[0]
 
 
-def _sent(run: Path | None, command: Command, *, until: str = "") -> State:
+def _state_after(run: Path | None, command: Command, *, until: str = "") -> State:
     """State after a command, or once it is `until`. Raises InputError: the run is not being acquired, or ended."""
     from coupole.acquisition.run_control import ask
 

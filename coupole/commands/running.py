@@ -66,7 +66,7 @@ def acquire(
             paths = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
             request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
             acquire_by_console(
-                console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, found=summary
+                console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, summary=summary
             )
         elif dry_run:
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
@@ -76,7 +76,7 @@ def acquire(
                 job, console, parent=output, resume=resume, confirm=not yes, figures=summary, with_mesh=with_mesh
             )
     except CoupoleError as error:
-        fail(error, as_json=as_json, found=summary)
+        fail(error, as_json=as_json, figures=summary)
         raise
     if as_json:
         print(json.dumps(summary))
@@ -94,7 +94,7 @@ def devices(
 
     from coupole.acquisition.opened_cell import open_cell
     from coupole.bounded import run_bounded
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 
@@ -102,7 +102,7 @@ def devices(
     cell = read_cell(rig or shipped_rig())
     document: dict[str, Any] = {}
     table = Table("device", "identity", "self-test", box=None)
-    with borrowed(cell, "devices"), open_cell(cell) as open_devices:
+    with borrowed_cell(cell, "devices"), open_cell(cell) as open_devices:
         for kind in ("ledbox", "camera", "robot"):
             identity, self_test = open_devices.identities[kind], run_bounded(getattr(open_devices, kind).self_test)
             document[kind] = {**vars(identity), "self_test": dict(self_test)}
@@ -120,7 +120,7 @@ def devices(
 def meter(
     plan: PlanPath,
     rig: RigOption = None,
-    saturated: Annotated[
+    max_saturated_share: Annotated[
         float,
         typer.Option("--saturated", min=0, max=0.5, help="Largest share of a picture's pixels that may saturate."),
     ] = 1e-3,
@@ -136,7 +136,7 @@ def meter(
 ) -> None:
     """Advise on a plan's exposure, by a few pictures of each view under a few lights, which are not stored."""
     from coupole.acquisition.looking import meter as meter_plan
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.preflight.exposure_advice import Request, write_plan
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console, show_advice
@@ -144,8 +144,8 @@ def meter(
     console = make_console(quiet=as_json)
     try:
         job = read_job(plan, rig)
-        with borrowed(job.cell, f"meter {plan.name}"):
-            advice = meter_plan(job, console, Request(saturated, snr, share), confirm=not yes)
+        with borrowed_cell(job.cell, f"meter {plan.name}"):
+            advice = meter_plan(job, console, Request(max_saturated_share, snr, share), confirm=not yes)
         if write is not None:
             write_plan(job.document, write, advice.exposure)
     except CoupoleError as error:
@@ -176,9 +176,9 @@ def live(
     entered in the ledger) the camera is opened; the arm is not moved.
     """
     from coupole.acquisition.looking import watch_cell, watch_run
-    from coupole.console.command_line.client import borrowed
+    from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import Cell, read_cell
-    from coupole.plan.yamlfile import read
+    from coupole.plan.yamlfile import read_document
     from coupole.preflight.job import read_job
     from coupole.viewing.live import Choice
     from coupole.viewing.terminal import make_console
@@ -187,9 +187,9 @@ def live(
     if what.is_dir():
         watch_run(what, console, port=port)
         return
-    source = read_job(what) if "views" in read(what).data else read_cell(what)
+    source = read_job(what) if "views" in read_document(what).data else read_cell(what)
     choice = Choice(led, exposure_us)
-    with borrowed(source if isinstance(source, Cell) else source.cell, "live"):
+    with borrowed_cell(source if isinstance(source, Cell) else source.cell, "live"):
         watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
 
 

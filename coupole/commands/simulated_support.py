@@ -38,7 +38,7 @@ def with_things(rig_path: Path, things: Sequence[Mapping[str, Any]], path: Path,
     from coupole.plan.rewriting import named_paths, rewritten
     from coupole.plan.rig import Rig
 
-    document = yamlfile.read(rig_path)
+    document = yamlfile.read_document(rig_path)
     entries = [(at, value) for at, value in named_paths(document.validate(Rig)) if at in document.value_places]
     changes = {at: str(document.resolve(value)) for at, value in entries}
     yaml = YAML()

@@ -14,7 +14,7 @@ import typer
 
 from coupole.commands.calibrating import EmissionOption, emission_of
 from coupole.commands.common import JsonOption, fail
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError, StorageError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class SpotOfObject:
     ] = 0.02
 
 
-@flattened
+@flatten_options
 def budget(
     records: Annotated[
         list[Path] | None,
@@ -104,7 +104,7 @@ def budget(
             _refuse_target(out)
         all_records = _with_plan(read_records(records or []), plan)
         with console.status("propagating distributions"):
-            result = _propagated(
+            result = _propagate(
                 all_records, beside or [], start, Geometry(spot.incidence_deg), emission, coverage or COVERAGES
             )
         if out is not None:
@@ -129,7 +129,7 @@ def _say(result: _Result, console: Console, *, as_json: bool) -> None:
 @dataclass(frozen=True)
 class _Result:
     budget: Budget
-    spread: Spread
+    dome_spread: Spread
     """Spread of the first case."""
     cases: list[Case]
     """Our records, then those of `--beside`."""
@@ -139,8 +139,8 @@ class _Result:
     """Document as `--json` prints it."""
 
 
-def _propagated(
-    ours: tuple[InForce, ...],
+def _propagate(
+    own_records: tuple[InForce, ...],
     beside: list[Path],
     start: Known,
     geometry: Geometry,
@@ -153,13 +153,15 @@ def _propagated(
     from coupole.calibration.budget.records import doubts, known_from, read_records
     from coupole.calibration.budget.report import as_json as figures_of
 
-    figures = known_from(ours, start)
+    figures = known_from(own_records, start)
     our_budget = budget_of(figures, geometry, emission=emission_of(emission), coverages=coverages)
-    our_spread = _spread(figures)
-    cases = [Case(_folder(ours), ours, our_spread)]
+    our_spread = _spread_over_dome(figures)
+    cases = [Case(_folder(own_records), own_records, our_spread)]
     if beside:
         their_records = read_records(beside)
-        cases.append(Case(_folder(their_records), their_records, _spread(known_from(their_records, start))))
+        cases.append(
+            Case(_folder(their_records), their_records, _spread_over_dome(known_from(their_records, start)))
+        )
     table = accuracies(cases)
     doubts_of_records = doubts([item for case in cases for item in case.records], datetime.now(UTC))
     document = figures_of(our_budget, our_spread, cases, table) | {"doubts": doubts_of_records}
@@ -171,8 +173,8 @@ def _write_report(out: Path, result: _Result) -> None:
     from coupole.calibration.budget.page import page
     from coupole.calibration.budget.report import draw_budget
 
-    picture = draw_budget(result.budget, result.spread)
-    text = page(result.budget, result.spread, result.cases, result.table, picture, result.doubts)
+    picture = draw_budget(result.budget, result.dome_spread)
+    text = page(result.budget, result.dome_spread, result.cases, result.table, picture, result.doubts)
     _write(
         {
             out: picture,
@@ -182,15 +184,15 @@ def _write_report(out: Path, result: _Result) -> None:
     )
 
 
-def _with_plan(given: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
+def _with_plan(given_records: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
     """The records given, and for kinds that are not given those in force for a plan."""
     from coupole.calibration.budget.records import of_use
     from coupole.preflight.job import read_job
 
     if plan is None:
-        return given
-    kinds = {item.record.kind for item in given}
-    return given + tuple(
+        return given_records
+    kinds = {item.record.kind for item in given_records}
+    return given_records + tuple(
         item for item in of_use(read_job(plan).calibrations or ()) if item.record.kind not in kinds
     )
 
@@ -200,13 +202,13 @@ def _folder(records: tuple[InForce, ...]) -> str:
     return records[0].path.resolve().parent.name if records else "no records"
 
 
-def _spread(known: Known) -> Spread:
+def _spread_over_dome(figures: Known) -> Spread:
     """Samples over a dome: LEDs of equal density on the sphere above 20 degrees elevation."""
     from coupole.calibration.budget.budget import Geometry, spread_over
 
     steps = [(number + 0.5) / _SAMPLES for number in range(_SAMPLES)]
     cosines = [1.0 - step * (1.0 - math.cos(math.radians(70.0))) for step in steps]
-    return spread_over(known, [Geometry(math.degrees(math.acos(cosine))) for cosine in cosines])
+    return spread_over(figures, [Geometry(math.degrees(math.acos(cosine))) for cosine in cosines])
 
 
 def _refuse_target(out: Path) -> None:
@@ -227,13 +229,13 @@ def _write(files: Mapping[Path, bytes]) -> None:
             raise StorageError(f"{path}: cannot write the budget: {error.strerror}. Free its disk.") from error
 
 
-def _show(console: Console, found: Budget) -> None:
+def _show(console: Console, budget: Budget) -> None:
     from rich.table import Table
 
     from coupole.calibration.budget.page import verdict
 
     table = Table("source", "taken as", "said by", "alone", "variance", "without", box=None)
-    for share in found.shares:
+    for share in budget.shares:
         table.add_row(
             share.source,
             share.figure,
@@ -243,10 +245,10 @@ def _show(console: Console, found: Budget) -> None:
             f"{share.width_decrease:.1%}",
         )
     console.print(table)
-    for interval in found.numeric.intervals:
+    for interval in budget.numeric.intervals:
         if interval.kind == "symmetric":
-            low, high = found.relative(interval.coverage)
-            short = found.relative(interval.coverage, "shortest")
+            low, high = budget.relative(interval.coverage)
+            short = budget.relative(interval.coverage, "shortest")
             console.print(
                 f"{interval.coverage:.0%}: [{low:+.2%}, {high:+.2%}], shortest [{short[0]:+.2%}, {short[1]:+.2%}]"
             )
@@ -254,8 +256,10 @@ def _show(console: Console, found: Budget) -> None:
         "alone: half its own 68 % interval; variance: its share by the linear formula; without: how much"
     )
     console.print("narrower the interval is without it")
-    console.print(f"linear formula: u {found.linear.result.u / found.nominal:.2%}; {found.numeric.trials} trials")
-    for v in found.validations:
+    console.print(
+        f"linear formula: u {budget.linear.result.u / budget.nominal:.2%}; {budget.numeric.trials} trials"
+    )
+    for v in budget.validations:
         console.print(f"  at {v.coverage:.0%}, to digit {v.digits} of u (JCGM 101, section 8): it {verdict(v)}")
 
 

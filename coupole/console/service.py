@@ -64,7 +64,7 @@ def serve(
     folder = console_folder(cell)
     make_folder(folder)
     folder.chmod(0o700)  # hashes of passwords, and who did what
-    with _owned(folder):
+    with _console_lock(folder):
         context, listening = tls_context(tls), listen(host, port)
         port = listening.getsockname()[1]
         url = f"{'https' if tls else 'http'}://{in_url(host)}:{port}"
@@ -132,7 +132,7 @@ def _parts(cell: Cell, folder: Path, plans: Path, origins: frozenset[str], cooki
 
 
 @contextlib.contextmanager
-def _owned(folder: Path) -> Iterator[None]:
+def _console_lock(folder: Path) -> Iterator[None]:
     """The cell's console, of this process alone. Raises InputError: another one has it."""
     with (folder / "lock").open("w", encoding="utf-8") as lock:
         try:

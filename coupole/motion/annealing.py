@@ -7,7 +7,7 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
+def anneal(seconds, posture_cost_s, first, order, tour_places, rolls, hottest_s, coldest_s):  # type: ignore[no-untyped-def]
     """The best order of groups [n], and the places chosen in it [n], found by random changes.
 
     `seconds` [places, places] between places, symmetric; place 0 is the start, those of group g are `first[g]` to
@@ -21,7 +21,7 @@ def anneal(seconds, posture_cost_s, first, order, picked, rolls, hottest_s, cold
     n = len(order)
     # visit i, from 1 to n, is at tour[i], of group order[i - 1]
     order, tour = order.copy(), np.zeros(n + 1, np.int64)
-    tour[1:] = picked
+    tour[1:] = tour_places
     best_order, best_tour = order.copy(), tour.copy()
     gained_s, best_gained_s = 0.0, 0.0
     heat_s, cooling = hottest_s, (coldest_s / hottest_s) ** (1.0 / len(rolls))

@@ -129,15 +129,15 @@ def reach_mm(arm: Arm, body: Body, from_link: int = 0) -> Floats:
 
 
 def part_apart(
-    arm: Arm, body: Body, other: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
+    arm: Arm, body: Body, other_body: Body, postures_deg: Sequence[Sequence[float]], by_mm: float
 ) -> Body | None:
     """The part of a body whose spheres are more than `by_mm` from another in all of some postures; None if there
     is none."""
     apart = np.ones(len(body.spheres.radii_mm), dtype=bool)
     for joints_deg in postures_deg:
         frames = link_frames(arm, joints_deg)
-        at, other_centers_mm = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other))
-        distances_mm = np.linalg.norm(at[:, None] - other_centers_mm, axis=2) - other.spheres.radii_mm
+        at, other_centers_mm = (apply(frames[b.link], b.spheres.centers_mm) for b in (body, other_body))
+        distances_mm = np.linalg.norm(at[:, None] - other_centers_mm, axis=2) - other_body.spheres.radii_mm
         apart &= distances_mm.min(axis=1) > body.spheres.radii_mm + by_mm
     if not apart.any():
         return None

@@ -42,14 +42,14 @@ class Contact:
     """Two bodies that are too close."""
 
     body: str
-    other: str
+    other_name: str
     distance_mm: float
     """Conservative; negative where they overlap."""
     required_mm: float
 
     def __str__(self) -> str:
         how = f"{self.distance_mm:.0f} mm from" if self.distance_mm > 0 else "inside"
-        return f"{self.body} would be {how} {self.other}; {self.required_mm:.3g} mm must be kept"
+        return f"{self.body} would be {how} {self.other_name}; {self.required_mm:.3g} mm must be kept"
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class _Pair:
     reach_mm: Floats
     kind: int
     figures: tuple[float, ...] = ()
-    other: Body | None = None
+    other_body: Body | None = None
 
     def contact(self, margin_mm: float) -> Contact:
         return Contact(self.body.name, self.other_name, float(margin_mm + self.required_mm), self.required_mm)
@@ -195,7 +195,7 @@ class CellBodies:
             reach = reach_mm(self._arm, body)
             if len(points):
                 required_mm = self._required_mm(keep.object_mm, reach)
-                pairs.append(_Pair(body, shape.name, required_mm, reach, SHAPE, other=shape))
+                pairs.append(_Pair(body, shape.name, required_mm, reach, SHAPE, other_body=shape))
             pairs += [
                 _Pair(body, name, self._required_mm(keep_mm, reach), reach, kind, figures)
                 for name, keep_mm, kind, figures in solids
@@ -223,7 +223,9 @@ class CellBodies:
                     reach = reach_mm(self._arm, part, from_link=other_body.link)
                     required_mm = self._required_mm(self._keep.self_mm, reach)
                     pairs.append(
-                        _Pair(part, f"the arm's {other_body.name}", required_mm, reach, SHAPE, other=other_body)
+                        _Pair(
+                            part, f"the arm's {other_body.name}", required_mm, reach, SHAPE, other_body=other_body
+                        )
                     )
         return pairs
 
@@ -242,13 +244,13 @@ class CellBodies:
         """The pairs as arrays for the compiled functions."""
         from coupole.motion.distances import SUPPORT_FRAME, Model
 
-        all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other) if body is not None]
+        all_bodies = [body for pair in self._pairs for body in (pair.body, pair.other_body) if body is not None]
         bodies = list({id(body): body for body in all_bodies}.values())
         tree_of = {id(body): tree for tree, body in enumerate(bodies)}
         numbers, figures = [], np.zeros((len(self._pairs), 13))
         for row, pair in zip(figures, self._pairs, strict=True):
-            obstacle = pair.other or pair.body
-            on_link = pair.other.link if pair.other and pair.other.link != SUPPORT_FRAME else 0
+            obstacle = pair.other_body or pair.body
+            on_link = pair.other_body.link if pair.other_body and pair.other_body.link != SUPPORT_FRAME else 0
             trees = tree_of[id(pair.body)], tree_of[id(obstacle)]
             numbers.append((trees[0], pair.body.link, pair.kind, trees[1], obstacle.link, on_link))
             row[0], row[1:7] = pair.required_mm, pair.reach_mm

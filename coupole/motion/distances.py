@@ -192,8 +192,8 @@ def _margin(nodes, trees, numbers, figures, frames, pair, far, hasty):  # type: 
 
 
 @numba.njit(cache=True, nogil=True)
-def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # type: ignore[no-untyped-def]
-    """Bound of the relative motion of a pair while the axes turn by at most `turned` [6] radians from a posture.
+def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turns_rad):  # type: ignore[no-untyped-def]
+    """Bound of the relative motion of a pair while the axes turn by at most `turns_rad` [6] from a posture.
 
     A point moves by at most each axis' turn times its greatest distance from that axis during the turn, which is
     its present distance plus its motion by the axes farther out.
@@ -209,7 +209,7 @@ def _moved_mm(nodes, trees, numbers, figures, joints, frames, pair, turned):  # 
         ux, uy, uz = frames[k + 1, 0, axis], frames[k + 1, 1, axis], frames[k + 1, 2, axis]
         dx, dy, dz = x - frames[k + 1, 0, 3], y - frames[k + 1, 1, 3], z - frames[k + 1, 2, 3]
         away = _length(uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx)
-        motion_mm += turned[k] * min(figures[pair, 1 + k], away + radius + motion_mm)
+        motion_mm += turns_rad[k] * min(figures[pair, 1 + k], away + radius + motion_mm)
     return motion_mm
 
 

@@ -58,12 +58,12 @@ def arm_of(rig: Rig) -> kinematics.Arm:
     description. Raises InputError if the arm has no description."""
     arm, description = planning_arm(rig), described_arm(rig)
     if arm is None or description is None:
-        raise undescribed(rig)
+        raise undescribed_arm_error(rig)
     limits_deg = zip(arm.limits_deg, description.posture_limits_deg, strict=True)
     return replace(arm, limits_deg=tuple((max(a[0], b[0]), min(a[1], b[1])) for a, b in limits_deg))
 
 
-def undescribed(rig: Rig) -> InputError:
+def undescribed_arm_error(rig: Rig) -> InputError:
     """The error of a rig whose arm has no description."""
     return InputError(f"nothing describes the arm that `{rig.robot.driver}` moves: name its file under `arm:`")
 
@@ -82,7 +82,7 @@ def bodies_of(
     """
     arm = described_arm(rig)
     if arm is None:
-        raise undescribed(rig)
+        raise undescribed_arm_error(rig)
     base_from_support = rig.support.base_from_support.matrix()
     support_from_base = inverse(base_from_support)
     leds_mm = leds.positions_mm @ support_from_base[:3, :3].T + support_from_base[:3, 3]

@@ -20,7 +20,7 @@ from coupole.geometry import Transform, apply, inverse
 from coupole.joint_chain import FLANGE
 from coupole.kinematics import link_frames
 from coupole.motion.bodies import Capsule, capsules_of
-from coupole.motion.itinerary import undescribed
+from coupole.motion.itinerary import undescribed_arm_error
 from coupole.motion.patches import PATCHES, Patches, patches_at, patches_of
 from coupole.plan.arm_description import ArmDescription
 from coupole.plan.led_table import LedTable
@@ -62,7 +62,7 @@ class Occlusion:
 
     codes: NDArray[np.uint8]
     """[patches, leds] REACHED, AWAY, BY_OBJECT, BY_ARM or BY_TOOL."""
-    seen: NDArray[np.bool_]
+    is_seen: NDArray[np.bool_]
     """[patches] True where the camera sees the patch's point."""
     areas_mm2: NDArray[np.float64]
     """[patches] their weights."""
@@ -70,7 +70,7 @@ class Occlusion:
     def share(self, code: int = REACHED) -> NDArray[np.float64]:
         """[leds] share of the surface seen by the camera that has this code; 0 if the camera sees nothing of
         it."""
-        weights = np.where(self.seen, self.areas_mm2, 0.0)
+        weights = np.where(self.is_seen, self.areas_mm2, 0.0)
         share: NDArray[np.float64] = weights @ (self.codes == code) / max(weights.sum(), 1e-300)
         return share
 
@@ -79,8 +79,8 @@ class Occlusion:
 
         Parts smaller than a patch may be lit all the same.
         """
-        reaches: NDArray[np.bool_] = (self.codes[self.seen] == REACHED).any(axis=0)
-        return ~reaches & self.seen.any()
+        reaches: NDArray[np.bool_] = (self.codes[self.is_seen] == REACHED).any(axis=0)
+        return ~reaches & self.is_seen.any()
 
     def arrays(self, patches: Patches) -> dict[str, NDArray[np.generic]]:
         """Arrays by name, to be stored with a view's frames and read without this module.
@@ -90,7 +90,7 @@ class Occlusion:
         """
         return {
             "codes": self.codes,
-            "seen": self.seen,
+            "seen": self.is_seen,
             "points_mm": patches.points_mm.astype(np.float32),
             "normals": patches.normals.astype(np.float32),
             "areas_mm2": patches.areas_mm2.astype(np.float32),
@@ -126,12 +126,12 @@ class Occlusions:
         codes[(by >= 0) & (by < len(links))] = BY_ARM
         codes[by >= len(links)] = BY_TOOL
         arm = slice(len(links))
-        visible = self._seen(
+        visible = self._visible_patches(
             sight_of(self.rig, frames[FLANGE] @ self.rig.flange_from_camera.matrix()), axes_mm[arm], radii_mm[arm]
         )
         return Occlusion(codes, visible, self.patches.areas_mm2)
 
-    def _seen(
+    def _visible_patches(
         self, sight: Sight, axes_mm: NDArray[np.float64], radii_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
         """[patches] True where a camera sees the patch: inside the image, facing the camera, unobstructed."""
@@ -143,7 +143,9 @@ class Occlusions:
         visible &= np.einsum("pk,pk->p", eye_mm - starts_mm, self.patches.normals) > 0
         visible &= hidden_by(starts_mm, eye_mm[None], axes_mm, radii_mm, visible[:, None])[:, 0] < 0
         candidates = np.flatnonzero(visible)
-        visible[candidates] = ~blocked(self.mesh, starts_mm[candidates], np.tile(eye_mm, (len(candidates), 1)))
+        visible[candidates] = ~blocked_segments(
+            self.mesh, starts_mm[candidates], np.tile(eye_mm, (len(candidates), 1))
+        )
         return visible
 
 
@@ -157,7 +159,7 @@ def occlusions_of(
     """
     arm = described_arm(rig)
     if arm is None:
-        raise undescribed(rig)
+        raise undescribed_arm_error(rig)
     patches = patches_of(corners_mm, count) if len(corners_mm) else patches_at(targets_mm)
     support_from_base = inverse(rig.support.base_from_support.matrix())
     leds_mm = apply(support_from_base, leds.positions_mm)
@@ -180,7 +182,7 @@ def own_codes(
     faces &= np.einsum("plk,lk->pl", to_leds, led_normals) < 0
     patch, led = np.nonzero(faces)
     codes = np.where(faces, REACHED, AWAY).astype(np.uint8)
-    codes[patch, led] = np.where(blocked(mesh, starts_mm[patch], leds_mm[led]), BY_OBJECT, REACHED)
+    codes[patch, led] = np.where(blocked_segments(mesh, starts_mm[patch], leds_mm[led]), BY_OBJECT, REACHED)
     return codes
 
 
@@ -202,7 +204,7 @@ def ray_mesh(corners_mm: NDArray[np.float64]) -> Any:
     return scene
 
 
-def blocked(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+def blocked_segments(mesh: Any, starts_mm: NDArray[np.float64], ends_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
     """[n] True where the segment between two points [n, 3] meets a triangle of a `ray_mesh`."""
     if mesh is None or len(starts_mm) == 0:
         return np.zeros(len(starts_mm), np.bool_)
@@ -229,11 +231,11 @@ def hidden_by(
     ends_mm: NDArray[np.float64],
     axes_mm: NDArray[np.float64],
     radii_mm: NDArray[np.float64],
-    asked: NDArray[np.bool_],
+    is_asked: NDArray[np.bool_],
 ) -> NDArray[np.int16]:
     """Find for each segment from a start [n, 3] to an end [m, 3] the first capsule (axes [k, 2, 3], radii [k])
-    that it meets, [n, m]; -1 where it meets none, or where `asked` [n, m] is False."""
-    capsule_numbers = np.full(asked.shape, -1, np.int16)
+    that it meets, [n, m]; -1 where it meets none, or where `is_asked` [n, m] is False."""
+    capsule_numbers = np.full(is_asked.shape, -1, np.int16)
     if len(starts_mm):
         center_mm = starts_mm.mean(axis=0)
         reach_mm = float(np.linalg.norm(starts_mm - center_mm, axis=1).max())
@@ -242,7 +244,7 @@ def hidden_by(
             np.ascontiguousarray(ends_mm),
             axes_mm,
             radii_mm,
-            asked,
+            is_asked,
             center_mm,
             reach_mm,
             capsule_numbers,
@@ -284,9 +286,9 @@ def segment_distance_mm(p, q, a, b):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _first_met(starts, ends, axes, radii, asked, center, reach, found):  # type: ignore[no-untyped-def]
-    """Fill `found` [n, m]. No segment to an end is farther than `reach` from the one that starts at `center`: a
-    capsule that this one misses by more is not tested for each start."""
+def _first_met(starts, ends, axes, radii, is_asked, center, reach, capsule_numbers):  # type: ignore[no-untyped-def]
+    """Fill `capsule_numbers` [n, m]. No segment to an end is farther than `reach` from the one that starts at
+    `center`: a capsule that this one misses by more is not tested for each start."""
     near = np.empty(len(radii), np.int64)
     for j in range(len(ends)):
         count = 0
@@ -295,10 +297,10 @@ def _first_met(starts, ends, axes, radii, asked, center, reach, found):  # type:
                 near[count] = k
                 count += 1
         for i in range(len(starts) if count else 0):
-            if not asked[i, j]:
+            if not is_asked[i, j]:
                 continue
             for n in range(count):
                 k = near[n]
                 if segment_distance_mm(starts[i], ends[j], axes[k, 0], axes[k, 1]) <= radii[k]:
-                    found[i, j] = k
+                    capsule_numbers[i, j] = k
                     break

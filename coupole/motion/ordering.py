@@ -75,7 +75,7 @@ def shortest_tour(
     order = np.arange(len(choices))
     best, best_s = (order, order), np.inf
     for seed in range(1 if as_written else _RESTARTS):
-        order, place_indices = _settled(times, groups, order, seed, as_written=as_written)
+        order, place_indices = _settled_order(times, groups, order, seed, as_written=as_written)
         total_s = _way_s(times.seconds, groups, place_indices)
         if total_s < best_s:
             best, best_s = (order, place_indices), total_s
@@ -84,7 +84,7 @@ def shortest_tour(
     return Tour(tuple(order.tolist()), tuple(places[1:]), tuple(planner.leg(a, b) for a, b in pairwise(places)))
 
 
-def _settled(
+def _settled_order(
     times: _Times, groups: _Groups, order: NDArray[np.int64], seed: int, *, as_written: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """An order and its places that are still best when all legs of the tour are known."""
@@ -111,11 +111,11 @@ class _Times:
         self._looked_at = np.zeros(self.seconds.shape, dtype=bool)
         self._to_find: set[tuple[int, int]] = set()
 
-    def learn_blocked(self, picked: NDArray[np.int64]) -> bool:
+    def learn_blocked(self, place_indices: NDArray[np.int64]) -> bool:
         """Check the straight motions of a tour; True if one is blocked, whose time is then increased by a
         detour."""
         is_blocked = False
-        for a, b in self._legs(picked):
+        for a, b in self._legs(place_indices):
             if not self._looked_at[a, b]:
                 self._looked_at[a, b] = self._looked_at[b, a] = True
                 if not self._planner.is_straight(self._places[a], self._places[b]):
@@ -124,24 +124,24 @@ class _Times:
                     self._set(a, b, self.seconds[a, b] + _DETOUR_S)
         return is_blocked
 
-    def learn_detours(self, picked: NDArray[np.int64]) -> bool:
+    def learn_detours(self, place_indices: NDArray[np.int64]) -> bool:
         """Plan the legs of a tour that are not straight; True if there was one to plan."""
-        detours = self._to_find.intersection(self._legs(picked))
+        detours = self._to_find.intersection(self._legs(place_indices))
         for a, b in sorted(detours):
             self._set(a, b, self._planner.leg(self._places[a], self._places[b]).duration_s)
         self._to_find -= detours
         return bool(detours)
 
-    def _legs(self, picked: NDArray[np.int64]) -> list[tuple[int, int]]:
-        return [(min(a, b), max(a, b)) for a, b in pairwise([0, *picked.tolist()])]
+    def _legs(self, place_indices: NDArray[np.int64]) -> list[tuple[int, int]]:
+        return [(min(a, b), max(a, b)) for a, b in pairwise([0, *place_indices.tolist()])]
 
     def _set(self, a: int, b: int, seconds: float) -> None:
         self.seconds[a, b] = self.seconds[b, a] = seconds
 
 
-def _way_s(seconds: Floats, groups: _Groups, picked: NDArray[np.int64]) -> float:
-    way = np.concatenate([[0], picked])
-    return float(seconds[way[:-1], way[1:]].sum() + groups.posture_cost_s[picked].sum())
+def _way_s(seconds: Floats, groups: _Groups, place_indices: NDArray[np.int64]) -> float:
+    way = np.concatenate([[0], place_indices])
+    return float(seconds[way[:-1], way[1:]].sum() + groups.posture_cost_s[place_indices].sum())
 
 
 def _best_places(seconds: Floats, groups: _Groups, order: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -165,7 +165,7 @@ def _best_order(
     seconds: Floats,
     groups: _Groups,
     order: NDArray[np.int64],
-    picked: NDArray[np.int64],
+    place_indices: NDArray[np.int64],
     seed: int,
     *,
     again: bool,
@@ -178,6 +178,6 @@ def _best_order(
     hottest_s = max(share * float(np.median(seconds[0, 1:])), 2 * _COLDEST_S)
     rolls = np.random.default_rng(seed).random((changes, 5))
     order_and_places: tuple[Any, Any] = anneal(
-        seconds, groups.posture_cost_s, groups.first, order, picked, rolls, hottest_s, _COLDEST_S
+        seconds, groups.posture_cost_s, groups.first, order, place_indices, rolls, hottest_s, _COLDEST_S
     )
     return order_and_places

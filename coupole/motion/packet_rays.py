@@ -79,12 +79,13 @@ class PacketMesh:
         _first_met(_address("rtcIntersect16"), self.scene, start_mm, ways, ARGUMENTS, number, distance)
         return number, distance
 
-    def blocked(
-        self, starts_mm: NDArray[np.float32], asked: NDArray[np.int64], end_mm: NDArray[np.float64]
+    def blocked_rays(
+        self, starts_mm: NDArray[np.float32], start_rows: NDArray[np.int64], end_mm: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """[asked] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the end."""
-        are_blocked = np.empty(len(asked), np.bool_)
-        _blocked(blocked16(), self.scene, starts_mm, asked, end_mm, ARGUMENTS, are_blocked)
+        """[start_rows] True where a triangle lies between a start, by its row in `starts_mm` [n, 3], and the
+        end."""
+        are_blocked = np.empty(len(start_rows), np.bool_)
+        _fill_blocked(blocked16(), self.scene, starts_mm, start_rows, end_mm, ARGUMENTS, are_blocked)
         return are_blocked
 
     def blocked_along(self, starts_mm: NDArray[np.float32], ways_mm: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -183,21 +184,21 @@ def trace(function, scene, rays, words, valid, lanes, far, arguments):  # type: 
 
 
 @numba.njit(cache=True, nogil=True)
-def _blocked(function, scene, starts, asked, end, arguments, found):  # type: ignore[no-untyped-def]
+def _fill_blocked(function, scene, starts, start_rows, end, arguments, are_blocked):  # type: ignore[no-untyped-def]
     rays, words, valid = packet()
-    for first in range(0, len(asked), LANES):
-        lanes = min(LANES, len(asked) - first)
+    for first in range(0, len(start_rows), LANES):
+        lanes = min(LANES, len(start_rows) - first)
         for lane in range(lanes):
-            start = starts[asked[first + lane]]
+            start = starts[start_rows[first + lane]]
             for k in range(3):
                 rays[k, lane], rays[4 + k, lane] = start[k], np.float32(end[k] - start[k])
         trace(function, scene, rays, words, valid, lanes, np.float32(1.0), arguments)
         for lane in range(lanes):
-            found[first + lane] = rays[FAR, lane] < 0.0
+            are_blocked[first + lane] = rays[FAR, lane] < 0.0
 
 
 @numba.njit(cache=True, nogil=True)
-def _blocked_one_by_one(function, scene, starts, ways, arguments, found):  # type: ignore[no-untyped-def]
+def _blocked_one_by_one(function, scene, starts, ways, arguments, are_blocked):  # type: ignore[no-untyped-def]
     """A ray's numbers lie one behind the other as a packet's rows do."""
     rays, words, _ = packet()
     ray, word = rays[0], words[0]
@@ -208,7 +209,7 @@ def _blocked_one_by_one(function, scene, starts, ways, arguments, found):  # typ
             ray[k], ray[4 + k] = starts[n, k], ways[min(n, len(ways) - 1), k]
         ray[FAR] = 1.0
         _call_embree_of_one(function, scene, address, more)
-        found[n] = ray[FAR] < 0.0
+        are_blocked[n] = ray[FAR] < 0.0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -48,7 +48,7 @@ def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches
     if width_mm == 0.0:
         return patches_at([])
     size_mm = float(np.ptp(corners_mm, axis=(0, 1)).max())
-    pieces_mm, triangle = _cut(corners_mm, max(_PIECE_EDGE * width_mm, _LEAST_EDGE * size_mm))
+    pieces_mm, triangle = _cut_triangles(corners_mm, max(_PIECE_EDGE * width_mm, _LEAST_EDGE * size_mm))
     areas_mm2, normals = _areas_and_normals(pieces_mm)
     real = areas_mm2 > 0
     pieces_mm, triangle, areas_mm2, normals = pieces_mm[real], triangle[real], areas_mm2[real], normals[real]
@@ -56,7 +56,7 @@ def patches_of(corners_mm: NDArray[np.float64], count: int = PATCHES) -> Patches
     traits = np.hstack([centers_mm, _TURN_WIDTHS * width_mm * normals])
     patch = np.zeros(len(pieces_mm), np.int64)
     representatives = []
-    for number, members in enumerate(_halved(traits, areas_mm2, min(count, len(pieces_mm)))):
+    for number, members in enumerate(_equal_groups(traits, areas_mm2, min(count, len(pieces_mm)))):
         patch[members] = number
         mean = _mean(traits[members], areas_mm2[members])
         representatives.append(members[np.argmin(np.linalg.norm(traits[members] - mean, axis=1))])
@@ -84,7 +84,9 @@ def _areas_and_normals(corners_mm: NDArray[np.float64]) -> tuple[NDArray[np.floa
     return length / 2, across / np.where(length > 0, length, 1.0)[:, None]
 
 
-def _cut(corners_mm: NDArray[np.float64], edge_mm: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _cut_triangles(
+    corners_mm: NDArray[np.float64], edge_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Triangles halved across their longest edge until none has an edge longer than `edge_mm`, and for each piece
     the triangle that it comes from."""
     done_mm, done_of = [], []
@@ -108,7 +110,9 @@ def _mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[
     return np.asarray(weights @ values / weights.sum())
 
 
-def _halved(traits: NDArray[np.float64], weights: NDArray[np.float64], count: int) -> list[NDArray[np.int64]]:
+def _equal_groups(
+    traits: NDArray[np.float64], weights: NDArray[np.float64], count: int
+) -> list[NDArray[np.int64]]:
     """Divide items with traits [n, k] into `count` groups of about equal weight with similar members."""
     groups, open_groups = [], [(np.arange(len(traits)), count)]
     while open_groups:

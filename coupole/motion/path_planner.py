@@ -62,7 +62,7 @@ class PathPlanner:
 
     def is_straight(self, start: Joints, goal: Joints) -> bool:
         """True if the straight motion is clear."""
-        a, b = _sorted(start, goal)
+        a, b = _sorted_pair(start, goal)
         key = (a.tobytes(), b.tobytes())
         if key not in self._straight:
             self._straight[key] = self._clear(a, b)
@@ -70,7 +70,7 @@ class PathPlanner:
 
     def leg(self, start: Joints, goal: Joints) -> Leg:
         """The leg from one posture to another."""
-        a, b = _sorted(start, goal)
+        a, b = _sorted_pair(start, goal)
         key = (a.tobytes(), b.tobytes())
         if key not in self._chains:
             self._chains[key] = self._find(a, b)
@@ -91,7 +91,7 @@ class PathPlanner:
         if chain is None and self._is_cut_off(start) == self._is_cut_off(goal):
             chain = self._rrt_connect(start, goal)
         if chain is not None:
-            return self._shortened(chain)
+            return self._shortened_chain(chain)
         assert self._bodies is not None
         contact = self._bodies.contact_on_the_way(start, goal)
         assert contact is not None
@@ -182,7 +182,7 @@ class PathPlanner:
             if not greedy:
                 return last_node
 
-    def _shortened(self, chain: list[Joints]) -> list[Joints]:
+    def _shortened_chain(self, chain: list[Joints]) -> list[Joints]:
         """Leave out via points that are not needed, then cut corners at random."""
         random = np.random.default_rng(self._seed)
         chain = list(chain)
@@ -205,7 +205,7 @@ class PathPlanner:
         return chain
 
 
-def _sorted(a: Joints, b: Joints) -> tuple[Joints, Joints]:
+def _sorted_pair(a: Joints, b: Joints) -> tuple[Joints, Joints]:
     """The two postures in an order that does not depend on the order of the arguments."""
     return (b, a) if a.tobytes() > b.tobytes() else (a, b)
 

@@ -72,32 +72,38 @@ def _from_half_turn_deg(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return off
 
 
-def margin(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> NDArray[np.float64]:
+def margin(
+    arm: Arm, joints_deg: ArrayLike, required_margin: SingularityMargin = SINGULARITY_MARGIN
+) -> NDArray[np.float64]:
     """[...] distance of a posture [..., 6] from the nearest singularity, over the least distance allowed."""
     wrist_deg, elbow_deg, shoulder_mm = distances(arm, joints_deg)
-    shares = (wrist_deg / kept.wrist_deg, elbow_deg / kept.elbow_deg, shoulder_mm / kept.shoulder_mm)
+    shares = (
+        wrist_deg / required_margin.wrist_deg,
+        elbow_deg / required_margin.elbow_deg,
+        shoulder_mm / required_margin.shoulder_mm,
+    )
     least: NDArray[np.float64] = np.minimum.reduce(shares)
     return least
 
 
-def reason(arm: Arm, joints_deg: ArrayLike, kept: SingularityMargin = SINGULARITY_MARGIN) -> str:
+def reason(arm: Arm, joints_deg: ArrayLike, required_margin: SingularityMargin = SINGULARITY_MARGIN) -> str:
     """The singularity that a posture [6] is too near to, as a phrase for messages; empty if there is none."""
     wrist_deg, elbow_deg, shoulder_mm = (float(distance) for distance in distances(arm, joints_deg))
-    if wrist_deg < kept.wrist_deg:
+    if wrist_deg < required_margin.wrist_deg:
         return (
             f"the wrist would be stretched, with A5 {wrist_deg:.1f} deg from its singularity; "
-            f"{kept.wrist_deg:g} deg must be kept"
+            f"{required_margin.wrist_deg:g} deg must be kept"
         )
-    if elbow_deg < kept.elbow_deg:
+    if elbow_deg < required_margin.elbow_deg:
         return (
             f"the elbow would be stretched or folded, with A3 {elbow_deg:.1f} deg from its singularity; "
-            f"{kept.elbow_deg:g} deg must be kept"
+            f"{required_margin.elbow_deg:g} deg must be kept"
         )
-    if shoulder_mm < kept.shoulder_mm:
+    if shoulder_mm < required_margin.shoulder_mm:
         where = "axis 1" if isinstance(structure_of(arm), SphericalWrist) else "the plane of axes 1 and 2"
         return (
             f"the wrist's centre would be {shoulder_mm:.1f} mm from {where}, the shoulder's singularity; "
-            f"{kept.shoulder_mm:g} mm must be kept"
+            f"{required_margin.shoulder_mm:g} mm must be kept"
         )
     return ""
 

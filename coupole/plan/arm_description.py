@@ -149,7 +149,7 @@ class ArmDescription(Model):
 def read_arm(path: Path, files: InputFiles | None = None) -> ArmDescription:
     """Read an arm's file, from `files` if they are given. Raises InputError with all problems, each at its line
     and column."""
-    document = yamlfile.read(path, files)
+    document = yamlfile.read_document(path, files)
     description, problems = document.problems(ArmDescription)
     if description is not None:
         problems = description_problems(document, description)
@@ -214,22 +214,24 @@ def shipped_arm(name: str) -> ArmDescription:
 
 def arm_named(
     document: Document,
-    named: Path | ArmDescription | None,
+    arm_reference: Path | ArmDescription | None,
     driver: str,
     settings: Mapping[str, Any],
     files: InputFiles,
 ) -> tuple[ArmDescription | None, list[Problem]]:
     """The arm under `arm:` in a rig's document, or else its driver's, and the problems found in it."""
-    if isinstance(named, ArmDescription):
-        if named.link_meshes is not None:
-            named = named.model_copy(update={"link_meshes": document.resolve(named.link_meshes)})
-        return named, description_problems(document, named, ("arm",))
-    if named is None:
+    if isinstance(arm_reference, ArmDescription):
+        if arm_reference.link_meshes is not None:
+            arm_reference = arm_reference.model_copy(
+                update={"link_meshes": document.resolve(arm_reference.link_meshes)}
+            )
+        return arm_reference, description_problems(document, arm_reference, ("arm",))
+    if arm_reference is None:
         try:
             return arm_of_driver(driver, settings), []
         except InputError as error:
             return None, list(error.problems) or [document.problem(("robot", "settings", "model"), str(error))]
-    path = document.resolve(named)
+    path = document.resolve(arm_reference)
     if not files.there(path):
         return None, [document.problem(("arm",), f"expected the arm's file; there is no {path}")]
     try:

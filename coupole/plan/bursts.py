@@ -94,11 +94,13 @@ class Burst:
         drops = np.isin(self.table["led"], list(leds)) & (self.table["led"] != NO_LED)
         return self.only({label for label, drop in zip(self.labels, drops, strict=True) if label and not drop})
 
-    def only(self, wanted: Collection[ShotLabel]) -> Burst:
+    def only(self, wanted_labels: Collection[ShotLabel]) -> Burst:
         """The same burst with those shots only, and new marks."""
         inner = self.inner
-        keep = [i for i in inner if self.labels[i] in wanted]
-        marks = [label if label in wanted else None for i, label in enumerate(self.labels) if i not in inner]
+        keep = [i for i in inner if self.labels[i] in wanted_labels]
+        marks = [
+            label if label in wanted_labels else None for i, label in enumerate(self.labels) if i not in inner
+        ]
         dark = _dark_step(self.timing, sends_edge=self.hardware)
         own_labels = [self.labels[i] for i in keep]
         table, labels = with_marks(self.marks, self.table[keep], own_labels, marks, dark)

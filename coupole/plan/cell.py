@@ -87,7 +87,7 @@ def users_data_folder() -> Path:
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
     """Read a rig and its dome, into `files` if they are given. Raises InputError with all problems."""
     files = InputFiles() if files is None else files
-    document = yamlfile.read(path, files)
+    document = yamlfile.read_document(path, files)
     rig, problems = document.problems(Rig)
     if rig is None:
         raise InputError(problems)
@@ -120,16 +120,16 @@ def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
 
 
 def _damage_w_per_lm(
-    document: Document, key: str, given: Path | None, files: InputFiles, problems: list[Problem]
+    document: Document, key: str, spectrum_file: Path | None, files: InputFiles, problems: list[Problem]
 ) -> float | None:
     """Return the damaging power per lumen of the lamps whose spectrum is in this file; None if no file is given,
     or if a problem was added to `problems`."""
-    if given is None:
+    if spectrum_file is None:
         return None
     from coupole.appearance.spectra.damage import damage_w_per_lm
     from coupole.appearance.spectra.measured import decode_text, parse_spectrum
 
-    path = document.resolve(given)
+    path = document.resolve(spectrum_file)
     try:
         return damage_w_per_lm(
             parse_spectrum(decode_text(files.read_bytes(path)), str(path), name=path.stem, unit="power")

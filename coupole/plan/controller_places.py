@@ -35,7 +35,7 @@ def places_of_arm(cell: Cell, identity: Identity | None = None) -> tuple[Path, .
     if in_world(cell.rig, dry_run=False):
         return (cell.state_folder,)
     by_address = _by_address(cell)
-    serials = dict.fromkeys([*_by_serial(identity), *_remembered(by_address)])
+    serials = dict.fromkeys([*_by_serial(identity), *_remembered_serials(by_address)])
     return (*(cell.controllers_folder / name for name in serials), by_address, cell.state_folder)
 
 
@@ -45,7 +45,7 @@ def remember_controller(cell: Cell, identity: Identity) -> None:
     if in_world(cell.rig, dry_run=False):
         return
     by_address = _by_address(cell)
-    new = [name for name in _by_serial(identity) if name not in _remembered(by_address)]
+    new = [name for name in _by_serial(identity) if name not in _remembered_serials(by_address)]
     if not new:
         return
     with contextlib.suppress(OSError):
@@ -81,7 +81,7 @@ def _by_serial(identity: Identity | None) -> list[str]:
     return [_file_name("serial", identity.vendor, identity.serial)]
 
 
-def _remembered(by_address: Path) -> list[str]:
+def _remembered_serials(by_address: Path) -> list[str]:
     try:
         lines = (by_address / _SERIALS).read_text("utf-8", errors="replace").splitlines()
     except OSError:

@@ -33,7 +33,7 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
     """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Raises InputError
     with all problems of all files."""
     files = InputFiles()
-    document = yamlfile.read(plan_path, files) if text is None else yamlfile.parse(plan_path, text)
+    document = yamlfile.read_document(plan_path, files) if text is None else yamlfile.parse(plan_path, text)
     plan, problems = document.problems(Plan)
     cell: Cell | None = None
     rig_path = rig_path or _named_rig(document)

@@ -72,9 +72,9 @@ def _short(value: Any) -> str:
 def rewritten(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
     """The document's `text` with other values at these key paths; a key that is not there yet is added at the top
     level. Comments stay where the file's form allows it; else the result is JSON, which is YAML too."""
-    new_data = _changed(document.data, changes)
+    new_data = _with_changes(document.data, changes)
     try:
-        edited_text = _edited(document, text, changes)
+        edited_text = _edited_text(document, text, changes)
         if yamlfile.parse(document.path, edited_text).data == new_data:
             return edited_text
     except (InputError, LookupError):  # an alias, a merged mapping, or a file in braces that lacks a key
@@ -82,7 +82,7 @@ def rewritten(document: Document, text: str, changes: Mapping[KeyPath, str]) -> 
     return json.dumps(new_data, indent=1, ensure_ascii=False) + "\n"
 
 
-def _changed(data: dict[str, Any], changes: Mapping[KeyPath, str]) -> dict[str, Any]:
+def _with_changes(data: dict[str, Any], changes: Mapping[KeyPath, str]) -> dict[str, Any]:
     changed_data = copy.deepcopy(data)
     for (*parents, last), value in changes.items():
         part: Any = changed_data
@@ -92,7 +92,7 @@ def _changed(data: dict[str, Any], changes: Mapping[KeyPath, str]) -> dict[str, 
     return changed_data
 
 
-def _edited(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
+def _edited_text(document: Document, text: str, changes: Mapping[KeyPath, str]) -> str:
     root = yamlfile.compose(document.path, text)
     spans, added_text = [], ""
     for at, value in changes.items():

@@ -68,7 +68,7 @@ def planning_arm(rig: Rig) -> Arm | None:
     driver, settings = device_for(rig, "robot", dry_run=False)
     model = settings_class(driver)
     if hasattr(model, "arm"):
-        arm: Arm = model(**_known(NOWHERE["robot"], model) | settings).arm()  # type: ignore[attr-defined]
+        arm: Arm = model(**_known_settings(NOWHERE["robot"], model) | settings).arm()  # type: ignore[attr-defined]
         return arm
     motion = rig.motion
     return slowed_arm(
@@ -83,7 +83,7 @@ def robot_settings_here(rig: Rig) -> Any:
     """Settings of the robot's driver as if its controller were on this machine, at the rig's cycle."""
     driver, settings = device_for(rig, "robot", dry_run=False)
     model = settings_class(driver)
-    return model(**settings | _known(NOWHERE["robot"], model))
+    return model(**settings | _known_settings(NOWHERE["robot"], model))
 
 
 def runs_tables(rig: Rig) -> bool:
@@ -99,7 +99,7 @@ def upload_s(rig: Rig, steps: int) -> float:
 
 def _ledbox_settings(rig: Rig) -> BaseModel:
     model = settings_class(rig.ledbox.driver)
-    return model(**_known(NOWHERE["ledbox"], model) | rig.ledbox.settings)
+    return model(**_known_settings(NOWHERE["ledbox"], model) | rig.ledbox.settings)
 
 
 def longest_light_s(rig: Rig, on_us: int) -> float:
@@ -129,9 +129,9 @@ def device_for(rig: Rig, kind: str, *, dry_run: bool) -> tuple[DriverName, dict[
     elif dry_run and not (rig.world is not None and rig.world.serves == "always"):
         has_stand_in = driver in ROBOT_STAND_INS or driver in LEDBOX_STAND_INS
         driver = driver if has_stand_in else DEFAULT_TWINS[kind]
-        settings = _known(settings, settings_class(driver))
+        settings = _known_settings(settings, settings_class(driver))
     if kind == "robot":
-        settings = _known(_robot_settings(rig), settings_class(driver)) | settings
+        settings = _known_settings(_robot_settings(rig), settings_class(driver)) | settings
     return driver, settings
 
 
@@ -232,14 +232,14 @@ def world_problems(document: Document, rig: Rig, settings: Mapping[str, Any]) ->
 
 
 def _settings_problems(
-    document: Document, at: tuple[str, ...], driver: DriverName, given: dict[str, Any]
+    document: Document, at: tuple[str, ...], driver: DriverName, given_settings: dict[str, Any]
 ) -> list[Problem]:
     try:
         load_class(driver)
         model = settings_class(driver)
     except (ImportError, AttributeError) as error:
         return [document.problem((*at, "driver"), f"cannot find `{driver}`: {error}")]
-    return document.problems(model, (*at, "settings"), given=_known(given, model))[1]
+    return document.problems(model, (*at, "settings"), given_values=_known_settings(given_settings, model))[1]
 
 
 def _robot_settings(rig: Rig) -> dict[str, Any]:
@@ -249,7 +249,7 @@ def _robot_settings(rig: Rig) -> dict[str, Any]:
     return arm | {setting: getattr(rig.motion, figure) for figure, setting in _MOTION_SETTINGS.items()}
 
 
-def _known(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+def _known_settings(settings: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
     """The settings that the model has."""
     return {name: value for name, value in settings.items() if name in model.model_fields}
 

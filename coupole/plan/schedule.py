@@ -47,18 +47,18 @@ class Schedule:
     def frames(self) -> int:
         return sum(len(b.labels) for bursts in self.bursts for b in bursts)
 
-    def without(self, hidden: Mapping[str, Collection[int]]) -> Schedule:
+    def without(self, hidden_leds: Mapping[str, Collection[int]]) -> Schedule:
         """The same without some LEDs in some views (LED ids by name of view)."""
         return Schedule(
             self.views,
             tuple(
-                tuple(b.without(hidden[view.name]) for b in bursts) if hidden.get(view.name) else bursts
+                tuple(b.without(hidden_leds[view.name]) for b in bursts) if hidden_leds.get(view.name) else bursts
                 for view, bursts in zip(self.views, self.bursts, strict=True)
             ),
             self.labels,
         )
 
-    def left(self, proven: Collection[ShotId]) -> Schedule:
+    def without_proven(self, proven: Collection[ShotId]) -> Schedule:
         """Return the schedule of what is still to be taken: views with unproven frames, with their bursts reduced
         to these."""
         remaining_bursts = [bursts_left(bursts, proven) for bursts in self.bursts]

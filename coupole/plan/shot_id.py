@@ -132,11 +132,11 @@ class ShotId:
         return ShotId(view, ShotLabel.parse(label))
 
 
-def _light(found: re.Match[str]) -> Light:
-    if found["led"] is not None:
-        return Led(int(found["led"]))
-    if found["dark"] is not None:
-        return Dark(int(found["dark"]))
-    if found["mark"] is not None:
-        return PanelMark(int(found["panel"]), int(found["mark"]))
-    return Panel(int(found["panel"]))
+def _light(match: re.Match[str]) -> Light:
+    if match["led"] is not None:
+        return Led(int(match["led"]))
+    if match["dark"] is not None:
+        return Dark(int(match["dark"]))
+    if match["mark"] is not None:
+        return PanelMark(int(match["panel"]), int(match["mark"]))
+    return Panel(int(match["panel"]))

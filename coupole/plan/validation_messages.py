@@ -111,27 +111,27 @@ class _Explainer:
         if self.kind == "union" and below:
             yield from self._union(path, value, list(below.values()))
         elif self.kind == "tagged-union" and isinstance(value, dict):
-            yield from self._tagged(path, value, own_errors, below)
+            yield from self._tagged_union(path, value, own_errors, below)
         elif self.kind == "model" and isinstance(value, dict):
             yield from self._model(path, value, own_errors, below)
         elif self.kind in ("tuple", "list", "set") and isinstance(value, list):
             yield from self._list(path, value, own_errors, below)
         elif self.kind == "dict" and isinstance(value, dict):
-            yield from self._own(path, value, own_errors)
+            yield from self._own_mistake(path, value, own_errors)
             for key, inner in below.items():
                 yield from self._inner(self.node["values_schema"]).mistakes((*path, key), value.get(key), inner)
         else:
-            yield from self._own(path, value, own_errors or [error for _, error in errors])
+            yield from self._own_mistake(path, value, own_errors or [error for _, error in errors])
 
-    def _own(self, path: KeyPath, value: Any, own: list[dict[str, Any]]) -> Iterator[Mistake]:
+    def _own_mistake(self, path: KeyPath, value: Any, own_errors: list[dict[str, Any]]) -> Iterator[Mistake]:
         """The first error of the value itself: a validator's message, or what was expected and found."""
-        for error in own[:1]:
+        for error in own_errors[:1]:
             if error["type"] in ("value_error", "assertion_error"):
                 yield Mistake(path, str(error["ctx"]["error"]))
             elif self.kind in _WORDS or self.kind in _CONTAINERS or self.kind in ("literal", "enum", "union"):
-                yield Mistake(path, f"expected {self.words()}, found {found(value)}{self._hint(value)}")
+                yield Mistake(path, f"expected {self.words()}, found {found_text(value)}{self._hint(value)}")
             else:
-                yield Mistake(path, f"{error['msg']}; found {found(value)}")
+                yield Mistake(path, f"{error['msg']}; found {found_text(value)}")
 
     def _hint(self, value: Any) -> str:
         choices = [item for item in self._literals() if isinstance(item, str)]
@@ -146,22 +146,24 @@ class _Explainer:
                 if isinstance(value, _CONTAINERS.get(member.kind, ())):
                     yield from member.mistakes(path, value, errors)
                     return
-        yield from self._own(path, value, [{"type": "union", "msg": ""}])
+        yield from self._own_mistake(path, value, [{"type": "union", "msg": ""}])
 
-    def _tagged(self, path: KeyPath, value: dict[str, Any], own: list[Any], below: Any) -> Iterator[Mistake]:
+    def _tagged_union(
+        self, path: KeyPath, value: dict[str, Any], own_errors: list[Any], below: Any
+    ) -> Iterator[Mistake]:
         for tag, errors in below.items():
             yield from self._inner(self.node["choices"][tag]).mistakes(path, value, errors)
-        if own and (key := self.node["discriminator"]) in value:
+        if own_errors and (key := self.node["discriminator"]) in value:
             tag, tags = value[key], [str(item) for item in self.node["choices"]]
             near = did_you_mean(tag, tags) if isinstance(tag, str) else None
             hint = f"; did you mean `{near}`?" if near else ""
-            yield Mistake((*path, key), f"expected one of {_quoted(tags)}, found {found(tag)}{hint}")
-        elif own:
+            yield Mistake((*path, key), f"expected one of {_quoted_list(tags)}, found {found_text(tag)}{hint}")
+        elif own_errors:
             known_keys = {
                 name for choice in self.node["choices"].values() for name in self._inner(choice).fields()
             }
             near = did_you_mean(key, [name for name in value if name not in known_keys])
-            tags_text = f"one of {_quoted(self.node['choices'])}"
+            tags_text = f"one of {_quoted_list(self.node['choices'])}"
             if near:
                 yield Mistake(
                     (*path, near), f"unknown key `{near}`; did you mean `{key}`, {tags_text}?", at_key=True
@@ -169,8 +171,8 @@ class _Explainer:
             else:
                 yield Mistake((*path, key), f"missing key `{key}`: {tags_text}")
 
-    def _model(self, path: KeyPath, value: dict[str, Any], own: list[Any], below: Any) -> Iterator[Mistake]:
-        yield from self._own(path, value, own)
+    def _model(self, path: KeyPath, value: dict[str, Any], own_errors: list[Any], below: Any) -> Iterator[Mistake]:
+        yield from self._own_mistake(path, value, own_errors)
         fields = self.fields()
         missing = [key for key, errors in below.items() if _only(errors) == "missing"]
         unknown = [key for key, errors in below.items() if _only(errors) == "extra_forbidden"]
@@ -187,14 +189,14 @@ class _Explainer:
             if _only(errors) not in ("missing", "extra_forbidden"):
                 yield from self._inner(fields[key]).mistakes((*path, key), value.get(key), errors)
 
-    def _list(self, path: KeyPath, value: list[Any], own: list[Any], below: Any) -> Iterator[Mistake]:
+    def _list(self, path: KeyPath, value: list[Any], own_errors: list[Any], below: Any) -> Iterator[Mistake]:
         # pydantic also reports a list with failed items as too short, because it does not count these.
         fits = self.node.get("min_length", 0) <= len(value) <= self.node.get("max_length", math.inf)
-        lengths = [error for error in own if error["type"] in ("too_short", "too_long")]
+        lengths = [error for error in own_errors if error["type"] in ("too_short", "too_long")]
         absent = [index for index, errors in below.items() if _only(errors) == "missing" and index >= len(value)]
         if absent or (lengths and not (fits and self._variable())):
             yield Mistake(path, f"expected {self.words()}, found {len(value)}")
-        yield from self._own(path, value, [error for error in own if error not in lengths])
+        yield from self._own_mistake(path, value, [error for error in own_errors if error not in lengths])
         for index, errors in below.items():
             if index not in absent:
                 yield from self._inner(self._item(int(index))).mistakes((*path, index), value[int(index)], errors)
@@ -235,7 +237,7 @@ class _Explainer:
         if self.kind == "union":
             return " or ".join(self._inner(choice).words() for choice in self._choices())
         if self.kind == "tagged-union":
-            return f"a mapping whose `{self.node['discriminator']}` is one of {_quoted(self.node['choices'])}"
+            return f"a mapping whose `{self.node['discriminator']}` is one of {_quoted_list(self.node['choices'])}"
         if self.kind in ("tuple", "list", "set"):
             return self._list_words()
         if self.kind == "str" and "pattern" in self.node:
@@ -260,7 +262,7 @@ class _Explainer:
         return f"a list of {plural}" + (f" ({' and '.join(counts)})" if counts else "")
 
 
-def found(value: Any) -> str:
+def found_text(value: Any) -> str:
     """A value as the operator would recognise it."""
     if value is None:
         return "nothing"
@@ -275,7 +277,7 @@ def found(value: Any) -> str:
     return f"{value}, no finite number" if isinstance(value, float) and not math.isfinite(value) else f"{value}"
 
 
-def _quoted(words: Iterable[Any]) -> str:
+def _quoted_list(words: Iterable[Any]) -> str:
     return ", ".join(f"`{word}`" for word in words)
 
 

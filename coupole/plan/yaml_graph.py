@@ -46,7 +46,7 @@ def _composed_quickly(text: str) -> Node | None:
         root = yaml.compose(text if ends else text + "\n", Loader=yaml.CSafeLoader)
         # Where the text just ends, so does an open block.
         whole = ends or (isinstance(root, yaml.CollectionNode) and root.flow_style)
-        return _converted(root) if root is not None and whole else None
+        return _ruamel_node(root) if root is not None and whole else None
     except (yaml.YAMLError, _EmptyError):
         return None
 
@@ -55,7 +55,7 @@ class _EmptyError(Exception):
     """A value that is not there: the two libraries place it differently."""
 
 
-def _converted(node: yaml.Node) -> Node:
+def _ruamel_node(node: yaml.Node) -> Node:
     """ruamel's node for PyYAML's, with the tag that ruamel gives it. Raises _EmptyError."""
     marks = node.start_mark, node.end_mark
     if isinstance(node, yaml.ScalarNode):
@@ -66,8 +66,8 @@ def _converted(node: yaml.Node) -> Node:
         return ScalarNode(tag, node.value, *marks, style=node.style or None)
     kind = SequenceNode if isinstance(node, yaml.SequenceNode) else MappingNode
     inner = (
-        [_converted(child) for child in node.value]
+        [_ruamel_node(child) for child in node.value]
         if isinstance(node, yaml.SequenceNode)
-        else [(_converted(key), _converted(value)) for key, value in node.value]
+        else [(_ruamel_node(key), _ruamel_node(value)) for key, value in node.value]
     )
     return kind(_resolver.resolve(kind, None, (True, True)), inner, *marks, flow_style=node.flow_style)

@@ -1,8 +1,8 @@
 """YAML files with file:line:column, all errors at once.
 
-`read` turns a file into a `Document`: plain data, and the position of each key and value. `Document.validate`
-checks a part of it against a pydantic model; its errors become `Problem`s in the order of the file, with messages
-from `coupole.plan.validation_messages`.
+`read_document` turns a file into a `Document`: plain data, and the position of each key and value.
+`Document.validate` checks a part of it against a pydantic model; its errors become `Problem`s in the order of the
+file, with messages from `coupole.plan.validation_messages`.
 
 Typing is YAML 1.2's core schema: `yes` and `on` are text, `014` is fourteen, `0o14` is twelve. Keys are always
 text. Models are checked as strictly as JSON would be: `"5"` is not a number, 1.5 and 5.0 are not integers, while
@@ -65,14 +65,14 @@ class Document:
     key_places: dict[KeyPath, Place] = field(repr=False)
     text: str = field(repr=False)
     """Text that was parsed: without byte order mark, with LF line ends."""
-    _resolved: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _resolved_paths: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def resolve(self, path: Path) -> Path:
         """`path` made absolute; a relative one is relative to this document's folder. Links are followed once:
         they lead to the same place as long as the document is used."""
-        if path not in self._resolved:
-            self._resolved[path] = (self.path.parent / path.expanduser()).resolve()
-        return self._resolved[path]
+        if path not in self._resolved_paths:
+            self._resolved_paths[path] = (self.path.parent / path.expanduser()).resolve()
+        return self._resolved_paths[path]
 
     def problem(self, key_path: KeyPath, message: str) -> Problem:
         """A problem at the value of `key_path`, or at the nearest parent key that exists."""
@@ -91,15 +91,15 @@ class Document:
         return value
 
     def problems(
-        self, model: type[M], at: KeyPath = (), *, given: dict[str, Any] | None = None
+        self, model: type[M], at: KeyPath = (), *, given_values: dict[str, Any] | None = None
     ) -> tuple[M | None, list[Problem]]:
         """The part at key path `at` as a `model`, or None with all problems, in the order of the file.
 
-        A part that is not in the file counts as an empty mapping. Values `given` need not be in the file.
+        A part that is not in the file counts as an empty mapping. `given_values` need not be in the file.
         """
         part = self._part(at)
-        if given and isinstance(part, dict):
-            part = given | part
+        if given_values and isinstance(part, dict):
+            part = given_values | part
         try:
             return model.model_validate_json(json.dumps(_finite(part)), strict=True), []
         except ValidationError as error:
@@ -129,7 +129,7 @@ class Document:
         return Problem(str(self.path), *place, key_text(key_path), message)
 
 
-def read(path: Path, files: InputFiles | None = None) -> Document:
+def read_document(path: Path, files: InputFiles | None = None) -> Document:
     """Read a YAML file whose root is a mapping.
 
     Raises InputError: no file, not UTF-8, tabs as indentation, YAML syntax, duplicate keys, unknown
@@ -141,14 +141,14 @@ def read(path: Path, files: InputFiles | None = None) -> Document:
 def parse(path: Path, text: str) -> Document:
     """The same of a file's text; `path` is where it is, or was."""
     try:
-        data, value_places, key_places = pickle.loads(_parsed(text))
+        data, value_places, key_places = pickle.loads(_parsed_bytes(text))
         return Document(path, data, value_places, key_places, text)
     except InputError as error:
         raise InputError([replace(problem, file=str(path)) for problem in error.problems]) from error
 
 
 @functools.lru_cache(maxsize=64)
-def _parsed(text: str) -> bytes:
+def _parsed_bytes(text: str) -> bytes:
     """Data and places of values and keys, pickled: one command reads some files several times, a record of a
     calibration for a second each, and whoever reads one may change what he was given. Problems name no file."""
     path = Path()
@@ -176,7 +176,7 @@ def text_of(path: Path, files: InputFiles | None = None) -> str:
     files = InputFiles() if files is None else files
     try:
         if path in files:
-            return _decoded(path, files.read_bytes(path))
+            return _decoded_text(path, files.read_bytes(path))
         if not path.exists():
             raise InputError([Problem(str(path), 0, 0, "", "no such file")])
         if not path.is_file():
@@ -187,10 +187,10 @@ def text_of(path: Path, files: InputFiles | None = None) -> str:
         raw = files.read_bytes(path)
     except (OSError, ValueError) as error:  # ValueError: a null byte in the path
         raise InputError([Problem(str(path), 0, 0, "", f"cannot be read: {error}")]) from error
-    return _decoded(path, raw)
+    return _decoded_text(path, raw)
 
 
-def _decoded(path: Path, raw: bytes) -> str:
+def _decoded_text(path: Path, raw: bytes) -> str:
     try:
         return raw.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:

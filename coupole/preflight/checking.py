@@ -83,14 +83,14 @@ def check_job(
     and the job at the pace that LEDs and disk allow."""
     rig = job.cell.rig
     home_deg = rig.motion.home_joints_deg
-    views = job.schedule.left(proven).views if proven else job.schedule.views
+    views = job.schedule.without_proven(proven).views if proven else job.schedule.views
     plan_views = job.motion.itinerary if paths else job.motion.unchecked_itinerary
     itinerary = plan_views(views, home_deg)
     all_views = job.motion.unchecked_itinerary(job.schedule.views, home_deg) if proven else None
     history = ledger_of(job.cell, job.plan.object.id).read_history() if job.plan.object else History()
     before = history.total_lux_h
 
-    def checked(pace: Pace) -> tuple[Job, Report]:
+    def check_at(pace: Pace) -> tuple[Job, Report]:
         paced_job = at_pace(job, pace)
         checking = partial(
             check,
@@ -105,7 +105,7 @@ def check_job(
             return paced_job, checking(paced_job.schedule, itinerary=itinerary, dose_before_lux_h=before)
         of_all = checking(paced_job.schedule, itinerary=all_views)
         remaining_report = checking(
-            paced_job.schedule.left(proven),
+            paced_job.schedule.without_proven(proven),
             itinerary=itinerary,
             dose_before_lux_h=before,
             whole=Whole(
@@ -119,7 +119,7 @@ def check_job(
         )
         return paced_job, remaining_report
 
-    job, report = _cooled(*checked(Pace(disk_us=_disk_us(rig, storage))), checked)
+    job, report = _at_cool_pace(*check_at(Pace(disk_us=_disk_us(rig, storage))), check_at)
     report.object_check = _object_check(job, itinerary, proven)
     if report.object_check is not None:
         report.refusals += report.object_check.refusals
@@ -184,7 +184,7 @@ def _object_check(job: Job, itinerary: Itinerary, proven: Collection[ShotId]) ->
     """The object in its views, as far as they are still to be taken; None without a mesh."""
     if job.plan.object is None:
         return None
-    schedule = job.schedule.left(proven) if proven else job.schedule
+    schedule = job.schedule.without_proven(proven) if proven else job.schedule
     return check_object(job.plan.object.id, job.shape.corners_mm, job.cell.rig, schedule, itinerary)
 
 
@@ -220,10 +220,10 @@ def _disk_us(rig: Rig, storage: StorageFacts) -> int:
     return math.ceil(seconds * 1e6 / _DISK_GRAIN_US) * _DISK_GRAIN_US
 
 
-def _cooled(job: Job, report: Report, checked: Callable[[Pace], tuple[Job, Report]]) -> tuple[Job, Report]:
+def _at_cool_pace(job: Job, report: Report, check_at: Callable[[Pace], tuple[Job, Report]]) -> tuple[Job, Report]:
     """The fastest pace at which LEDs do not get too hot; unchanged if none of the tried ones is sufficient."""
     if not report.too_hot:
         return job, report
     paces = [replace(job.pace, led_duty=duty) for duty in _LED_DUTIES]
-    first = bisect_left(paces, True, key=lambda pace: not checked(pace)[1].too_hot)
-    return checked(paces[first]) if first < len(paces) else (job, report)
+    first = bisect_left(paces, True, key=lambda pace: not check_at(pace)[1].too_hot)
+    return check_at(paces[first]) if first < len(paces) else (job, report)

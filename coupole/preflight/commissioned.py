@@ -24,7 +24,7 @@ from coupole.plan.cell import Cell
 from coupole.plan.controller_places import places_of_arm
 from coupole.plan.plan import Model, Name
 from coupole.plan.rig_devices import in_world
-from coupole.preflight.commissioned_rig import STEPS, Step, covered
+from coupole.preflight.commissioned_rig import STEPS, Step, covered_settings
 
 __all__ = ["STEPS", "Step"]
 _DEVICES: Mapping[Step, tuple[str, ...]] = {
@@ -70,7 +70,7 @@ class StepResult(Model):
     """Failure and what to do about it; empty if nothing was wrong."""
 
     @property
-    def passed(self) -> bool:
+    def has_passed(self) -> bool:
         return (
             not self.failure
             and all(limit.is_met for limit in self.limits)
@@ -93,15 +93,15 @@ class CommissioningRecord(Model):
         return next((step_result for step_result in self.steps if step_result.step == step), None)
 
     @property
-    def passed(self) -> bool:
+    def has_passed(self) -> bool:
         """True if every step was done and passed."""
-        return all((step_result := self.result(step)) is not None and step_result.passed for step in STEPS)
+        return all((step_result := self.result(step)) is not None and step_result.has_passed for step in STEPS)
 
     def with_result(self, result: StepResult) -> CommissioningRecord:
         """The same record with a new result in place of an older one of that step."""
         results = {step_result.step: step_result for step_result in self.steps} | {result.step: result}
-        return _sealed(
-            self.rig, tuple(results[step] for step in STEPS if step in results), simulated=self.simulated
+        return _sealed_record(
+            self.rig, tuple(results[step] for step in STEPS if step in results), is_simulated=self.simulated
         )
 
 
@@ -111,7 +111,7 @@ def record_path(cell: Cell) -> Path:
 
 
 def empty_record(cell: Cell) -> CommissioningRecord:
-    return _sealed(cell.rig.name, (), simulated=in_world(cell.rig, dry_run=False))
+    return _sealed_record(cell.rig.name, (), is_simulated=in_world(cell.rig, dry_run=False))
 
 
 def read_commissioning(cell: Cell) -> CommissioningRecord | None:
@@ -121,7 +121,7 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
     was edited or cannot be read.
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
-    records = {path: _read(path) for path in paths if path.exists()}
+    records = {path: _read_record(path) for path in paths if path.exists()}
     is_simulated = in_world(cell.rig, dry_run=False)
     own_records = {path: record for path, record in records.items() if record.simulated == is_simulated}
     if not own_records:
@@ -133,13 +133,13 @@ def read_commissioning(cell: Cell) -> CommissioningRecord | None:
         results = [
             step_result for record in own_records.values() if (step_result := record.result(step)) is not None
         ]
-        fitting = [result for result in results if not outdated(cell, result)]
+        fitting = [result for result in results if not why_outdated(cell, result)]
         steps += sorted(fitting or results, key=lambda result: result.ended)[-1:]
-    return _sealed(cell.rig.name, tuple(steps), simulated=is_simulated)
+    return _sealed_record(cell.rig.name, tuple(steps), is_simulated=is_simulated)
 
 
-def _read(path: Path) -> CommissioningRecord:
-    document = yamlfile.read(path)
+def _read_record(path: Path) -> CommissioningRecord:
+    document = yamlfile.read_document(path)
     record = document.validate(CommissioningRecord)
     if content_sha256(json.loads(record.model_dump_json())) != record.sha256:
         message = "the record was edited after it was made: its content has another checksum. Commission anew"
@@ -155,7 +155,7 @@ def write_commissioning(cell: Cell, record: CommissioningRecord) -> None:
 
 def settings_of(cell: Cell, step: Step) -> dict[str, JsonValue]:
     """All of the rig that the result of a step depends on."""
-    plain: dict[str, JsonValue] = json.loads(json.dumps(covered(cell, step)))
+    plain: dict[str, JsonValue] = json.loads(json.dumps(covered_settings(cell, step)))
     return plain
 
 
@@ -178,7 +178,7 @@ def devices_of(step: Step, identities: Mapping[str, Identity]) -> dict[str, str]
     }
 
 
-def outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
+def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identity] | None = None) -> str:
     """Return why a step's result does not fit the rig (and the opened devices) any more; empty if it still
     does."""
     before, now = result.settings, settings_of(cell, result.step)
@@ -214,9 +214,9 @@ def commissioning_refusals(cell: Cell, identities: Mapping[str, Identity] | None
         if result is None:
             why = f"it covers {_places(settings_of(cell, step))}"
             refusals.append(f"commissioning: the step {step} was not done; {why}. Say `{command}`")
-        elif not result.passed:
+        elif not result.has_passed:
             refusals.append(f"commissioning: the step {step} did not pass. Say `{command}`")
-        elif why := outdated(cell, result, identities):
+        elif why := why_outdated(cell, result, identities):
             refusals.append(f"commissioning: the step {step} does not fit any more: {why}. Say `{command}`")
     return refusals
 
@@ -238,13 +238,13 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:12]}..."
 
 
-def _sealed(rig: str, steps: tuple[StepResult, ...], *, simulated: bool) -> CommissioningRecord:
+def _sealed_record(rig: str, steps: tuple[StepResult, ...], *, is_simulated: bool) -> CommissioningRecord:
     record = CommissioningRecord.model_construct(
         schema_version=1,
         kind="commissioning",
         rig=rig,
         software=f"coupole {coupole.__version__}",
-        simulated=simulated,
+        simulated=is_simulated,
         steps=steps,
         sha256="",
     )

@@ -87,7 +87,7 @@ def steps_of(key: str) -> tuple[Step, ...]:
     return next((steps for place, steps in _STEPS.items() if _is_at(key, place)), STEPS)
 
 
-def covered(cell: Cell, step: Step) -> dict[str, Any]:
+def covered_settings(cell: Cell, step: Step) -> dict[str, Any]:
     """All of the rig that the result of a step depends on: values by their key, as in `keep_out.0.min_mm`."""
     return {key: _value(cell, value) for key, value in everything(cell).items() if step in steps_of(key)}
 

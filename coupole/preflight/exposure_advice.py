@@ -118,13 +118,13 @@ def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
         exposure = BracketExposure(kind="bracket", exposures_us=tuple(exposures_us))
     changes: dict[str, Any] = {"exposure": exposure, "repeats": _REPEATS, "darks_per_view": 0}
     if len(rows):
-        metering_rows = rows[_spread(leds.positions_mm[rows], METERING_LIGHTS)]
+        metering_rows = rows[_spread_rows(leds.positions_mm[rows], METERING_LIGHTS)]
         changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[metering_rows]))
         changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
     return plan.model_copy(update=changes)
 
 
-def _spread(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+def _spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """`count` of the positions [n, 3], each as far as possible from those before it."""
     indices = [0]
     apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
@@ -174,18 +174,18 @@ def noise_of(views: Iterable[Metered]) -> Noise:
     return Noise(max(math.sqrt(max(offset, 0.0)), _ROUNDING_DN), max(float(gain), 1e-6))
 
 
-def advise_view(view: str, metered: Metered, request: Request, noise: Noise) -> ViewAdvice:
+def advise_view(view: str, metering: Metered, request: Request, noise: Noise) -> ViewAdvice:
     """Bounds of a view's exposure."""
-    white = metered.frame_format.white_dn - metered.frame_format.black_dn
+    white = metering.frame_format.white_dn - metering.frame_format.black_dn
     rates = []
-    for by_exposure in metered.samples.values():
+    for by_exposure in metering.samples.values():
         rate = np.full(next(iter(by_exposure.values()))[0].shape, np.inf)
         for exposure_us, samples in sorted(by_exposure.items()):  # the longest that is not saturated counts
             mean = np.mean(samples, axis=0)
             rate = np.where(np.max(samples, axis=0) < white, mean / exposure_us, rate)
         rates.append(rate)
-    shortest_metered_us = min(e for by_exposure in metered.samples.values() for e in by_exposure)
-    longest_metered_us = max(e for by_exposure in metered.samples.values() for e in by_exposure)
+    shortest_metered_us = min(e for by_exposure in metering.samples.values() for e in by_exposure)
+    longest_metered_us = max(e for by_exposure in metering.samples.values() for e in by_exposure)
     per_light = np.minimum(np.array(rates), white / shortest_metered_us)
     brightest = np.quantile(per_light, 1.0 - request.saturated_share, axis=1).max()
     best = per_light.max(axis=0)
@@ -224,12 +224,12 @@ def advise(views: Mapping[str, Metered], request: Request, *, longest_us: int) -
             f"even {high_us} us are too short for the required signal-to-noise ratio: "
             "open the aperture or raise the gain"
         )
-    first = _rounded(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
+    first = _rounded_us(min(max(min(shortest_us, brightest_us), low_us), high_us), up=shortest_us <= brightest_us)
     if shortest_us <= brightest_us:
         return Advice(noise, advices, FixedExposure(kind="fixed", exposure_us=first), tuple(remarks))
     exposures_us = [first]
     while exposures_us[-1] < min(shortest_us, high_us) and len(exposures_us) < 16:
-        exposures_us.append(_rounded(min(exposures_us[-1] * _BRACKET_STEP, shortest_us, high_us), up=True))
+        exposures_us.append(_rounded_us(min(exposures_us[-1] * _BRACKET_STEP, shortest_us, high_us), up=True))
         if exposures_us[-1] <= exposures_us[-2]:
             exposures_us.pop()
             break
@@ -261,7 +261,7 @@ def write_plan(plan: Document, out: Path, exposure: FixedExposure | BracketExpos
         raise InputError(f"{out}: exists already; choose another name") from error
 
 
-def _rounded(exposure_us: float, *, up: bool) -> int:
+def _rounded_us(exposure_us: float, *, up: bool) -> int:
     """Two digits: 8137 becomes 8200 or 8100."""
     step = 10.0 ** max(0, math.floor(math.log10(max(exposure_us, 1.0))) - 1)
     return max(10, int((math.ceil if up else math.floor)(round(exposure_us / step, 6)) * step))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform, inverse
 from coupole.kinematics import forward
 from coupole.motion.itinerary import Itinerary, arm_of
-from coupole.motion.occlusion import RAY_START_MM, Sight, blocked, ray_mesh, sight_of
+from coupole.motion.occlusion import RAY_START_MM, Sight, blocked_segments, ray_mesh, sight_of
 from coupole.plan.rig import Lens, Rig
 from coupole.plan.schedule import Schedule, ViewPose
 
@@ -190,7 +190,7 @@ def points_shown(
     eye_mm = sight.support_from_camera[:3, 3]
     away_mm = np.linalg.norm(eye_mm - points_mm, axis=1)
     starts_mm = points_mm + (eye_mm - points_mm) * (RAY_START_MM / np.maximum(away_mm, RAY_START_MM))[:, None]
-    visible = ~blocked(mesh, starts_mm, np.tile(eye_mm, (len(starts_mm), 1)))
+    visible = ~blocked_segments(mesh, starts_mm, np.tile(eye_mm, (len(starts_mm), 1)))
     pixels, depth_mm = sight.project(points_mm)
     inside = (pixels >= -0.5) & (pixels <= np.array((sight.width_px, sight.height_px)) - 0.5)
     return visible, inside.all(axis=1) & (depth_mm > 0) & visible, depth_mm
@@ -210,9 +210,9 @@ def _camera_pose(view: ViewPose, number: int, rig: Rig, itinerary: Itinerary) ->
 # -- verdicts -----------------------------------------------------------------------------------------------
 
 
-def _judged_placement(name: str, placed: Placement, disk_radius_mm: float) -> tuple[list[str], list[str]]:
+def _judged_placement(name: str, placement: Placement, disk_radius_mm: float) -> tuple[list[str], list[str]]:
     """Refusals and warnings about the object's place."""
-    lowest = placed.lowest_over_disk_mm
+    lowest = placement.lowest_over_disk_mm
     if lowest is None:
         return [f"object {name}: it is beside the disk; correct `support_from_object`"], []
     refusals: list[str] = []
@@ -224,21 +224,21 @@ def _judged_placement(name: str, placed: Placement, disk_radius_mm: float) -> tu
         )
     elif lowest > RESTS_MM:
         warnings.append(f"object {name}: it begins {lowest:.1f} mm above the disk; is it on a stand?")
-    if placed.reach_mm > disk_radius_mm:
-        over_mm = placed.reach_mm - disk_radius_mm
+    if placement.reach_mm > disk_radius_mm:
+        over_mm = placement.reach_mm - disk_radius_mm
         warnings.append(f"object {name}: it reaches {over_mm:.0f} mm beyond the disk's rim")
     return refusals, warnings
 
 
 def _judged_views(
-    name: str, framings: Sequence[Framing], aimed: Sequence[bool], sharp_mm: tuple[float, float]
+    name: str, framings: Sequence[Framing], are_aimed: Sequence[bool], sharp_mm: tuple[float, float]
 ) -> tuple[list[str], list[str]]:
     """Refusals and warnings about what views see. Views that light nothing, or take no aim, are only warned of."""
     refusals: list[str] = []
     warnings: list[str] = []
     partly, blurred_framings = [], []
     sharp = f"{sharp_mm[0]:.0f} to {sharp_mm[1]:.0f} mm"
-    for framing, is_aimed in zip(framings, aimed, strict=True):
+    for framing, is_aimed in zip(framings, are_aimed, strict=True):
         problem = ""
         if not framing.fills and not framing.in_field:
             problem = f"view {framing.view}: object {name} is out of its field"
@@ -253,13 +253,13 @@ def _judged_views(
         partly += [framing] if framing.in_field < _ALL else []
         blurred_framings += [framing] if framing.in_focus < _MOST else []
     if partly:
-        least = min(partly, key=lambda seen: seen.in_field)
+        least = min(partly, key=lambda entry: entry.in_field)
         warnings.append(
             f"object {name}: {_count(partly, framings)} part of it out of the field; view {least.view} has "
             f"{least.in_field:.0%} of what it could see"
         )
     if blurred_framings:
-        least = min(blurred_framings, key=lambda seen: seen.in_focus)
+        least = min(blurred_framings, key=lambda entry: entry.in_focus)
         warnings.append(
             f"object {name}: {_count(blurred_framings, framings)} part of it out of focus; in view {least.view} "
             f"{least.in_focus:.0%} is sharp ({sharp}; it is {least.nearest_mm:.0f} to "

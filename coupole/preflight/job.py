@@ -101,13 +101,13 @@ def at_pace(job: Job, pace: Pace) -> Job:
     return replace(job, schedule=schedule, pace=pace)
 
 
-def without_hidden(job: Job, known: Mapping[str, Sequence[int]] | None = None) -> Job:
+def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = None) -> Job:
     """Return the same job without the LEDs that light nothing that a view sees, if the plan has `hidden_lights:
-    skip`. These LEDs are the `known` ones, if a run began without them, otherwise those for the postures of the
+    skip`. These LEDs are the `known_leds`, if a run began without them, otherwise those for the postures of the
     paths from home."""
     if job.plan.hidden_lights != "skip":
         return job
-    hidden_leds = dict(known) if known is not None else _hidden_from_home(job)
+    hidden_leds = dict(known_leds) if known_leds is not None else _hidden_from_home(job)
     return replace(job, schedule=job.schedule.without(hidden_leds), hidden_leds=hidden_leds)
 
 

@@ -59,7 +59,7 @@ def read_object(files: PlanFiles) -> ObjectShape:
     return ObjectShape(files.mesh_path, corners, _dose_points(corners, targets), tuple(remarks))
 
 
-def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -> NDArray[np.float64]:
+def load_corners(mesh_path: Path, measured_object: MeasuredObject, files: InputFiles) -> NDArray[np.float64]:
     """Triangles [n, 3, 3] of a mesh file in the support frame, mm. Raises InputError with the place in it."""
     try:
         data = files.read_bytes(mesh_path)
@@ -68,8 +68,8 @@ def load_corners(mesh_path: Path, measured: MeasuredObject, files: InputFiles) -
     except MemoryError as error:
         raise InputError(f"{mesh_path}: it does not fit into this machine's memory") from error
     mesh = read_mesh(mesh_path, data)
-    corners = mesh.vertices.astype(np.float64)[mesh.triangles] * MM_PER_UNIT[measured.mesh_unit]
-    return apply(measured.support_from_object.matrix(), corners)
+    corners = mesh.vertices.astype(np.float64)[mesh.triangles] * MM_PER_UNIT[measured_object.mesh_unit]
+    return apply(measured_object.support_from_object.matrix(), corners)
 
 
 def _impossible_size(corners: NDArray[np.float64], size_mm: float, unit: str, diameter_mm: float) -> str:

@@ -94,7 +94,7 @@ def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]
     scene = config["scene"]
     with tempfile.TemporaryDirectory(prefix="coupole-inputs-") as folder:
 
-        def copied(path: str, place: str) -> str:
+        def copied_path(path: str, place: str) -> str:
             copy = Path(folder, place, Path(path).name)
             copy.parent.mkdir()
             copy.write_bytes(files.read_bytes(Path(path)))
@@ -103,40 +103,42 @@ def frozen(config: dict[str, Any], files: InputFiles) -> Iterator[dict[str, Any]
         objects = [
             {
                 **scene_object,
-                "path": copied(scene_object["path"], f"object{number}"),
+                "path": copied_path(scene_object["path"], f"object{number}"),
                 "pictures_beside": scene_object["path"],
             }
             for number, scene_object in enumerate(scene["objects"])
         ]
-        yield {**config, "scene": {**scene, "leds": copied(scene["leds"], "dome"), "objects": objects}}
+        yield {**config, "scene": {**scene, "leds": copied_path(scene["leds"], "dome"), "objects": objects}}
 
 
-def _robot_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
+def _robot_config(rig: Rig, overrides: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
     """Settings of the robot's stand-in: from the rig, and from its driver's settings."""
     _, settings = device_for(rig, "robot", dry_run=dry_run)
     stand_in = stand_in_for(rig, dry_run=dry_run)
     alike = {name: settings[name] for name in stand_in.alike if name in settings}
     start = {"start_joints_deg": list(rig.motion.home_joints_deg)}
-    return {"kind": stand_in.kind, **start, **stand_in.settings, **alike, **given}
+    return {"kind": stand_in.kind, **start, **stand_in.settings, **alike, **overrides}
 
 
-def _ledbox_config(rig: Rig, given: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
+def _ledbox_config(rig: Rig, overrides: Mapping[str, Any], *, dry_run: bool) -> dict[str, Any]:
     """Settings of the LED box's stand-in: from the rig, and from its driver's settings."""
     _, settings = device_for(rig, "ledbox", dry_run=dry_run)
     stand_in = ledbox_stand_in(rig, dry_run=dry_run)
     alike = {name: settings[name] for name in stand_in.alike if name in settings}
-    return {"kind": stand_in.kind, **alike, **given}
+    return {"kind": stand_in.kind, **alike, **overrides}
 
 
-def _camera_config(rig: Rig, given: Mapping[str, Any], rehearsed: Job | None, *, dry_run: bool) -> dict[str, Any]:
+def _camera_config(
+    rig: Rig, overrides: Mapping[str, Any], rehearsed_job: Job | None, *, dry_run: bool
+) -> dict[str, Any]:
     """Settings of the camera's stand-in from the rig; none if a dry run uses another kind of camera."""
     kind = camera_kind(rig, dry_run=dry_run)
-    if rehearsed is not None:
-        every = max(1, rehearsed.schedule.frames // len(rehearsed.schedule.views) // DRY_RUN_PICTURES)
-        given = {"render_every": every, **given}
+    if rehearsed_job is not None:
+        every = max(1, rehearsed_job.schedule.frames // len(rehearsed_job.schedule.views) // DRY_RUN_PICTURES)
+        overrides = {"render_every": every, **overrides}
     if kind != camera_kind(rig, dry_run=False):
-        given = {name: value for name, value in given.items() if name == "render_every"}
-    return {"kind": kind, **given}
+        overrides = {name: value for name, value in overrides.items() if name == "render_every"}
+    return {"kind": kind, **overrides}
 
 
 def _objects(job: Job | None) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from coupole.motion.occlusion import RAY_START_MM, blocked, ray_mesh
+from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh
 from coupole.reflectance.extraction.lamp_sight import lit_on
 from coupole.reflectance.result_folder import complete
 from coupole.reflectance.run_result import AS_MEASURED, INTER_REFLECTION, SAMPLES, RunResult, ViewSamples
@@ -179,7 +179,7 @@ def direct_irradiance(scene: Scene, led_mm: Floats, led_normals: Floats, *, pape
         starts = (centres + RAY_START_MM * normals)[patch]
         for part in range(0, len(patch), _RAYS):
             some = slice(part, part + _RAYS)
-            light[patch[some], led[some]] *= ~blocked(scene.rays, starts[some], led_mm[led[some]])
+            light[patch[some], led[some]] *= ~blocked_segments(scene.rays, starts[some], led_mm[led[some]])
         irradiance += (light / _POINTS).astype(np.float32)
     return irradiance
 

@@ -115,8 +115,8 @@ def as_planned(run: Run) -> AsPlanned:
     if "stored" not in run.about["plan"] or "stored" not in run.about["rig"]:
         raise InputError("the run keeps no copy of its plan and rig")
     files = InputFiles()
-    plan = yamlfile.read(run.plan_path, files).validate(Plan)
-    document = yamlfile.read(run.rig_path, files)
+    plan = yamlfile.read_document(run.plan_path, files).validate(Plan)
+    document = yamlfile.read_document(run.rig_path, files)
     rig = document.validate(Rig)
     leds = read_led_table(document.resolve(rig.dome.leds), files)
     description, _ = arm_named(document, rig.arm, rig.robot.driver, rig.robot.settings, files)

@@ -106,7 +106,7 @@ def _text(path: Path, files: InputFiles) -> str:
 def _read_model(path: Path, files: InputFiles, model: type[Plan] | type[Rig]) -> tuple[Document, BaseModel] | None:
     """A plan or rig and its model; None if it is none."""
     try:
-        document = yamlfile.read(path, files)
+        document = yamlfile.read_document(path, files)
         return document, document.validate(model)
     except InputError:
         return None
@@ -208,7 +208,7 @@ class _Keeper:
         beside = None if meshes is None else str(Path(meshes).relative_to(f"{FOLDER}/arm"))
         make_folder(self.run / FOLDER / "arm")
         if arm_name:
-            source = yamlfile.read(document.resolve(Path(arm_name)), self.files)
+            source = yamlfile.read_document(document.resolve(Path(arm_name)), self.files)
             link_meshes = beside or (str(arm.link_meshes) if arm.link_meshes else None)
             changes: dict[KeyPath, str] = {("link_meshes",): link_meshes} if link_meshes else {}
             text = rewritten(source, source.text, changes)
@@ -222,7 +222,7 @@ class _Keeper:
 
 def _files_of_record(path: Path, files: InputFiles) -> Iterator[str]:
     try:
-        entries = yamlfile.read(path, files).data.get("files", [])
+        entries = yamlfile.read_document(path, files).data.get("files", [])
     except InputError:
         return
     for entry in entries if isinstance(entries, list) else []:
@@ -277,7 +277,7 @@ def _changes_of(
     except InputError:
         yield f"the {kind} {path} is another file, and the old one is not understood any more"
         return
-    now = yamlfile.read(path, files).validate(model)
+    now = yamlfile.read_document(path, files).validate(model)
     if changes := differences(then, now, apart):
         yield f"the {kind} {path}: {'; '.join(changes)}"
 

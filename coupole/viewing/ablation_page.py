@@ -18,26 +18,26 @@ from coupole.viewing.reflectance_page import STYLE
 PAGE = "ablation.html"
 
 
-def write(folder: Path, told: dict[str, Any]) -> Path:
+def write(folder: Path, document: dict[str, Any]) -> Path:
     """Write the page of what `ablate_result` found. Raises StorageError."""
     path = folder / PAGE
     try:
-        write_synced(path, "".join(_page(folder.resolve().name, told)))
+        write_synced(path, "".join(_page(folder.resolve().name, document)))
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror}") from error
     return path
 
 
-def _page(name: str, told: dict[str, Any]) -> Iterator[str]:
+def _page(name: str, document: dict[str, Any]) -> Iterator[str]:
     title = f"{html.escape(name)}: fewer LEDs, samples, coefficients"
     yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     yield (
         "<p>Mean absolute error under the LEDs kept for the check, in % of the camera's range, of "
-        f"{told['triangles']} triangles spread over the object. All fits are compared by the same samples."
+        f"{document['triangles']} triangles spread over the object. All fits are compared by the same samples."
     )
-    picture = base64.b64encode(_drawn(told["mae"])).decode()
+    picture = base64.b64encode(_plot_png(document["mae"])).decode()
     yield f'<img src="data:image/png;base64,{picture}" style="background:none;max-width:100%" alt="errors">'
-    for setting, steps in told["mae"].items():
+    for setting, steps in document["mae"].items():
         yield f"<h2>{html.escape(setting)}</h2><table><tr><th>"
         yield "".join(f"<th>{value:g}" for value, _ in steps)
         for fit in FITS.values():
@@ -52,7 +52,7 @@ def _page(name: str, told: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _drawn(mae: dict[str, Any]) -> bytes:
+def _plot_png(mae: dict[str, Any]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

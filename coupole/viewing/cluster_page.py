@@ -25,33 +25,36 @@ _TOLD = {
 }
 
 
-def write(folder: Path, told: dict[str, Any]) -> Path:
+def write(folder: Path, document: dict[str, Any]) -> Path:
     """Write the page of what `cluster_result` said. Raises InputError without clusters, StorageError."""
     path = folder / PAGE
     try:
-        write_synced(path, "".join(_page(folder, told)))
+        write_synced(path, "".join(_page(folder, document)))
     except OSError as error:
         raise StorageError(f"{path}: {error.strerror}") from error
     return path
 
 
-def _page(folder: Path, told: dict[str, Any]) -> Iterator[str]:
+def _page(folder: Path, document: dict[str, Any]) -> Iterator[str]:
     title = f"{html.escape(folder.resolve().name)}: clusters"
     yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
-    yield f"<p>{told['clusters']} materials for {told['triangles']} triangles, {told['borrowed']} of which had "
-    yield f"too few samples for one of their own; {told['without']} have none."
+    yield (
+        f"<p>{document['clusters']} materials for {document['triangles']} triangles, {document['borrowed']} of "
+        "which had "
+    )
+    yield f"too few samples for one of their own; {document['without']} have none."
     yield "<table><tr><th><th>mean error under LEDs left out, % of range"
     for name, text in _TOLD.items():
-        mae = told["mae"][name]
+        mae = document["mae"][name]
         yield f"<tr><th>{text}<td>{'' if mae is None else f'{100 * mae:.3f}'}"
     yield "</table>"
-    if told["without_view"] is not None:
-        kinds = ((text, told["mae_of_view"][name]) for name, text in _TOLD.items())
+    if document["without_view"] is not None:
+        kinds = ((text, document["mae_of_view"][name]) for name, text in _TOLD.items())
         errors = (f"{text} {100 * mae:.3f} %" for text, mae in kinds if mae is not None)
-        yield f"<p>From the view {html.escape(told['without_view'])}, of which clusters had no samples: "
+        yield f"<p>From the view {html.escape(document['without_view'])}, of which clusters had no samples: "
         yield f"{', '.join(errors)} (their own materials had them)."
-    if told["mae_ratio"] is not None:
-        yield f"<p>Ratio {told['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics)."
+    if document["mae_ratio"] is not None:
+        yield f"<p>Ratio {document['mae_ratio']:.2f}; published: 1.7 (seed 003, figure 6, harmonics)."
     result = RunResult(folder)
     clusters = result.clusters
     colours = np.random.default_rng(5).uniform(0.2, 1.0, (len(clusters.alpha), 3))

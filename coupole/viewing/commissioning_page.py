@@ -23,7 +23,7 @@ def write(record_path: Path, record: CommissioningRecord) -> Path:
 def page(record: CommissioningRecord) -> str:
     """The page as HTML."""
     name = html.escape(f"Commissioning of {record.rig}")
-    verdict = "<p class=ok><b>Passed.</b>" if record.passed else "<p class=bad><b>Not passed.</b>"
+    verdict = "<p class=ok><b>Passed.</b>" if record.has_passed else "<p class=bad><b>Not passed.</b>"
     remark = "<p>Simulated: no real cell." if record.simulated else ""
     parts = []
     for step in STEPS:
@@ -54,7 +54,7 @@ def _step(result: StepResult) -> str:
     ]
     failure = f"<p class=bad>{html.escape(result.failure)}" if result.failure else ""
     return (
-        f"<h2>{result.step}: <span class={'ok>passed' if result.passed else 'bad>not passed'}</span></h2>"
+        f"<h2>{result.step}: <span class={'ok>passed' if result.has_passed else 'bad>not passed'}</span></h2>"
         f"<p>{html.escape(result.person)}, {result.ended:%Y-%m-%d %H:%M} UTC{failure}"
         + (table("<th>limit<th class=n>found<th class=n>at most<th><th>", limits) if limits else "")
         + (table("<th>asked<th>answer", answers) if answers else "")

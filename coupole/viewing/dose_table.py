@@ -16,8 +16,8 @@ NOT_KNOWN = "not known"
 NO_BUDGET = "  it has no light budget: `coupole dose {} --budget LUX_H --name NAME` gives it one"
 
 
-def show_dose(console: Console, ledger: Ledger, history: History, others: list[str]) -> None:
-    """Light of each run, the total, and remarks. `others`: objects with nearly the same id."""
+def show_dose(console: Console, ledger: Ledger, history: History, similar_ids: list[str]) -> None:
+    """Light of each run, the total, and remarks. `similar_ids`: objects with nearly the same id."""
     title = f"{ledger.object_id}: light received"
     table = Table("run", "first", "lux.h", "damage, mW.h/m2", "", box=None, title=title, title_justify="left")
     for run in history.runs:
@@ -43,14 +43,14 @@ def show_dose(console: Console, ledger: Ledger, history: History, others: list[s
     limit_lux_h = history.warn_above_lux_h
     if limit_lux_h is not None and history.total_lux_h > limit_lux_h:
         console.print(f"[yellow]note:[/] the total is above {limit_lux_h:g} lux.h")
-    for similar_id in others:
+    for similar_id in similar_ids:
         console.print(f"[yellow]note:[/] there is also a ledger of `{similar_id}`: is it the same object?")
     if history.unreadable:
         console.print(f"[yellow]note:[/] {history.unreadable} lines of the ledger cannot be read")
     console.print(f"  {escape(str(ledger.path))}", soft_wrap=True)
 
 
-def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, Any]:
+def document(ledger: Ledger, history: History, similar_ids: list[str]) -> dict[str, Any]:
     """Return the document for `--json`."""
     return {
         "object": ledger.object_id,
@@ -62,7 +62,7 @@ def document(ledger: Ledger, history: History, others: list[str]) -> dict[str, A
         ],
         "warn_above_lux_h": history.warn_above_lux_h,
         "above_warning": history.warn_above_lux_h is not None and history.total_lux_h > history.warn_above_lux_h,
-        "similar_ids": others,
+        "similar_ids": similar_ids,
         "unreadable_lines": history.unreadable,
         "damage_b_per_nm": B_PER_NM,
         "runs": {run: _sums(history.of_run(run)) for run in history.runs},

@@ -20,13 +20,15 @@ _HEIGHT = _CURVES + _BARS + 60.0
 _SIGNS = {"match": "ok", "mixture": "ok", "ambiguous": "stopped", "unknown": "stopped"}
 
 
-def write(folder: Path, found: list[Finding], library: str) -> Path:
+def write(folder: Path, findings: list[Finding], library: str) -> Path:
     """Write the page of findings that share a library. Raises StorageError."""
     path = folder / PAGE
-    parts = [section(f"s{number}", text(finding.name), _of_one(finding)) for number, finding in enumerate(found)]
+    parts = [
+        section(f"s{number}", text(finding.name), _of_one(finding)) for number, finding in enumerate(findings)
+    ]
     heading = "Identification of pigments"
     body = f"<h1>{heading}</h1><p>Library: <code>{text(library)}</code></p>"
-    if len(found) > 1:
+    if len(findings) > 1:
         body += table(
             "Spectra",
             ("spectrum", "verdict", "class", "probability"),
@@ -37,10 +39,10 @@ def write(folder: Path, found: list[Finding], library: str) -> Path:
                     text(finding.class_name),
                     _percent(finding),
                 )
-                for number, finding in enumerate(found)
+                for number, finding in enumerate(findings)
             ],
         )
-    body += "".join(parts) + section("library", "What the verdicts are worth", _worth(found[-1].rates))
+    body += "".join(parts) + section("library", "What the verdicts are worth", _worth(findings[-1].rates))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_synced(path, page(heading, body))
@@ -49,46 +51,46 @@ def write(folder: Path, found: list[Finding], library: str) -> Path:
     return path
 
 
-def _of_one(found: Finding) -> str:
-    nm = found.evidence.wavelengths_nm
-    second = found.candidates[1].class_name
-    best = found.candidates[0]
-    extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if found.near_infrared else ''}"
+def _of_one(finding: Finding) -> str:
+    nm = finding.evidence.wavelengths_nm
+    second = finding.candidates[1].class_name
+    best = finding.candidates[0]
+    extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if finding.near_infrared else ''}"
     body = facts(
         {
-            "verdict": _verdict(found),
-            "why": text(found.reason),
-            "compared": "; ".join(map(text, (extent, *found.remarks))),
-            "not in the library": f"{found.not_in_library:.0%}",
+            "verdict": _verdict(finding),
+            "why": text(finding.reason),
+            "compared": "; ".join(map(text, (extent, *finding.remarks))),
+            "not in the library": f"{finding.not_in_library:.0%}",
         }
     )
     body += table(
         "Parts of the mixture",
         ("class", "reference", "share of K/S"),
-        [(text(part.class_name), text(part.name), f"{part.share:.0%}") for part in found.parts],
+        [(text(part.class_name), text(part.name), f"{part.share:.0%}") for part in finding.parts],
     )
     body += table(
         "Most probable classes",
         ("class", "probability", "nearest reference"),
         [
             (text(candidate.class_name), f"{candidate.probability:.1%}", text(candidate.name))
-            for candidate in found.candidates[:_CANDIDATES]
+            for candidate in finding.candidates[:_CANDIDATES]
         ],
     )
     return body + (
-        f"<figure>{_drawn(found.evidence, best.class_name, second)}<figcaption>Above: the spectrum (solid), the "
-        f"nearest reference of {text(best.class_name)} (long dashes) and of {text(second)} (short dashes), their "
-        "K/S by the factors that suit best. Below: what each band says, upwards for the first class, downwards "
-        "for the second, in units of the spread within classes.</figcaption></figure>"
+        f"<figure>{_evidence_svg(finding.evidence, best.class_name, second)}<figcaption>Above: the spectrum "
+        f"(solid), the nearest reference of {text(best.class_name)} (long dashes) and of {text(second)} (short "
+        "dashes), their K/S by the factors that suit best. Below: what each band says, upwards for the first "
+        "class, downwards for the second, in units of the spread within classes.</figcaption></figure>"
     )
 
 
-def _verdict(found: Finding) -> str:
-    return f'<span class="{_SIGNS[found.verdict]}">{found.verdict}</span>'
+def _verdict(finding: Finding) -> str:
+    return f'<span class="{_SIGNS[finding.verdict]}">{finding.verdict}</span>'
 
 
-def _percent(found: Finding) -> str:
-    return f"{found.candidates[0].probability:.0%}"
+def _percent(finding: Finding) -> str:
+    return f"{finding.candidates[0].probability:.0%}"
 
 
 def _worth(rates: HeldOutRates) -> str:
@@ -106,7 +108,7 @@ def _worth(rates: HeldOutRates) -> str:
     )
 
 
-def _drawn(evidence: Evidence, best: str, second: str) -> str:
+def _evidence_svg(evidence: Evidence, best: str, second: str) -> str:
     nm = evidence.wavelengths_nm
     curves = (evidence.reflectance, evidence.best, evidence.runner_up)
     highest = max(0.1, 1.05 * max(float(curve.max()) for curve in curves))

@@ -17,7 +17,7 @@ _MOST_BYTES, _NAP_S = 64, 0.5
 
 
 @contextmanager
-def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
+def key_actions(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
     """Call what belongs to a key when it is pressed alone (or with Enter), in another thread; True if any is
     read.
 
@@ -32,7 +32,7 @@ def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
     modes = termios.tcgetattr(terminal)
     handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
     end_reader, end = os.pipe()
-    thread = threading.Thread(target=_read, args=(terminal, end_reader, actions), name="keys", daemon=True)
+    thread = threading.Thread(target=_read_keys, args=(terminal, end_reader, actions), name="keys", daemon=True)
     try:
         tty.setcbreak(terminal, termios.TCSANOW)
         thread.start()
@@ -49,15 +49,15 @@ def obeyed(actions: Mapping[str, Callable[[], object]]) -> Iterator[bool]:
             signal.signal(number, handler)
 
 
-def _read(terminal: int, ended: int, actions: Mapping[str, Callable[[], object]]) -> None:
+def _read_keys(terminal: int, end_fd: int, actions: Mapping[str, Callable[[], object]]) -> None:
     while True:
-        ready, _, _ = select.select([terminal, ended], [], [])
-        if ended in ready:
+        ready, _, _ = select.select([terminal, end_fd], [], [])
+        if end_fd in ready:
             return
         try:
             typing = os.read(terminal, _MOST_BYTES)
         except OSError:  # in the background, or the terminal is gone
-            if select.select([ended], [], [], _NAP_S)[0]:
+            if select.select([end_fd], [], [], _NAP_S)[0]:
                 return
             continue
         if not typing:

@@ -14,32 +14,32 @@ from coupole.viewing.spectra_drawing import Array, Curve, chart
 
 
 def layer_page(
-    given: LayerGiven, samples: Samples, found: Coefficients, model: Deserved, four: FourFlux | None
+    description: LayerGiven, samples: Samples, fit: Coefficients, model: Deserved, four: FourFlux | None
 ) -> str:
     """HTML."""
-    nm, sure = samples.wavelengths_nm, found.determined_bands
+    nm, sure = samples.wavelengths_nm, fit.determined_bands
     unit = "per mm" if samples.is_per_mm else "of the layer"
     head = {
         "Model": f"{text(model.model)}: {text(model.because)}",
-        "Spectra": str(found.spectra),
-        "Binder": f"index {given.binder_index:g}, {text(given.geometry)}",
-        "Noise": f"{given.noise:g} of full reflectance, standard uncertainty",
+        "Spectra": str(fit.spectra),
+        "Binder": f"index {description.binder_index:g}, {text(description.geometry)}",
+        "Noise": f"{description.noise:g} of full reflectance, standard uncertainty",
         "Bands": f"{len(nm)} of {nm[0]:g} to {nm[-1]:g} nm; S is told in {int(sure.sum())} of them",
     }
-    body = f"<h1>{text(given.name)}: absorption and scattering</h1>{facts(head)}"
+    body = f"<h1>{text(description.name)}: absorption and scattering</h1>{facts(head)}"
     if sure.sum() > 1:
         sure_nm = nm[sure]
         curves = [
-            _with_band("K", found.absorption[sure], found.u_absorption[sure]),
-            _with_band("S", found.scattering[sure], found.u_scattering[sure]),
+            _with_band("K", fit.absorption[sure], fit.u_absorption[sure]),
+            _with_band("S", fit.scattering[sure], fit.u_scattering[sure]),
         ]
         body += section("coefficients", "K and S", chart(f"K and S {unit}, with 95 % bands", sure_nm, curves))
     fits = []
-    for film, told_film in zip(samples.films, given.films, strict=True):
-        prediction = layer_fit.predict(found, samples.face, film.thickness_mm, film.ground)
+    for film, told_film in zip(samples.films, description.films, strict=True):
+        prediction = layer_fit.predict(fit, samples.face, film.thickness_mm, film.ground)
         fits += [
             Curve(f"{told_film.spectrum.name}, measured", film.reflectance),
-            Curve(f"{told_film.spectrum.name}, fitted", prediction.seen, dashed=True),
+            Curve(f"{told_film.spectrum.name}, fitted", prediction.seen, is_dashed=True),
         ]
     body += section("fit", "Measured and fitted", chart("Reflectance in air", nm, fits))
     if four is not None:
@@ -49,7 +49,7 @@ def layer_page(
             _with_band("s_j, backward", four.backward, four.u_backward),
         ]
         body += section("four", "Four fluxes", chart(f"Directional light, {unit}, 95 % bands", nm, directional))
-    return page(f"{given.name}: K and S", body)
+    return page(f"{description.name}: K and S", body)
 
 
 def _with_band(name: str, values: Array, u: Array) -> Curve:

@@ -84,11 +84,11 @@ class Studio:
         self._choice = choice
 
     @property
-    def watched(self) -> bool:
+    def is_watched(self) -> bool:
         """False if no page has asked for some seconds (at the beginning: none has come)."""
         return time.monotonic() - self._asked_s < UNWATCHED_S
 
-    def asked(self) -> None:
+    def note_request(self) -> None:
         """A page asks, so that somebody may be watching."""
         self._asked_s = time.monotonic()
 
@@ -102,13 +102,13 @@ class Studio:
             self._choice = choice
 
     @property
-    def shown(self) -> Shown | None:
+    def shown_frame(self) -> Shown | None:
         with self._lock:
             return self._shown
 
-    def show(self, shown: Shown) -> None:
+    def show(self, frame: Shown) -> None:
         with self._lock:
-            self._shown = shown
+            self._shown = frame
 
 
 class FrameRate:
@@ -138,11 +138,11 @@ class RunSource:
         newest: FrameProven | None = None
         while not studio.closing.is_set():
             is_changed = self._ask_status(studio)
-            last, display = self._newest(), studio.shown
+            last, display = self._newest(), studio.shown_frame
             if last is not None and last != newest:
                 newest = last
                 number += 1
-                display = replace(self._read(last, number), frames_per_s=pace.beat())
+                display = replace(self._read_frame(last, number), frames_per_s=pace.beat())
                 studio.show(self._with_status(display))
             elif is_changed and display is not None:
                 number += 1
@@ -163,10 +163,10 @@ class RunSource:
             studio.remark = "the run goes on"
         return self._status != before
 
-    def _with_status(self, shown: Shown) -> Shown:
+    def _with_status(self, frame: Shown) -> Shown:
         now = self._status
         progress = f"{now.state}, {now.proven} of {now.shots} shots proven"
-        return replace(shown, run=progress, dose_lux_h=now.dose_lux_h)
+        return replace(frame, run=progress, dose_lux_h=now.dose_lux_h)
 
     def _newest(self) -> FrameProven | None:
         frame = None
@@ -175,7 +175,7 @@ class RunSource:
                 frame = event
         return frame
 
-    def _read(self, event: FrameProven, number: int) -> Shown:
+    def _read_frame(self, event: FrameProven, number: int) -> Shown:
         file = read_view(self._run.folder / event.file, [event])
         raw, record = file.pixels(event.index), file.records[event.index]
         coding = Coding(file.pattern, file.black_dn, file.white_dn)
@@ -193,10 +193,10 @@ class Wanted(BaseModel):
     exposure_us: int = 0
 
 
-def read_wanted(posted: bytes) -> Wanted:
+def read_wanted(body: bytes) -> Wanted:
     """Raises InputError for anything else than JSON like {"led": 417, "exposure_us": 8000}."""
     try:
-        return Wanted.model_validate_json(posted)
+        return Wanted.model_validate_json(body)
     except ValidationError as error:
         problem = error.errors()[0]
         if not problem["loc"]:
@@ -205,10 +205,10 @@ def read_wanted(posted: bytes) -> Wanted:
         raise InputError(f"{where}: expected a whole number: {problem['msg']}") from error
 
 
-def choice_from(wanted: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
+def choice_from(request: Wanted, before: Choice, leds: tuple[int, ...], longest_us: int) -> Choice:
     """A viewer's choice, checked. Raises InputError for an LED or an exposure that the cell does not have."""
-    led = wanted.led if "led" in wanted.model_fields_set else before.led
-    exposure_us = wanted.exposure_us if "exposure_us" in wanted.model_fields_set else before.exposure_us
+    led = request.led if "led" in request.model_fields_set else before.led
+    exposure_us = request.exposure_us if "exposure_us" in request.model_fields_set else before.exposure_us
     if led is not None and led not in leds:
         raise InputError(f"led: expected one of the dome's, found {led!r}")
     if not 10 <= exposure_us <= longest_us:
@@ -216,14 +216,14 @@ def choice_from(wanted: Wanted, before: Choice, leds: tuple[int, ...], longest_u
     return Choice(led, exposure_us)
 
 
-def run_source(source: Source, studio: Studio, failed: Callable[[Exception], None]) -> threading.Thread:
-    """Start a thread that fills the studio; `failed` is called with the error that ends it."""
+def run_source(source: Source, studio: Studio, on_failure: Callable[[Exception], None]) -> threading.Thread:
+    """Start a thread that fills the studio; `on_failure` is called with the error that ends it."""
 
     def work() -> None:
         try:
             source.frames(studio)
         except Exception as error:  # noqa: BLE001  passed to the thread that reports it
-            failed(error)
+            on_failure(error)
             studio.closing.set()
 
     thread = threading.Thread(target=work, name="live", daemon=True)

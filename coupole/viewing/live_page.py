@@ -76,11 +76,11 @@ class _Page:
         if path == "":
             return Answer("text/html; charset=utf-8", self.html)
         if path == "figures":
-            self.studio.asked()
+            self.studio.note_request()
             return Answer("application/json", self._figures())
-        frame = self.studio.shown
+        frame = self.studio.shown_frame
         if path == "picture" and frame is not None:
-            self.studio.asked()
+            self.studio.note_request()
             marks = parse_qs(query).get("mark", [""])[0].split(",")
             picture = look(
                 frame.raw, frame.coding, _WIDTH_PX, saturation="saturation" in marks, focus="focus" in marks
@@ -88,13 +88,13 @@ class _Page:
             return Answer("image/jpeg", picture)
         raise Refused(HTTPStatus.NOT_FOUND, "nothing here yet")
 
-    def choose(self, target: str, posted: bytes) -> Answer:
+    def choose(self, target: str, body: bytes) -> Answer:
         """Take a viewer's choice and return the figures. Raises Refused, or InputError if it is not valid."""
         if self._place(target)[0] != "choose":
             raise Refused(HTTPStatus.NOT_FOUND, "choices go to `choose`")
         if not self.leds:
             raise InputError("this is a run: light and exposure follow its plan")
-        self.studio.choose(choice_from(read_wanted(posted), self.studio.choice, self.leds, self.longest_us))
+        self.studio.choose(choice_from(read_wanted(body), self.studio.choice, self.leds, self.longest_us))
         return Answer("application/json", self._figures())
 
     def _place(self, target: str) -> tuple[str, str]:
@@ -176,7 +176,7 @@ class _Viewer(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """A viewer's choice: {"led": 417, "exposure_us": 8000}, led null for none."""
-        self._answer_with(lambda: self.server.page.choose(self.path, self._posted()))
+        self._answer_with(lambda: self.server.page.choose(self.path, self._read_body()))
 
     def _answer_with(self, work: Callable[[], Answer]) -> None:
         try:
@@ -199,7 +199,7 @@ class _Viewer(BaseHTTPRequestHandler):
         if self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
             raise Refused(HTTPStatus.FORBIDDEN, "another site's page may not ask")
 
-    def _posted(self) -> bytes:
+    def _read_body(self) -> bytes:
         if self.headers.get(_OURS) != "1":
             raise InputError("only the page of this server may change light and exposure")
         lengths = self.headers.get_all("Content-Length", [])
@@ -269,7 +269,7 @@ def _hang_up(connection: socket.socket) -> None:
 
 
 def _figures(studio: Studio, leds: tuple[int, ...]) -> dict[str, Any]:
-    frame, choice = studio.shown, studio.choice
+    frame, choice = studio.shown_frame, studio.choice
     document = {}
     if frame is not None:
         document = {

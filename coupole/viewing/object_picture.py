@@ -38,7 +38,7 @@ def write_object_picture(job: Job, path: Path) -> None:
         ((True, f"from above: x {x} mm, y {y} mm"), (False, f"from the front (-y): x {x} mm, z {z} mm"))
     ):
         lookout = _lookout(low, high, above=above)
-        sheet.paste(_seen(lookout, support, solid), (k * _WIDTH_PX, _STRIP_PX))
+        sheet.paste(_view_from(lookout, support, solid), (k * _WIDTH_PX, _STRIP_PX))
         pen.text((k * _WIDTH_PX + 10, 6), words, fill=_ink())
         _scale_bar(pen, lookout, k * _WIDTH_PX)
     sheet.save(path, optimize=True)
@@ -53,14 +53,14 @@ def _lookout(low: Any, high: Any, *, above: bool) -> Lookout:
     return Lookout(eye, scale, _WIDTH_PX, _HEIGHT_PX, perspective=False)
 
 
-def _seen(lookout: Lookout, support: Solid, measured: Solid) -> Any:
+def _view_from(lookout: Lookout, support: Solid, object_solid: Solid) -> Any:
     canvas = Canvas(lookout)
     canvas.fill([support], [colours.SUPPORT])
-    canvas.fill([measured], [colours.OBJECT])
+    canvas.fill([object_solid], [colours.OBJECT])
     for axis, colour in ((0, colours.HOME), (1, colours.CAMERA_WAY), (2, colours.SIGHT)):
         end = np.zeros(3)
         end[axis] = 40.0
-        canvas.line(np.array((np.zeros(3), end)), colour, 2.5, hidden=0.35)
+        canvas.line(np.array((np.zeros(3), end)), colour, 2.5, hidden_opacity=0.35)
     return canvas.image()
 
 

@@ -62,9 +62,9 @@ def moment(utc: str) -> str:
     return f'<time datetime="{text(utc)}">{text(utc[:19].replace("T", " "))}</time>'
 
 
-def link(path: str, shown: str = "") -> str:
+def link(path: str, words: str = "") -> str:
     """Return a link to a file beside the page."""
-    return f'<a href="{text(path)}">{text(shown or path)}</a>'
+    return f'<a href="{text(path)}">{text(words or path)}</a>'
 
 
 def anchor(name: str) -> str:

@@ -37,7 +37,7 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
     table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
     table.add_row("white is exposed to", _white(report))
     if report.object_check is not None:
-        table.add_row("object", _placed(report.object_check.placement))
+        table.add_row("object", _placement_text(report.object_check.placement))
     console.print(table)
     for warning in report.warnings:
         console.print(f"[yellow]note:[/] {warning}")
@@ -56,7 +56,7 @@ def show_views(console: Console, report: Report) -> None:
     framings = {framing.view: framing for framing in report.object_check.views}
     table = Table("view", "object in field", "of the field", "mm away", "sharp", "px per mm", box=None)
     for view in report.views:
-        table.add_row(view.name, *_framed(framings[view.name]))
+        table.add_row(view.name, *_framing_cells(framings[view.name]))
     console.print(table)
     nearest, farthest = (_distance(mm) for mm in report.object_check.sharp_mm)
     console.print(f"sharp (blurred over at most {SHARP_PX:g} pixels) is {nearest} to {farthest}")
@@ -128,11 +128,11 @@ def _white(report: Report) -> str:
     )
 
 
-def _placed(placed: Placement) -> str:
-    size = " x ".join(f"{high - low:.0f}" for low, high in zip(placed.low_mm, placed.high_mm, strict=True))
-    lowest = placed.lowest_over_disk_mm
+def _placement_text(placement: Placement) -> str:
+    size = " x ".join(f"{high - low:.0f}" for low, high in zip(placement.low_mm, placement.high_mm, strict=True))
+    lowest = placement.lowest_over_disk_mm
     where = "beside the disk" if lowest is None else f"its lowest point {_height(lowest)}"
-    return f"{size} mm, {where}, up to {placed.reach_mm:.0f} mm from its centre"
+    return f"{size} mm, {where}, up to {placement.reach_mm:.0f} mm from its centre"
 
 
 def _height(over_disk_mm: float) -> str:
@@ -141,15 +141,15 @@ def _height(over_disk_mm: float) -> str:
     return f"{abs(over_disk_mm):.1f} mm {'above the disk' if over_disk_mm > 0 else 'inside the disk'}"
 
 
-def _framed(seen: Framing) -> list[str]:
-    if not seen.fills:
-        return [f"{seen.in_field:.0%}", "0%", "-", "-", "-"]
-    least, most = seen.px_per_mm
+def _framing_cells(framing: Framing) -> list[str]:
+    if not framing.fills:
+        return [f"{framing.in_field:.0%}", "0%", "-", "-", "-"]
+    least, most = framing.px_per_mm
     return [
-        f"{seen.in_field:.0%}",
-        f"{seen.fills:.0%}",
-        f"{seen.nearest_mm:.0f} to {seen.farthest_mm:.0f}",
-        f"{seen.in_focus:.0%}",
+        f"{framing.in_field:.0%}",
+        f"{framing.fills:.0%}",
+        f"{framing.nearest_mm:.0f} to {framing.farthest_mm:.0f}",
+        f"{framing.in_focus:.0%}",
         f"{least:.1f} to {most:.1f}",
     ]
 

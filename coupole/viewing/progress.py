@@ -55,7 +55,7 @@ class ViewExposure:
     """Exposure of a view, by the frames of a sample of its lights."""
 
     pictures: int = 0
-    saturated: float = 0.0
+    saturated_share: float = 0.0
     """Largest share of saturated pixels of any sampled frame."""
     brightest: float = 0.0
     """Highest 99.9 % quantile of any sampled frame, share of full scale above black."""
@@ -68,16 +68,16 @@ class ViewExposure:
         brightest = (float(np.quantile(raw, 0.999)) - black_dn) / (white_dn - black_dn)
         self.add_figures(brightest, float(np.mean(raw >= white_dn)))
 
-    def add_figures(self, brightest: float, saturated: float) -> None:
+    def add_figures(self, brightest: float, saturated_share: float) -> None:
         """The same of a frame whose quantile (share of full scale) and share of saturated pixels are known."""
         self.pictures += 1
         self.quantiles.append(brightest)
         self.brightest = max(self.brightest, brightest)
         self.median_bright = float(np.median(self.quantiles))
-        self.saturated = max(self.saturated, saturated)
+        self.saturated_share = max(self.saturated_share, saturated_share)
 
     def verdict(self) -> str:
         """`over-exposed`, `under-exposed` or `well exposed`."""
-        if self.saturated > OVER_EXPOSED:
+        if self.saturated_share > OVER_EXPOSED:
             return "over-exposed"
         return "under-exposed" if self.median_bright < UNDER_EXPOSED else "well exposed"

@@ -114,13 +114,13 @@ def figures(raw: NDArray[np.uint16], coding: Coding) -> Figures:
     )
 
 
-def _sharpness(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+def _sharpness(plane: NDArray[np.float32], other_plane: NDArray[np.float32]) -> float:
     """Return the sharpness of two planes [h, w] of the same scene with independent noise; 0 if there is only
     noise."""
-    products = np.diff(one, axis=0)[:, 1:] * np.diff(other, axis=0)[:, 1:]
-    products += np.diff(one, axis=1)[1:] * np.diff(other, axis=1)[1:]
+    products = np.diff(plane, axis=0)[:, 1:] * np.diff(other_plane, axis=0)[:, 1:]
+    products += np.diff(plane, axis=1)[1:] * np.diff(other_plane, axis=1)[1:]
     energy, noise = float(products.mean()), float(products.std()) / math.sqrt(products.size)
-    level = float(np.mean(one * other))
+    level = float(np.mean(plane * other_plane))
     return energy / level if energy > _BEYOND_NOISE * noise and level > 0 else 0.0
 
 

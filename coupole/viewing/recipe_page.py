@@ -14,10 +14,10 @@ from coupole.viewing.page_parts import page, section, table, text
 from coupole.viewing.spectra_drawing import Array, Curve, chart, patches
 
 
-def recipe_page(name: str, found: Found, matches: Sequence[Sequence[Match]]) -> str:
-    """HTML; `matches` are those of each of `found.recipes` under each light."""
-    best, under = found.best, matches[found.chosen_index]
-    body = f"<h1>{text(name)}: recipe</h1><p>{text(found.verdict())}.</p>"
+def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) -> str:
+    """HTML; `matches` are those of each of `search.recipes` under each light."""
+    best, under = search.best, matches[search.chosen_index]
+    body = f"<h1>{text(name)}: recipe</h1><p>{text(search.verdict())}.</p>"
     shares = [
         [text(paint), f"{100 * share:.1f} %", f"{100 * best.half_widths[paint]:.1f} %"]
         for paint, share in sorted(best.shares.items(), key=lambda item: -item[1])
@@ -32,11 +32,11 @@ def recipe_page(name: str, found: Found, matches: Sequence[Sequence[Match]]) -> 
     ]
     note = "Adapted to the screen's white (CAT16); colours outside its gamut are nearest ones."
     body += section("colours", "Side by side", f'{patches(patch_pairs)}<p class="note">{note}</p>')
-    bands = found.bands
-    curves = [Curve("target", found.target[bands]), Curve("recipe", best.reflectance[bands], dashed=True)]
+    bands = search.bands
+    curves = [Curve("target", search.target[bands]), Curve("recipe", best.reflectance[bands], is_dashed=True)]
     body += section("spectra", "Spectra", chart("Reflectance in air", WAVELENGTHS_NM[bands], curves))
     lights = [m.light for m in under]
-    rows = [_row(mixture, of_one) for mixture, of_one in zip(found.recipes, matches, strict=True)]
+    rows = [_row(mixture, of_one) for mixture, of_one in zip(search.recipes, matches, strict=True)]
     head = ("paints", "root mean square", *(f"dE00 {light}" for light in lights), "shares")
     body += section("fewer", "With fewer paints", table("best recipes by number of paints", head, rows))
     return page(f"{name}: recipe", body)

@@ -29,21 +29,21 @@ _STONE = (0.75, 0.72, 0.66)
 _LOOPS_SHOWN, _TARGETS_SHOWN = 12, 60
 
 
-def write(found: Registered, merged: Merged | None, folder: Path) -> None:
+def write(registration: Registered, merged_mesh: Merged | None, folder: Path) -> None:
     """Write the report beside what was merged. Raises OSError."""
-    body = f"<h1>{len(found.names)} scans registered</h1><ul>"
-    body += "".join(f"<li>{text(remark[0].upper() + remark[1:])}." for remark in remarks(found)) + "</ul>"
-    body += section("pictures", "Pictures", _pictures(found, merged, folder))
-    body += section("files", "Files", _files(merged))
-    body += section("scans", "Scans", _scans(found))
-    body += section("loops", "Loops", _loops(found))
-    body += section("targets", "Targets", _targets(found))
+    body = f"<h1>{len(registration.names)} scans registered</h1><ul>"
+    body += "".join(f"<li>{text(remark[0].upper() + remark[1:])}." for remark in remarks(registration)) + "</ul>"
+    body += section("pictures", "Pictures", _pictures(registration, merged_mesh, folder))
+    body += section("files", "Files", _files(merged_mesh))
+    body += section("scans", "Scans", _scans(registration))
+    body += section("loops", "Loops", _loops(registration))
+    body += section("targets", "Targets", _targets(registration))
     (folder / REPORT).write_text(page("Scans registered", body), encoding="utf-8")
 
 
-def _pictures(found: Registered, merged: Merged | None, folder: Path) -> str:
-    figures = _image(scans_drawn(found), "Each scan in its place in a colour of its own, from three sides")
-    if merged is not None:
+def _pictures(registration: Registered, merged_mesh: Merged | None, folder: Path) -> str:
+    figures = _image(scans_drawn(registration), "Each scan in its place in a colour of its own, from three sides")
+    if merged_mesh is not None:
         mesh = read_ply(MeshFile(folder / "mesh.ply"))
         vertices = mesh.vertices.astype(np.float64)
         solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
@@ -58,25 +58,26 @@ def _image(sheet: Any, alternative: str) -> str:
     return f"<figure>{image}<figcaption>{text(alternative)}.</figcaption></figure>"
 
 
-def scans_drawn(found: Registered) -> Any:
+def scans_drawn(registration: Registered) -> Any:
     """The scans' coarse points, each scan in a colour of its own, as a PIL image."""
     clouds = [
-        moved_points(found.first_from_scan[k], found.scans[k].coarse.points_mm) for k in found.placed_numbers
+        moved_points(registration.first_from_scan[k], registration.scans[k].coarse.points_mm)
+        for k in registration.placed_numbers
     ]
     colours = [np.tile(_hue(k / len(clouds)), (len(cloud), 1)) for k, cloud in enumerate(clouds)]
     points, colour = np.concatenate(clouds), np.concatenate(colours)
     if len(points) > _DRAWN_POINTS:
         some = np.random.default_rng(0).choice(len(points), _DRAWN_POINTS, replace=False)
         points, colour = points[some], colour[some]
-    return drawn(points, lambda canvas: canvas.dots(points, colour, 1.5))
+    return sheet_of_sides(points, lambda canvas: canvas.dots(points, colour, 1.5))
 
 
 def solid_drawn(solid: Solid, colours: Any) -> Any:
     """A solid in one colour, or one for each face, from three sides."""
-    return drawn(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], outlined=False))
+    return sheet_of_sides(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], outlined=False))
 
 
-def drawn(points: Points, draw: Any) -> Any:
+def sheet_of_sides(points: Points, draw: Any) -> Any:
     """A PIL image from three sides; `draw` draws on a canvas."""
     from PIL import Image, ImageDraw
 
@@ -107,57 +108,64 @@ def _hue(share: float) -> NDArray[np.float64]:
     return np.asarray(0.5 + 0.35 * np.cos(thirds))
 
 
-def _files(merged: Merged | None) -> str:
+def _files(merged_mesh: Merged | None) -> str:
     rows = {link("registration.json"): "poses with covariances, loops, rejected pairs"}
-    if merged is not None:
-        rows[link("mesh.ply")] = f"{merged.triangles:,} triangles, from cells of {merged.cell_mm:.3g} mm"
-        rows |= {link(name): f"{count:,} points" for name, count in merged.levels.items()}
+    if merged_mesh is not None:
+        rows[link("mesh.ply")] = f"{merged_mesh.triangles:,} triangles, from cells of {merged_mesh.cell_mm:.3g} mm"
+        rows |= {link(name): f"{count:,} points" for name, count in merged_mesh.levels.items()}
     return facts(rows)
 
 
-def _scans(found: Registered) -> str:
+def _scans(registration: Registered) -> str:
     rows = []
-    for number, scan in enumerate(found.scans):
-        is_placed = number in found.placed_numbers
+    for number, scan in enumerate(registration.scans):
+        is_placed = number in registration.placed_numbers
         rows.append(
             (
                 text(scan.name),
                 f"{scan.survey.count:,}",
                 f"{scan.survey.spacing_mm:.3g}",
                 text(scan.viewpoint.stand),
-                f"{point_uncertainty_mm(found, number):.3g}" if is_placed else "not placed",
+                f"{point_uncertainty_mm(registration, number):.3g}" if is_placed else "not placed",
             )
         )
     head = ("scan", "points", "spacing, mm", "seen from", "u of its points, mm")
     note = (
         "<p>u: standard uncertainty (68 %) of where a scan's pose puts its points, in the frame of the first scan"
     )
-    note += ", or of the control points." if found.site_from_first is not None else "."
+    note += ", or of the control points." if registration.site_from_first is not None else "."
     return table("Scans", head, rows) + note
 
 
-def _loops(found: Registered) -> str:
+def _loops(registration: Registered) -> str:
     rows: Sequence[Sequence[str]] = [
-        (text(" - ".join(found.names[k] for k in loop.scans)), f"{loop.error_mm:.3g}", f"{loop.error_deg:.3g}")
-        for loop in found.loops[:_LOOPS_SHOWN]
+        (
+            text(" - ".join(registration.names[k] for k in loop.scans)),
+            f"{loop.error_mm:.3g}",
+            f"{loop.error_deg:.3g}",
+        )
+        for loop in registration.loops[:_LOOPS_SHOWN]
     ]
     if not rows:
         return "<p>No pairs form a ring."
-    summary = f"<p>{len(found.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
+    summary = f"<p>{len(registration.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
     summary += (
-        f"{worst_loop_mm(found):.3g} mm. All uncertainties hold a factor of {found.loop_factor:.2f} by the loops."
+        f"{worst_loop_mm(registration):.3g} mm. All uncertainties hold a factor of {registration.loop_factor:.2f} "
+        "by the loops."
     )
     return summary + table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
 
 
-def _targets(found: Registered) -> str:
+def _targets(registration: Registered) -> str:
     rows = [
         (
             text(sighting.name),
-            text(found.names[found.placed_numbers[sighting.scan]]),
+            text(registration.names[registration.placed_numbers[sighting.scan]]),
             f"{sighting.u_mm:.3g}",
             f"{sighting.left_mm:.3g}",
         )
-        for sighting in sorted(found.fit.sightings, key=lambda one: -one.left_mm / one.u_mm)[:_TARGETS_SHOWN]
+        for sighting in sorted(registration.fit.sightings, key=lambda entry: -entry.left_mm / entry.u_mm)[
+            :_TARGETS_SHOWN
+        ]
     ]
     return table("Targets", ("target", "scan", "stated u, mm", "off, mm"), rows)

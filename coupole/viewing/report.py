@@ -16,7 +16,7 @@ from coupole.storage.durable import write_synced
 from coupole.storage.journal_events import Event, FrameProven, ViewBegun
 from coupole.storage.run import Run
 from coupole.storage.run_status import Status, status
-from coupole.viewing import report_facts as told
+from coupole.viewing import report_facts as run_facts
 from coupole.viewing.page_parts import facts, page, section, table, text
 from coupole.viewing.report_pictures import (
     coverage_in_words,
@@ -41,28 +41,28 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
     return path
 
 
-def _page(run: Run, found: Status) -> str:
+def _page(run: Run, run_status: Status) -> str:
     events = list(journal.read_events(run.journal_path))
     views = sampled_views(run, (event for event in events if isinstance(event, FrameProven)))
     object_coverage = _coverage(run, views)
-    lines = told.troubles(events, views, found)
+    lines = run_facts.troubles(events, views, run_status)
     sections = {
-        "measured": ("What was measured", _measured(run, events, views)),
+        "measured": ("What was measured", _measured_views(run, events, views)),
         "exposure": ("Exposure", exposures(views, run.about.get("scaling") or "")),
         "coverage": (
             "Coverage of the object",
             coverages(object_coverage) if isinstance(object_coverage, Coverage) else "",
         ),
-        "light": ("Light on the object", told.light(events, views, found)),
-        "time": ("Time", told.sessions(found)),
-        "calibrations": ("Calibrations", told.calibrations(run)),
-        "trouble": ("What went wrong", told.trouble(lines)),
+        "light": ("Light on the object", run_facts.light(events, views, run_status)),
+        "time": ("Time", run_facts.sessions(run_status)),
+        "calibrations": ("Calibrations", run_facts.calibrations(run)),
+        "trouble": ("What went wrong", run_facts.trouble(lines)),
         "pictures": ("Pictures", pictures(views)),
-        "technical": ("Devices and software", told.technical(run, events, found)),
+        "technical": ("Devices and software", run_facts.technical(run, events, run_status)),
     }
     parts = {name: part for name, part in sections.items() if part[1]}
     remark = "<p>Simulated: no real light, no real object.</p>" if run.is_simulated else ""
-    glance = facts(_glance(run, found, views, object_coverage, lines))
+    glance = facts(_glance(run, run_status, views, object_coverage, lines))
     body = "".join(section(name, *part) for name, part in parts.items())
     head = f"<header><h1>{text(run.folder.name)}</h1>{remark}</header>"
     return page(run.folder.name, f"{head}<main>{glance}{_contents(parts)}{body}</main>")
@@ -82,25 +82,31 @@ def _coverage(run: Run, views: Sequence[SampledView]) -> Coverage | str:
 
 
 def _glance(
-    run: Run, found: Status, views: Sequence[SampledView], covered: Coverage | str, lines: Sequence[str]
+    run: Run,
+    run_status: Status,
+    views: Sequence[SampledView],
+    object_coverage: Coverage | str,
+    lines: Sequence[str],
 ) -> dict[str, str]:
-    kind = {"done": "ok", "failed": "bad"}.get(found.state, "stopped")
-    why = f": {text(found.reason)}" if found.reason and found.state != "done" else ""
-    whole = "ok" if found.missing == 0 else kind
+    kind = {"done": "ok", "failed": "bad"}.get(run_status.state, "stopped")
+    why = f": {text(run_status.reason)}" if run_status.reason and run_status.state != "done" else ""
+    whole = "ok" if run_status.missing == 0 else kind
     things = "one thing" if len(lines) == 1 else f"{len(lines)} things"
     return {
-        "outcome": f"<b class={kind}>{found.state}</b>{why}",
-        "go on with": f"<code>{text(found.go_on)}</code> ({found.frames_left} frames are left)"
-        if found.go_on
+        "outcome": f"<b class={kind}>{run_status.state}</b>{why}",
+        "go on with": f"<code>{text(run_status.go_on)}</code> ({run_status.frames_left} frames are left)"
+        if run_status.go_on
         else "",
         "object": text(run.about.get("object") or "none"),
-        "shots": f"<span class={whole}>{found.proven} of {found.shots} proven</span>, {found.reshot} re-shot, "
-        f"{found.darks_proven} dark frames",
+        "shots": f"<span class={whole}>{run_status.proven} of {run_status.shots} proven</span>, "
+        f"{run_status.reshot} re-shot, {run_status.darks_proven} dark frames",
         "exposure": _exposure_in_words(run, views),
-        "coverage": coverage_in_words(covered) if isinstance(covered, Coverage) else covered,
-        "light": told.light_in_words(found, found.dose_budget_lux_h or _plans_budget_lux_h(run)),
-        "duration": told.duration_in_words(found),
-        "calibrations": told.calibrations_in_words(run),
+        "coverage": coverage_in_words(object_coverage)
+        if isinstance(object_coverage, Coverage)
+        else object_coverage,
+        "light": run_facts.light_in_words(run_status, run_status.dose_budget_lux_h or _plans_budget_lux_h(run)),
+        "duration": run_facts.duration_in_words(run_status),
+        "calibrations": run_facts.calibrations_in_words(run),
         "trouble": f'<a href="#trouble">{things} went wrong</a>' if lines else "none",
     }
 
@@ -114,19 +120,19 @@ def _plans_budget_lux_h(run: Run) -> float | None:
     """Read the dose budget from the plan, for runs whose journal has none; None if the plan has none or cannot be
     read."""
     try:
-        plan = yamlfile.read(run.plan_path).validate(Plan)
+        plan = yamlfile.read_document(run.plan_path).validate(Plan)
     except (InputError, OSError):
         return None
     return plan.object.dose_budget_lux_h if plan.object else None
 
 
-def _measured(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> str:
+def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> str:
     """Views, their lights and what of them is proven."""
     hidden_counts = {event.view: len(event.hidden_leds) for event in events if isinstance(event, ViewBegun)}
     rows = []
     for view in views:
-        share = f"{view.proven} of {view.expected}"
-        if view.proven < view.expected:
+        share = f"{view.proven} of {view.expected_frames}"
+        if view.proven < view.expected_frames:
             share = f"<span class=stopped>{share}</span>"
         left_out = len(run.hidden_leds.get(view.name, ()))
         hidden_text = f"{left_out}, left out" if left_out else str(hidden_counts.get(view.name, "")) or "not known"

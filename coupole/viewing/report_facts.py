@@ -22,14 +22,14 @@ _MOST_LINES = 30
 _STOPPED_IN_0_1 = "Interrupted"
 
 
-def light_in_words(found: Status, budget_lux_h: float | None) -> str:
+def light_in_words(run_status: Status, budget_lux_h: float | None) -> str:
     """Return the light of all sessions; a burst whose end was not recorded counts as planned."""
-    light_s = sum(session.light_s for session in found.sessions)
+    light_s = sum(session.light_s for session in run_status.sessions)
     budget = f" (the object may receive {budget_lux_h:g} in its life)" if budget_lux_h else ""
-    return f"{found.dose_lux_h:.3f} lux h{budget}, LEDs on for {light_s:.1f} s"
+    return f"{run_status.dose_lux_h:.3f} lux h{budget}, LEDs on for {light_s:.1f} s"
 
 
-def light(events: Sequence[Event], views: Iterable[SampledView], found: Status) -> str:
+def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Status) -> str:
     """The dose by view, at the point of the object that received most."""
     total = run_dose.lux_h_of_points(events)
     if not total:
@@ -40,36 +40,38 @@ def light(events: Sequence[Event], views: Iterable[SampledView], found: Status) 
         of_view = [e for e in events if isinstance(e, BurstBegun | BurstEnded) and e.view == view.name]
         lux_h = run_dose.lux_h_of_points(of_view)
         rows.append((text(view.name), f"{lux_h[point] if lux_h else 0.0:.3f}"))
-    was_killed = any(session.outcome == "" for session in found.sessions)
+    was_killed = any(session.outcome == "" for session in run_status.sessions)
     note = (
         '<p class="note">A burst in which a session was killed counts as it was planned.</p>' if was_killed else ""
     )
     return table("Light on the point that received most", ("view", "lux h"), rows) + note
 
 
-def duration_in_words(found: Status) -> str:
+def duration_in_words(run_status: Status) -> str:
     """Return the duration of all sessions together."""
-    total_s = sum(session.duration_s for session in found.sessions)
-    pauses = sum(session.pauses for session in found.sessions)
-    paused_s = sum(session.paused_s for session in found.sessions)
-    count = len(found.sessions)
+    total_s = sum(session.duration_s for session in run_status.sessions)
+    pauses = sum(session.pauses for session in run_status.sessions)
+    paused_s = sum(session.paused_s for session in run_status.sessions)
+    count = len(run_status.sessions)
     pause_text = f"{pauses} {'pause' if pauses == 1 else 'pauses'} of {duration_text(paused_s)} in all"
     sessions = "1 session" if count == 1 else f"{count} sessions"
     return f"{duration_text(total_s)} in {sessions}, {pause_text if pauses else 'no pause'}"
 
 
-def sessions(found: Status) -> str:
+def sessions(run_status: Status) -> str:
     """Return a table of sessions: when each began, how long it took and was paused, and how it ended."""
     rows = []
-    for number, session in enumerate(found.sessions, 1):
-        outcome, reason = _end_of(session, found, last=number == len(found.sessions))
+    for number, session in enumerate(run_status.sessions, 1):
+        outcome, reason = _end_of(session, run_status, last=number == len(run_status.sessions))
         pause_text = f"{session.pauses} ({duration_text(session.paused_s)})" if session.pauses else "none"
         rows.append((moment(session.begun), duration_text(session.duration_s), pause_text, outcome, text(reason)))
     return table("Sessions", ("begun (UTC)", "duration", "pauses", "ended", "why"), rows)
 
 
-def _end_of(session: Session, found: Status, *, last: bool) -> tuple[str, str]:
-    outcome = session.outcome or (found.state if last and found.state in ("running", "paused") else "killed")
+def _end_of(session: Session, run_status: Status, *, last: bool) -> tuple[str, str]:
+    outcome = session.outcome or (
+        run_status.state if last and run_status.state in ("running", "paused") else "killed"
+    )
     return outcome, session.reason or (KILLED if outcome == "killed" else "")
 
 
@@ -112,7 +114,7 @@ def _records(run: Run) -> dict[str, tuple[Any, str]]:
 # -- trouble --------------------------------------------------------------------------------------------------
 
 
-def troubles(events: Iterable[Event], views: Iterable[SampledView], found: Status) -> list[str]:
+def troubles(events: Iterable[Event], views: Iterable[SampledView], run_status: Status) -> list[str]:
     """Return what went wrong, a line of HTML each."""
     lines = []
     for event in events:
@@ -123,13 +125,13 @@ def troubles(events: Iterable[Event], views: Iterable[SampledView], found: Statu
             dead = f"; LEDs without current: {', '.join(map(str, event.dead_leds))}" if event.dead_leds else ""
             reason = f" ({event.reason})" if event.reason else ""
             lines.append(f"<li>{moment(event.t)} view {text(event.view)}: {text(why + dead + reason)}</li>")
-    if found.reshot:
-        lines.append(f"<li>{found.reshot} frames were taken again</li>")
+    if run_status.reshot:
+        lines.append(f"<li>{run_status.reshot} frames were taken again</li>")
     lines += [f"<li class=bad>view {text(view.name)}: {text(view.trouble)}</li>" for view in views if view.trouble]
     lines += [
         f"<li>{moment(session.ended)} a session had no end: it was killed, or the power failed</li>"
-        for number, session in enumerate(found.sessions, 1)
-        if _end_of(session, found, last=number == len(found.sessions))[0] == "killed"
+        for number, session in enumerate(run_status.sessions, 1)
+        if _end_of(session, run_status, last=number == len(run_status.sessions))[0] == "killed"
     ]
     return lines
 
@@ -146,7 +148,7 @@ def trouble(lines: Sequence[str]) -> str:
 # -- the technical --------------------------------------------------------------------------------------------
 
 
-def technical(run: Run, events: Iterable[Event], found: Status) -> str:
+def technical(run: Run, events: Iterable[Event], run_status: Status) -> str:
     """Devices, software, clocks, counters, files."""
     about = run.about
     devices = [
@@ -160,7 +162,7 @@ def technical(run: Run, events: Iterable[Event], found: Status) -> str:
                 "created": moment(about.get("created", "")),
                 "operator": text(f"{about.get('operator', '')} on {about.get('host', 'an unnamed machine')}"),
                 "software": text(f"{software.get('name', '')} {software.get('version', '')}"),
-                "proof": text(found.proof),
+                "proof": text(run_status.proof),
                 "licence": text(about.get("licence") or "not stated"),
                 "contact": text(about.get("contact") or "not stated"),
             }
@@ -211,7 +213,7 @@ def _link_of_the_arm(events: Iterable[Event]) -> str:
 def _files(run: Run) -> str:
     names = ("README.txt", "run.json", "journal.jsonl", "manifest.sha256")
     paths = [run.folder / name for name in names]
-    paths += [run.folder / entry["stored"] for entry in _stored(run)]
+    paths += [run.folder / entry["stored"] for entry in _stored_files(run)]
     paths += [run.view_path(view) for view in run.about["views"]]
     rows = [
         (link(str(path.relative_to(run.folder))), bytes_text(path.stat().st_size))
@@ -221,6 +223,6 @@ def _files(run: Run) -> str:
     return table("Files of the run", ("file", "size"), rows)
 
 
-def _stored(run: Run) -> list[dict[str, Any]]:
+def _stored_files(run: Run) -> list[dict[str, Any]]:
     entries = [run.about["plan"], run.about["rig"], *run.about.get("files", [])]
     return [entry for entry in entries if entry.get("stored")]

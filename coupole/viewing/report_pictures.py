@@ -33,15 +33,15 @@ def exposures(views: Sequence[SampledView], scaling: str) -> str:
         (
             f'<a href="#view-{anchor(view.name)}">{text(view.name)}</a>',
             f"{exposure.exposure_us / 1e3:g} ms",
-            f"{exposure.seen.pictures} of {exposure.frames}",
-            f"{exposure.seen.brightest:.0%}",
-            f"{exposure.seen.saturated:.2%}" + (f"<br>{text(exposure.worst)}" if exposure.worst else ""),
+            f"{exposure.sample.pictures} of {exposure.frames}",
+            f"{exposure.sample.brightest:.0%}",
+            f"{exposure.sample.saturated_share:.2%}" + (f"<br>{text(exposure.worst)}" if exposure.worst else ""),
             _histogram(view.name, exposure),
-            exposure.seen.verdict(),
+            exposure.sample.verdict(),
         )
         for view in views
         for exposure in view.exposures
-        if exposure.seen.pictures
+        if exposure.sample.pictures
     ]
     if not rows:
         return ""
@@ -60,53 +60,55 @@ def exposures(views: Sequence[SampledView], scaling: str) -> str:
     )
 
 
-def _histogram(view: str, one: SampledExposure) -> str:
-    most = math.log1p(max((int(counts.max()) for counts in one.histograms.values()), default=1)) or 1.0
+def _histogram(view: str, exposure: SampledExposure) -> str:
+    most = math.log1p(max((int(counts.max()) for counts in exposure.histograms.values()), default=1)) or 1.0
     lines = []
-    for name, counts in one.histograms.items():
+    for name, counts in exposure.histograms.items():
         heights = _HEIGHT * (1 - np.log1p(counts) / most)
         points = " ".join(f"{(n + 0.5) * _WIDTH / BINS:.1f},{y:.1f}" for n, y in enumerate(heights))
         lines.append(f'<polyline class="{name}" points="{points}"/>')
-    black = one.black_share * _WIDTH
+    black = exposure.black_share * _WIDTH
     lines.append(f'<line x1="{black:.1f}" x2="{black:.1f}" y1="0" y2="{_HEIGHT}"/>')
-    caption = f"Histogram of view {view} at {one.exposure_us / 1e3:g} ms"
+    caption = f"Histogram of view {view} at {exposure.exposure_us / 1e3:g} ms"
     return (
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
         f'aria-label="{text(caption)}">{"".join(lines)}</svg>'
     )
 
 
-def coverage_in_words(found: Coverage) -> str:
+def coverage_in_words(coverage: Coverage) -> str:
     """The share of the surface that is in the pictures at all."""
-    return f"{found.shares[0]:.0%} of the surface that can be seen from above the disk is in a view"
+    return f"{coverage.shares[0]:.0%} of the surface that can be seen from above the disk is in a view"
 
 
-def coverages(found: Coverage) -> str:
+def coverages(coverage: Coverage) -> str:
     """Shares of the surface by number of views, drawings, and what each view has of the object."""
     size = " x ".join(
-        f"{high - low:.0f}" for low, high in zip(found.placement.low_mm, found.placement.high_mm, strict=True)
+        f"{high - low:.0f}"
+        for low, high in zip(coverage.placement.low_mm, coverage.placement.high_mm, strict=True)
     )
     at_least = ", ".join(
         f"{share:.0%} in {'one view' if n == 0 else f'{n + 1} views'} or more"
-        for n, share in enumerate(found.shares)
+        for n, share in enumerate(coverage.shares)
     )
-    near, far = found.sharp_mm
+    near, far = coverage.sharp_mm
     drawings = "".join(
         f"<figure>{picture('png', data, f'The object {whence}, coloured by the number of views')}"
         f"<figcaption>{whence}</figcaption></figure>"
-        for whence, data in found.drawings.items()
+        for whence, data in coverage.drawings.items()
     )
     return (
         facts(
             {
-                "surface": f"{at_least}; of what can be seen from above the disk ({found.reachable:.0%} of all)",
+                "surface": f"{at_least}; of what can be seen from above the disk ({coverage.reachable:.0%} of "
+                "all)",
                 "object": f"{size} mm",
                 "sharp": f"{near:.0f} mm to {f'{far:.0f} mm' if math.isfinite(far) else 'infinity'} from the lens "
                 f"(blurred over at most {SHARP_PX:g} pixels)",
             }
         )
         + f'<div class="drawings">{drawings}</div>{_legend()}'
-        + table("What each view has of the object", _FRAMED, _framings(found))
+        + table("What each view has of the object", _FRAMED, _framings(coverage))
         + '<p class="note">By the mesh, the measured poses and the rig\'s lens. Of the arm, which may stand in a '
         "view's way, nothing is counted; nor which lights reach a point.</p>"
     )
@@ -115,8 +117,8 @@ def coverages(found: Coverage) -> str:
 _FRAMED = ("view", "object in field", "of the field", "mm away", "sharp", "px per mm")
 
 
-def _framings(found: Coverage) -> Iterable[Sequence[str]]:
-    for view in found.views:
+def _framings(coverage: Coverage) -> Iterable[Sequence[str]]:
+    for view in coverage.views:
         away = f"{view.nearest_mm:.0f} to {view.farthest_mm:.0f}" if math.isfinite(view.nearest_mm) else "-"
         scale = f"{view.px_per_mm[0]:.1f} to {view.px_per_mm[1]:.1f}" if math.isfinite(view.px_per_mm[0]) else "-"
         shares = f"{view.in_field:.0%}", f"{view.fills:.0%}"

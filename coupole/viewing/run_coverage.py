@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coupole.errors import InputError
 from coupole.geometry import Transform, inverse
-from coupole.motion.occlusion import RAY_START_MM, blocked, ray_mesh, sight_of
+from coupole.motion.occlusion import RAY_START_MM, blocked_segments, ray_mesh, sight_of
 from coupole.plan.reading import read_plan
 from coupole.plan.rig import Rig
 from coupole.preflight.framing import (
@@ -94,7 +94,7 @@ def coverage(rig: Rig, corners_mm: NDArray[np.float64], poses: dict[str, Transfo
         tuple(framings),
         tuple(float(np.mean(counts > n)) for n in range(min(MOST, len(sights)))),
         float(reachable.mean()),
-        {name: _drawn(mesh, corners_mm, views_of, *where) for name, where in FROM.items()},
+        {name: _drawing_png(mesh, corners_mm, views_of, *where) for name, where in FROM.items()},
     )
 
 
@@ -110,11 +110,11 @@ def _seen_from_above(mesh: Any, points_mm: NDArray[np.float64]) -> NDArray[np.bo
     for direction in directions:
         rows = np.flatnonzero(~is_open)
         starts_mm = points_mm[rows] + RAY_START_MM * direction
-        is_open[rows] = ~blocked(mesh, starts_mm, starts_mm + far_mm * direction)
+        is_open[rows] = ~blocked_segments(mesh, starts_mm, starts_mm + far_mm * direction)
     return is_open
 
 
-def _drawn(
+def _drawing_png(
     mesh: Any, corners_mm: NDArray[np.float64], views_of: Any, azimuth_deg: float, elevation_deg: float
 ) -> bytes:
     """A parallel projection as PNG: the colour tells the number of views, the shade the slope."""

@@ -89,14 +89,14 @@ def _page(folder: Path) -> Iterator[str]:
     yield f"{HEAD}<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
     for remark in remarks(about):
         yield f"<p>{html.escape(remark)}"
-    yield from _missed(about)
+    yield from _table_of_fits(about)
     yield from _uncertain(about)
     yield from _material_uncertainty(about)
     fits = {name: _fields(RunResult(folder).materials_path(name)) for name in MATERIALS}
     for view in sorted((folder / "samples").glob("*.h5")):
         yield f"<h2>View {html.escape(view.stem)}</h2>"
         yield from _view(view, fits)
-        yield from _reconstructed(RunResult(folder), view, about)
+        yield from _reconstruction(RunResult(folder), view, about)
     yield "<h2>Share of triangles and LEDs</h2><table><tr><th>view"
     codes = about["views"][0]["share_by_code"]
     yield "".join(f"<th>{html.escape(name)}" for name in codes)
@@ -171,7 +171,7 @@ def _bounds(pair: Sequence[float]) -> str:
     return f"{pair[0]:+.2f} to {pair[1]:+.2f} %"
 
 
-def _missed(about: dict[str, Any]) -> Iterator[str]:
+def _table_of_fits(about: dict[str, Any]) -> Iterator[str]:
     """A table of the fits."""
     yield (
         "<h2>Under the LEDs kept for the check</h2><table><tr><th><th>mean error of pictures, % of range"
@@ -186,7 +186,7 @@ def _missed(about: dict[str, Any]) -> Iterator[str]:
     yield "</table><p>Pictures are compared by blocks of 2 x 2 pixels, one pixel of each channel (seed 003, 6.3)."
 
 
-def _reconstructed(result: RunResult, path: Path, about: dict[str, Any]) -> Iterator[str]:
+def _reconstruction(result: RunResult, path: Path, about: dict[str, Any]) -> Iterator[str]:
     """A frame that was kept for the check, and what each fit makes of it; that which shows most."""
     view = next(view for view in result.views if view.path == path)
     frames = read_check_frames(result, view)
@@ -251,8 +251,8 @@ def _rgb(values: NDArray[Any]) -> NDArray[Any]:
     return values if values.shape[-1] == 3 else np.repeat(values, 3, axis=-1)
 
 
-def _picture(seen: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:
+def _picture(triangle_rows: NDArray[np.int32], values: NDArray[Any]) -> NDArray[np.float32]:
     """[h, w, n] of values [triangles, n]; 0 where nothing is seen."""
-    picture = np.zeros((*seen.shape, values.shape[1]), np.float32)
-    picture[seen >= 0] = values[seen[seen >= 0]]
+    picture = np.zeros((*triangle_rows.shape, values.shape[1]), np.float32)
+    picture[triangle_rows >= 0] = values[triangle_rows[triangle_rows >= 0]]
     return picture

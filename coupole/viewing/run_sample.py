@@ -29,8 +29,8 @@ class SampledExposure:
 
     exposure_us: int
     frames: int
-    """Proven shots; the sample is `seen.pictures` of them."""
-    seen: ViewExposure = field(default_factory=ViewExposure)
+    """Proven shots; the sample is `sample.pictures` of them."""
+    sample: ViewExposure = field(default_factory=ViewExposure)
     worst: str = ""
     """The sampled shot with the largest share of saturated pixels; empty if none has any."""
     histograms: dict[str, NDArray[np.int64]] = field(default_factory=dict)
@@ -40,9 +40,9 @@ class SampledExposure:
 
     def add(self, shot: str, raw: NDArray[np.uint16], coding: Coding) -> None:
         """Count a frame [H, W], DN."""
-        before = self.seen.saturated
-        self.seen.add(raw, black_dn=coding.black_dn, white_dn=coding.white_dn)
-        self.worst = shot if self.seen.saturated > before else self.worst
+        before = self.sample.saturated_share
+        self.sample.add(raw, black_dn=coding.black_dn, white_dn=coding.white_dn)
+        self.worst = shot if self.sample.saturated_share > before else self.worst
         self.black_share = coding.black_dn / coding.white_dn
         for name, plane in channels(raw, coding.pattern).items():
             steps = (plane.ravel().astype(np.uint32) * BINS) // (coding.white_dn + 1)
@@ -55,7 +55,7 @@ class SampledView:
     """A view's proven frames, and what a sample of them shows."""
 
     name: str
-    expected: int = 0
+    expected_frames: int = 0
     """Frames that the plan asks for, dark ones included."""
     proven: int = 0
     darks: int = 0
@@ -73,13 +73,15 @@ class SampledView:
     def verdict(self) -> str:
         """`over-exposed` if even the shortest exposure saturates, `under-exposed` if even the longest is dark,
         else `well exposed`; empty without pictures."""
-        figures = [exposure.seen for exposure in self.exposures if exposure.seen.pictures]
+        figures = [exposure.sample for exposure in self.exposures if exposure.sample.pictures]
         if not figures:
             return ""
-        if figures[0].saturated > OVER_EXPOSED:
+        if figures[0].saturated_share > OVER_EXPOSED:
             return figures[0].verdict()
         return (
-            "well exposed" if len(figures) > 1 and figures[-1].saturated > OVER_EXPOSED else figures[-1].verdict()
+            "well exposed"
+            if len(figures) > 1 and figures[-1].saturated_share > OVER_EXPOSED
+            else figures[-1].verdict()
         )
 
 
@@ -91,13 +93,13 @@ def sampled_views(run: Run, proven: Iterable[FrameProven]) -> list[SampledView]:
         frames.setdefault(event.shot.view, []).append(event)
     for shot in run.expected_shots():
         shot_counts[shot.view] += 1
-    return [_sampled(run, name, of_view, shot_counts.get(name, 0)) for name, of_view in frames.items()]
+    return [_sampled_view(run, name, of_view, shot_counts.get(name, 0)) for name, of_view in frames.items()]
 
 
-def _sampled(run: Run, name: str, proven: Sequence[FrameProven], expected: int) -> SampledView:
+def _sampled_view(run: Run, name: str, proven: Sequence[FrameProven], expected_frames: int) -> SampledView:
     shots = sorted((event for event in proven if event.shot.is_shot), key=lambda event: str(event.shot))
     leds = {event.shot.light for event in shots if isinstance(event.shot.light, Led)}
-    view = SampledView(name, expected, len(proven), len(proven) - len(shots), len(leds))
+    view = SampledView(name, expected_frames, len(proven), len(proven) - len(shots), len(leds))
     if shots:
         try:
             _look_into(view, read_view(run.view_path(name), shots), shots)

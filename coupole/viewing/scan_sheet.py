@@ -66,7 +66,7 @@ def picture(scan: Scan) -> Any:
     for place, (name, elevation_deg, azimuth_deg) in enumerate(_SIDES):
         eye = look_at(tuple(middle), 3 * size_mm, azimuth_deg, elevation_deg)
         canvas = Canvas(Lookout(eye, 0.9 * _HEIGHT_PX / size_mm, _WIDTH_PX, _HEIGHT_PX, perspective=False))
-        canvas.fill([solid], [_STONE], outlined=False)
+        canvas.fill([solid], [_STONE], has_outline=False)
         canvas.dots(scan.targets_mm, _STICKER, 3.0)
         corner = (place % 2 * _WIDTH_PX, place // 2 * _HEIGHT_PX)
         sheet.paste(canvas.image(), corner)

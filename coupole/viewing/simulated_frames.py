@@ -58,7 +58,7 @@ def simulate(job: Job, folder: Path, count: int, *, width_px: int | None, progre
     coding = Coding(sensor.bayer_pattern, sensor.black_dn, sensor.white_dn)
     with frozen(world_config(job.cell, job, sensor), job.cell.files) as config:
         stills = load_class(STILLS)(config)
-    shots = list(_spread(job, count))
+    shots = list(_spread_shots(job, count))
     if not shots:
         raise InputError(f"{job.document.path}: expected shots with light; the plan has none")
     previews, pictures = [], []
@@ -98,7 +98,7 @@ def flange_at(view: ViewPose, job: Job) -> Transform:
     return base_from_flange(view, job.cell.rig)
 
 
-def _spread(job: Job, count: int) -> Iterator[tuple[ViewPose, Burst, int]]:
+def _spread_shots(job: Job, count: int) -> Iterator[tuple[ViewPose, Burst, int]]:
     """Shots of all views in turn, in each spread evenly over its bursts and lights."""
     views = job.schedule.views
     for number, view in enumerate(views):

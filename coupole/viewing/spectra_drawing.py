@@ -23,7 +23,7 @@ class Curve:
     values: Array
     low: Array | None = None
     high: Array | None = None
-    dashed: bool = False
+    is_dashed: bool = False
 
 
 def chart(title: str, nm: Array, curves: Sequence[Curve]) -> str:
@@ -43,7 +43,7 @@ def chart(title: str, nm: Array, curves: Sequence[Curve]) -> str:
         if curve.low is not None and curve.high is not None:
             around = points(np.concatenate([curve.high, curve.low[::-1]]), np.concatenate([nm, nm[::-1]]))
             shapes.append(f'<polygon points="{around}" style="fill:{colour};opacity:.22"/>')
-        dash = ";stroke-dasharray:5 4" if curve.dashed else ""
+        dash = ";stroke-dasharray:5 4" if curve.is_dashed else ""
         shapes.append(f'<polyline points="{points(curve.values, nm)}" style="stroke:{colour}{dash}"/>')
     marks = [
         _mark(_LEFT - 4, points(np.array([v]), nm[:1]).split(",")[1], "end", f"{v:.3g}") for v in (bottom, top)

@@ -85,12 +85,12 @@ def step_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, TaskID] = {}
 
-        def say(step: str, done: int, of: int) -> None:
+        def say(step: str, count: int, of: int) -> None:
             if step not in tasks:
                 for task in bars.tasks:
                     bars.update(task.id, completed=task.total)
                 tasks[step] = bars.add_task(step)
-            bars.update(tasks[step], completed=done, total=of)
+            bars.update(tasks[step], completed=count, total=of)
 
         yield say
         for task in bars.tasks:
@@ -229,16 +229,17 @@ def show_status(console: Console, status: Status) -> None:
 
 
 def show_dry_run(
-    console: Console, exposures: Mapping[str, ViewExposure], outcome: Outcome, found: dict[str, Any]
+    console: Console, exposures: Mapping[str, ViewExposure], outcome: Outcome, figures: dict[str, Any]
 ) -> None:
     """Print the result of a dry run."""
     from coupole.preflight.exposure_scale import HOW_TO_KNOW
 
     console.print(
-        f"dry run: {duration_text(found['duration_s'])} of the cell's time in {duration_text(found['machine_s'])} "
-        f"({found['speed']:.1f} times faster); preflight said {duration_text(found['preflight_s'])}"
+        f"dry run: {duration_text(figures['duration_s'])} of the cell's time in "
+        f"{duration_text(figures['machine_s'])} ({figures['speed']:.1f} times faster); preflight "
+        f"said {duration_text(figures['preflight_s'])}"
     )
-    if found["exposure_scale"] is None:
+    if figures["exposure_scale"] is None:
         console.print(f"exposure: not known; {HOW_TO_KNOW}")
     else:
         table = Table("view", "pictures", "brightest", "saturated", "exposure", box=None)
@@ -247,11 +248,11 @@ def show_dry_run(
                 view,
                 str(exposure.pictures),
                 f"{exposure.brightest:.0%}",
-                f"{exposure.saturated:.2%}",
+                f"{exposure.saturated_share:.2%}",
                 exposure.verdict(),
             )
         console.print(table)
-        console.print(f"exposure judged by {found['exposure_scale']}", markup=False)
+        console.print(f"exposure judged by {figures['exposure_scale']}", markup=False)
     if outcome.reshot or outcome.over_triggers or outcome.lost_transfers:
         console.print(
             f"{outcome.reshot} shots re-shot, {outcome.over_triggers} edges came while the camera was busy, "
@@ -295,20 +296,20 @@ class LiveFigures:
         if self._live is not None:
             self._live.stop()
 
-    def show(self, shown: Shown | None) -> None:
+    def show(self, frame: Shown | None) -> None:
         """Print the figures of the newest frame, if they are new."""
-        if shown is None or shown.number == self._number:
+        if frame is None or frame.number == self._number:
             return
-        self._number = shown.number
-        figures = shown.figures
-        best = self._best[shown.title] = max(self._best.get(shown.title, 0.0), figures.sharpness)
+        self._number = frame.number
+        figures = frame.figures
+        best = self._best[frame.title] = max(self._best.get(frame.title, 0.0), figures.sharpness)
         saturation = ", ".join(f"{name} {share:.2%}" for name, share in figures.saturated.items())
         detail = f"sharpness {figures.sharpness / best:.0%} of the best" if best else "nothing but noise"
-        if shown.run:  # its frames are under different lights: their sharpness cannot be compared
-            detail = f"{shown.run}, {shown.dose_lux_h:.3f} lux.h"
+        if frame.run:  # its frames are under different lights: their sharpness cannot be compared
+            detail = f"{frame.run}, {frame.dose_lux_h:.3f} lux.h"
         line = (
-            f"{shown.title}, {shown.exposure_us} us: brightest {figures.brightest:.0%}; saturated {saturation}; "
-            f"{detail}; {shown.frames_per_s:.1f} frames/s"
+            f"{frame.title}, {frame.exposure_us} us: brightest {figures.brightest:.0%}; saturated {saturation}; "
+            f"{detail}; {frame.frames_per_s:.1f} frames/s"
         )
         if self._live is not None:
             self._live.update("\n".join([line, *(_bars(name, bins) for name, bins in figures.histograms.items())]))

@@ -49,18 +49,18 @@ class Outlet:
         threading.Thread(target=self._give, name=f"text {fd}", daemon=True).start()
         threading.Thread(target=self._listen, name=f"text into {fd}", daemon=True).start()
 
-    def put(self, text: bytes) -> None:
+    def append(self, text: bytes) -> None:
         """Append text to what libraries and children have written so far. Never waits."""
         with self._order:
             self.collect()
-            self.queue.put(text)
+            self.queue.append(text)
 
     def collect(self) -> bool:
         """Put what libraries and children have written into the queue. Return whether any of them can write
         more."""
         with self._order, contextlib.suppress(BlockingIOError):
             while text := os.read(self._pipe, 65536):
-                self.queue.put(text)
+                self.queue.append(text)
             return False
         return True
 
@@ -81,7 +81,7 @@ class Outlet:
                 except BlockingIOError:  # whoever gave us the stream had made it so
                     select.select([], [self.reader_fd], [])
                 except OSError:  # a closed pipe, a terminal that is gone, a full disk
-                    self.queue.failed(text)
+                    self.queue.note_refused(text)
                     break
                 else:
                     self.queue.gave(count)
@@ -95,7 +95,7 @@ class _Stream(io.RawIOBase):
         self._outlet = outlet
 
     def write(self, text: bytes) -> int:  # type: ignore[override]
-        self._outlet.put(bytes(text))
+        self._outlet.append(bytes(text))
         return len(text)
 
     def writable(self) -> bool:
@@ -108,7 +108,7 @@ class _Stream(io.RawIOBase):
         return os.isatty(self._outlet.reader_fd)
 
 
-_installed: dict[str, Outlet] = {}
+_outlets: dict[str, Outlet] = {}
 
 
 def keep_standard_places() -> None:
@@ -130,10 +130,10 @@ def install() -> None:
     keep_standard_places()
     for fd, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
-        if name in _installed or not _is(stream, fd):
+        if name in _outlets or not _is(stream, fd):
             continue
         outlet = Outlet(fd, TextQueue() if fd == 2 else TextQueue(_DOCUMENT_BYTES, tells=False))
-        _installed[name] = outlet
+        _outlets[name] = outlet
         encoding, errors = getattr(stream, "encoding", "utf-8"), getattr(stream, "errors", "backslashreplace")
         setattr(
             sys,
@@ -164,7 +164,7 @@ def full_stdout() -> str:
 
 def unread() -> Unread | None:
     """Return what of standard error was not taken so far; None if all was, or its reader is only a little late."""
-    outlet = _installed.get("stderr")
+    outlet = _outlets.get("stderr")
     text = outlet.queue.unread() if outlet else None
     return text if text and (text.lost_bytes or text.stalled_s >= PATIENCE_S) else None
 
@@ -172,7 +172,7 @@ def unread() -> Unread | None:
 def terminal_size() -> os.terminal_size | None:
     """Return the size of the terminal that reads standard error; None if none does, or text does not go there by a
     queue."""
-    outlet = _installed.get("stderr")
+    outlet = _outlets.get("stderr")
     with contextlib.suppress(OSError):
         return os.get_terminal_size(outlet.reader_fd) if outlet else None
     return None
@@ -181,7 +181,7 @@ def terminal_size() -> os.terminal_size | None:
 def say_now(text: str, patience_s: float) -> None:
     """Write text to standard error, and give its reader this time to take it. Never waits longer."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody is there
-        if "stderr" in _installed:
+        if "stderr" in _outlets:
             sys.stderr.write(text)
             finish(patience_s, 0.0)
         elif select.select([], [sys.stderr.fileno()], [], patience_s)[1]:
@@ -190,12 +190,12 @@ def say_now(text: str, patience_s: float) -> None:
 
 def finish(patience_s: float = PATIENCE_S, document_s: float = DOCUMENT_PATIENCE_S) -> None:
     """Wait a bounded time until the readers have taken everything; `document_s`: for that of standard output."""
-    for name, outlet in _installed.items():
+    for name, outlet in _outlets.items():
         with contextlib.suppress(OSError, ValueError):
             getattr(sys, name).flush()
         outlet.collect()
-    for name, outlet in _installed.items():
-        outlet.queue.drained(document_s if name == "stdout" else patience_s, AT_MOST_S)
+    for name, outlet in _outlets.items():
+        outlet.queue.wait_until_drained(document_s if name == "stdout" else patience_s, AT_MOST_S)
 
 
 def _is(stream: object, fd: int) -> bool:

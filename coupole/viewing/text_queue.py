@@ -38,7 +38,7 @@ class TextQueue:
         self._moved_s = time.monotonic()
         self._changed = threading.Condition()
 
-    def put(self, text: bytes) -> None:
+    def append(self, text: bytes) -> None:
         """Append text. Never waits."""
         if not text:
             return
@@ -54,8 +54,8 @@ class TextQueue:
             self._changed.notify_all()
 
     def take(self, wait_s: float | None = None) -> bytes:
-        """The oldest piece, to be given to the reader, which `gave` or `failed` then tells of; empty if none comes
-        within a time."""
+        """The oldest piece, to be given to the reader, which `gave` or `note_refused` then tells of; empty if none
+        comes within a time."""
         with self._changed:
             self._changed.wait_for(lambda: self._pieces or (self._tells and self._untold_bytes), wait_s)
             if self._tells and self._untold_bytes:
@@ -73,7 +73,7 @@ class TextQueue:
             self._moved_s = time.monotonic()
             self._changed.notify_all()
 
-    def failed(self, rest: bytes) -> None:
+    def note_refused(self, rest: bytes) -> None:
         """The reader refused this rest of what was handed out."""
         with self._changed:
             self._taken_bytes -= len(rest)
@@ -86,7 +86,7 @@ class TextQueue:
             stalled_s = time.monotonic() - self._moved_s if waiting else 0.0
             return Unread(self._lost_lines, self._lost_bytes, waiting, stalled_s)
 
-    def drained(self, patience_s: float, at_most_s: float) -> bool:
+    def wait_until_drained(self, patience_s: float, at_most_s: float) -> bool:
         """Wait until the reader has all, or takes nothing for `patience_s`, or `at_most_s` have passed."""
         begun_s = time.monotonic()
         with self._changed:

@@ -58,11 +58,11 @@ def look(job: Job, console: Console, *, paths: bool) -> Scene:
 
 
 @contextmanager
-def _doing(console: Console, what: str) -> Iterator[None]:
+def _doing(console: Console, action: str) -> Iterator[None]:
     """Report slow work: by a temporary line on a terminal, by a plain one elsewhere."""
     if console.is_terminal:
-        with console.status(what):
+        with console.status(action):
             yield
     else:
-        console.print(what)
+        console.print(action)
         yield

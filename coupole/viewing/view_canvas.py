@@ -63,7 +63,12 @@ class Canvas:
         self._near = np.full(size, -np.inf)
 
     def fill(
-        self, solids: Sequence[Solid], colours: Sequence[ArrayLike], *, opacity: float = 1.0, outlined: bool = True
+        self,
+        solids: Sequence[Solid],
+        colours: Sequence[ArrayLike],
+        *,
+        opacity: float = 1.0,
+        has_outline: bool = True,
     ) -> None:
         """Draw solids, each in one colour [3] or one per face [faces, 3]. Transparent ones are drawn as one layer:
         only the nearest of them is visible, and solids drawn later shine through."""
@@ -83,21 +88,21 @@ class Canvas:
         _rasterise(pixels, near, layer, face)
         is_front = (face >= 0) & (layer >= self._near)
         pixel_colours = (colour * self._shade(corners_mm)[:, None])[face[is_front]]
-        if outlined:
+        if has_outline:
             pixel_colours[_edges(np.where(face >= 0, body[face], -1))[is_front]] *= _OUTLINE
         self._colour[is_front] += opacity * (pixel_colours - self._colour[is_front])
         if opacity == 1.0:
             self._near = layer
 
-    def line(self, points_mm: Points, colour: Colour, width_px: float, *, hidden: float = 0.15) -> None:
-        """Draw a line through points [n, 3]; where it is hidden, with the opacity `hidden`."""
+    def line(self, points_mm: Points, colour: Colour, width_px: float, *, hidden_opacity: float = 0.15) -> None:
+        """Draw a line through points [n, 3]; where it is hidden, with `hidden_opacity`."""
         for a, b in pairwise(points_mm):
             (start, end), near = self._project(np.array((a, b)))
             if not np.isfinite(near).all():
                 continue
             share = np.linspace(0, 1, int(np.abs(end - start).max()) + 2)
             centers = start + share[:, None] * (end - start)
-            self._stamp(centers, near[0] + share * (near[1] - near[0]), colour, width_px / 2, 1.0, hidden)
+            self._stamp(centers, near[0] + share * (near[1] - near[0]), colour, width_px / 2, 1.0, hidden_opacity)
 
     def dots(self, points_mm: Points, colours: ArrayLike, radius_px: float, *, opacity: float = 1.0) -> None:
         """Draw discs of one size round points [n, 3], far ones first, in colours [n, 3] or one [3]."""
@@ -139,7 +144,7 @@ class Canvas:
         colour: ArrayLike,
         radius_px: float,
         opacity: float,
-        hidden: float,
+        hidden_opacity: float,
     ) -> None:
         """Draw overlapping discs [n, 2] as one shape, so that their opacity does not accumulate."""
         radius = radius_px * OVERSAMPLING
@@ -154,7 +159,7 @@ class Canvas:
         bias = _LINE_BIAS * nearness[inside] if self._lookout.perspective else _LINE_BIAS_MM * _NEARNESS_PER_MM
         is_front = nearness[inside] + bias >= self._near.ravel()[flat]
         at, of = np.unique(flat, return_inverse=True)
-        strength = np.full((len(at), 1), hidden, np.float32)
+        strength = np.full((len(at), 1), hidden_opacity, np.float32)
         strength[of[is_front]] = opacity
         pixels = self._colour.reshape(-1, 3)
         pixels[at] += strength * (np.asarray(colour, np.float32) - pixels[at])

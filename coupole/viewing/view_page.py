@@ -17,7 +17,7 @@ from coupole.viewing.terminal import duration_text
 from coupole.viewing.view_colours import Colour, css
 from coupole.viewing.view_scene import Scene, Stop
 from coupole.viewing.view_sight import sight_lines
-from coupole.viewing.view_solids import Points, Solid, disk, joined, with_fewer_faces
+from coupole.viewing.view_solids import Points, Solid, disk, join_solids, with_fewer_faces
 
 _OBJECT_FACES = 30_000
 _ROUND = 12
@@ -157,13 +157,13 @@ def _words_on(scene: Scene, stop: Stop) -> str:
 
 def _cell(scene: Scene) -> list[Any]:
     traces = [_mesh(disk("support", scene.rig.support.diameter_mm / 2, _SUPPORT_THICKNESS_MM), colours.SUPPORT)]
-    if scene.measured is not None:
-        traces.append(_mesh(with_fewer_faces(scene.measured, _OBJECT_FACES), colours.OBJECT))
+    if scene.object_solid is not None:
+        traces.append(_mesh(with_fewer_faces(scene.object_solid, _OBJECT_FACES), colours.OBJECT))
     traces += [_mesh(volume, colours.KEEP_OUT, 0.1, f"keep-out {volume.name}") for volume in scene.keep_out]
-    traces.append(_mesh(joined("arm at home", scene.arm(scene.home_deg, _ROUND)), colours.HOME, 0.25))
-    if not scene.used.all():
+    traces.append(_mesh(join_solids("arm at home", scene.arm(scene.home_deg, _ROUND)), colours.HOME, 0.25))
+    if not scene.is_used.all():
         marker = {"size": 2, "color": css(colours.UNUSED)}
-        traces.append(_points(scene.leds_mm[~scene.used], marker, "LED that the plan does not light"))
+        traces.append(_points(scene.leds_mm[~scene.is_used], marker, "LED that the plan does not light"))
     return traces
 
 
@@ -173,14 +173,14 @@ def _arm(scene: Scene, stop: Stop, *, opacity: float) -> list[Any]:
     if stop.joints_deg is not None:
         arm = scene.arm(stop.joints_deg, _ROUND)
         of_tool = _is(scene.tool_names)
-        traces.append(_mesh(_those(arm, of_tool), colours.TOOL, opacity, _words_on(scene, stop)))
+        traces.append(_mesh(_joined_parts(arm, of_tool), colours.TOOL, opacity, _words_on(scene, stop)))
         traces.append(
-            _mesh(_those(arm, lambda name: not of_tool(name)), colours.ARM, opacity, _words_on(scene, stop))
+            _mesh(_joined_parts(arm, lambda name: not of_tool(name)), colours.ARM, opacity, _words_on(scene, stop))
         )
     if stop.clash is not None:
         arm = scene.arm(stop.clash.joints_deg, _ROUND)
         touches = _is(stop.clash.bodies)
-        red, rest = _those(arm, touches), _those(arm, lambda name: not touches(name))
+        red, rest = _joined_parts(arm, touches), _joined_parts(arm, lambda name: not touches(name))
         words = f"{stop.number} {stop.name}: {stop.clash.words}"
         traces += [_mesh(red, colours.RED, 1.0, words), _mesh(rest, colours.ARM, 0.3, words)]
         traces.append(_text(red.vertices_mm.mean(axis=0), stop.clash.words, colours.RED))
@@ -191,8 +191,8 @@ def _is(names: frozenset[str] | tuple[str, ...]) -> Callable[[str], bool]:
     return lambda name: name in names
 
 
-def _those(parts: Sequence[Solid], wanted: Callable[[str], bool]) -> Solid:
-    return joined("arm", [part for part in parts if wanted(part.name)])
+def _joined_parts(parts: Sequence[Solid], is_wanted: Callable[[str], bool]) -> Solid:
+    return join_solids("arm", [part for part in parts if is_wanted(part.name)])
 
 
 def _ways(stop: Stop) -> list[Any]:
@@ -226,15 +226,15 @@ def _leds(scene: Scene, share: NDArray[np.float64], stop: Stop | None) -> Any:
         hover += "by the arm %{customdata[4]:.0%}, by the tool %{customdata[5]:.0%}"
     marker = {
         "size": 3.5,
-        "color": share[scene.used].astype(np.float32),
+        "color": share[scene.is_used].astype(np.float32),
         "cmin": 0,
         "cmax": 1,
         "colorscale": [[k / 8, css(colours.of_share(k / 8))] for k in range(9)],
         "showscale": True,
         "colorbar": {"title": {"text": "reached"}, "tickformat": ".0%", "len": 0.5, "thickness": 12},
     }
-    told_of = np.stack(columns, axis=1)[scene.used].astype(np.float32)
-    trace = _points(scene.leds_mm[scene.used], marker, hover)
+    told_of = np.stack(columns, axis=1)[scene.is_used].astype(np.float32)
+    trace = _points(scene.leds_mm[scene.is_used], marker, hover)
     return trace.update(customdata=told_of)
 
 

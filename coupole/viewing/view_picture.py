@@ -47,7 +47,7 @@ def write_picture(scene: Scene, path: Path) -> None:
     ):
         _paste(sheet, pen, _cell_from(scene, lookout), (x, top), title)
     _legend(pen, (_MARGIN + 14, _HEADER + height - 14))
-    pictures = _chosen([stop for stop in scene.stops if stop.sight is not None])
+    pictures = _chosen_stops([stop for stop in scene.stops if stop.sight is not None])
     for k, stop in enumerate(pictures):
         _through_the_camera(sheet, pen, scene, stop, _MARGIN + k * (_CAMERA_WIDTH + _MARGIN), strip_top)
     _column(pen, scene, _MARGIN + len(pictures) * (_CAMERA_WIDTH + _MARGIN) + 8, strip_top)
@@ -86,8 +86,8 @@ def _cell_from(scene: Scene, lookout: Lookout) -> Any:
     canvas = Canvas(lookout)
     support = disk("support", scene.rig.support.diameter_mm / 2, _SUPPORT_THICKNESS_MM)
     canvas.fill([support], [colours.SUPPORT])
-    if scene.measured is not None:
-        canvas.fill([scene.measured], [colours.OBJECT])
+    if scene.object_solid is not None:
+        canvas.fill([scene.object_solid], [colours.OBJECT])
     home = scene.arm(scene.home_deg, _ROUND)
     colour = [colours.TOOL if part.name in scene.tool_names else colours.HOME for part in home]
     canvas.fill(home, colour, opacity=1.0 if lookout.perspective else 0.5)
@@ -101,13 +101,15 @@ def _cell_from(scene: Scene, lookout: Lookout) -> Any:
         canvas.fill([volume], [colours.RED if is_touched else colours.KEEP_OUT], opacity=0.08)
     for stop in scene.stops:
         canvas.line(stop.flange_way_mm, colours.FLANGE_WAY, 1.0)
-        canvas.line(stop.camera_way_mm, colours.RED if stop.refusal else colours.CAMERA_WAY, 2.0, hidden=0.3)
+        canvas.line(
+            stop.camera_way_mm, colours.RED if stop.refusal else colours.CAMERA_WAY, 2.0, hidden_opacity=0.3
+        )
         canvas.dots(stop.vias_mm, colours.CAMERA_WAY, 3.0)
         if stop.sight is not None:
             sight_colour = colours.RED if stop.refusal else colours.SIGHT
             for line_mm in sight_lines(stop.sight):
                 canvas.line(line_mm, sight_colour, 1.0)
-            canvas.line(stop.footprint_mm, sight_colour, 1.2, hidden=0.3)
+            canvas.line(stop.footprint_mm, sight_colour, 1.2, hidden_opacity=0.3)
     image = canvas.image()
     _labels(image, scene, lookout)
     return image
@@ -134,7 +136,7 @@ def _dots_of_leds(canvas: Canvas, scene: Scene, lookout: Lookout) -> None:
     """LEDs, those on the near side of the dome faint, so that the inside is visible."""
     towards_eye = -lookout.world_from_eye[:3, 2]
     near_side = scene.leds_mm @ towards_eye > 0
-    colour = np.where(scene.used[:, None], colours.of_share(scene.led_share), colours.UNUSED)
+    colour = np.where(scene.is_used[:, None], colours.of_share(scene.led_share), colours.UNUSED)
     for side, opacity in ((near_side, 0.3), (~near_side, 1.0)):
         canvas.dots(scene.leds_mm[side], colour[side], 3.2 if lookout.perspective else 2.2, opacity=opacity)
 
@@ -156,10 +158,10 @@ def _labels(image: Any, scene: Scene, lookout: Lookout) -> None:
             parts = [p for p in scene.arm(stop.clash.joints_deg, 8) if p.name in stop.clash.bodies]
             if parts:
                 at, _ = lookout.project(np.concatenate([part.vertices_mm for part in parts]).mean(axis=0))
-                _haloed(pen, at, f"{stop.number}: {stop.clash.words}", image.width)
+                _write_with_halo(pen, at, f"{stop.number}: {stop.clash.words}", image.width)
 
 
-def _haloed(pen: Any, at: Any, words: str, width: int) -> None:
+def _write_with_halo(pen: Any, at: Any, words: str, width: int) -> None:
     font = _font(15)
     length = pen.textlength(words, font)
     x = min(max(4.0, at[0] - length / 2), max(4.0, width - length - 4))
@@ -171,19 +173,19 @@ def _haloed(pen: Any, at: Any, words: str, width: int) -> None:
 # -- through the camera -------------------------------------------------------------------------------------------
 
 
-def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left: int, top: int) -> None:
+def _through_the_camera(sheet: Any, pen: Any, scene: Scene, stop: Stop, left_px: int, top_px: int) -> None:
     """The camera's picture in a view, the object coloured by the share of LEDs that reach it."""
     assert stop.sight is not None
     width = min(_CAMERA_WIDTH, (_STRIP - 84) * stop.sight.width_px // stop.sight.height_px)
     height = width * stop.sight.height_px // stop.sight.width_px
     colour = colours.css(colours.RED if stop.refusal else colours.INK)
-    _paste(sheet, pen, _seen_by(scene, stop, width, height), (left, top + 24), "", colour)
-    pen.text((left, top + 16), f"{stop.number}  {stop.name}", colour, _font(15), anchor="ls")
+    _paste(sheet, pen, _seen_by(scene, stop, width, height), (left_px, top_px + 24), "", colour)
+    pen.text((left_px, top_px + 16), f"{stop.number}  {stop.name}", colour, _font(15), anchor="ls")
     for row, words in enumerate(_words_on(scene, stop)):
-        pen.text((left, top + height + 34 + 17 * row), words, colour, _font(12), anchor="lt")
+        pen.text((left_px, top_px + height + 34 + 17 * row), words, colour, _font(12), anchor="lt")
 
 
-def _chosen(stops: list[Stop]) -> list[Stop]:
+def _chosen_stops(stops: list[Stop]) -> list[Stop]:
     """Refused views first, then others at even intervals, in the order of visiting."""
     refusals = [stop for stop in stops if stop.refusal][:_CAMERAS]
     clear = [stop for stop in stops if not stop.refusal]
@@ -199,8 +201,8 @@ def _seen_by(scene: Scene, stop: Stop, width: int, height: int) -> Any:
         Lookout(stop.sight.support_from_camera, scale, width, height, perspective=True), (0.93, 0.93, 0.94)
     )
     canvas.fill([disk("support", scene.rig.support.diameter_mm / 2, _SUPPORT_THICKNESS_MM)], [colours.SUPPORT])
-    if scene.measured is not None:
-        canvas.fill([scene.measured], [_lit(scene, stop)])
+    if scene.object_solid is not None:
+        canvas.fill([scene.object_solid], [_lit(scene, stop)])
     if stop.joints_deg is not None:
         links = [part for part in scene.arm(stop.joints_deg, _ROUND) if part.name not in scene.tool_names]
         canvas.fill(links, [colours.ARM] * len(links))
@@ -209,9 +211,9 @@ def _seen_by(scene: Scene, stop: Stop, width: int, height: int) -> Any:
 
 def _lit(scene: Scene, stop: Stop) -> Any:
     """Colours of the object's faces: the share of the plan's LEDs that reach them."""
-    if stop.shadow is None or not scene.used.any():
+    if stop.shadow is None or not scene.is_used.any():
         return np.array(colours.OBJECT)
-    share = (stop.shadow.codes[:, scene.used] == REACHED).mean(axis=1)
+    share = (stop.shadow.codes[:, scene.is_used] == REACHED).mean(axis=1)
     return colours.of_share(np.append(share, 0.0)[scene.patch_of_face])
 
 
@@ -230,7 +232,7 @@ def _header(pen: Any, scene: Scene) -> None:
     move_s = sum(stop.leg_s or 0.0 for stop in scene.stops)
     words = (
         f"on {scene.rig.name}: {len(scene.stops)} views, {len(clear)} of them clear, {move_s:.1f} s of motion, "
-        f"{int(scene.used.sum())} of {len(scene.used)} LEDs"
+        f"{int(scene.is_used.sum())} of {len(scene.is_used)} LEDs"
     )
     if not scene.paths_checked:
         words += "; paths were not checked for collisions"

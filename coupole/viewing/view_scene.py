@@ -27,7 +27,7 @@ from coupole.plan.rig import KeepOut, KeepOutBox, KeepOutSphere, Rig
 from coupole.plan.schedule import ViewPose
 from coupole.preflight.job import Job
 from coupole.viewing.view_sight import footprint
-from coupole.viewing.view_solids import Points, Solid, box, capsule, joined, sphere
+from coupole.viewing.view_solids import Points, Solid, box, capsule, join_solids, sphere
 
 _WAY_STEP_DEG = 3.0
 _CLASH_PLACES = 200
@@ -45,12 +45,12 @@ class Clash:
         """Both bodies and their distance, as text."""
         apart_mm = self.contact.distance_mm
         how = f"{apart_mm:.0f} mm from" if apart_mm > 0 else f"{-apart_mm:.0f} mm inside"
-        return f"{self.contact.body} {how} {self.contact.other}"
+        return f"{self.contact.body} {how} {self.contact.other_name}"
 
     @property
     def bodies(self) -> tuple[str, str]:
         """Both bodies, by the names that solids have."""
-        return self.contact.body, self.contact.other.removeprefix("the arm's ").removeprefix("the ")
+        return self.contact.body, self.contact.other_name.removeprefix("the arm's ").removeprefix("the ")
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ class Scene:
     rig: Rig
     stops: tuple[Stop, ...]
     refusals: tuple[str, ...]
-    measured: Solid | None
+    object_solid: Solid | None
     """The object."""
     patch_of_face: NDArray[np.int64]
     """[faces] of the object, -1 for none."""
     keep_out: tuple[Solid, ...]
     leds_mm: Points
     led_ids: NDArray[np.int64]
-    used: NDArray[np.bool_]
+    is_used: NDArray[np.bool_]
     """[leds] True for those that the plan lights."""
     paths_checked: bool
     links: tuple[Capsule, ...]
@@ -116,12 +116,15 @@ class Scene:
 
     def light_on(self, stop: Stop) -> list[str]:
         """Text on the plan's LEDs in a view, one string per line."""
-        if stop.shadow is None or not self.used.any():
+        if stop.shadow is None or not self.is_used.any():
             return []
-        share, dark_leds = stop.shadow.share()[self.used].mean(), stop.shadow.occluded_leds()[self.used].sum()
+        share, dark_leds = (
+            stop.shadow.share()[self.is_used].mean(),
+            stop.shadow.occluded_leds()[self.is_used].sum(),
+        )
         return [
             f"an LED reaches {share:.0%} of the visible surface",
-            f"{dark_leds} of {self.used.sum()} LEDs reach nothing of it",
+            f"{dark_leds} of {self.is_used.sum()} LEDs reach nothing of it",
         ]
 
     def arm(self, joints_deg: Joints, around: int = 24) -> list[Solid]:
@@ -134,7 +137,7 @@ class Scene:
         parts: dict[str, list[Solid]] = {}
         for part, axis_mm, radius_mm in zip(capsules, axes_mm, radii_mm, strict=True):
             parts.setdefault(part.body, []).append(capsule(part.body, axis_mm[0], axis_mm[1], radius_mm, around))
-        return [joined(name, of) for name, of in parts.items()]
+        return [join_solids(name, of) for name, of in parts.items()]
 
 
 def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals: Sequence[str]) -> Scene:
@@ -147,11 +150,11 @@ def scene_of(job: Job, itinerary: Itinerary, bodies: CellBodies | None, refusals
     for number, index in enumerate([*itinerary.order, *refused_indices], start=1):
         view, visit = views[index], itinerary.visits[index]
         if visit is not None:
-            stops.append(_visited(number, view, place_deg, visit, rig, shadows))
+            stops.append(_visited_stop(number, view, place_deg, visit, rig, shadows))
             place_deg = visit.joints_deg
         else:
             why = _refusal(view, itinerary.refusals)
-            stops.append(_refused(number, view, why, (place_deg, home_deg), rig, bodies, shadows))
+            stops.append(_refused_stop(number, view, why, (place_deg, home_deg), rig, bodies, shadows))
     is_lit = np.zeros(len(job.cell.leds.ids), np.bool_)
     is_lit[leds_of_plan(job.plan, job.cell.leds, rig.support.base_from_support.matrix())] = True
     return Scene(
@@ -181,7 +184,9 @@ def _refusal(view: ViewPose, refusals: Sequence[str]) -> str:
     return next((text.removeprefix(start) for text in refusals if text.startswith(start)), "")
 
 
-def _visited(number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: Rig, shadows: Occlusions) -> Stop:
+def _visited_stop(
+    number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: Rig, shadows: Occlusions
+) -> Stop:
     way_deg = [from_deg, *visit.leg.waypoints]
     sight = _sight(view, visit.joints_deg, rig)
     return Stop(
@@ -198,7 +203,7 @@ def _visited(number: int, view: ViewPose, from_deg: Joints, visit: Visit, rig: R
     )
 
 
-def _refused(
+def _refused_stop(
     number: int,
     view: ViewPose,
     why: str,

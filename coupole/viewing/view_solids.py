@@ -28,7 +28,7 @@ class Solid:
         return self.vertices_mm[self.faces]
 
 
-def joined(name: str, solids: Sequence[Solid]) -> Solid:
+def join_solids(name: str, solids: Sequence[Solid]) -> Solid:
     """Several solids as one."""
     before = np.cumsum([0] + [len(solid.vertices_mm) for solid in solids])
     return Solid(

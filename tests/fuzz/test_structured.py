@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 
 VALUES = st.recursive(
     st.none()
@@ -67,7 +67,7 @@ def test_any_value_anywhere_is_read_or_refused_at_its_line(
         from coupole.errors import InputError
 
         try:
-            found, problems = read(path).problems(model)
+            found, problems = read_document(path).problems(model)
         except InputError as error:
             found, problems = None, list(error.problems)
         assert (found is None) == bool(problems)

@@ -16,7 +16,7 @@ from PIL import Image
 from coupole.appearance.render.materials import Metal
 from coupole.appearance.render.objects import Piece
 from coupole.appearance.render.scene_file import Camera
-from coupole.commands.restore import read
+from coupole.commands.restore import checked_restoration
 from coupole.errors import InputError
 from coupole.heritage.restoration.painted_mesh import read_painted
 from coupole.heritage.restoration.part_labels import Parts, parts_of
@@ -105,7 +105,9 @@ def restoration(folder: Path, text: str, *names: str) -> Restoration:
     (folder / "parts.yaml").write_text(PARTS)
     (folder / "r.yaml").write_text(text)
     nothing = (None, None, None)
-    return read(mesh, folder / "parts.yaml", folder / "r.yaml", names, "mm", nothing, lambda *_: None)
+    return checked_restoration(
+        mesh, folder / "parts.yaml", folder / "r.yaml", names, "mm", nothing, lambda *_: None
+    )
 
 
 @pytest.mark.parametrize(
@@ -185,7 +187,7 @@ def test_a_picked_file_whose_numbers_do_not_fit_is_refused(tmp_path: Path) -> No
 def test_shipped_restorations_are_whole() -> None:
     folder = Path(__file__).parents[2] / "configs" / "restorations"
     document, given = read_restoration(folder / "bust.yaml")
-    wanted = read(
+    wanted = checked_restoration(
         folder / "bust.ply",
         folder / "bust-parts.yaml",
         document.path,

@@ -100,7 +100,7 @@ def test_the_camera_above_a_box_is_as_far_as_geometry_says() -> None:
 
 def test_an_arm_through_the_support_is_named() -> None:
     contacts = cell().contacts((0.0, -90.0, 0.0, 0.0, 0.0, 0.0))
-    assert any(contact.other == "the support" and contact.distance_mm < 0 for contact in contacts)
+    assert any(contact.other_name == "the support" and contact.distance_mm < 0 for contact in contacts)
 
 
 def test_a_keep_out_box_that_only_link_1_enters_is_named_with_it() -> None:
@@ -114,7 +114,7 @@ def test_a_keep_out_box_that_only_link_1_enters_is_named_with_it() -> None:
     box = ("shelf", tuple(at_mm - 10.0), tuple(at_mm + 10.0))
     around = Surroundings(BASE_FROM_SUPPORT, 740.0, 1500.0, 74.0, np.zeros((0, 3)), (), (box,))
     bodies = CellBodies(KR10, around, TOOL, Clearances())
-    touching = [contact.body for contact in bodies.contacts(home_deg) if contact.other == "keep-out `shelf`"]
+    touching = [contact.body for contact in bodies.contacts(home_deg) if contact.other_name == "keep-out `shelf`"]
     assert touching == ["link 1"]
     turned_deg = np.array((60.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     swept = bodies.contact_on_the_way(np.array(home_deg) - turned_deg, np.array(home_deg) + turned_deg)
@@ -126,7 +126,7 @@ def test_an_arm_through_the_dome_is_named() -> None:
     contacts = cell().contacts(STRETCHED)
     around = apply(inverse(BASE_FROM_SUPPORT), link_frames(KR10_R1100_SIXX, STRETCHED)[7][:3, 3])
     assert np.linalg.norm(around) > 1300
-    assert any(contact.other == "the dome" for contact in contacts)
+    assert any(contact.other_name == "the dome" for contact in contacts)
 
 
 def test_a_message_names_both_bodies_the_distance_and_what_must_be_kept() -> None:
@@ -249,7 +249,7 @@ def test_what_is_far_away_may_be_said_to_be_no_farther_than_asked() -> None:
 
 def test_a_camera_folded_onto_the_forearm_is_named() -> None:
     contacts = cell(self_mm=10.0).contacts((0.0, -90.0, 60.0, 0.0, 119.0, 0.0))
-    assert ("camera", "the arm's link 4") in [(contact.body, contact.other) for contact in contacts]
+    assert ("camera", "the arm's link 4") in [(contact.body, contact.other_name) for contact in contacts]
 
 
 def _fcl_mesh(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> object:

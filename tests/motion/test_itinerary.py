@@ -21,12 +21,12 @@ from coupole.motion.singularities import SINGULARITY_MARGIN
 from coupole.plan.led_table import read_led_table
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import ViewPose
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.preflight.job import read_job
 
 ROOT = REPO
 LINK_MESHES = SHARED_DATA / "robot/kr10r1100sixx"
-RIG = read(ROOT / "configs/rigs/sim.yaml").validate(Rig)
+RIG = read_document(ROOT / "configs/rigs/sim.yaml").validate(Rig)
 DOME = read_led_table(ROOT / "configs/domes/coupole.csv")
 HOME_DEG = RIG.motion.home_joints_deg
 

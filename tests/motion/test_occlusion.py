@@ -27,7 +27,7 @@ from coupole.motion.occlusion import (
     Occlusion,
     Occlusions,
     Sight,
-    blocked,
+    blocked_segments,
     hidden_by,
     occlusions_of,
     own_codes,
@@ -288,7 +288,7 @@ def test_of_a_sphere_the_camera_sees_the_cap_that_its_rays_graze(demo: Job) -> N
     towards = (view.support_from_camera[:3, 3] - center_mm) / distance_mm
     height = (found.patches.points_mm - center_mm) @ towards
     sure = np.abs(height - radius_mm**2 / distance_mm) > 1.0
-    assert np.array_equal(found.at(visit.joints_deg).seen[sure], (height > radius_mm**2 / distance_mm)[sure])
+    assert np.array_equal(found.at(visit.joints_deg).is_seen[sure], (height > radius_mm**2 / distance_mm)[sure])
 
 
 def test_what_is_out_of_the_picture_is_not_seen(demo: Job) -> None:
@@ -297,7 +297,7 @@ def test_what_is_out_of_the_picture_is_not_seen(demo: Job) -> None:
     visit = plan_itinerary([view], rig, None, rig.motion.home_joints_deg).visits[0]
     assert visit is not None
     far_right = apply(view.support_from_camera, [(x, 0, 335) for x in (-110, -90, 0, 90, 110)])
-    seen = occlusions_of(rig, demo.cell.leds, NO_MESH, far_right).at(visit.joints_deg).seen
+    seen = occlusions_of(rig, demo.cell.leds, NO_MESH, far_right).at(visit.joints_deg).is_seen
     assert seen.tolist() == [False, True, True, True, False]  # 512 x 44 um at 39.1 mm: 193 mm wide
 
 
@@ -323,7 +323,7 @@ def test_without_a_mesh_the_targets_stand_for_the_object(cell: CellFolder) -> No
     visit = plan_itinerary(job.schedule.views, rig, None, rig.motion.home_joints_deg).visits[0]
     assert visit is not None
     shadow = shadows.at(visit.joints_deg)
-    assert shadow.seen.tolist() == [True]
+    assert shadow.is_seen.tolist() == [True]
     assert set(np.unique(shadow.codes)) <= {REACHED, BY_ARM, BY_TOOL}
     assert shadow.share().mean() > 0.8
 
@@ -346,5 +346,5 @@ def test_a_step_of_the_surface_hides_what_is_higher_than_the_rays_start() -> Non
     led = np.array([(1000.0, 0, 0.2)])
     low = patches_at([(0, 0, 0)])
     assert ray_starts(low)[0, 2] == RAY_START_MM
-    assert blocked(ray_mesh(wall), ray_starts(low), led).tolist() == [True]
-    assert blocked(ray_mesh(wall - (0, 0, 20.0)), ray_starts(low), led).tolist() == [False]
+    assert blocked_segments(ray_mesh(wall), ray_starts(low), led).tolist() == [True]
+    assert blocked_segments(ray_mesh(wall - (0, 0, 20.0)), ray_starts(low), led).tolist() == [False]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coupole.motion.occlusion import blocked, blocked_along, ray_mesh
+from coupole.motion.occlusion import blocked_along, blocked_segments, ray_mesh
 from coupole.motion.packet_rays import LANES, PacketMesh
 
 
@@ -20,8 +20,8 @@ def test_what_lies_between_two_points_is_found(rays: int) -> None:
     corners, random = soup(400), np.random.default_rng(rays)
     starts = random.normal(0, 60, (rays + 50, 3)).astype(np.float32)
     asked, end = random.permutation(rays + 50)[:rays], np.array([300.0, 20.0, -10.0])
-    found = PacketMesh(corners).blocked(starts, asked, end)
-    alone = blocked(ray_mesh(corners), starts[asked], np.broadcast_to(end, (rays, 3)))
+    found = PacketMesh(corners).blocked_rays(starts, asked, end)
+    alone = blocked_segments(ray_mesh(corners), starts[asked], np.broadcast_to(end, (rays, 3)))
     assert np.array_equal(found, alone)
     if rays == 1000:
         assert 100 < found.sum() < 900

@@ -93,7 +93,7 @@ def test_a_place_inside_something_has_no_way_to_it_and_says_what_is_there() -> N
     leg = planner(block).leg(HOME, LEFT)
     assert leg.waypoints == ()
     assert leg.contact is not None
-    assert leg.contact.other == "keep-out `block`"
+    assert leg.contact.other_name == "keep-out `block`"
 
 
 def test_a_leg_goes_over_home_where_that_is_the_way_round() -> None:

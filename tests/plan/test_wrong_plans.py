@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from coupole.errors import InputError, Problem
 from coupole.plan.plan import Model, Plan
 from coupole.plan.rig import Rig
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 
 PLAN = """\
 schema_version: 1
@@ -140,7 +140,7 @@ def problems_of(folder: Path, text: str, model: type[Model]) -> list[Problem]:
     path = folder / "wrong.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as refused:
-        read(path).validate(model)
+        read_document(path).validate(model)
     return list(refused.value.problems)
 
 
@@ -162,13 +162,13 @@ def changed(good: str, old: str, new: str) -> str:
 def test_the_good_plan_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "good.yaml"
     path.write_text(PLAN, encoding="utf-8")
-    assert read(path).validate(Plan).rig == Path("../rigs/sim.yaml")
+    assert read_document(path).validate(Plan).rig == Path("../rigs/sim.yaml")
 
 
 def test_the_good_rig_is_accepted(tmp_path: Path) -> None:
     path = tmp_path / "good.yaml"
     path.write_text(RIG, encoding="utf-8")
-    assert read(path).validate(Rig).dome.leds == Path("../domes/coupole.csv")
+    assert read_document(path).validate(Rig).dome.leds == Path("../domes/coupole.csv")
 
 
 @pytest.mark.parametrize(("old", "new", "key", "phrase"), WRONG_PLANS)
@@ -238,7 +238,7 @@ def test_a_mutated_plan_is_accepted_or_refused_with_problems(
     path = tmp_path_factory.getbasetemp() / "mutated.yaml"
     path.write_text(text, encoding="utf-8")
     try:
-        read(path).validate(Plan)
+        read_document(path).validate(Plan)
     except InputError as error:
         unplaced = [problem for problem in error.problems if not problem.line]
     else:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from coupole.errors import InputError
-from coupole.plan.yamlfile import Document, read
+from coupole.plan.yamlfile import Document, read_document
 
 
 class Port(BaseModel):
@@ -26,7 +26,7 @@ class Port(BaseModel):
 def document(folder: Path, text: str | bytes) -> Document:
     path = folder / "some.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read(path)
+    return read_document(path)
 
 
 def refusal(folder: Path, text: str | bytes) -> list[str]:
@@ -135,7 +135,7 @@ def test_aliases_that_multiply_each_other_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["gone.yaml", "."])
 def test_a_missing_file_or_a_folder_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"no such file|found a folder"):
-        read(tmp_path / name)
+        read_document(tmp_path / name)
 
 
 def test_a_byte_order_mark_and_windows_line_ends_do_not_shift_places(tmp_path: Path) -> None:

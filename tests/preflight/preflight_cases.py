@@ -13,10 +13,10 @@ from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import Schedule, build_schedule
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.preflight.preflight import Report, StorageFacts, check
 
-RIG, _ = read(REPO / "configs/rigs/sim.yaml").problems(Rig)
+RIG, _ = read_document(REPO / "configs/rigs/sim.yaml").problems(Rig)
 DOME = read_led_table(REPO / "configs/domes/coupole.csv")
 ROOMY = StorageFacts(free_bytes=10**15, write_bytes_s=10e9)
 CENTRE = np.zeros((1, 3))

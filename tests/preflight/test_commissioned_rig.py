@@ -26,8 +26,8 @@ from coupole.preflight.commissioned import (
     CommissioningRecord,
     commissioning_refusals,
     empty_record,
-    outdated,
     read_commissioning,
+    why_outdated,
     write_commissioning,
 )
 from coupole.preflight.commissioned_rig import HARMLESS, steps_of
@@ -107,7 +107,7 @@ def full(real: CellFolder) -> tuple[Cell, CommissioningRecord]:
 
 
 def asked_for(cell: Cell, record: CommissioningRecord) -> list[str]:
-    return [one.step for one in record.steps if outdated(cell, one)]
+    return [one.step for one in record.steps if why_outdated(cell, one)]
 
 
 def others(model: type[BaseModel], plain: dict[str, Any], at: tuple[str | int, ...]) -> Iterator[BaseModel]:

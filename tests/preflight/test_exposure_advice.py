@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coupole.devices import FrameFormat
 from coupole.errors import InputError
 from coupole.plan.plan import FixedExposure
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.preflight.exposure_advice import Metered, Noise, Request, advise, advise_view, noise_of, write_plan
 
 BLACK, WHITE = 64, 4095
@@ -131,9 +131,9 @@ PLAN = "schema_version: 1  # this stays\nname: x\nexposure: {kind: fixed, exposu
 def test_the_plan_is_written_with_its_comments_and_the_new_exposure(tmp_path: Path) -> None:
     plan, out = tmp_path / "plan.yaml", tmp_path / "metered.yaml"
     plan.write_text(PLAN)
-    write_plan(read(plan), out, FixedExposure(kind="fixed", exposure_us=1234))
+    write_plan(read_document(plan), out, FixedExposure(kind="fixed", exposure_us=1234))
     assert out.read_text() == PLAN.replace("8000", "1234")
-    assert read(out).data["exposure"]["exposure_us"] == 1234
+    assert read_document(out).data["exposure"]["exposure_us"] == 1234
 
 
 @pytest.mark.parametrize("out", ["other/plan.yaml", "plan.yaml"])
@@ -142,5 +142,5 @@ def test_a_plan_is_written_neither_elsewhere_nor_over_another(tmp_path: Path, ou
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN)
     with pytest.raises(InputError, match=r"plan\.yaml: "):
-        write_plan(read(plan), tmp_path / out, FixedExposure(kind="fixed", exposure_us=1234))
+        write_plan(read_document(plan), tmp_path / out, FixedExposure(kind="fixed", exposure_us=1234))
     assert plan.read_text() == PLAN

@@ -17,7 +17,7 @@ from places import REPO
 from coupole.geometry import look_at
 from coupole.motion.occlusion import ray_mesh, sight_of
 from coupole.plan.rig import Rig
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.preflight.framing import (
     SHARP_PX,
     Framing,
@@ -27,7 +27,7 @@ from coupole.preflight.framing import (
     surface_samples,
 )
 
-RIG, _ = read(REPO / "configs/rigs/sim.yaml").problems(Rig)
+RIG, _ = read_document(REPO / "configs/rigs/sim.yaml").problems(Rig)
 ABOVE = {**TOP, "target_mm": [0, 0, 0], "azimuth_deg": 0, "elevation_deg": 90}
 
 

@@ -11,7 +11,7 @@ import relight_cases as cases
 from relief_in_mitsuba import Mitsuba
 from relight_cases import Coat, moved, sheet, unit, waves, write_exr, write_result
 
-from coupole.motion.occlusion import blocked, ray_mesh
+from coupole.motion.occlusion import blocked_segments, ray_mesh
 from coupole.reflectance.new_light.beams import Beam
 from coupole.reflectance.new_light.light_kinds import (
     AnyLight,
@@ -218,7 +218,7 @@ def reached_and_traced(scene: RelitScene, beam: Beam) -> tuple[np.ndarray, np.nd
     facing = np.sum((ends - places_mm) * normals, axis=1) > 0
     if beam.exponent:
         facing &= (places_mm - beam.place) @ beam.axis > 0
-    return codes, ~blocked(ray_mesh(scene.result.corners_mm), starts, ends) & facing
+    return codes, ~blocked_segments(ray_mesh(scene.result.corners_mm), starts, ends) & facing
 
 
 def distant(scene: RelitScene, towards: np.ndarray) -> Beam:

@@ -102,6 +102,6 @@ def test_a_description_of_the_tile_that_was_changed_by_hand_is_kept(rig: Path, t
     out.mkdir()
     (out / "tile.yaml").write_text("schema_version: 1\nside_mm: 40.0\n")
     Campaign(
-        rig, out, None, Repeatability(0.03, 0.003), simulated=True, ask=False, console=make_console(quiet=True)
+        rig, out, None, Repeatability(0.03, 0.003), is_simulated=True, ask=False, console=make_console(quiet=True)
     )
     assert (out / "tile.yaml").read_text() == "schema_version: 1\nside_mm: 40.0\n"

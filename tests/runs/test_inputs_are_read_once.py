@@ -17,7 +17,7 @@ from places import REPO
 from real_cells import real_cell
 
 from coupole.acquisition import session
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.storage import journal
 from coupole.storage.as_planned import as_planned
 from coupole.storage.frame_file import read_frames, read_poses_and_attributes
@@ -61,7 +61,7 @@ def test_a_plan_edited_while_acquire_asks_to_begin_is_run_and_kept_as_it_was_che
         run = cell.run_folder
         about = Run(run).about
         assert exposures_us(run) == {8000}
-        assert read(run / "inputs/plan.yaml").data["exposure"]["exposure_us"] == 8000
+        assert read_document(run / "inputs/plan.yaml").data["exposure"]["exposure_us"] == 8000
         assert (about["plan"]["text"], about["plan"]["sha256"]) == (
             checked,
             hashlib.sha256(checked.encode()).hexdigest(),

@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from coupole.commands.option_groups import flattened
+from coupole.commands.option_groups import flatten_options
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Box:
     height_mm: Annotated[float | None, typer.Option("--height-mm")] = None
 
 
-@flattened
+@flatten_options
 def pack(
     thing: Annotated[str, typer.Argument()],
     count: Annotated[int, typer.Option("--count")] = 1,

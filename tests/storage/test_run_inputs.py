@@ -17,7 +17,7 @@ from coupole.plan.cell import read_cell
 from coupole.plan.link_meshes import LINKS, link_mesh_path
 from coupole.plan.plan import Plan
 from coupole.plan.rewriting import rewritten
-from coupole.plan.yamlfile import parse, read
+from coupole.plan.yamlfile import parse, read_document
 from coupole.preflight.job import read_job
 from coupole.storage import run_inputs
 from coupole.storage.run_inputs import Inputs, changes_since, keep
@@ -52,10 +52,10 @@ def test_a_mesh_of_more_than_the_limit_is_named_by_hash_and_copied_on_request(
     mesh = Path(cell.plan_data["object"]["mesh"])
     monkeypatch.setattr(run_inputs, "MOST_COPIED_BYTES", mesh.stat().st_size - 1)
     about = keep(inputs_of(cell), tmp_path / "without")
-    assert read(tmp_path / "without/inputs/plan.yaml").data["object"]["mesh"] == str(mesh)
+    assert read_document(tmp_path / "without/inputs/plan.yaml").data["object"]["mesh"] == str(mesh)
     assert str(mesh) not in {entry["path"] for entry in about["files"] if entry["stored"]}
     keep(inputs_of(cell, copy_large=True), tmp_path / "with")
-    assert read(tmp_path / "with/inputs/plan.yaml").data["object"]["mesh"] == "object/relief.ply"
+    assert read_document(tmp_path / "with/inputs/plan.yaml").data["object"]["mesh"] == "object/relief.ply"
     assert (tmp_path / "with/inputs/object/relief.ply").read_bytes() == mesh.read_bytes()
 
 
@@ -104,14 +104,14 @@ def test_records_are_copied_with_the_files_beside_them(cell: CellFolder, tmp_pat
     cell.write(calibrations=[str(RECORD), str(records / "a/flat.yaml"), str(records / "b/flat.yaml")])
     keep(inputs_of(cell), tmp_path / "run")
     inputs = tmp_path / "run/inputs"
-    named = [inputs / name for name in read(inputs / "plan.yaml").data["calibrations"]]
+    named = [inputs / name for name in read_document(inputs / "plan.yaml").data["calibrations"]]
     assert named[0].read_bytes() == RECORD.read_bytes()
     assert [json.loads(path.read_text())["of"] for path in named[1:]] == ["a", "b"]
     assert [(path.parent / "flat.h5").read_text() for path in named[1:]] == ["a", "b"]
 
 
 def test_an_arms_file_is_copied_with_the_meshes_of_its_links(cell: CellFolder, tmp_path: Path) -> None:
-    arm = read(REPO / "configs/robots/kr10_r1100_sixx.yaml").data
+    arm = read_document(REPO / "configs/robots/kr10_r1100_sixx.yaml").data
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     for name in ("base_link", *(f"link_{k}" for k in range(1, 7))):
@@ -131,7 +131,7 @@ def test_an_arms_file_is_copied_with_the_meshes_of_its_links(cell: CellFolder, t
 
 
 def test_another_arm_is_a_change(cell: CellFolder, tmp_path: Path) -> None:
-    arm = read(REPO / "configs/robots/kr10_r1100_sixx.yaml").data
+    arm = read_document(REPO / "configs/robots/kr10_r1100_sixx.yaml").data
     (tmp_path / "arm.yaml").write_text(json.dumps(arm))
     cell.rig_data["arm"] = "arm.yaml"
     cell.write()
@@ -162,7 +162,7 @@ def test_a_rewritten_text_has_the_wanted_data_whatever_its_form(text: str) -> No
 def test_values_that_are_the_defaults_are_no_change(cell: CellFolder, tmp_path: Path) -> None:
     about = keep(inputs_of(cell), tmp_path / "run")
     cell.write(repeats=1, order="fastest")
-    assert isinstance(read(cell.plan).validate(Plan), Plan)
+    assert isinstance(read_document(cell.plan).validate(Plan), Plan)
     assert changes_since(about, tmp_path / "run", inputs_of(cell)) == []
     cell.write(repeats=2)
     found = changes_since(about, tmp_path / "run", inputs_of(cell))

@@ -29,7 +29,7 @@ def test_a_key_alone_is_obeyed_and_function_keys_and_pasted_text_are_not(termina
     outer, inner = terminal
     modes = termios.tcgetattr(inner)
     pressed: list[str] = []
-    with keys.obeyed({"p": lambda: pressed.append("p"), "q": lambda: pressed.append("q")}) as read:
+    with keys.key_actions({"p": lambda: pressed.append("p"), "q": lambda: pressed.append("q")}) as read:
         assert read
         assert termios.tcgetattr(inner) != modes
         for typed in (b"\x1bOP", b"\x1bOQ", b"quick\n", b"x", b"pq"):
@@ -48,6 +48,6 @@ def test_in_the_background_nothing_is_read_and_the_modes_are_left(
 ) -> None:
     monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
     modes = termios.tcgetattr(terminal[1])
-    with keys.obeyed({"p": lambda: None}) as read:
+    with keys.key_actions({"p": lambda: None}) as read:
         assert not read
         assert termios.tcgetattr(terminal[1]) == modes

@@ -208,9 +208,9 @@ def test_only_pages_that_ask_count_as_viewers(server: LiveServer, studio: Studio
     ask(server, "GET", f"/{token(server)}/")
     ask(server, "GET", "/wrong/figures")
     ask(server, "GET", f"/{token(server)}/figures", None, {"Host": "example.org"})
-    assert not studio.watched
+    assert not studio.is_watched
     ask(server, "GET", f"/{token(server)}/figures")
-    assert studio.watched
+    assert studio.is_watched
 
 
 # -- slow clients ------------------------------------------------------------------------------------------------

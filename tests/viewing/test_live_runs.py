@@ -19,7 +19,7 @@ def test_the_last_frame_of_a_killed_run_is_not_passed_off_as_live(tmp_path: Path
     source = threading.Thread(target=RunSource(run.folder).frames, args=(studio,))
     source.start()
     try:
-        shown = cells.wait_until(lambda: studio.shown, "the last frame")
+        shown = cells.wait_until(lambda: studio.shown_frame, "the last frame")
         assert shown.run == "interrupted, 3 of 4 shots proven"
         assert studio.remark == "the run is not being acquired (interrupted): this is its last frame"
     finally:

@@ -43,7 +43,7 @@ def exposure(exposure_us: int, *pictures: np.ndarray) -> SampledExposure:
 
 def test_the_worst_picture_of_an_exposure_is_named_with_its_share() -> None:
     found = exposure(8000, picture(0.5), picture(0.5, 20), picture(0.5, 4))
-    assert found.seen.saturated == 0.01
+    assert found.sample.saturated_share == 0.01
     assert found.worst == "top/led0001/e0"
     assert {name: counts.sum() for name, counts in found.histograms.items()} == {"R": 1500, "G": 3000, "B": 1500}
     assert sum(int(counts[-1]) for counts in found.histograms.values()) == 24

@@ -11,7 +11,7 @@ from coupole.motion.occlusion import Sight, ray_mesh
 from coupole.viewing.view_canvas import Canvas, Lookout
 from coupole.viewing.view_colours import of_share
 from coupole.viewing.view_sight import footprint
-from coupole.viewing.view_solids import Solid, box, capsule, disk, joined, sphere, with_fewer_faces
+from coupole.viewing.view_solids import Solid, box, capsule, disk, join_solids, sphere, with_fewer_faces
 
 BLUE, GREEN = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 
@@ -39,9 +39,9 @@ def test_a_solid_is_closed_and_has_its_volume(solid: Solid, volume_mm3: float) -
 
 
 def test_joined_solids_keep_all_their_faces() -> None:
-    both = joined("both", [sphere("a", (0, 0, 0), 10), box("b", (20, 0, 0), (30, 10, 10))])
+    both = join_solids("both", [sphere("a", (0, 0, 0), 10), box("b", (20, 0, 0), (30, 10, 10))])
     assert mesh_of(both).volume == pytest.approx(1000 + mesh_of(sphere("a", (0, 0, 0), 10)).volume)
-    assert len(joined("none", []).faces) == 0
+    assert len(join_solids("none", []).faces) == 0
 
 
 def test_a_simplified_mesh_has_fewer_faces_and_about_the_same_shape() -> None:
@@ -79,12 +79,12 @@ def test_bodies_that_cross_each_hide_a_part_of_the_other() -> None:
 
 def test_a_line_behind_a_body_is_faint_and_one_before_it_is_not() -> None:
     canvas = Canvas(Lookout(look_at((0, 0, 0), 500, 0, 90), 1.0, 200, 200, perspective=False), (0.0, 0.0, 0.0))
-    canvas.fill([box("b", (-90, -90, -10), (90, 90, 10))], [(0.0, 0.0, 0.0)], outlined=False)
+    canvas.fill([box("b", (-90, -90, -10), (90, 90, 10))], [(0.0, 0.0, 0.0)], has_outline=False)
     for height in (-100.0, 100.0):
         for axis in range(2):
             ends = np.zeros((2, 3))
             ends[:, axis], ends[:, 1 - axis], ends[:, 2] = (-80, 80), np.sign(height) * 40, height
-            canvas.line(ends, (1.0, 1.0, 1.0), 3.0, hidden=0.2)
+            canvas.line(ends, (1.0, 1.0, 1.0), 3.0, hidden_opacity=0.2)
     levels = np.unique(np.asarray(canvas.image()).max(axis=2))
     assert 51 in levels
     assert 255 in levels

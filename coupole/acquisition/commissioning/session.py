@@ -38,10 +38,10 @@ from coupole.preflight.commissioned import (
     StepResult,
     devices_of,
     empty_record,
-    outdated,
     read_commissioning,
     record_path,
     settings_of,
+    why_outdated,
     write_commissioning,
 )
 from coupole.storage.arm_faults import faults_of
@@ -114,7 +114,7 @@ def commission(
                     _say(console, result)
                     if failure is not None:
                         raise failure
-                    if not result.passed:
+                    if not result.has_passed:
                         raise CommissioningFailed(step, shortcomings(result))
         except DeviceError as error:
             if error.device == "robot":
@@ -165,7 +165,7 @@ def _due(cell: Cell, record: CommissioningRecord, opened_cell: OpenedCell) -> li
     return [
         step
         for step, result in results.items()
-        if result is None or not result.passed or outdated(cell, result, opened_cell.identities)
+        if result is None or not result.has_passed or why_outdated(cell, result, opened_cell.identities)
     ]
 
 
@@ -191,12 +191,12 @@ def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResu
         remarks=tuple(findings.remarks),
         failure=failure,
     )
-    if not result.passed and not failure:
+    if not result.has_passed and not failure:
         result = result.model_copy(update={"failure": findings.remedy})
     return result, error
 
 
 def _say(console: Console, result: StepResult) -> None:
-    console.print(f"{result.step}: {'passed' if result.passed else 'NOT PASSED'}", markup=False)
-    for line in (*result.remarks, *(shortcomings(result) if not result.passed else ())):
+    console.print(f"{result.step}: {'passed' if result.has_passed else 'NOT PASSED'}", markup=False)
+    for line in (*result.remarks, *(shortcomings(result) if not result.has_passed else ())):
         console.print(f"  {line}", markup=False)

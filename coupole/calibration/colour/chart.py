@@ -150,7 +150,7 @@ class KnownChart:
 def read_chart(path: Path, without: Sequence[str] = ()) -> KnownChart:
     """A chart's description and values, `without` some patches more. Raises InputError with all problems: wrong
     keys, patches without values, too few patches, no grey one."""
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     whole = document.validate(Chart)
     if strange := sorted({*whole.without, *without} - set(whole.model_copy(update={"without": ()}).patch_names)):
         raise InputError(f"{path}: the chart has no patch {', '.join(strange)} to leave out")

@@ -92,7 +92,7 @@ class Sighting:
 
 def read_board(path: Path) -> Board:
     """A board's description. Raises InputError with every problem of the file."""
-    return yamlfile.read(path).validate(Board)
+    return yamlfile.read_document(path).validate(Board)
 
 
 def detect(board: Board, picture: Picture) -> Sighting | str:

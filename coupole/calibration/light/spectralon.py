@@ -51,4 +51,4 @@ class Tile(Model):
 
 def read_tile(path: Path) -> Tile:
     """A tile's description (YAML). Raises InputError with all problems."""
-    return yamlfile.read(path).validate(Tile)
+    return yamlfile.read_document(path).validate(Tile)

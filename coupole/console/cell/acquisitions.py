@@ -67,10 +67,10 @@ class Acquisitions:
         answer is stopped as by Ctrl-C. Raises InputError: it is not being acquired, or does not answer."""
         for state in [self.state] if self.state and Path(self.state["run"]).name == run else running():
             if Path(state["run"]).name == run and self._is_ours(state):
-                return self._told(state, command)
+                return self._send_command(state, command)
         raise InputError(f"{run}: is not being acquired in this cell")
 
-    def _told(self, state: State, command: Command) -> State:
+    def _send_command(self, state: State, command: Command) -> State:
         try:
             return ask(Path(state["run"]), command)
         except InputError:
@@ -93,7 +93,7 @@ class Acquisitions:
                 raise InputError(why)
             return self._queue.add(by, at_once=True, **fields)
 
-    def lend(self, pid: int, who: str, what: str) -> None:
+    def lend(self, pid: int, borrower: str, purpose: str) -> None:
         """Give the cell to a process for its work, until it gives it back or ends; nothing begins meanwhile. One
         that has it keeps it. Raises InputError: something else has the cell."""
         with self._beginning:
@@ -101,7 +101,7 @@ class Acquisitions:
                 return
             if why := self._had_by() or ("the queue is about to begin a plan" if self._queue.following else ""):
                 raise InputError(why)
-            self.lending.lend(pid, who, what)
+            self.lending.lend(pid, borrower, purpose)
 
     def output(self, entry: Entry) -> tuple[str, dict[str, Any]]:
         """Return what an entry's process has printed (the last 64 KiB), and its figures as of `acquire --json`,

@@ -100,7 +100,7 @@ class Bench:
         """Somebody looks at it: its state is kept fresh for a while."""
         self._looked_s = self._now_s()
 
-    def open(self, who: str, plan: str) -> None:
+    def open(self, person: str, plan: str) -> None:
         """Begin it; the object of a plan lies on the support, or nothing. Raises InputError: something has the
         cell, or there is no such plan."""
         with self._lock:
@@ -108,9 +108,9 @@ class Bench:
                 raise InputError(f"the devices are {self.phase}")
             lies = ["--object", str(self._plans.path(plan))] if plan else []
             rig = str(self._cell.document.path.resolve())
-            task = self._tasks.begin("open the devices", ["bench", rig, "--yes", *lies], who)
+            task = self._tasks.begin("open the devices", ["bench", rig, "--yes", *lies], person)
             try:
-                self._acquisitions.lend(task.process.pid, who, "the devices are open")
+                self._acquisitions.lend(task.process.pid, person, "the devices are open")
             except InputError:
                 task.stop()
                 raise
@@ -123,10 +123,10 @@ class Bench:
             raise InputError(f"the devices are {self.phase}")
         return self._close(why)
 
-    def give_way(self, what: str) -> None:
+    def give_way(self, action: str) -> None:
         """Something is about to begin: close it, as soon as the arm has ended what it does."""
         if self.is_own and self.phase in ("open", "opening") and self.work.get("state") != "running":
-            self._closing = f"closed, because {what} begins"
+            self._closing = f"closed, because {action} begins"
             threading.Thread(target=self._close, args=(self._closing,), daemon=True).start()
 
     def stop(self) -> list[str]:

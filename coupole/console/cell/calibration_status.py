@@ -35,9 +35,9 @@ class RecordRow:
     kind: str
     path: Path | None = None
     """None: no record of this kind is in force."""
-    needed: bool = False
+    is_needed: bool = False
     """Plans that want calibrations want this kind."""
-    created: str = ""
+    created_at: str = ""
     """UTC, ISO 8601."""
     age_days: float = 0.0
     left_days: float = 0.0
@@ -66,14 +66,14 @@ class StepNow:
     """A step of a campaign."""
 
     step: Step
-    made: tuple[str, ...]
+    accepted_kinds: tuple[str, ...]
     """Kinds of its records that are there and accepted."""
-    missed: tuple[str, ...]
+    missed_limits: tuple[str, ...]
     """Limits that its records miss."""
 
     @property
-    def done(self) -> bool:
-        return set(self.made) == set(self.step.records)
+    def is_done(self) -> bool:
+        return set(self.accepted_kinds) == set(self.step.records)
 
 
 class CalibrationStatus:
@@ -95,7 +95,7 @@ class CalibrationStatus:
         kinds = [*USUAL, *(kind for kind in get_args(Kind) if kind not in USUAL), ""]
         rows_in_force = [row for kind in kinds for row in rows if row.kind == kind]
         missing = [
-            RecordRow(kind, needed=bool(rows) and kind in NEEDED)
+            RecordRow(kind, is_needed=bool(rows) and kind in NEEDED)
             for kind in USUAL
             if kind not in {r.kind for r in rows_in_force}
         ]
@@ -108,7 +108,7 @@ class CalibrationStatus:
 
     def _plan(self, path: Path) -> PlanRow | None:
         try:
-            document = yamlfile.read(path)
+            document = yamlfile.read_document(path)
             rig = document.data.get("rig") if "views" in document.data else None
             if not isinstance(rig, str) or document.resolve(Path(rig)).resolve() != self.rig_path.resolve():
                 return None
@@ -163,12 +163,12 @@ def _row(path: Path, cell: Cell) -> RecordRow:
         return RecordRow("", path, against=tuple(str(error).splitlines()))
     now = datetime.now(UTC)
     ratios = [(limit.found / limit.limit, limit) for limit in record.limits if limit.limit > 0]
-    worst = max(ratios, key=lambda one: one[0], default=None)
+    worst = max(ratios, key=lambda entry: entry[0], default=None)
     return RecordRow(
         kind=record.kind,
         path=path,
-        needed=record.kind in NEEDED,
-        created=record.created.isoformat(),
+        is_needed=record.kind in NEEDED,
+        created_at=record.created.isoformat(),
         age_days=(now - record.created).total_seconds() / _DAY_S,
         left_days=(record.validity.expires - now).total_seconds() / _DAY_S,
         tightest=_limit_words(worst[1].what, worst[1].found, worst[1].limit, worst[1].unit) if worst else "",
@@ -196,8 +196,8 @@ def _step(step: Step, folder: Path) -> StepNow:
     return StepNow(step, tuple(passed_kinds), tuple(problems))
 
 
-def _limit_words(what: str, found: float, limit: float, unit: str) -> str:
-    return f"{what}: {found:.3g} of at most {limit:.3g} {unit}".rstrip()
+def _limit_words(quantity: str, value: float, limit: float, unit: str) -> str:
+    return f"{quantity}: {value:.3g} of at most {limit:.3g} {unit}".rstrip()
 
 
 def _without(path: Path, reasons: Sequence[str]) -> list[str]:

@@ -50,7 +50,7 @@ class Lending:
         with self._lock:
             return bool(self.lent_to) and self._loan is not None and self._loan.pid == pid
 
-    def lend(self, pid: int, who: str, what: str) -> None:
+    def lend(self, pid: int, borrower: str, purpose: str) -> None:
         """Raises InputError: it is lent, or there is no such process."""
         with self._lock:
             if self.lent_to:
@@ -59,7 +59,7 @@ class Lending:
                 process = os.pidfd_open(pid)
             except OSError as error:
                 raise InputError(f"process {pid}: {error.strerror}") from error
-            self._loan = _Loan(pid, process, f"{who}: {what}")
+            self._loan = _Loan(pid, process, f"{borrower}: {purpose}")
 
     def interrupt(self) -> None:
         """End what the cell is lent for, as Ctrl-C does. Raises InputError: it is not lent."""

@@ -63,7 +63,7 @@ def state_of(
     at_work, entry = acquisitions.state or {}, queue.running
     if not at_work:
         _forget_runs()
-    own_state = "halted" if queue.halted else "idle"
+    own_state = "halted" if queue.halt_reason else "idle"
     if entry is not None:
         own_state = "concluding" if entry.run else "starting"
     faults = faults_of(cell).standing()
@@ -78,7 +78,7 @@ def state_of(
         dose=at_work.get("dose_lux_h", 0.0),
         **(_object_of(cell, at_work["run"]) if at_work else _NO_OBJECT),
         left_s=at_work.get("left_s"),
-        halted=queue.halted,
+        halted=queue.halt_reason,
         arm_fault=faults[-1].message if faults else "",
         devices=_devices(at_work["run"]) if at_work else bench.identities,
         lent_to=acquisitions.lending.lent_to,
@@ -92,18 +92,20 @@ def state_of(
 
 
 def _entries_now(queue: PlanQueue, left_s: float | None) -> list[EntryNow]:
-    times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, halted=bool(queue.halted))
+    times = expected_times(queue.entries, datetime.now(UTC), left_s=left_s, is_halted=bool(queue.halt_reason))
     ended_ids = [entry.id for entry in queue.entries if entry.ended]
     entries = []
     for entry in queue.entries:
         if entry.id in ended_ids[:-_ENDED_TOLD]:
             continue
-        begin, end = (utc_text(_rounded(time)) if time else None for time in times.get(entry.id, (None, None)))
+        begin, end = (
+            utc_text(_rounded_to_10_s(time)) if time else None for time in times.get(entry.id, (None, None))
+        )
         entries.append(EntryNow(**dict(entry), expected_begin=begin, expected_end=end))
     return entries
 
 
-def _rounded(time: datetime) -> datetime:
+def _rounded_to_10_s(time: datetime) -> datetime:
     """Round a time to 10 s, so that an expected time does not change with every look."""
     return datetime.fromtimestamp(round(time.timestamp(), -1), UTC)
 
@@ -144,7 +146,7 @@ def _ledger_when(ledgers: Path, former: Path, run: str) -> tuple[Ledger | None, 
     InputError."""
     opened_run = Run(Path(run))
     object_id = opened_run.about.get("object") or ""
-    budget = (yamlfile.read(opened_run.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
+    budget = (yamlfile.read_document(opened_run.plan_path).data.get("object") or {}).get("dose_budget_lux_h")
     return Ledger(ledgers, object_id, former) if object_id else None, object_id, budget
 
 

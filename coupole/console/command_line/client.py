@@ -64,7 +64,7 @@ def call(
     cell: Cell,
     method: str,
     path: str,
-    asked: dict[str, Any] | None = None,
+    request: dict[str, Any] | None = None,
     *,
     patience_s: float = _PATIENCE_S,
     given_up: Callable[[], bool] = _never,
@@ -75,8 +75,8 @@ def call(
     place = _place(cell)
     connection = _Local(place, patience_s)
     try:
-        body = None if asked is None else json.dumps(asked)
-        _connected(cell, connection, end_s, given_up)
+        body = None if request is None else json.dumps(request)
+        _connect(cell, connection, end_s, given_up)
         connection.request(method, path, body, {"Content-Type": "application/json"} if body else {})
         with _told_if_given_up(rig, begins_nothing(method, path)):
             _await(connection.sock, place, rig, end_s, given_up)
@@ -100,7 +100,7 @@ def _place(cell: Cell) -> str:
         raise NotServed(f"{cell.document.path}: no console can be served here: {error}") from error
 
 
-def _connected(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[], bool]) -> None:
+def _connect(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[], bool]) -> None:
     """Connect, waiting for a console that has the cell and does not listen yet. Raises NotServed: none has it."""
     rig, begun_s, has_spoken = cell.document.path, time.monotonic(), False
     while True:
@@ -192,11 +192,11 @@ def is_served(cell: Cell) -> bool:
 
 
 @contextlib.contextmanager
-def borrowed(cell: Cell, what: str) -> Iterator[None]:
-    """The cell for `what` this process does, lent by its console; where none is served nobody is asked. Raises
-    InputError: a run is at work, somebody else is in control, or has it."""
+def borrowed_cell(cell: Cell, purpose: str) -> Iterator[None]:
+    """The cell for the `purpose` of this process, lent by its console; where none is served nobody is asked.
+    Raises InputError: a run is at work, somebody else is in control, or has it."""
     try:
-        call(cell, "POST", "/api/v1/cell/lease", {"what": what})
+        call(cell, "POST", "/api/v1/cell/lease", {"what": purpose})
     except NotServed:
         yield
         return

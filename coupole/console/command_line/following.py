@@ -27,7 +27,7 @@ from coupole.plan.rig_devices import in_world
 from coupole.preflight.checking import preflight_of
 from coupole.preflight.job import read_job, without_hidden
 from coupole.storage.run import Run
-from coupole.viewing.keys import obeyed
+from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Progress
 from coupole.viewing.terminal import RunObserver, alarm
@@ -40,31 +40,31 @@ _FIELDS = tuple(Progress.__dataclass_fields__)
 def acquire_by_console(
     cell: Cell,
     console: Console,
-    asked: dict[str, Any],
+    request: dict[str, Any],
     *,
     confirm: bool,
-    found: dict[str, Any],
+    summary: dict[str, Any],
 ) -> None:
-    """Enter a plan or a run to be resumed (`asked`: as of `POST /api/v1/queue`), which begins at once, and follow
-    it to its end; `found` is filled with the figures of `--json`.
+    """Enter a plan or a run to be resumed (`request`: as of `POST /api/v1/queue`), which begins at once, and
+    follow it to its end; `summary` is filled with the figures of `--json`.
 
     Raises InputError: the queue is at work, or somebody else is in control; and what the acquisition raised.
     """
     if confirm and not in_world(cell.rig, dry_run=False):
-        _confirm(cell, console, asked)
+        _confirm(cell, console, request)
     control = Control()
     follower = _Followed(cell, console, control)
     with obeyed_by(control, follower.stop):
-        follower.enter(asked)
-        follower.to_its_end(found)
+        follower.enter(request)
+        follower.to_its_end(summary)
 
 
-def _confirm(cell: Cell, console: Console, asked: dict[str, Any]) -> None:
+def _confirm(cell: Cell, console: Console, request: dict[str, Any]) -> None:
     """Show what a real cell is about to do, and ask. Raises PreflightRefused, Interrupted."""
-    run = Run(Path(asked["resume"])) if asked.get("resume") else None
-    plan = Path(asked["plan"]) if asked.get("plan") else run.plan_path if run else Path()
+    run = Run(Path(request["resume"])) if request.get("resume") else None
+    plan = Path(request["plan"]) if request.get("plan") else run.plan_path if run else Path()
     job = without_hidden(read_job(plan, cell.document.path), run.hidden_leds if run else None)
-    folder = run.folder if run else Path(asked.get("output") or cell.storage_folder)
+    folder = run.folder if run else Path(request.get("output") or cell.storage_folder)
     job, preflight = preflight_of(
         job, folder, allocated_bytes=run.allocated_bytes() if run else 0, proven=run.proven() if run else ()
     )
@@ -84,14 +84,14 @@ class _Followed:
         self._bars = contextlib.ExitStack()
         self._has_bars = False
 
-    def enter(self, asked: dict[str, Any]) -> None:
+    def enter(self, request: dict[str, Any]) -> None:
         try:
-            begin = {**asked, "now": True}
+            begin = {**request, "now": True}
             self._entry = call(self._cell, "POST", "/api/v1/queue", begin, given_up=self._control.stop.is_set)
         except GivenUp:
             raise self._control.interruption() from None
         except InputError as error:
-            rig, plan = self._cell.document.path, asked.get("plan") or f"--resume {asked['resume']}"
+            rig, plan = self._cell.document.path, request.get("plan") or f"--resume {request['resume']}"
             raise InputError(
                 f"not begun: {error}\nA console owns this cell: `coupole queue {rig} {plan}` enters it in its "
                 "queue, and shows that."
@@ -115,7 +115,7 @@ class _Followed:
                     continue
                 else:
                     return
-            if self._ended:
+            if self._has_ended:
                 return
             time.sleep(_LOOK_EVERY_S)
 
@@ -125,13 +125,13 @@ class _Followed:
         return Path(self._entry["run"]) if self._entry.get("run") else None
 
     @property
-    def _ended(self) -> bool:
+    def _has_ended(self) -> bool:
         return bool(self._entry.get("ended"))
 
-    def to_its_end(self, found: dict[str, Any]) -> None:
+    def to_its_end(self, summary: dict[str, Any]) -> None:
         """Show what the process says and does; raises what it raised."""
         keys = {"p": self._pause_or_go_on, "q": self.stop}
-        with obeyed(keys) as has_keys, self._bars:
+        with key_actions(keys) as has_keys, self._bars:
             if has_keys:
                 self._console.print("keys: p pauses after the burst, and goes on; q stops")
             for output in self._outputs():
@@ -139,13 +139,13 @@ class _Followed:
                 self._say(output["said"])
                 self._show_progress()
                 figures = output["figures"]
-        self._conclude(figures, found)
+        self._conclude(figures, summary)
 
     def _outputs(self) -> Iterator[dict[str, Any]]:
         """Yield the output until the entry has ended. Raises Interrupted: the entry was taken out before it began;
         DeviceLost: the console has ended, and after it what it had begun."""
         is_announced = False
-        while not self._ended:
+        while not self._has_ended:
             try:
                 yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
             except (NotServed, NoAnswer) as error:
@@ -185,9 +185,9 @@ class _Followed:
                 is_paused = state["state"] in ("paused", "pausing")
                 ask(self._run, "go-on" if is_paused else "pause")
 
-    def _say(self, said: str) -> None:
+    def _say(self, output_text: str) -> None:
         """Print what is new in the process's output, in whole lines."""
-        whole = said[: said.rfind("\n") + 1]
+        whole = output_text[: output_text.rfind("\n") + 1]
         new = whole[len(self._printed) :] if whole.startswith(self._printed) else whole
         self._printed = whole
         for line in new.splitlines():
@@ -197,7 +197,7 @@ class _Followed:
     def _show_progress(self) -> None:
         """Bars on a terminal; elsewhere the process's own lines say it."""
         state = self._state() if self._console.is_terminal else None
-        if state is None or "view" not in state or self._ended:
+        if state is None or "view" not in state or self._has_ended:
             return
         progress = Progress(**{name: state[name] for name in _FIELDS})
         if not self._has_bars:
@@ -206,8 +206,8 @@ class _Followed:
             self._bars.enter_context(self._observer.showing(progress.frames, progress.views))
         self._observer.progress(progress)
 
-    def _conclude(self, figures: dict[str, Any], found: dict[str, Any]) -> None:
-        found.update(
+    def _conclude(self, figures: dict[str, Any], summary: dict[str, Any]) -> None:
+        summary.update(
             {name: value for name, value in figures.items() if name not in ("error", "kind", "exit_code")}
         )
         if self._entry["exit_code"] == 0:

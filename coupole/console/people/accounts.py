@@ -81,7 +81,7 @@ class Accounts:
         self.first_token = "" if _has_engineer(self._stored) else secrets.token_urlsafe(24)
         """Token with which an engineer signs in while no engineer has an account; empty if it does not hold."""
 
-    def listed(self) -> list[Account]:
+    def all_accounts(self) -> list[Account]:
         """Return all accounts, by name."""
         return [Account(name, Role.of(entry["role"])) for name, entry in sorted(self._stored.items())]
 
@@ -105,7 +105,9 @@ class Accounts:
             raise InputError(f"password: expected {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters")
         password_hash = self._hasher.hash(password)
         with self._lock:
-            if alike := [other_name for other_name in self._stored if _seen(other_name) == _seen(name)]:
+            if alike := [
+                other_name for other_name in self._stored if _visible_form(other_name) == _visible_form(name)
+            ]:
                 raise InputError(f"name: {alike[0]} has an account already")
             self._keep({**self._stored, name: {"role": role.word, "password": password_hash}})
             if role is Role.ENGINEER:
@@ -171,28 +173,28 @@ class Accounts:
             self.first_token = ""
         return FIRST_ENGINEER
 
-    def _keep(self, stored: dict[str, dict[str, Any]]) -> None:
+    def _keep(self, entries: dict[str, dict[str, Any]]) -> None:
         try:
             make_folder(self._path.parent)
             if not self._path.exists():
                 self._path.touch(mode=0o600)
-            write_synced(self._path, json.dumps(stored, indent=2, ensure_ascii=False))
+            write_synced(self._path, json.dumps(entries, indent=2, ensure_ascii=False))
             self._path.chmod(0o600)
         except OSError as error:
             raise StorageError(f"{self._path}: the account cannot be kept: {error.strerror}") from error
-        self._stored = stored
+        self._stored = entries
 
 
-def _key(kept: dict[str, Any]) -> str:
+def _key(entry: dict[str, Any]) -> str:
     """Differs for each account, as its password is hashed with a salt of its own."""
-    return hashlib.sha256(kept["password"].encode()).hexdigest()
+    return hashlib.sha256(entry["password"].encode()).hexdigest()
 
 
-def _seen(name: str) -> str:
+def _visible_form(name: str) -> str:
     """Return a name as a reader sees it: two that differ only by capitals, width or spaces are one person in a
     log."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 
-def _has_engineer(stored: dict[str, dict[str, Any]]) -> bool:
-    return any(entry["role"] == Role.ENGINEER.word for entry in stored.values())
+def _has_engineer(entries: dict[str, dict[str, Any]]) -> bool:
+    return any(entry["role"] == Role.ENGINEER.word for entry in entries.values())

@@ -21,10 +21,10 @@ class Audit:
         self._file, self._lock = LineFile(path), threading.Lock()
         self.trouble = ""
 
-    def note(self, name: str, asked: str, status: int, address: str, about: str = "") -> None:
+    def note(self, name: str, action: str, status: int, address: str, about: str = "") -> None:
         """`name` (empty: nobody who is signed in) at `address` asked for something, and got this HTTP status;
         `about`: what of it the path does not say."""
-        line = {"t": utc_now(), "name": name, "asked": asked, "status": status, "from": address}
+        line = {"t": utc_now(), "name": name, "asked": action, "status": status, "from": address}
         if about:
             line["about"] = about
         try:

@@ -42,7 +42,7 @@ def guard(app: FastAPI, service: Service) -> None:
     """Put the guard in front of an app."""
 
     @app.middleware("http")
-    async def logged(request: Request, call_next: Callable[[Request], Any]) -> Response:
+    async def log_request(request: Request, call_next: Callable[[Request], Any]) -> Response:
         status = 500  # if it raises
         try:
             response: Response = await check(request, call_next)
@@ -98,11 +98,11 @@ def _answer_errors(app: FastAPI) -> None:
         )
 
     @app.exception_handler(RequestValidationError)
-    async def malformed(_: Request, error: RequestValidationError) -> Response:
+    async def answer_malformed(_: Request, error: RequestValidationError) -> Response:
         return JSONResponse({"detail": _finite(jsonable_encoder(error.errors()))}, 422)
 
     @app.exception_handler(CoupoleError)
-    async def failed(_: Request, error: CoupoleError) -> Response:
+    async def answer_failure(_: Request, error: CoupoleError) -> Response:
         return _no(409, str(error))
 
     @app.exception_handler(NotAllowed)
@@ -110,13 +110,13 @@ def _answer_errors(app: FastAPI) -> None:
         return _no(refusal.status, str(refusal))
 
 
-def _finite(found: Any) -> Any:
+def _finite(content: Any) -> Any:
     """Return a value that JSON can express: numbers that are not finite (NaN) become text."""
-    if isinstance(found, dict):
-        return {key: _finite(value) for key, value in found.items()}
-    if isinstance(found, list):
-        return [_finite(value) for value in found]
-    return str(found) if isinstance(found, float) and not math.isfinite(found) else found
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_finite(value) for value in content]
+    return str(content) if isinstance(content, float) and not math.isfinite(content) else content
 
 
 class _WebSocketGuard:
@@ -185,13 +185,13 @@ def address_of(request: Request | WebSocket) -> str:
     return request.client.host if request.client else "command line"
 
 
-def session_of(request: Request | WebSocket, service: Service, *, used: bool = True) -> Session | None:
+def session_of(request: Request | WebSocket, service: Service, *, counts_as_use: bool = True) -> Session | None:
     """Return the session of whoever asks; None without one. Looking on does not count as using it."""
     if is_command_line(request):
         return service.command_line
     if bearer := bearer_of(request):
-        return service.sessions.of(bearer, script=True, used=used)
-    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False, used=used)
+        return service.sessions.of(bearer, script=True, counts_as_use=counts_as_use)
+    return service.sessions.of(request.cookies.get(service.cookie, ""), script=False, counts_as_use=counts_as_use)
 
 
 def is_of_this_machine(request: Request | WebSocket) -> bool:

@@ -14,11 +14,11 @@ class NotAllowed(Exception):
         self.status = status
 
 
-def allow(service: Service, who: Account, role: Role, action: str, *, acts: bool = False) -> None:
+def allow(service: Service, account: Account, role: Role, action: str, *, acts: bool = False) -> None:
     """Raise NotAllowed if somebody's role, or who is in control, forbids an action."""
-    if who.role < role:
-        raise NotAllowed(403, f"{action}: only for {role.word}s; {who.name} is {who.role.word}")
-    of_command_line = who is service.command_line.account
-    if acts and not service.control.act(who, keep=not of_command_line):
+    if account.role < role:
+        raise NotAllowed(403, f"{action}: only for {role.word}s; {account.name} is {account.role.word}")
+    of_command_line = account is service.command_line.account
+    if acts and not service.control.act(account, keep=not of_command_line):
         how = "`coupole queue RIG --take-control` takes it" if of_command_line else "ask for it first"
         raise NotAllowed(409, f"{action}: {service.control.now.name} is in control; {how}")

@@ -54,8 +54,9 @@ class Sessions:
             self._by_hash[_hash(secret)] = Session(account, now_s, script)
         return secret
 
-    def of(self, secret: str, *, script: bool, used: bool = True) -> Session | None:
-        """The session of this kind with this secret, if it is not over; from now on it counts as just `used`."""
+    def of(self, secret: str, *, script: bool, counts_as_use: bool = True) -> Session | None:
+        """The session of this kind with this secret, if it is not over; `counts_as_use`: from now on it
+        counts as just used."""
         with self._lock:
             session = self._by_hash.get(_hash(secret))
             if session is None or session.script is not script:
@@ -63,7 +64,7 @@ class Sessions:
             if self._now_s() - session.seen_s > IDLE_S or not self._holds(session.account):
                 self._by_hash.pop(_hash(secret), None)
                 return None
-            if used:
+            if counts_as_use:
                 session.seen_s = self._now_s()
             return session
 

@@ -23,7 +23,7 @@ from coupole.errors import InputError, Problem
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.plan import possible_path
 from coupole.plan.reading import PlanFiles, read_plan
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.preflight.files import Files
 from coupole.storage.ledger import ledger_of
 from coupole.storage.run import Run
@@ -44,35 +44,35 @@ class Entering:
         self.preflight.close()
 
     def enter(
-        self, asked: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
+        self, request: NewEntry, by: str, *, by_command_line: bool, may_still: Callable[[], None] = lambda: None
     ) -> Entry:
         """A new entry. The command line may name files anywhere, other people only plans and runs of this cell's
         folders. `may_still` raises if whoever asked may not any more, after preflight. Raises InputError: it
         cannot be run, with all problems; StorageError."""
-        if bool(asked.plan or asked.resume) == bool(asked.hold):
+        if bool(request.plan or request.resume) == bool(request.hold):
             raise InputError("expected either `plan` or `hold`, or `resume`")
-        if asked.hold:
-            if asked.now:
+        if request.hold:
+            if request.now:
                 raise InputError("`now`: a hold does not begin")
-            return self._queue.add(by, before=asked.before, hold=asked.hold)
-        if not by_command_line and (asked.output or asked.with_mesh or (asked.plan and asked.resume)):
+            return self._queue.add(by, before=request.before, hold=request.hold)
+        if not by_command_line and (request.output or request.with_mesh or (request.plan and request.resume)):
             raise InputError("`output`, `with_mesh` and `plan` with `resume` are for the command line")
-        run = self._run(asked.resume, anywhere=by_command_line) if asked.resume else None
-        plan = self._plan(asked.plan, anywhere=by_command_line) if asked.plan else None
+        run = self._run(request.resume, anywhere=by_command_line) if request.resume else None
+        plan = self._plan(request.plan, anywhere=by_command_line) if request.plan else None
         fields: dict[str, Any] = {
             "plan": str(plan.document.path.resolve()) if plan else "",
             "resume": str(run.folder) if run else "",
-            "output": str(Path(asked.output).resolve()) if asked.output else "",
-            "with_mesh": asked.with_mesh,
+            "output": str(Path(request.output).resolve()) if request.output else "",
+            "with_mesh": request.with_mesh,
         }
-        if asked.now:
+        if request.now:
             return self._acquisitions.begin_at_once(by, **fields)
         files = plan or (read_plan(run.plan_path) if run else None)
         assert files is not None
         fields["needs"] = self._needs(files, fields, by)
-        self._refuse(Entry(id="new", by=by, entered="", **fields), asked.before)
+        self._refuse(Entry(id="new", by=by, entered="", **fields), request.before)
         may_still()
-        return self._queue.add(by, before=asked.before, **fields)
+        return self._queue.add(by, before=request.before, **fields)
 
     def move(self, number: str, before: str) -> None:
         """Raises InputError: it does not wait, or another order exceeds an object's budget; StorageError."""
@@ -85,7 +85,7 @@ class Entering:
 
     def _plan(self, name: str, *, anywhere: bool) -> PlanFiles:
         path = _place("plan", self._plans, name, anywhere=anywhere)
-        if "views" not in read(path).data:
+        if "views" not in read_document(path).data:
             raise InputError(f"{path}: expected a plan, with `views`")
         files = read_plan(path, self._rig if anywhere else None)
         if files.cell.document.path.resolve() != self._rig:
@@ -172,5 +172,5 @@ def _place(key: str, folder: Path, name: str, *, anywhere: bool) -> Path:
     return path
 
 
-def _problem(named: str, refusal: str) -> Problem:
-    return Problem(named, 0, 0, "", refusal)
+def _problem(file_name: str, refusal: str) -> Problem:
+    return Problem(file_name, 0, 0, "", refusal)

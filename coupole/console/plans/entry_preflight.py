@@ -60,12 +60,12 @@ class EntryPreflight:
     def of(self, files: Files, by: str, *, beside_a_run: bool) -> Found:
         """Return what preflight says of files. Raises InputError: it takes too long, is given up, or its process
         died."""
-        with self._told(f"{(files.resume or files.plan).name}, entered by {by} at {utc_now()[11:19]} UTC"):
+        with self._with_words(f"{(files.resume or files.plan).name}, entered by {by} at {utc_now()[11:19]} UTC"):
             niceness = BESIDE_A_RUN if beside_a_run else 0
             return self._process.run(check_entry, AT_MOST_S, niceness, files, measure=not beside_a_run)
 
     @contextlib.contextmanager
-    def _told(self, words: str) -> Iterator[None]:
+    def _with_words(self, words: str) -> Iterator[None]:
         self._for = words
         try:
             yield

@@ -41,11 +41,11 @@ class ObjectFiles:
         ledgers = [*self._cell.ledger_folder.glob("*.jsonl"), *self._cell.former_ledger_folder.glob("*.jsonl")]
         object_ids = {path.stem for path in ledgers}
         object_ids |= {row.object for row in self._runs.rows() if row.object}
-        object_ids |= set(self._named())
+        object_ids |= set(self._plans_by_object())
         return sorted(object_ids)
 
     def plans_of(self, object_id: str) -> list[NamedBy]:
-        return self._named().get(object_id, [])
+        return self._plans_by_object().get(object_id, [])
 
     def runs_of(self, object_id: str) -> list[RunRow]:
         """The newest first."""
@@ -97,11 +97,13 @@ class ObjectFiles:
             raise InputError(f"object: expected an id as in a plan; found {object_id!r}")
         return self._folder / f"{object_id}.jpg"
 
-    def _named(self) -> dict[str, list[NamedBy]]:
+    def _plans_by_object(self) -> dict[str, list[NamedBy]]:
         plans_by_object: dict[str, list[NamedBy]] = {}
         for name in self._plans.names():
             try:
-                object_keys = yamlfile.parse(self._plans.path(name), self._plans.read(name)).data.get("object")
+                object_keys = yamlfile.parse(self._plans.path(name), self._plans.read_text(name)).data.get(
+                    "object"
+                )
             except CoupoleError:
                 continue
             if isinstance(object_keys, dict) and isinstance(object_keys.get("id"), str):

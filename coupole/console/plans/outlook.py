@@ -22,18 +22,18 @@ class AtWork:
 
 
 def expected_times(
-    entries: Sequence[Entry], now: datetime, *, left_s: float | None, halted: bool
+    entries: Sequence[Entry], now: datetime, *, left_s: float | None, is_halted: bool
 ) -> dict[str, tuple[datetime | None, datetime | None]]:
     """Begin and end of each entry that runs or waits, by its id; None where a person decides on it (a hold, a
     queue that is halted), or where it is not known. `left_s` of the run at work."""
     times: dict[str, tuple[datetime | None, datetime | None]] = {}
-    free_at: datetime | None = None if halted else now
+    free_at: datetime | None = None if is_halted else now
     for entry in entries:
         if entry.state == "running":
             begun_at = datetime.fromisoformat(entry.begun)
             free_at = _end_of_running(entry, begun_at, now, left_s)
             times[entry.id] = begun_at, free_at
-            free_at = None if halted else free_at
+            free_at = None if is_halted else free_at
     for entry in entries:
         if entry.state == "waiting":
             begins = free_at
@@ -43,10 +43,10 @@ def expected_times(
     return times
 
 
-def _end_of_running(entry: Entry, begun: datetime, now: datetime, left_s: float | None) -> datetime | None:
+def _end_of_running(entry: Entry, begun_at: datetime, now: datetime, left_s: float | None) -> datetime | None:
     if left_s is not None:
         return now + timedelta(seconds=left_s)
-    return max(now, begun + timedelta(seconds=_whole_s(entry))) if entry.needs else None
+    return max(now, begun_at + timedelta(seconds=_whole_s(entry))) if entry.needs else None
 
 
 def _whole_s(entry: Entry) -> float:

@@ -100,9 +100,9 @@ def _rewritten(text: str, before: PlanFields, fields: PlanFields, target_mm: tup
     return out.getvalue()
 
 
-def _same_views(one: PlanFields, other: PlanFields) -> bool:
+def _same_views(first: PlanFields, second: PlanFields) -> bool:
     return all(
-        getattr(one, name) == getattr(other, name)
+        getattr(first, name) == getattr(second, name)
         for name in ("distance_mm", "elevations_deg", "azimuths", "own_views")
     )
 
@@ -123,7 +123,7 @@ def _flow(mapping: dict[str, Any]) -> CommentedMap:
     return flow_map
 
 
-def _listed(values: Any) -> CommentedSeq:
+def _flow_sequence(values: Any) -> CommentedSeq:
     flow_sequence = CommentedSeq(values)
     flow_sequence.fa.set_flow_style()
     return flow_sequence
@@ -132,7 +132,7 @@ def _listed(values: Any) -> CommentedSeq:
 def _exposure(exposures_us: tuple[int, ...]) -> dict[str, Any]:
     if len(exposures_us) == 1:
         return {"kind": "fixed", "exposure_us": exposures_us[0]}
-    return {"kind": "bracket", "exposures_us": _listed(sorted(exposures_us))}
+    return {"kind": "bracket", "exposures_us": _flow_sequence(sorted(exposures_us))}
 
 
 def _exposures(exposure: Any) -> tuple[int, ...]:
@@ -182,10 +182,10 @@ def _views(fields: PlanFields, target_mm: tuple[float, ...]) -> CommentedSeq:
     grid = CommentedMap(
         kind="grid",
         name=ALL_ROUND,
-        target_mm=_listed([round(float(value), 1) for value in target_mm]),
+        target_mm=_flow_sequence([round(float(value), 1) for value in target_mm]),
         distance_mm=fields.distance_mm,
-        azimuths_deg=_listed(_azimuths(fields.azimuths)),
-        elevations_deg=_listed(fields.elevations_deg),
+        azimuths_deg=_flow_sequence(_azimuths(fields.azimuths)),
+        elevations_deg=_flow_sequence(fields.elevations_deg),
     )
     return CommentedSeq([grid])
 

@@ -56,7 +56,7 @@ class PlanFiles:
             raise InputError(f"plan: expected a .yaml file below {self.folder}; found {name!r}")
         return path
 
-    def read(self, name: str) -> str:
+    def read_text(self, name: str) -> str:
         """Raises InputError."""
         return yamlfile.text_of(self.path(name))
 

@@ -112,7 +112,7 @@ class PlanQueue:
         return self._kept.entries
 
     @property
-    def halted(self) -> str:
+    def halt_reason(self) -> str:
         """Reason why nothing more begins; empty if something may."""
         return self._kept.halted
 
@@ -123,7 +123,7 @@ class PlanQueue:
     @property
     def following(self) -> Entry | None:
         """The first that waits, if it may begin now."""
-        if self.halted or self.running is not None:
+        if self.halt_reason or self.running is not None:
             return None
         return next((entry for entry in self.entries if entry.state == "waiting"), None)
 
@@ -143,13 +143,13 @@ class PlanQueue:
             if at_once and (why := self._in_the_way()):
                 raise InputError(why)
             entry = Entry(id=secrets.token_hex(6), by=by, entered=utc_now(), **fields)
-            self._keep(self._with(entry, before, self.entries), "" if at_once else self.halted)
+            self._keep(self._with(entry, before, self.entries), "" if at_once else self.halt_reason)
         return entry
 
     def move(self, number: str, before: str) -> None:
         """Put an entry that waits before another one, or at the end. Raises InputError, StorageError."""
         with self._lock:
-            self._keep(self.order_after(number, before), self.halted)
+            self._keep(self.order_after(number, before), self.halt_reason)
 
     def order_after(self, number: str, before: str) -> tuple[Entry, ...]:
         """All entries as they would be after `move`. Raises InputError."""
@@ -164,7 +164,7 @@ class PlanQueue:
         """Take out an entry that waits. Raises InputError, StorageError."""
         with self._lock:
             self.waiting_entry(number)
-            self._keep(tuple(entry for entry in self.entries if entry.id != number), self.halted)
+            self._keep(tuple(entry for entry in self.entries if entry.id != number), self.halt_reason)
 
     def waiting_entry(self, number: str) -> Entry:
         """Raises InputError: none with this id waits."""
@@ -185,9 +185,9 @@ class PlanQueue:
         if self.running is not None:
             return f"{self.running.words} is being acquired"
         if self.waiting:
-            return f"{self.waiting[0].words} waits" + (f": {self.halted}" if self.halted else "")
+            return f"{self.waiting[0].words} waits" + (f": {self.halt_reason}" if self.halt_reason else "")
         ended_entries = [entry for entry in self.entries if entry.ended]
-        return self.halted if self.halted and ended_entries and ended_entries[-1].hold else ""
+        return self.halt_reason if self.halt_reason and ended_entries and ended_entries[-1].hold else ""
 
     def entry(self, number: str) -> Entry:
         """Raises InputError: there is none with this id."""
@@ -201,7 +201,7 @@ class PlanQueue:
         with self._lock:
             changed_entry = self.entry(number).model_copy(update=fields)
             self._keep(
-                tuple(changed_entry if entry.id == number else entry for entry in self.entries), self.halted
+                tuple(changed_entry if entry.id == number else entry for entry in self.entries), self.halt_reason
             )
             return changed_entry
 
@@ -211,7 +211,7 @@ class PlanQueue:
         with self._lock:
             changed_entry = self.entry(number).model_copy(update=fields)
             entries = tuple(changed_entry if entry.id == number else entry for entry in self.entries)
-            self._keep(entries, halt or self.halted)
+            self._keep(entries, halt or self.halt_reason)
 
     def halt(self, why: str) -> None:
         """Begin nothing more until somebody goes on with it, also if that cannot be written. Raises
@@ -220,18 +220,18 @@ class PlanQueue:
             self._kept = self._kept.model_copy(update={"halted": why})
             self._keep(self.entries, why)
 
-    def go_on(self, seen: str | None = None) -> None:
-        """Begin what waits, from now on. Raises InputError: `seen`, why it was halted when somebody decided, is
-        not why it is now."""
+    def go_on(self, seen_reason: str | None = None) -> None:
+        """Begin what waits, from now on. Raises InputError: `seen_reason`, why it was halted when somebody
+        decided, is not why it is now."""
         with self._lock:
-            if seen is not None and self.halted not in (seen, ""):
-                raise InputError(f"queue: it waits for something else by now: {self.halted}")
+            if seen_reason is not None and self.halt_reason not in (seen_reason, ""):
+                raise InputError(f"queue: it waits for something else by now: {self.halt_reason}")
             self._keep(self.entries, "")
 
-    def _keep(self, entries: tuple[Entry, ...], halted: str) -> None:
+    def _keep(self, entries: tuple[Entry, ...], halt_reason: str) -> None:
         old_ids = {entry.id for entry in [entry for entry in entries if entry.ended][:-MOST_ENDED]}
         entries = tuple(entry for entry in entries if entry.id not in old_ids)
-        queue = _Kept(halted=halted, entries=entries)
+        queue = _Kept(halted=halt_reason, entries=entries)
         try:
             make_folder(self._path.parent)
             write_synced(self._path, json.dumps(queue.model_dump(), indent=2, ensure_ascii=False))

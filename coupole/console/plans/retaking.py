@@ -20,7 +20,9 @@ def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
     keeps. Raises InputError: there is no such view, or the run's plan cannot be read."""
     files = read_plan(run.plan_path)
     plan = files.plan
-    view_keys = next((candidate for candidate in map(_single, _expanded(plan)) if candidate["name"] == view), None)
+    view_keys = next(
+        (candidate for candidate in map(_single, _single_views(plan)) if candidate["name"] == view), None
+    )
     if view_keys is None:
         raise InputError(f"{view!r}: no view of {run.folder.name}")
     whole = plan.model_dump(mode="json", exclude_unset=True)
@@ -38,14 +40,14 @@ def retaking_plan(run: Run, view: str, name: str, rig: Path) -> str:
     )
 
 
-def name_of_retake(run: Run, view: str, taken: set[str]) -> str:
+def name_of_retake(run: Run, view: str, taken_names: set[str]) -> str:
     """A name for the plan that no other one has."""
     run_name = run.folder.name.partition("-")[2]
     stem = re.sub(r"[^\w.-]", "-", f"{run_name}-{view}")[:48]
-    return next(name for k in range(1, len(taken) + 2) if (name := f"{stem}-again{k}") not in taken)
+    return next(name for k in range(1, len(taken_names) + 2) if (name := f"{stem}-again{k}") not in taken_names)
 
 
-def _expanded(plan: Plan) -> list[View]:
+def _single_views(plan: Plan) -> list[View]:
     views: list[View] = []
     for view in plan.views:
         views += views_of_grid(view) if isinstance(view, Grid) else [view]

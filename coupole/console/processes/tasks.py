@@ -42,12 +42,12 @@ class Task:
     command: tuple[str, ...]
     """Arguments of `coupole`."""
     by: str
-    begun: str
+    begun_at: str
     process: subprocess.Popen[bytes] = field(repr=False)
     folder: Path = field(repr=False)
     begun_s: float = field(default_factory=time.monotonic)
     ended_s: float | None = None
-    _found: dict[str, Any] | None = None
+    _figures: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         self._log = GrowingFile(self.folder / f"{self.id}.log", _MOST_SAID)
@@ -68,31 +68,31 @@ class Task:
         return (self.ended_s if not self.running and self.ended_s else time.monotonic()) - self.begun_s
 
     @property
-    def said(self) -> str:
+    def output_text(self) -> str:
         """The end of what it printed for people."""
         return self._log.text
 
     @property
-    def found(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Its `--json`; empty until it has ended, and if there is none."""
         if self.running:
             return {}
-        if self._found is None:
+        if self._figures is None:
             try:
                 path = self.folder / f"{self.id}.json"
                 figures = json_of(path.read_bytes().splitlines()[-1], str(path), allow_nan=True)
             except (OSError, InputError, IndexError):
                 figures = {}
-            self._found = figures if isinstance(figures, dict) else {}
-        return self._found
+            self._figures = figures if isinstance(figures, dict) else {}
+        return self._figures
 
     @property
     def why(self) -> str:
         """Reason why the task failed, in a line; empty if it did not."""
         if self.running or self.exit_code == 0:
             return ""
-        lines = [line.strip() for line in self.said.splitlines() if line.strip()]
-        return str(self.found.get("error") or (lines[-1] if lines else "it was stopped"))
+        lines = [line.strip() for line in self.output_text.splitlines() if line.strip()]
+        return str(self.figures.get("error") or (lines[-1] if lines else "it was stopped"))
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until the task has ended. Raises subprocess.TimeoutExpired."""
@@ -124,14 +124,16 @@ class Tasks:
             number = secrets.token_hex(6)
             output_path, figures_path = self._folder / f"{number}.log", self._folder / f"{number}.json"
             with output_path.open("wb") as errors, figures_path.open("wb") as figures:
-                process = self._beginner.submit(_begun, [*_COUPOLE, *command, "--json"], figures, errors).result()
+                process = self._beginner.submit(
+                    _begin_process, [*_COUPOLE, *command, "--json"], figures, errors
+                ).result()
             task = Task(number, words, tuple(command), by, utc_now(), process, self._folder)
             self._tasks[number] = task
             self._forget_old()
         return task
 
     @property
-    def listed(self) -> list[Task]:
+    def newest_first(self) -> list[Task]:
         """The newest first."""
         return list(reversed(self._tasks.values()))
 
@@ -158,7 +160,7 @@ class Tasks:
                     (self._folder / f"{number}.{kind}").unlink(missing_ok=True)
 
 
-def _begun(command: Sequence[str], figures: BinaryIO, errors: BinaryIO) -> subprocess.Popen[bytes]:
+def _begin_process(command: Sequence[str], figures: BinaryIO, errors: BinaryIO) -> subprocess.Popen[bytes]:
     """A process that ends with the thread that calls this."""
     return subprocess.Popen(
         [sys.executable, "-I", "-S", _BOUND, str(os.getpid()), *command],

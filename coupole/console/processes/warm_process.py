@@ -56,9 +56,9 @@ def _end_with_console() -> None:
 class WarmProcess:
     """One process, that does one thing after the other; a new one after it died or was ended."""
 
-    def __init__(self, what: str) -> None:
-        """`what` it does, for people: `reads plans`."""
-        self._what, self._lock = what, threading.Lock()
+    def __init__(self, activity: str) -> None:
+        """`activity`: what it does, for people: `reads plans`."""
+        self._what, self._lock = activity, threading.Lock()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(_IMPORTED)
         self._step = RawArray("c", _LONGEST_STEP)

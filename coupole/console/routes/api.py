@@ -64,30 +64,30 @@ def _add_sign_in(app: FastAPI, service: Service) -> None:
         return RedirectResponse("/run", 303)
 
     @app.post("/api/v1/sign-in", responses={401: {"description": "Wrong, or tried too often."}})
-    def sign_in(asked: SignIn, request: Request, response: Response) -> dict[str, str]:
+    def sign_in(credentials: SignIn, request: Request, response: Response) -> dict[str, str]:
         """Begin a session: a cookie for browsers, or for a script `session`, to be sent as `Authorization:
         Bearer`."""
         here = is_of_this_machine(request)
-        if asked.name:
-            account = service.accounts.sign_in(asked.name, asked.password, here=here)
+        if credentials.name:
+            account = service.accounts.sign_in(credentials.name, credentials.password, here=here)
         else:
-            account = service.accounts.sign_in_first(asked.token) if here else None
+            account = service.accounts.sign_in_first(credentials.token) if here else None
         if account is None:
             raise NotAllowed(401, "name or password are wrong, or were wrong too often: try again in a minute")
-        secret = service.sessions.begin(account, script=asked.script)
+        secret = service.sessions.begin(account, script=credentials.script)
         answer = {"name": account.name, "role": account.role.word}
-        if asked.script:
+        if credentials.script:
             return {**answer, "session": secret}
         safe = request.url.scheme == "https"
         response.set_cookie(service.cookie, secret, httponly=True, samesite="strict", secure=safe)
         return answer
 
     @app.post("/api/v1/sign-out")
-    def sign_out(who: Who, request: Request, response: Response) -> dict[str, str]:
+    def sign_out(person: Who, request: Request, response: Response) -> dict[str, str]:
         """End this session."""
         service.sessions.end(bearer_of(request) or request.cookies.get(service.cookie, ""))
         response.delete_cookie(service.cookie)
-        return {"name": who.name}
+        return {"name": person.name}
 
     @app.get("/api/v1/token")
     def token(request: Request) -> dict[str, str]:
@@ -111,11 +111,11 @@ def _add_cell(app: FastAPI, service: Service) -> None:
         return StreamingResponse(_events(service, request), media_type="text/event-stream")
 
     @app.post("/api/v1/queue", responses=REFUSALS)
-    async def add(asked: NewEntry, who: Who, request: Request) -> Entry:
+    async def add(new_entry: NewEntry, person: Who, request: Request) -> Entry:
         """Enter a plan, a run to be resumed, or a hold. Preflight is made first, for which this waits; what cannot
         be run with what runs and waits before it is refused with all its problems."""
-        allow(service, who, Role.OPERATOR, "queue", acts=True)
-        request.state.about = asked.plan or asked.resume or asked.hold
+        allow(service, person, Role.OPERATOR, "queue", acts=True)
+        request.state.about = new_entry.plan or new_entry.resume or new_entry.hold
         here = is_command_line(request)
 
         def may_still() -> None:
@@ -123,46 +123,46 @@ def _add_cell(app: FastAPI, service: Service) -> None:
                 raise NotAllowed(401, "the session is over: sign in again")
             if refusal := why_unwanted(request, service):
                 raise NotAllowed(409, refusal)
-            allow(service, who, Role.OPERATOR, "queue", acts=True)
+            allow(service, person, Role.OPERATOR, "queue", acts=True)
 
-        enter = partial(service.entering.enter, asked, who.name, by_command_line=here, may_still=may_still)
-        quick = asked.now or bool(asked.hold)
+        enter = partial(service.entering.enter, new_entry, person.name, by_command_line=here, may_still=may_still)
+        quick = new_entry.now or bool(new_entry.hold)
         limiter = None if quick else service.entering.one_at_a_time
         return await to_thread.run_sync(enter, limiter=limiter, abandon_on_cancel=True)
 
     @app.delete("/api/v1/queue/{entry}", responses=REFUSALS)
-    def remove(entry: Text, who: Who) -> dict[str, str]:
+    def remove(entry: Text, person: Who) -> dict[str, str]:
         """Take out an entry that waits."""
-        allow(service, who, Role.OPERATOR, "take out", acts=True)
+        allow(service, person, Role.OPERATOR, "take out", acts=True)
         service.queue.remove(entry)
         return {"removed": entry}
 
     @app.post("/api/v1/queue/{entry}/stop", responses=REFUSALS)
-    def stop(entry: Text, who: Who) -> dict[str, str]:
+    def stop(entry: Text, person: Who) -> dict[str, str]:
         """Stop what an entry has begun, at any time, also before its run has a name."""
-        allow(service, who, Role.OPERATOR, "stop")
+        allow(service, person, Role.OPERATOR, "stop")
         service.acquisitions.stop(service.queue.entry(entry))
         return {"stopped": entry}
 
     @app.post("/api/v1/queue/go-on", responses=REFUSALS)
-    def go_on(who: Who) -> StateNow:
+    def go_on(person: Who) -> StateNow:
         """Go on with the queue after a hold, a fault or a stop."""
-        allow(service, who, Role.OPERATOR, "go on with the queue", acts=True)
+        allow(service, person, Role.OPERATOR, "go on with the queue", acts=True)
         service.queue.go_on()
         return service.state()
 
     @app.post("/api/v1/runs/{run}/{command}", responses=REFUSALS)
-    def tell(run: Text, command: Literal["pause", "go-on", "stop"], who: Who) -> dict[str, Any]:
+    def tell(run: Text, command: Literal["pause", "go-on", "stop"], person: Who) -> dict[str, Any]:
         """Send a command to the run that is being acquired. Any operator may pause and stop, whoever is in
         control: this never harms. `stop` is answered when the lights are off and the arm was told to stop, or with
         the `trouble`."""
-        allow(service, who, Role.OPERATOR, command, acts=command == "go-on")
+        allow(service, person, Role.OPERATOR, command, acts=command == "go-on")
         return service.acquisitions.tell(run, command)
 
 
 async def _events(service: Service, request: Request) -> AsyncIterator[str]:
     before, said_s = "", 0.0
-    while session_of(request, service, used=False) is not None:
+    while session_of(request, service, counts_as_use=False) is not None:
         now = service.newest()
         state_text = now.model_dump_json(exclude={"t"})
         if state_text != before or time.monotonic() - said_s > _ALIVE_EVERY_S:
@@ -176,34 +176,34 @@ async def _events(service: Service, request: Request) -> AsyncIterator[str]:
 
 def _add_people(app: FastAPI, service: Service) -> None:
     @app.post("/api/v1/control/take", responses=REFUSALS)
-    def take(who: Who) -> dict[str, str]:
+    def take(person: Who) -> dict[str, str]:
         """Take control, or ask for it; an engineer, and anybody after five minutes without a sign, takes it."""
-        allow(service, who, Role.OPERATOR, "take control")
-        return asdict(service.control.take(who))
+        allow(service, person, Role.OPERATOR, "take control")
+        return asdict(service.control.take(person))
 
     @app.post("/api/v1/control/give", responses=REFUSALS)
-    def give(asked: Hand, who: Who) -> dict[str, str]:
+    def give(handover: Hand, person: Who) -> dict[str, str]:
         """Hand control over to who asked for it, or give it up."""
-        allow(service, who, Role.OPERATOR, "give control")
-        return asdict(service.control.give(who, asked.to))
+        allow(service, person, Role.OPERATOR, "give control")
+        return asdict(service.control.give(person, handover.to))
 
     @app.get("/api/v1/accounts", responses=REFUSALS)
-    def accounts(who: Who) -> list[dict[str, str]]:
+    def accounts(person: Who) -> list[dict[str, str]]:
         """All accounts, for engineers."""
-        if who.role < Role.ENGINEER:
+        if person.role < Role.ENGINEER:
             raise NotAllowed(403, "accounts: only for engineers")
-        return [{"name": account.name, "role": account.role.word} for account in service.accounts.listed()]
+        return [{"name": account.name, "role": account.role.word} for account in service.accounts.all_accounts()]
 
     @app.post("/api/v1/accounts", responses=REFUSALS)
-    def new_account(asked: NewAccount, who: Who) -> dict[str, str]:
+    def new_account(request: NewAccount, person: Who) -> dict[str, str]:
         """A new account."""
-        allow(service, who, Role.ENGINEER, "new account")
-        account = service.accounts.add(asked.name, asked.password, Role.of(asked.role))
+        allow(service, person, Role.ENGINEER, "new account")
+        account = service.accounts.add(request.name, request.password, Role.of(request.role))
         return {"name": account.name, "role": account.role.word}
 
     @app.delete("/api/v1/accounts/{name}", responses=REFUSALS)
-    def no_account(name: Text, who: Who) -> dict[str, str]:
+    def no_account(name: Text, person: Who) -> dict[str, str]:
         """Take an account away; its sessions are over."""
-        allow(service, who, Role.ENGINEER, "remove account")
+        allow(service, person, Role.ENGINEER, "remove account")
         service.accounts.remove(name)
         return {"removed": name}

@@ -26,17 +26,17 @@ def add_routes_at_the_cell(app: FastAPI, service: Service) -> None:
     _add_light(app, service, service.cell)
 
     @app.post("/api/v1/queue/{entry}/move", responses=REFUSALS)
-    async def move(entry: Text, asked: Move, who: Who) -> StateNow:
+    async def move(entry: Text, place: Move, person: Who) -> StateNow:
         """Put an entry that waits before another one, or at the end."""
-        allow(service, who, Role.OPERATOR, "move", acts=True)
+        allow(service, person, Role.OPERATOR, "move", acts=True)
         limiter = service.entering.one_at_a_time
-        await to_thread.run_sync(service.entering.move, entry, asked.before, limiter=limiter)
+        await to_thread.run_sync(service.entering.move, entry, place.before, limiter=limiter)
         return service.state()
 
     @app.delete("/api/v1/preflight", responses=REFUSALS)
-    def give_up(who: Who) -> dict[str, str]:
+    def give_up(person: Who) -> dict[str, str]:
         """Give up the preflight that is being made: what it is of is not entered."""
-        allow(service, who, Role.OPERATOR, "give up a preflight")
+        allow(service, person, Role.OPERATOR, "give up a preflight")
         words = service.entering.preflight.words
         service.entering.preflight.give_up()
         return {"given_up": words}
@@ -56,24 +56,24 @@ def _add_loan(app: FastAPI, service: Service) -> None:
         return request.client.port
 
     @app.post("/api/v1/cell/lease", responses=REFUSALS)
-    def lend(asked: Lease, who: Who, request: Request) -> dict[str, str]:
+    def lend(lease: Lease, person: Who, request: Request) -> dict[str, str]:
         """Lend the cell to the process that asks, by the Unix socket, until it gives it back or ends. The queue
         waits meanwhile. A process that the console itself has begun acts for whoever asked for it there."""
-        allow(service, who, Role.OPERATOR, asked.what)
+        allow(service, person, Role.OPERATOR, lease.what)
         pid = borrower(request)
         if not begun_here(pid):
-            allow(service, who, Role.OPERATOR, asked.what, acts=True)
-        request.state.about = asked.what
+            allow(service, person, Role.OPERATOR, lease.what, acts=True)
+        request.state.about = lease.what
         try:
-            service.acquisitions.lend(pid, who.name, asked.what)
+            service.acquisitions.lend(pid, person.name, lease.what)
         except InputError as error:
-            raise NotAllowed(409, f"{asked.what}: {error}") from error
+            raise NotAllowed(409, f"{lease.what}: {error}") from error
         return {"lent_to": service.acquisitions.lending.lent_to}
 
     @app.delete("/api/v1/cell/lease", responses=REFUSALS)
-    def give_back(who: Who, request: Request) -> dict[str, str]:
+    def give_back(person: Who, request: Request) -> dict[str, str]:
         """Give the cell back."""
-        allow(service, who, Role.OPERATOR, "give back")
+        allow(service, person, Role.OPERATOR, "give back")
         service.acquisitions.lending.give_back(borrower(request))
         return {"lent_to": service.acquisitions.lending.lent_to}
 
@@ -88,29 +88,31 @@ def _add_light(app: FastAPI, service: Service, cell: Cell) -> None:
         return document(ledger_of(cell, thing))
 
     @app.post("/api/v1/objects/{thing}/light", responses=REFUSALS)
-    def enter(thing: Text, asked: Light, who: Who, request: Request) -> dict[str, Any]:
+    def enter(thing: Text, new_light: Light, person: Who, request: Request) -> dict[str, Any]:
         """Enter light that was given elsewhere in an object's ledger."""
-        allow(service, who, Role.OPERATOR, "enter light")
-        request.state.about = f"{asked.dose_lux_h:g} lux.h: {asked.note}"
+        allow(service, person, Role.OPERATOR, "enter light")
+        request.state.about = f"{new_light.dose_lux_h:g} lux.h: {new_light.note}"
         ledger = ledger_of(cell, thing)
-        ledger.enter(asked.dose_lux_h, asked.note)
+        ledger.enter(new_light.dose_lux_h, new_light.note)
         return document(ledger)
 
     @app.post("/api/v1/objects/{thing}/budget", responses=REFUSALS)
-    def set_budget(thing: Text, asked: Budget, who: Who, request: Request) -> dict[str, Any]:
+    def set_budget(thing: Text, budget: Budget, person: Who, request: Request) -> dict[str, Any]:
         """Say what an object may receive in its life, by a named person's word."""
-        allow(service, who, Role.OPERATOR, "set a light budget")
-        request.state.about = f"{asked.dose_lux_h:g} lux.h: {asked.reason}"
+        allow(service, person, Role.OPERATOR, "set a light budget")
+        request.state.about = f"{budget.dose_lux_h:g} lux.h: {budget.reason}"
         ledger = ledger_of(cell, thing)
-        name = asked.name.strip() or who.name
-        ledger.set_budget(asked.dose_lux_h, name if name == who.name else f"{name} (by {who.name})", asked.reason)
+        name = budget.name.strip() or person.name
+        ledger.set_budget(
+            budget.dose_lux_h, name if name == person.name else f"{name} (by {person.name})", budget.reason
+        )
         return document(ledger)
 
     @app.post("/api/v1/objects/{thing}/warning", responses=REFUSALS)
-    def warn(thing: Text, asked: Warn, who: Who, request: Request) -> dict[str, Any]:
+    def warn(thing: Text, warning: Warn, person: Who, request: Request) -> dict[str, Any]:
         """Have an object's ledger warn of more light than this."""
-        allow(service, who, Role.OPERATOR, "warn")
-        request.state.about = f"above {asked.above_lux_h} lux.h"
+        allow(service, person, Role.OPERATOR, "warn")
+        request.state.about = f"above {warning.above_lux_h} lux.h"
         ledger = ledger_of(cell, thing)
-        ledger.warn_above(asked.above_lux_h)
+        ledger.warn_above(warning.above_lux_h)
         return document(ledger)

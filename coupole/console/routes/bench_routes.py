@@ -69,7 +69,7 @@ class _Hold:
         try:
             while True:
                 jog_request = await self._socket.receive_json()
-                work = await to_thread.run_sync(self._renewed, jog_request)
+                work = await to_thread.run_sync(self._press_or_renew, jog_request)
                 if not is_moving:
                     is_moving = True
                     self._note(f"begins to move {_words(jog_request)}", 200)
@@ -87,15 +87,15 @@ class _Hold:
             await self._socket.send_json({"ended": outcome})
             await self._socket.close()
 
-    def _renewed(self, asked: Any) -> dict[str, Any]:
+    def _press_or_renew(self, request: Any) -> dict[str, Any]:
         """Press or renew. Raises NotAllowed, InputError."""
-        if not isinstance(asked, dict) or set(asked) != _RENEWED:
+        if not isinstance(request, dict) or set(request) != _RENEWED:
             raise InputError(f"expected {', '.join(sorted(_RENEWED))}")
         if refusal := self._service.loop_watch.refusal(HELD_STOOD_STILL_S):
             raise NotAllowed(409, refusal)
-        allow(self._service, self._who(), Role.OPERATOR, "move by hand", acts=True)
+        allow(self._service, self._account(), Role.OPERATOR, "move by hand", acts=True)
         goes_on = {"hold": self._number} if self._number is not None else {}
-        self._asked = {**asked, "from": address_of(self._socket)}
+        self._asked = {**request, "from": address_of(self._socket)}
         work = self._service.bench.ask("jog", **self._asked, **goes_on)
         self._number = int(work["hold"])
         return work
@@ -109,7 +109,7 @@ class _Hold:
             self._service.bench.ask("jog", **reversed_jog)
         return "the button was let go, or the connection was lost"
 
-    def _who(self) -> Account:
+    def _account(self) -> Account:
         session = session_of(self._socket, self._service)
         if session is None:
             raise NotAllowed(401, "the session is over: sign in again")
@@ -121,5 +121,5 @@ class _Hold:
         self._service.audit.note(name, f"hold {words}", status, address_of(self._socket))
 
 
-def _words(asked: dict[str, Any]) -> str:
-    return f"{asked['axis']} {'+' if asked['direction'] > 0 else '-'}"
+def _words(request: dict[str, Any]) -> str:
+    return f"{request['axis']} {'+' if request['direction'] > 0 else '-'}"

@@ -32,9 +32,9 @@ def add_object_routes(app: FastAPI, service: Service) -> None:
 
     @app.put("/api/v1/objects/{object_id}/photograph", responses=REFUSALS)
     def keep(
-        object_id: Text, picture: Annotated[bytes, Body(media_type="application/octet-stream")], who: Who
+        object_id: Text, picture: Annotated[bytes, Body(media_type="application/octet-stream")], person: Who
     ) -> dict[str, str]:
         """Keep a picture (JPEG, PNG or TIFF, at most 20 MB) in place of the one before."""
-        allow(service, who, Role.OPERATOR, "photograph")
+        allow(service, person, Role.OPERATOR, "photograph")
         service.objects.keep_photograph(object_id, picture)
         return {"object": object_id}

@@ -73,7 +73,7 @@ class FrameSheets:
                 shot.label.exposure,
                 int(exposures[event.index]),
             )
-            for shot, event in sorted(proven.items(), key=lambda one: _order(one[0]))
+            for shot, event in sorted(proven.items(), key=lambda entry: _order(entry[0]))
         ]
 
     def places(self, name: str) -> dict[int, LedPlace]:
@@ -84,7 +84,7 @@ class FrameSheets:
 
     def known_means(self, name: str, shots: Sequence[str]) -> dict[str, float]:
         """Return those of `means` that were read before. Raises InputError, StorageError."""
-        known_means, proven = self._kept(name), self._runs.proven(name)
+        known_means, proven = self._stored_means(name), self._runs.proven(name)
         mean_of_shot = {
             shot: known_means.get(proven[shot_id].xxh3)
             for shot in shots
@@ -96,7 +96,7 @@ class FrameSheets:
         """The mean above black of each of these proven frames of one view, as a share of full scale, by at most
         256 pairs of rows; `tell` is told how many of how many are read. Raises InputError, StorageError."""
         with self._reading:
-            known_means, proven = self._kept(name), self._runs.proven(name)
+            known_means, proven = self._stored_means(name), self._runs.proven(name)
             events = [proven[ShotId.parse(shot)] for shot in shots]
             missing = [event for event in events if event.xxh3 not in known_means]
             view = self._runs.view(name, missing) if missing else None
@@ -108,7 +108,7 @@ class FrameSheets:
                     self._keep(name, known_means)
         return {shot: known_means[event.xxh3] for shot, event in zip(shots, events, strict=True)}
 
-    def _kept(self, name: str) -> dict[str, float]:
+    def _stored_means(self, name: str) -> dict[str, float]:
         """Means by the frames' checksums."""
         self._runs.run(name)
         try:
@@ -117,10 +117,10 @@ class FrameSheets:
             return {}
         return means
 
-    def _keep(self, name: str, kept: dict[str, float]) -> None:
+    def _keep(self, name: str, means: dict[str, float]) -> None:
         make_folder(self._folder)
         partial = self._folder / f".{name}.part"
-        partial.write_text(json.dumps(kept), encoding="utf-8")
+        partial.write_text(json.dumps(means), encoding="utf-8")
         partial.replace(self._folder / f"{name}.json")
 
 

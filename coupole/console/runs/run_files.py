@@ -78,16 +78,16 @@ class _Followed:
     def event(self, shot: ShotId) -> FrameProven | None:
         """Raises StorageError."""
         with self._lock:
-            self._read()
+            self._read_news()
             return self._proven.get(shot)
 
-    def all(self) -> dict[ShotId, FrameProven]:
+    def proven_frames(self) -> dict[ShotId, FrameProven]:
         """Raises StorageError."""
         with self._lock:
-            self._read()
+            self._read_news()
             return dict(self._proven)
 
-    def _read(self) -> None:
+    def _read_news(self) -> None:
         try:
             about = self._path.stat()
         except OSError:
@@ -137,7 +137,7 @@ class RunFiles:
 
     def proven(self, name: str) -> dict[ShotId, FrameProven]:
         """Raises InputError, StorageError."""
-        return self._follow(name).all()
+        return self._follow(name).proven_frames()
 
     def _follow(self, name: str) -> _Followed:
         """The frames of the runs that were asked for last are kept."""
@@ -204,7 +204,7 @@ class RunFiles:
             self._notes.mkdir(parents=True, exist_ok=True)
             (self._notes / name).write_text(f"{t} {before}", encoding="utf-8")
 
-    def _verified(self, name: str, fingerprint: str) -> str:
+    def _verified_at(self, name: str, fingerprint: str) -> str:
         try:
             t, noted_fingerprint = (self._notes / name).read_text(encoding="utf-8").split()
         except (OSError, ValueError):
@@ -218,7 +218,7 @@ class RunFiles:
         if row is None or known_fingerprint != fingerprint or row.state in ("running", "paused", "created"):
             row = self._read_row(name)
             self._rows[name] = fingerprint, row
-        verified_at = self._verified(name, fingerprint)
+        verified_at = self._verified_at(name, fingerprint)
         return row if verified_at == row.verified else RunRow(**{**vars(row), "verified": verified_at})
 
     def _read_row(self, name: str) -> RunRow:

@@ -37,14 +37,14 @@ class Watched:
 class _Followed:
     run: Run
     follower: Follower
-    expected: Counter[str]
+    expected_counts: Counter[str]
     proven: Counter[str] = field(default_factory=Counter)
     newest: FrameProven | None = None
     reshot: int = 0
     hottest_board_c: float | None = None
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS_KEPT))
 
-    def read(self) -> None:
+    def read_news(self) -> None:
         for event in self.follower.news():
             match event:
                 case FrameProven():
@@ -80,17 +80,19 @@ class RunWatch:
                 followed_run = self._followed = _Followed(run, Follower(run.journal_path), shots_of_view)
                 self._read_s = 0.0
             if self._known is None or self._known.run != name or time.monotonic() - self._read_s > _NO_OFTENER_S:
-                followed_run.read()
-                self._known, self._read_s = _watched(followed_run), time.monotonic()
+                followed_run.read_news()
+                self._known, self._read_s = _watched_run(followed_run), time.monotonic()
             return self._known
 
 
-def _watched(followed: _Followed) -> Watched:
+def _watched_run(followed_run: _Followed) -> Watched:
     return Watched(
-        run=followed.run.folder.name,
-        views=tuple((view, followed.proven[view], count) for view, count in followed.expected.items()),
-        newest=followed.newest,
-        reshot=followed.reshot,
-        hottest_board_c=followed.hottest_board_c,
-        events=tuple(followed.events),
+        run=followed_run.run.folder.name,
+        views=tuple(
+            (view, followed_run.proven[view], count) for view, count in followed_run.expected_counts.items()
+        ),
+        newest=followed_run.newest,
+        reshot=followed_run.reshot,
+        hottest_board_c=followed_run.hottest_board_c,
+        events=tuple(followed_run.events),
     )

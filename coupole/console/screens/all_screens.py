@@ -22,7 +22,7 @@ from coupole.console.screens import (
     runs_screen,
     system_screen,
 )
-from coupole.console.screens.frame import Place, framed
+from coupole.console.screens.frame import Place, screen_frame
 from coupole.console.screens.visit import Visit
 from coupole.console.service_parts import Service
 
@@ -78,5 +78,5 @@ def _add(service: Service, path: str, place: Place, build: Build) -> None:
     @ui.page(path, title=f"{place.title} · Coupole")
     def page(request: Request) -> None:
         visit = Visit(service, request)
-        with framed(visit, place, tuple(SCREENS)):
+        with screen_frame(visit, place, tuple(SCREENS)):
             build(visit, **request.path_params)

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from coupole.console.screens.arm_picture import ArmPicture
 from coupole.console.screens.frame import NO_EMERGENCY_STOP, stop_bench
-from coupole.console.screens.parts import Choice, button, facts_html, named, panel
+from coupole.console.screens.parts import Choice, button, facts_html, panel, with_name
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 from coupole.viewing.terminal import duration_text
@@ -40,8 +40,8 @@ class ArmPanel:
                 self._picture = ArmPicture(visit.service.cell)
             with ui.column().classes("gap"):
                 with panel("The arm"):
-                    self._facts = named(ui.html("", sanitize=False), "arm").style("width:100%")
-                    self._joints = named(ui.html("", sanitize=False), "joints").style("width:100%")
+                    self._facts = with_name(ui.html("", sanitize=False), "arm").style("width:100%")
+                    self._joints = with_name(ui.html("", sanitize=False), "joints").style("width:100%")
                 with panel("Drive to"):
                     self._driving()
         with panel("Move by hand"):
@@ -73,7 +73,7 @@ class ArmPanel:
             self._drive = button("Drive", self._drive_path, icon="play_arrow", name="drive", kind="main")
             stop = button("Stop", lambda: stop_bench(self._visit), icon="stop", name="stop-arm", kind="stop")
             stop.set_enabled(self._visit.may_act)
-        self._words = named(ui.label("First look at the path, then drive.").classes("hint"), "path")
+        self._words = with_name(ui.label("First look at the path, then drive.").classes("hint"), "path")
         self._words.props("role=status")
         ui.label(NO_EMERGENCY_STOP).classes("small")
 
@@ -143,14 +143,14 @@ class ArmPanel:
 
 
 def _condition(arm: dict[str, Any]) -> dict[str, str]:
-    def told(value: bool | None, yes: str, no: str) -> str:
+    def flag_text(value: bool | None, yes: str, no: str) -> str:
         return "not told by this controller" if value is None else yes if value else no
 
     rows = {
         "mode": str(arm["mode"] or "not told by this controller"),
-        "emergency stop": told(arm["emergency_stop"], "PRESSED", "not pressed"),
-        "protective stop": told(arm["protective_stop"], "STOPPED", "no"),
-        "brakes": told(arm["brakes_released"], "released", "closed"),
+        "emergency stop": flag_text(arm["emergency_stop"], "PRESSED", "not pressed"),
+        "protective stop": flag_text(arm["protective_stop"], "STOPPED", "no"),
+        "brakes": flag_text(arm["brakes_released"], "released", "closed"),
         "moves": "yes" if arm["moving"] else "no",
     }
     if arm["fault"]:
@@ -187,8 +187,8 @@ class _Hand:
             Choice("Speed of the fastest point", _SHARES, name="share", value="0.4")
             self._words = ui.label().classes("hint hand-words")
         self._buttons = ui.html("", sanitize=False).style("width:100%")
-        self._switch = named(ui.label().classes("small"), "enabling-switch")
-        self._said = named(ui.label("No button is held."), "hand-said").props("role=status")
+        self._switch = with_name(ui.label().classes("small"), "enabling-switch")
+        self._said = with_name(ui.label("No button is held."), "hand-said").props("role=status")
         ui.label(
             "Hold a button with pointer, Space or Enter; the arm stops when it is let go, when the page is "
             "hidden, and 300 ms after it was last heard. Watch the arm, with your hand at the emergency stop."

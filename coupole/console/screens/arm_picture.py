@@ -12,7 +12,7 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from coupole.console.screens.parts import button, named
+from coupole.console.screens.parts import button, with_name
 from coupole.plan.cell import Cell
 
 Points = NDArray[np.float64]
@@ -39,7 +39,7 @@ class ArmPicture:
         with ui.element("div").classes("arm-pictures"):
             self._front = self._projection("from the front", self._cell_svg((0, 2)))
             self._top = self._projection("from above", self._cell_svg((0, 1)))
-        self._words = named(ui.label().classes("hint"), "posture")
+        self._words = with_name(ui.label().classes("hint"), "posture")
         self._turned = button("Turn it in 3D", self._toggle, icon="3d_rotation", name="in-3d", kind="flat")
         self._place = ui.column().classes("cell")
         self._model: _Model | None = None

@@ -7,7 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
-from coupole.console.screens.parts import Choice, button, named, panel
+from coupole.console.screens.parts import Choice, button, panel, with_name
 from coupole.console.screens.visit import Visit, in_thread
 
 _LOOK_EVERY_S = 0.2
@@ -22,11 +22,11 @@ class BenchBar:
         self._visit, self._bench, self._show = visit, visit.service.bench, show
         self._shown: object = ()
         with panel(), ui.row().classes("bar"):
-            self._words = named(ui.label(), "bench").props("role=status")
+            self._words = with_name(ui.label(), "bench").props("role=status")
             ui.space()
             self._plan = Choice("On the support lies the object of", {_NOTHING: "nothing"}, name="object-plan")
-            self._open = button("Open the devices", self._opened, icon="power", name="open", kind="main")
-            self._close = button("Close the devices", self._closed, icon="power_off", name="close")
+            self._open = button("Open the devices", self._open_devices, icon="power", name="open", kind="main")
+            self._close = button("Close the devices", self._close_devices, icon="power_off", name="close")
         self._tell()
         ui.timer(0.0, self._offer_plans, once=True)
         ui.timer(_LOOK_EVERY_S, self._tell)
@@ -36,12 +36,12 @@ class BenchBar:
         options = {name: name for name in names} | {_NOTHING: "no plan: the support is empty"}
         self._plan.set_options(options, names[0] if names else _NOTHING)
 
-    async def _opened(self) -> None:
+    async def _open_devices(self) -> None:
         account, plan = self._visit.account, self._plan.value
         name = account.name if account else ""
         await self._visit.act(f"open the devices, {plan or 'empty'}", lambda: self._bench.open(name, plan))
 
-    async def _closed(self) -> None:
+    async def _close_devices(self) -> None:
         trouble = await self._visit.act("close the devices", self._bench.close)
         if trouble:
             self._visit.say("; ".join(trouble), bad=True)

@@ -25,7 +25,7 @@ _THINGS = {
 }
 
 
-def placed(step: str) -> str:
+def support_svg(step: str) -> str:
     """SVG of the support with what a step (by its name) wants on it."""
     thing, words, dark = _THINGS[step]
     return (

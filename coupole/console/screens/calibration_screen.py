@@ -9,8 +9,8 @@ from nicegui import ui
 
 from coupole.console.cell.calibration_status import PlanRow, RecordRow, StepNow
 from coupole.console.people.accounts import Role
-from coupole.console.screens.calibration_pictures import placed
-from coupole.console.screens.parts import button, count, moment, named, panel, sure, table_html
+from coupole.console.screens.calibration_pictures import support_svg
+from coupole.console.screens.parts import button, count, moment, panel, sure, table_html, with_name
 from coupole.console.screens.task_list import TaskList
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
@@ -31,10 +31,10 @@ class _InForce:
     def __init__(self, visit: Visit) -> None:
         self._visit = visit
         with panel("In force for this rig"):
-            self._records = named(ui.html("", sanitize=False), "records").style("width:100%")
+            self._records = with_name(ui.html("", sanitize=False), "records").style("width:100%")
         with panel("Plans"):
             self._words = ui.label("Reading the plans …").classes("hint")
-            self._plans = named(ui.html("", sanitize=False), "plans").style("width:100%")
+            self._plans = with_name(ui.html("", sanitize=False), "plans").style("width:100%")
             button("Look again", self._look, name="look-again", icon="refresh")
         ui.timer(0.01, self._look, once=True)
 
@@ -64,7 +64,7 @@ _HEADS = ("record", "state", "made (UTC)", "age", "expires", "margin", "nearest 
 
 def _record_cells(row: RecordRow) -> list[str]:
     if row.path is None:
-        why = "bad|none; plans that want calibrations need it" if row.needed else "none in force"
+        why = "bad|none; plans that want calibrations need it" if row.is_needed else "none in force"
         return [row.kind, why, "", "", "", "", ""]
     if not row.kind:
         return [row.path.name, f"bad|{' '.join(row.against)}", "", "", "", "", ""]
@@ -75,7 +75,15 @@ def _record_cells(row: RecordRow) -> list[str]:
     if row.margin is not None and row.margin < _NARROW:
         margin = f"{'bad' if row.margin < 0 else 'warm'}|{margin}"
     state = f"bad|{'; '.join(row.against)}" if row.against else "good|holds"
-    return [row.kind, state, moment(row.created), count(round(row.age_days), "day"), expiry, margin, row.tightest]
+    return [
+        row.kind,
+        state,
+        moment(row.created_at),
+        count(round(row.age_days), "day"),
+        expiry,
+        margin,
+        row.tightest,
+    ]
 
 
 def _plan_cells(row: PlanRow) -> list[str]:
@@ -108,7 +116,9 @@ class _Campaign:
         status = self._visit.service.calibrations
         folder = await in_thread(status.campaign)
         steps = await in_thread(status.steps, folder or Path())
-        under_way = any(task.running for task in self._visit.service.tasks.listed if task.command[0] == WORDS_OF)
+        under_way = any(
+            task.running for task in self._visit.service.tasks.newest_first if task.command[0] == WORDS_OF
+        )
         self._new.set_enabled(self._visit.is_engineer and not under_way)
         self._where.set_text(
             f"Plans, runs and records are in {folder}." if folder else "Nothing is begun. An engineer begins."
@@ -119,11 +129,11 @@ class _Campaign:
         self._shown = state
         self._steps.clear()
         with self._steps:
-            following = next((step.step.name for step in steps if not step.done), "")
+            following = next((step.step.name for step in steps if not step.is_done), "")
             for number, step in enumerate(steps, 1):
                 self._card(number, step, folder, may=step.step.name == following and not under_way)
         self._lines.clear()
-        if folder is not None and any(step.made for step in steps):
+        if folder is not None and any(step.accepted_kinds for step in steps):
             with self._lines:
                 ui.label(f"To put them in force for all plans, write in {status.rig_path}:").classes("hint")
                 ui.html(html.escape(status.lines_for_the_rig(folder)), sanitize=False).classes("mono")
@@ -132,12 +142,12 @@ class _Campaign:
         step = now.step
         with ui.column().classes("step"):
             ui.html(f"<h3>{number}. {html.escape(step.name)}</h3>", sanitize=False)
-            ui.html(placed(step.name), sanitize=False).style("width:100%")
+            ui.html(support_svg(step.name), sanitize=False).style("width:100%")
             ui.label(f"On the support: {step.stands}.")
             ui.label(f"Makes: {', '.join(step.records)}.").classes("hint")
-            if now.missed:
-                ui.label("not accepted: " + "; ".join(now.missed)).classes("bad")
-            elif now.done:
+            if now.missed_limits:
+                ui.label("not accepted: " + "; ".join(now.missed_limits)).classes("bad")
+            elif now.is_done:
                 ui.label("done, accepted").classes("good")
             elif folder is not None:
                 begin = button("It is placed: begin", lambda: self._begin(now, folder), name=f"begin-{step.name}")
@@ -164,6 +174,6 @@ class _Campaign:
             words,
             lambda: self._visit.service.tasks.begin(words, command, account.name if account else ""),
             role=Role.ENGINEER,
-            done=f"{words}: begun",
+            done_text=f"{words}: begun",
         )
         await self._look()

@@ -32,11 +32,11 @@ class ContactSheet:
             self._where = ui.label("").props("role=status data-name=page")
             self._after = button("After", lambda: self._turn(1), name="page-after", icon="chevron_right")
 
-        def chosen(event: events.GenericEventArguments) -> object:
+        def on_choice(event: events.GenericEventArguments) -> object:
             return pick(str(event.args))
 
         self._sheet = ui.html("", sanitize=False).props("data-name=sheet").style("width:100%")
-        self._sheet.on("click", chosen, js_handler=_EMIT_CLICKED)
+        self._sheet.on("click", on_choice, js_handler=_EMIT_CLICKED)
 
     def show(self, frames: Sequence[SheetFrame]) -> None:
         """These, from the first page."""

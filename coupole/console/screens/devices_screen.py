@@ -8,7 +8,7 @@ from nicegui import ui
 
 from coupole.console.screens.arm_panel import ArmPanel
 from coupole.console.screens.bench_bar import BenchBar
-from coupole.console.screens.parts import button, facts_html, named, panel
+from coupole.console.screens.parts import button, facts_html, panel, with_name
 from coupole.console.screens.visit import Visit
 
 _CARDS = {"ledbox": "LED box", "camera": "Camera", "robot": "Arm"}
@@ -57,7 +57,7 @@ class _Card:
     def __init__(self, screen: _Screen, kind: str) -> None:
         self._visit, self._busy = screen._visit, False
         with panel(_CARDS[kind]):
-            self._facts = named(ui.html("", sanitize=False), f"device-{kind}").style("width:100%")
+            self._facts = with_name(ui.html("", sanitize=False), f"device-{kind}").style("width:100%")
             self._error = ui.label().classes("bad small").props("role=status")
             self._test = button(
                 "Test itself",
@@ -65,7 +65,7 @@ class _Card:
                 icon="fact_check",
                 name=f"test-{kind}",
             )
-            self._report = named(ui.html("", sanitize=False), f"report-{kind}").style("width:100%")
+            self._report = with_name(ui.html("", sanitize=False), f"report-{kind}").style("width:100%")
 
     def busy(self, busy: bool) -> None:
         self._busy = busy

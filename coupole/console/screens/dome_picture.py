@@ -48,11 +48,11 @@ class DomePicture:
         """`pick` is called with the shot of an LED that was chosen."""
         self._picture = ui.html("", sanitize=False).classes("dome").props("data-name=dome")
 
-        def chosen(event: events.GenericEventArguments) -> object:
+        def on_choice(event: events.GenericEventArguments) -> object:
             return pick(str(event.args))
 
-        self._picture.on("click", chosen, js_handler=_EMIT_CLICKED)
-        self._picture.on("keydown", chosen, js_handler=_EMIT_NEXT)
+        self._picture.on("click", on_choice, js_handler=_EMIT_CLICKED)
+        self._picture.on("keydown", on_choice, js_handler=_EMIT_NEXT)
 
     def show(
         self, places: Mapping[int, LedPlace], frames: Sequence[SheetFrame], means: Mapping[str, float]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from coupole.console.screens.parts import button, named, panel
+from coupole.console.screens.parts import button, panel, with_name
 from coupole.console.screens.visit import Visit
 from coupole.errors import InputError
 from coupole.storage.arm_faults import faults_of
@@ -19,8 +19,10 @@ class FaultOfArm:
         with self._panel:
             self._words = ui.label().classes("bad")
             ui.label("Find its cause, see that the cell is clear; then say so, with your name.").classes("hint")
-            self._cause = named(ui.input("What the cause was").classes("field"), "cause")
-            self._confirm = button("I was at the cell: the arm may move", self._said, name="confirm", kind="main")
+            self._cause = with_name(ui.input("What the cause was").classes("field"), "cause")
+            self._confirm = button(
+                "I was at the cell: the arm may move", self._confirm_fault, name="confirm", kind="main"
+            )
 
     def show(self, fault: str) -> None:
         """`fault` is empty if none stands."""
@@ -28,7 +30,7 @@ class FaultOfArm:
         self._words.text = fault
         self._confirm.set_enabled(self._visit.may_act)
 
-    async def _said(self) -> None:
+    async def _confirm_fault(self) -> None:
         account, cause = self._visit.account, str(self._cause.value or "").strip()
         faults = faults_of(self._visit.service.cell)
 
@@ -42,5 +44,7 @@ class FaultOfArm:
             faults.confirm(account.name, cause)
             return True
 
-        if await self._visit.act(f"confirm the arm: {cause}", confirm, done="confirmed: the arm may move again"):
+        if await self._visit.act(
+            f"confirm the arm: {cause}", confirm, done_text="confirmed: the arm may move again"
+        ):
             self._cause.set_value("")

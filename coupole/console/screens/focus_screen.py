@@ -13,7 +13,7 @@ from coupole.console.plans.plan_fields import fields_of
 from coupole.console.screens.bench_bar import BenchBar
 from coupole.console.screens.look_picture import LookPicture
 from coupole.console.screens.meter_panel import MeterPanel
-from coupole.console.screens.parts import button, clipping_words, facts_html, histogram_svg, named, panel
+from coupole.console.screens.parts import button, clipping_words, facts_html, histogram_svg, panel, with_name
 from coupole.console.screens.picture_settings import PictureSettings
 from coupole.console.screens.sharpness import Sharpness
 from coupole.console.screens.visit import Visit, in_thread
@@ -59,14 +59,14 @@ class _Screen:
         with panel("Picture"):
             with ui.row().classes("bar"):
                 self._live_button = button("Live", self._toggle, icon="videocam", name="live", kind="main")
-                self._once = button("One picture", self._one, icon="photo_camera", name="expose")
+                self._once = button("One picture", self._take_one, icon="photo_camera", name="expose")
                 self._settings.build_marks(self._set_grid)
-            self._refused = named(ui.label().classes("bad"), "refused").props("role=alert")
+            self._refused = with_name(ui.label().classes("bad"), "refused").props("role=alert")
             self._picture = LookPicture(self._visit, self._settings.set_region)
-            self._words = named(ui.label("No picture yet.").classes("hint"), "picture").props("role=status")
+            self._words = with_name(ui.label("No picture yet.").classes("hint"), "picture").props("role=status")
 
-    def _set_grid(self, shown: bool) -> None:
-        self._picture.set_grid(shown)
+    def _set_grid(self, is_shown: bool) -> None:
+        self._picture.set_grid(is_shown)
 
     def _build_region(self) -> None:
         with panel("Region and loupe"):
@@ -78,7 +78,7 @@ class _Screen:
     def _build_figures(self) -> None:
         with panel("Exposure"):
             self._histogram = ui.html("", sanitize=False).style("width:100%")
-            self._figures = named(ui.html("", sanitize=False), "exposed").style("width:100%")
+            self._figures = with_name(ui.html("", sanitize=False), "exposed").style("width:100%")
             with ui.row().classes("bar"):
                 self._white_button = button(
                     "White is in the region", self._take_white, icon="colorize", name="white"
@@ -86,9 +86,9 @@ class _Screen:
                 button(
                     "As the sensor sees it", lambda: self._settings.set_white(None), name="no-white", kind="flat"
                 )
-            self._white_words = named(ui.label().classes("small"), "white-words")
+            self._white_words = with_name(ui.label().classes("small"), "white-words")
         with panel("Light on the object"):
-            self._dose = named(ui.html("", sanitize=False), "bench-dose").style("width:100%")
+            self._dose = with_name(ui.html("", sanitize=False), "bench-dose").style("width:100%")
 
     # -- the bench's state --------------------------------------------------------------------------------------
 
@@ -113,7 +113,7 @@ class _Screen:
         if not name:
             return
         try:
-            fields = fields_of(plans.path(name), await in_thread(plans.read, name))
+            fields = fields_of(plans.path(name), await in_thread(plans.read_text, name))
         except CoupoleError as error:
             self._visit.say(str(error), bad=True)
             return
@@ -162,9 +162,9 @@ class _Screen:
         if not self._live or self._asking:
             return
         why = self._ending or why_live_ends(
-            watched=self._visit.is_watched,
+            is_watched=self._visit.is_watched,
             untouched_s=time.monotonic() - self._touched_s,
-            stopped=self._was_stopped,
+            is_stopped=self._was_stopped,
         )
         if why:
             self._end_live(why)
@@ -184,7 +184,7 @@ class _Screen:
         except CoupoleError:  # the devices are closed
             return True
 
-    async def _one(self) -> None:
+    async def _take_one(self) -> None:
         self._refused.text = ""
         await self._expose(live=False)
 
@@ -193,7 +193,7 @@ class _Screen:
         picture: dict[str, Any] | None = None
         try:
             request, words = self._settings.request(), self._settings.light_words
-            comparison_key = self._settings.compared
+            comparison_key = self._settings.comparison_key
             if live:
                 picture = await self._taken_live(request)
             else:
@@ -209,35 +209,37 @@ class _Screen:
             self._show_picture(picture, request, words, comparison_key)
         self._enable()
 
-    async def _taken_live(self, asked: dict[str, Any]) -> dict[str, Any]:
+    async def _taken_live(self, request: dict[str, Any]) -> dict[str, Any]:
         account = self._visit.account
         if account is None:
             raise NotAllowed(401, "the session is over: sign in again")
         allow(self._visit.service, account, Role.OPERATOR, "live pictures", acts=True)
-        picture = await in_thread(self._bench.ask, "frame", **asked, stops=self._stops)
+        picture = await in_thread(self._bench.ask, "frame", **request, stops=self._stops)
         self._taken += 1
         self._given_lux_h += picture["dose_lux_h"]
         return picture
 
-    def _show_picture(self, found: dict[str, Any], asked: dict[str, Any], words: str, compared: object) -> None:
-        self._picture.show(found, asked["gains"])
-        where = found["region"] or found
-        of = "of the region" if found["region"] else "of the whole picture"
-        self._sharpness.add(where["sharpness"], compared, of)
+    def _show_picture(
+        self, picture: dict[str, Any], request: dict[str, Any], words: str, comparison_key: object
+    ) -> None:
+        self._picture.show(picture, request["gains"])
+        where = picture["region"] or picture
+        of = "of the region" if picture["region"] else "of the whole picture"
+        self._sharpness.add(where["sharpness"], comparison_key, of)
         self._histogram.set_content(histogram_svg(where["histograms"]))
         self._figures.set_content(
             facts_html(
                 {
                     f"brightest {of}": f"{where['brightest']:.0%} of full scale",
                     **clipping_words(where["saturated"]),
-                    "this picture gave": f"{found['dose_lux_h']:.5f} lux h",
+                    "this picture gave": f"{picture['dose_lux_h']:.5f} lux h",
                 }
             )
         )
-        self._white = found["region"]["white_point"] if found["region"] else None
-        self._white_words.text = _white_words(asked["gains"], found["region"], self._white)
-        self._words.text = f"Picture {found['number']}: {words}"
-        self._show_dose(found["dose"])
+        self._white = picture["region"]["white_point"] if picture["region"] else None
+        self._white_words.text = _white_words(request["gains"], picture["region"], self._white)
+        self._words.text = f"Picture {picture['number']}: {words}"
+        self._show_dose(picture["dose"])
 
     def _take_white(self) -> None:
         self._settings.set_white(self._white)
@@ -256,13 +258,13 @@ class _Screen:
         self._dose.set_content(facts_html(rows))
 
 
-def why_live_ends(*, watched: bool, untouched_s: float, stopped: bool) -> str:
+def why_live_ends(*, is_watched: bool, untouched_s: float, is_stopped: bool) -> str:
     """Return why no further picture is taken by itself; empty if one is."""
-    if not watched:
+    if not is_watched:
         return "the page was closed"
     if untouched_s > LIVE_S:
         return f"nobody has touched this page for {LIVE_S:g} s"
-    return "stopped" if stopped else ""
+    return "stopped" if is_stopped else ""
 
 
 def _white_words(gains: list[float], region: dict[str, Any] | None, white: list[float] | None) -> str:

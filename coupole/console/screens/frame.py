@@ -39,7 +39,7 @@ class Place:
 
 
 @contextmanager
-def framed(visit: Visit, here: Place, places: Sequence[Place]) -> Iterator[None]:
+def screen_frame(visit: Visit, here: Place, places: Sequence[Place]) -> Iterator[None]:
     """Build a screen's content inside the frame."""
     ui.html('<a class="skip" href="#screen">Skip to the screen</a>', sanitize=False)
     drawer = _navigation(here, places)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from nicegui import events, ui
 
 from coupole.console.runs.frame_sheets import LedPlace
-from coupole.console.screens.parts import named
+from coupole.console.screens.parts import with_name
 from coupole.errors import InputError
 
 _EMIT = """(e) => {
@@ -28,12 +28,12 @@ class LedChooser:
         self._places, self._on_change = places, on_change
         first = max(places, key=lambda led: places[led].elevation_deg) if places else None
         words = "" if first is None else str(first)
-        self._field = named(ui.input("LEDs, by their ids", value=words, on_change=self._typed), "leds")
+        self._field = with_name(ui.input("LEDs, by their ids", value=words, on_change=self._on_typing), "leds")
         self._field.classes("field")
         self._at = {led: _at(place) for led, place in places.items()}
         self._still = "".join(f"M{x:.3f} {y:.3f}h0" for x, y in self._at.values())
         self._dome = ui.html("", sanitize=False).classes("led-chooser").props("data-name=led-dome")
-        self._dome.on("click", self._clicked, js_handler=_EMIT)
+        self._dome.on("click", self._toggle_nearest, js_handler=_EMIT)
         self._draw()
 
     @property
@@ -41,9 +41,9 @@ class LedChooser:
         """Raises InputError: not numbers."""
         return numbers(str(self._field.value or ""), "LEDs")
 
-    def _clicked(self, event: events.GenericEventArguments) -> None:
+    def _toggle_nearest(self, event: events.GenericEventArguments) -> None:
         x, y = (float(value) for value in event.args)
-        led = min(self._at, key=lambda one: math.dist(self._at[one], (x, y)), default=None)
+        led = min(self._at, key=lambda candidate: math.dist(self._at[candidate], (x, y)), default=None)
         if led is None or math.dist(self._at[led], (x, y)) > _NEAR:
             return
         try:
@@ -53,7 +53,7 @@ class LedChooser:
         chosen_leds = [other_led for other_led in leds if other_led != led] if led in leds else [*leds, led]
         self._field.set_value(", ".join(map(str, chosen_leds)))
 
-    def _typed(self) -> None:
+    def _on_typing(self) -> None:
         self._draw()
         self._on_change()
 
@@ -72,11 +72,11 @@ class LedChooser:
         )
 
 
-def numbers(text: str, what: str) -> list[int]:
+def numbers(text: str, label: str) -> list[int]:
     """Whole numbers with commas or blanks between them. Raises InputError."""
     words = [word for word in re.split(r"[,;\s]+", text) if word]
     if strange := [word for word in words if not re.fullmatch(r"\d{1,9}", word)]:
-        raise InputError(f"{what}: expected whole numbers, as in 3, 17; found {strange[0]!r}")
+        raise InputError(f"{label}: expected whole numbers, as in 3, 17; found {strange[0]!r}")
     return list(dict.fromkeys(map(int, words)))
 
 

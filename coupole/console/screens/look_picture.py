@@ -8,7 +8,7 @@ from typing import Any
 
 from nicegui import events, ui
 
-from coupole.console.screens.parts import named
+from coupole.console.screens.parts import with_name
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError
 
@@ -34,23 +34,25 @@ class LookPicture:
             self._look.style(f"aspect-ratio:{width}/{height}")
             self._image = ui.element("img").props('alt="No picture yet"').classes("look-picture")
             self._over = ui.html("", sanitize=False).classes("over")
-        self._look.on("picked", self._picked, js_handler="(e) => emit(e.detail)")
+        self._look.on("picked", self._on_pick, js_handler="(e) => emit(e.detail)")
         self._draw()
 
     def build_loupe(self) -> None:
         """Build the place where the loupe is shown."""
-        self._loupe = named(ui.html("", sanitize=False), "loupe").classes("loupe")
+        self._loupe = with_name(ui.html("", sanitize=False), "loupe").classes("loupe")
         self._loupe.set_content('<p class="hint">Click on the picture: each pixel of the sensor is one here.</p>')
 
-    def show(self, found: dict[str, Any], gains: Sequence[float]) -> None:
+    def show(self, picture: dict[str, Any], gains: Sequence[float]) -> None:
         """A picture that the bench has taken."""
-        self._number, self._gains = found["number"], gains
-        name = Path(found["picture"]).name
-        self._image.props(f'src="/api/v1/bench/pictures/{name}?{found["number"]}" alt="picture {found["number"]}"')
-        self._look.props(f"data-picture={found['number']}")
+        self._number, self._gains = picture["number"], gains
+        name = Path(picture["picture"]).name
+        self._image.props(
+            f'src="/api/v1/bench/pictures/{name}?{picture["number"]}" alt="picture {picture["number"]}"'
+        )
+        self._look.props(f"data-picture={picture['number']}")
 
-    def set_grid(self, shown: bool) -> None:
-        self._grid = shown
+    def set_grid(self, is_shown: bool) -> None:
+        self._grid = is_shown
         self._draw()
 
     def set_region(self, region: Sequence[int] | None) -> None:
@@ -83,7 +85,7 @@ class LookPicture:
             f'<p class="hint">{width} x {height} px of picture {picture["number"]}, from {left_px}, {top}</p>'
         )
 
-    async def _picked(self, event: events.GenericEventArguments) -> None:
+    async def _on_pick(self, event: events.GenericEventArguments) -> None:
         selection = event.args
         if "region" in selection:
             self._on_region([int(value) for value in selection["region"]])

@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from coupole.console.plans.plan_fields import fields_of, text_with
-from coupole.console.screens.parts import button, facts_html, named, panel, sure
+from coupole.console.screens.parts import button, facts_html, panel, sure, with_name
 from coupole.console.screens.visit import Visit
 
 
@@ -21,8 +21,8 @@ class MeterPanel:
         self._exposures_us: tuple[int, ...] = ()
         self._shown: object = None
         with panel("Meter the plan"):
-            self._words = named(ui.label().classes("hint"), "metering").props("role=status")
-            self._result = named(ui.html("", sanitize=False), "advice").style("width:100%")
+            self._words = with_name(ui.label().classes("hint"), "metering").props("role=status")
+            self._result = with_name(ui.html("", sanitize=False), "advice").style("width:100%")
             with ui.row().classes("bar"):
                 self._meter = button("Meter", self._begin, icon="exposure", name="meter")
                 self._put = button("Put this exposure into the plan", self._keep, icon="edit_note", name="put")
@@ -62,13 +62,13 @@ class MeterPanel:
         name, plans, exposures_us = self._bench.plan, self._visit.service.plan_files, self._exposures_us
 
         def keep() -> str:
-            text, path = plans.read(name), plans.path(name)
+            text, path = plans.read_text(name), plans.path(name)
             fields = replace(fields_of(path, text), exposures_us=exposures_us)
             return plans.write(name, text_with(path, text, fields), text)
 
         exposure_words = ", ".join(f"{exposure_us / 1000:g} ms" for exposure_us in exposures_us)
         await self._visit.act(
-            f"exposure of {name}: {exposure_words}", keep, acts=False, done=f"{name} has {exposure_words} now"
+            f"exposure of {name}: {exposure_words}", keep, acts=False, done_text=f"{name} has {exposure_words} now"
         )
 
 

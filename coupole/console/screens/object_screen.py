@@ -10,7 +10,7 @@ from urllib.parse import quote
 from nicegui import ui
 
 from coupole.console.plans.drafts import Draft
-from coupole.console.screens.parts import Choice, button, facts_html, named, panel, table_html
+from coupole.console.screens.parts import Choice, button, facts_html, panel, table_html, with_name
 from coupole.console.screens.visit import Visit, in_thread
 from coupole.errors import CoupoleError, InputError
 from coupole.storage.ledger_lines import History
@@ -38,10 +38,10 @@ class _Screen:
         with ui.element("div").classes("columns"):
             with panel("Is this your object?"):
                 self._photograph = ui.column().classes("cell")
-                self._lies = named(ui.html("", sanitize=False), "lies").style("width:100%")
+                self._lies = with_name(ui.html("", sanitize=False), "lies").style("width:100%")
                 self._plans = Choice("As this plan has it", {}, self._draw, name="by-plan")
             with panel("Light on it"):
-                self._sums = named(ui.html("", sanitize=False), "light").style("width:100%")
+                self._sums = with_name(ui.html("", sanitize=False), "light").style("width:100%")
                 self._bar = ui.linear_progress(0.0, show_value=False).props('aria-label="light of its budget"')
                 self._runs = ui.html("", sanitize=False).style("width:100%")
                 self._by_hand()
@@ -107,8 +107,8 @@ class _Screen:
 
     def _by_hand(self) -> None:
         with ui.row().classes("bar"):
-            amount = named(ui.number("Light given elsewhere, lux h", min=0).classes("field"), "amount")
-            note = named(
+            amount = with_name(ui.number("Light given elsewhere, lux h", min=0).classes("field"), "amount")
+            note = with_name(
                 ui.input("What it was", placeholder="photographed, 20 min at 500 lux").classes("field"), "note"
             )
 
@@ -125,7 +125,7 @@ class _Screen:
                     return True
 
                 if await self._visit.act(
-                    f"dose {object_id}: {dose:g} lux h, {note_text}", do, acts=False, done="entered"
+                    f"dose {object_id}: {dose:g} lux h, {note_text}", do, acts=False, done_text="entered"
                 ):
                     amount.set_value(None)
                     note.set_value("")
@@ -135,8 +135,8 @@ class _Screen:
 
     def _budget(self) -> None:
         with ui.row().classes("bar"):
-            amount = named(ui.number("It may receive in its life, lux h", min=0).classes("field"), "budget")
-            reason = named(ui.input("Why", placeholder="by the conservator, 12 May").classes("field"), "why")
+            amount = with_name(ui.number("It may receive in its life, lux h", min=0).classes("field"), "budget")
+            reason = with_name(ui.input("Why", placeholder="by the conservator, 12 May").classes("field"), "why")
 
             async def enter() -> None:
                 object_id, account = self._chooser.value, self._visit.account
@@ -149,7 +149,10 @@ class _Screen:
                     return True
 
                 if await self._visit.act(
-                    f"budget {object_id}: {budget} lux h, {reason_text}", do, acts=False, done="the budget is set"
+                    f"budget {object_id}: {budget} lux h, {reason_text}",
+                    do,
+                    acts=False,
+                    done_text="the budget is set",
                 ):
                     amount.set_value(None)
                     reason.set_value("")
@@ -170,10 +173,10 @@ class _Screen:
             if self._visit.may_act:
                 with ui.element("label").classes("choice"):
                     ui.label("Another photograph" if there else "A photograph of it: JPEG, PNG or TIFF")
-                    chooser = named(ui.element("input").props('type=file accept="image/*"'), "photograph")
-                    chooser.on("change", self._sent, js_handler=_SEND.replace("ADDRESS", f'"{address}"'))
+                    chooser = with_name(ui.element("input").props('type=file accept="image/*"'), "photograph")
+                    chooser.on("change", self._on_sent, js_handler=_SEND.replace("ADDRESS", f'"{address}"'))
 
-    async def _sent(self, event: object) -> None:
+    async def _on_sent(self, event: object) -> None:
         if refusal := str(getattr(event, "args", "")):
             self._visit.say(refusal, bad=True)
         await self._show()
@@ -186,7 +189,7 @@ class _Screen:
         self._lies.set_content('<p class="hint">drawing</p>')
         path = service.plan_files.new_drawing() / "object.png"
         try:
-            text = await in_thread(service.plan_files.read, name)
+            text = await in_thread(service.plan_files.read_text, name)
             await service.desk.draw_object(Draft(service.plan_files.path(name), text), path)
         except CoupoleError as error:
             self._lies.set_content(f'<p class="bad">{html.escape(str(error))}</p>')

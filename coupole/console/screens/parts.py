@@ -25,16 +25,16 @@ def button(
 ) -> ui.button:
     """Build a button with one of the four looks; `name` is its `data-name` in the page."""
     element = ui.button(words, icon=icon, on_click=on_click, color=None)
-    return named(element.classes(f"b-{kind}").props("unelevated no-caps"), name)
+    return with_name(element.classes(f"b-{kind}").props("unelevated no-caps"), name)
 
 
-def named(element: E, name: str) -> E:
+def with_name(element: E, name: str) -> E:
     """The element, with a `data-name` in the page."""
     element._props["data-name"] = name
     return element
 
 
-def labelled(element: E, words: str) -> E:
+def with_label(element: E, words: str) -> E:
     """The element, with words for who does not see it. They may be anybody's: `props` would take them for more."""
     element._props["aria-label"] = words
     return element
@@ -109,14 +109,14 @@ def histogram_svg(histograms: Mapping[str, Sequence[int]]) -> str:
     )
 
 
-def clipping_words(saturated: Mapping[str, float]) -> dict[str, str]:
+def clipping_words(saturated_shares: Mapping[str, float]) -> dict[str, str]:
     """Share of pixels at full scale by channel."""
-    return {f"{name} clipped": f"{share:.3%}" if share else "none" for name, share in saturated.items()}
+    return {f"{name} clipped": f"{share:.3%}" if share else "none" for name, share in saturated_shares.items()}
 
 
 async def sure(title: str, words: str, yes: str) -> bool:
     """Ask before something that cannot be undone, or takes long."""
-    with labelled(ui.dialog(), title) as dialog, ui.column().classes("panel ask"):
+    with with_label(ui.dialog(), title) as dialog, ui.column().classes("panel ask"):
         heading(title)
         ui.label(words)
         with ui.row():
@@ -129,7 +129,7 @@ async def sure(title: str, words: str, yes: str) -> bool:
 
 def link(words: str, target: str, *, name: str, new_tab: bool = True) -> ui.link:
     """Build a link to a page of this console."""
-    return named(ui.link(words, target, new_tab=new_tab), name)
+    return with_name(ui.link(words, target, new_tab=new_tab), name)
 
 
 def moment(t: str) -> str:
@@ -154,7 +154,7 @@ class Choice:
         self._words, self._name, self._on_change = words, name, on_change
         self._options, self.value = dict(options), value or next(iter(options), "")
         self._box = ui.html("", sanitize=False).classes("choice")
-        self._box.on("change", self._changed, js_handler="(e) => emit(e.target.value)")
+        self._box.on("change", self._take_change, js_handler="(e) => emit(e.target.value)")
         self.set_options(options, self.value)
 
     def set_options(self, options: Mapping[str, str], value: str = "") -> None:
@@ -173,13 +173,13 @@ class Choice:
     def set_visibility(self, visible: bool) -> None:
         self._box.set_visibility(visible)
 
-    def _changed(self, event: events.GenericEventArguments) -> object:
+    def _take_change(self, event: events.GenericEventArguments) -> object:
         if event.args not in self._options:
             return None
         self.value = str(event.args)
         return self._on_change()
 
 
-def count(number: int, what: str) -> str:
+def count(number: int, noun: str) -> str:
     """`1 day`, `2 days`."""
-    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

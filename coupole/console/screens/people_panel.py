@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from coupole.console.people.accounts import SHORTEST_PASSWORD, Account, Role
-from coupole.console.screens.parts import Choice, button, labelled, panel, sure
+from coupole.console.screens.parts import Choice, button, panel, sure, with_label
 from coupole.console.screens.visit import Visit
 
 _ROLES = {
@@ -34,7 +34,7 @@ class PeoplePanel:
     def _show(self) -> None:
         self._rows.clear()
         with self._rows:
-            for account in self._visit.service.accounts.listed():
+            for account in self._visit.service.accounts.all_accounts():
                 self._row(account)
 
     def _row(self, account: Account) -> None:
@@ -49,7 +49,7 @@ class PeoplePanel:
 
             words, name = f"role of {account.name}", f"role-{account.name}"
             role = Choice(words, _ROLES, change, name=name, value=account.role.word)
-            labelled(
+            with_label(
                 button("Remove", remove, name=f"remove-{account.name}", kind="flat"), f"remove {account.name}"
             )
 
@@ -61,7 +61,7 @@ class PeoplePanel:
             lambda: accounts.add(name, password, role),
             role=Role.ENGINEER,
             acts=False,
-            done=f"{name} may sign in",
+            done_text=f"{name} may sign in",
         )
         if account is not None:
             self._name.value = ""
@@ -74,7 +74,7 @@ class PeoplePanel:
             lambda: service.accounts.change_role(name, role),
             role=Role.ENGINEER,
             acts=False,
-            done=f"{name} is {role.word} now",
+            done_text=f"{name} is {role.word} now",
         )
         self._show()
 
@@ -86,6 +86,6 @@ class PeoplePanel:
                 lambda: service.accounts.remove(name),
                 role=Role.ENGINEER,
                 acts=False,
-                done=f"{name} is removed",
+                done_text=f"{name} is removed",
             )
             self._show()

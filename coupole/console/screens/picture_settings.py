@@ -9,7 +9,7 @@ from nicegui import ui
 
 from coupole.console.runs.frame_sheets import places_in
 from coupole.console.screens.led_chooser import LedChooser, numbers
-from coupole.console.screens.parts import button, named, panel
+from coupole.console.screens.parts import button, panel, with_name
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 
@@ -31,9 +31,11 @@ class PictureSettings:
     def build_light(self, cell: Cell) -> None:
         with panel("Light and exposure"):
             with ui.element("div").classes("fields"):
-                self._exposure = named(ui.number("Exposure, ms", value=8.0, min=_SHORTEST_MS, step=1), "exposure")
-                self._gain = named(ui.number("Gain, dB", value=0.0, min=0, step=1), "gain")
-                self._panels = named(ui.input("Panels, by their numbers", placeholder="none"), "panels")
+                self._exposure = with_name(
+                    ui.number("Exposure, ms", value=8.0, min=_SHORTEST_MS, step=1), "exposure"
+                )
+                self._gain = with_name(ui.number("Gain, dB", value=0.0, min=0, step=1), "gain")
+                self._panels = with_name(ui.input("Panels, by their numbers", placeholder="none"), "panels")
             for field in (self._exposure, self._gain, self._panels):
                 field.on_value_change(self._on_change)
             self._leds = LedChooser(places_in(cell), self._on_change)
@@ -41,16 +43,16 @@ class PictureSettings:
 
     def build_marks(self, set_grid: Callable[[bool], object]) -> None:
         grid = ui.checkbox("gridlines", value=True, on_change=lambda event: set_grid(bool(event.value)))
-        named(grid, "gridlines")
+        with_name(grid, "gridlines")
         for mark, words in (("saturation", "clipped in red"), ("focus", "sharp in green")):
-            self._marks[mark] = named(ui.checkbox(words, value=mark == "saturation"), f"mark-{mark}")
+            self._marks[mark] = with_name(ui.checkbox(words, value=mark == "saturation"), f"mark-{mark}")
             self._marks[mark].on_value_change(self._on_change)
 
     def build_region(self, show: Callable[[list[int] | None], object]) -> None:
         self._show_region = show
         with ui.element("div").classes("fields four"):
             self._region = {
-                side: named(ui.number(f"{side}, px", min=0, step=1, precision=0), f"region-{side}")
+                side: with_name(ui.number(f"{side}, px", min=0, step=1, precision=0), f"region-{side}")
                 for side in _SIDES
             }
         for field in self._region.values():
@@ -80,7 +82,7 @@ class PictureSettings:
         return f"{', '.join(lights) or 'no light'}, {request['exposure_us'] / 1000:g} ms"
 
     @property
-    def compared(self) -> object:
+    def comparison_key(self) -> object:
         """Sharpness is comparable as long as this stays the same."""
         request = self.request()
         return request["lights"], request["panels"], request["region"]

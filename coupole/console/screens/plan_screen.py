@@ -14,7 +14,7 @@ from nicegui import ui
 from coupole.console.plans.drafts import Checked, Draft
 from coupole.console.plans.plan_fields import PlanFields, fields_of, text_with
 from coupole.console.routes.messages import NewEntry, StateNow
-from coupole.console.screens.parts import Choice, button, facts_html, heading, named, panel
+from coupole.console.screens.parts import Choice, button, facts_html, heading, panel, with_name
 from coupole.console.screens.plan_verdict import figures_of, view_table
 from coupole.console.screens.visit import Visit, enter, in_background, in_thread
 from coupole.errors import InputError, Problem
@@ -43,7 +43,7 @@ class _Screen:
         self._filling = False
         self._turn = 0
         with ui.row().classes("bar"):
-            self._chooser = Choice("Plan", {}, self._chosen, name="plan")
+            self._chooser = Choice("Plan", {}, self._open_chosen, name="plan")
             button("New plan", self._ask_new, icon="add", name="new-plan")
             self._save = button("Save", self._save_plan, icon="save", name="save", kind="main")
             self._enter = button("Put in the queue", self._enter_plan, icon="playlist_add", name="enter")
@@ -51,13 +51,13 @@ class _Screen:
             with panel("Form"):
                 self._form()
             with panel("YAML"):
-                self._editor = named(
-                    ui.codemirror(language="YAML", on_change=self._typed, line_wrapping=True), "yaml"
+                self._editor = with_name(
+                    ui.codemirror(language="YAML", on_change=self._take_typing, line_wrapping=True), "yaml"
                 ).classes("editor")
-                self._problems = named(ui.html("", sanitize=False), "problems").props("role=status")
+                self._problems = with_name(ui.html("", sanitize=False), "problems").props("role=status")
         with ui.element("div").classes("columns"):
             with panel("Preflight"):
-                self._verdict = named(ui.html("", sanitize=False), "verdict").props("role=status")
+                self._verdict = with_name(ui.html("", sanitize=False), "verdict").props("role=status")
             with panel("Views"):
                 self._views = ui.html("", sanitize=False).style("width:100%")
         with panel("The cell"):
@@ -73,16 +73,16 @@ class _Screen:
         names = await in_thread(self._plans.names)
         if names:
             self._chooser.set_options({name: name for name in names})
-            await self._chosen()
+            await self._open_chosen()
         else:
             self._show_text("")
 
-    async def _chosen(self) -> None:
+    async def _open_chosen(self) -> None:
         name = self._chooser.value
         if not name or name == self._name:
             return
         try:
-            text = await in_thread(self._plans.read, name)
+            text = await in_thread(self._plans.read_text, name)
         except InputError as error:
             self._visit.say(str(error), bad=True)
             return
@@ -93,7 +93,7 @@ class _Screen:
     async def _ask_new(self) -> None:
         with ui.dialog() as dialog, ui.card().classes("dialog"):
             heading("New plan")
-            name = named(ui.input("Name", placeholder="vase-1").classes("field"), "new-name")
+            name = with_name(ui.input("Name", placeholder="vase-1").classes("field"), "new-name")
             kind = Choice("Begin with", _KINDS, name="kind")
             with ui.row():
                 button("Make", lambda: dialog.submit(True), name="make", kind="main")
@@ -107,12 +107,12 @@ class _Screen:
         if new_name is not None:
             names = await in_thread(plans.names)
             self._chooser.set_options({name: name for name in names}, new_name)
-            await self._chosen()
+            await self._open_chosen()
 
     async def _save_plan(self) -> bool:
         name, text, text_before = self._name, self._text, self._saved
         is_saved = await self._visit.act(
-            f"save plan {name}", lambda: self._plans.write(name, text, text_before), acts=False, done="saved"
+            f"save plan {name}", lambda: self._plans.write(name, text, text_before), acts=False, done_text="saved"
         )
         if is_saved:
             self._saved = text
@@ -136,26 +136,30 @@ class _Screen:
 
     def _form(self) -> None:
         with ui.element("div").classes("fields"):
-            self._object = named(ui.input("Object: its accession number").classes("field"), "object")
-            self._mesh = named(ui.input("Mesh: PLY, STL or OBJ").classes("field"), "mesh")
-            self._unit = Choice("Unit of the mesh", _UNITS, self._filled, name="mesh-unit")
-            self._budget = named(ui.number("Light in its life at most, lux h", min=0).classes("field"), "budget")
+            self._object = with_name(ui.input("Object: its accession number").classes("field"), "object")
+            self._mesh = with_name(ui.input("Mesh: PLY, STL or OBJ").classes("field"), "mesh")
+            self._unit = Choice("Unit of the mesh", _UNITS, self._take_field, name="mesh-unit")
+            self._budget = with_name(
+                ui.number("Light in its life at most, lux h", min=0).classes("field"), "budget"
+            )
             self._distance = ui.number("Distance of the camera, mm", min=1, max=3000).classes("field")
-            self._elevations = named(ui.input("Elevations, degrees").classes("field"), "elevations")
-            self._azimuths = named(ui.number("Views at each elevation", min=1, max=360, precision=0), "azimuths")
+            self._elevations = with_name(ui.input("Elevations, degrees").classes("field"), "elevations")
+            self._azimuths = with_name(
+                ui.number("Views at each elevation", min=1, max=360, precision=0), "azimuths"
+            )
             self._azimuths.classes("field")
-            self._exposures = named(ui.input("Exposures, us").classes("field"), "exposures")
-            self._every = named(ui.number("LEDs: every n-th", min=1, precision=0).classes("field"), "every")
+            self._exposures = with_name(ui.input("Exposures, us").classes("field"), "exposures")
+            self._every = with_name(ui.number("LEDs: every n-th", min=1, precision=0).classes("field"), "every")
             self._darks = ui.number("Dark frames for each view", min=0, precision=0).classes("field")
         inputs = [
             self._object, self._mesh, self._budget, self._distance, self._elevations, self._azimuths,
             self._exposures, self._every, self._darks,
         ]  # fmt: skip
         for field in inputs:
-            field.on("blur", self._filled)
-            field.on("keydown.enter", self._filled)
+            field.on("blur", self._take_field)
+            field.on("keydown.enter", self._take_field)
         self._round = button("Views all round the mesh", self._all_round, icon="360", name="all-round")
-        self._form_says = named(ui.label().classes("hint"), "form-says")
+        self._form_says = with_name(ui.label().classes("hint"), "form-says")
 
     def _show_fields(self, fields: PlanFields) -> None:
         self._filling = True
@@ -165,9 +169,9 @@ class _Screen:
         self._unit.set_options(_UNITS, fields.mesh_unit)
         self._budget.set_value(fields.budget_lux_h)
         self._distance.set_value(fields.distance_mm)
-        self._elevations.set_value(_joined(fields.elevations_deg))
+        self._elevations.set_value(_numbers_text(fields.elevations_deg))
         self._azimuths.set_value(fields.azimuths)
-        self._exposures.set_value(_joined(fields.exposures_us))
+        self._exposures.set_value(_numbers_text(fields.exposures_us))
         self._every.set_value(fields.every_led)
         self._darks.set_value(fields.darks_per_view)
         for field in (self._distance, self._elevations, self._azimuths):
@@ -200,7 +204,7 @@ class _Screen:
             darks_per_view=_whole(self._darks.value),
         )
 
-    def _filled(self) -> None:
+    def _take_field(self) -> None:
         """A field was left: its value goes into the text."""
         if self._filling or not self._name:
             return
@@ -238,14 +242,14 @@ class _Screen:
     def _show_text(self, text: str) -> None:
         self._text = text
         self._editor.set_value(text)
-        self._read()
+        self._read_text()
 
-    def _typed(self) -> None:
+    def _take_typing(self) -> None:
         if self._editor.value != self._text:
             self._text = self._editor.value
-            self._read()
+            self._read_text()
 
-    def _read(self) -> None:
+    def _read_text(self) -> None:
         """Show what the text says; preflight follows once nobody types."""
         self._state(self._visit.now)
         if not self._name:
@@ -280,13 +284,13 @@ class _Screen:
 
         in_background(check)
 
-    def _show_checked(self, found: Checked) -> None:
-        self._show_problems(found.problems)
-        if found.problems:
+    def _show_checked(self, checked_plan: Checked) -> None:
+        self._show_problems(checked_plan.problems)
+        if checked_plan.problems:
             self._verdict.set_content('<p class="bad">Not checked: the plan has mistakes.</p>')
             self._views.set_content("")
             return
-        report = found.report
+        report = checked_plan.report
         verdict_html = "".join(f'<p class="bad">refused: {html.escape(words)}</p>' for words in report["refusals"])
         verdict_html = (
             verdict_html
@@ -294,8 +298,8 @@ class _Screen:
         )
         verdict_html += "" if report["refusals"] else "before it begins).</p>"
         verdict_html += "".join(f'<p class="warm">{html.escape(words)}</p>' for words in report["warnings"])
-        self._verdict.set_content(verdict_html + facts_html(figures_of(found)))
-        self._views.set_content(view_table(found))
+        self._verdict.set_content(verdict_html + facts_html(figures_of(checked_plan)))
+        self._views.set_content(view_table(checked_plan))
 
     def _show_problems(self, problems: Sequence[Problem]) -> None:
         lines = self._text.splitlines()
@@ -350,18 +354,18 @@ class _Screen:
             ).style("width:100%")
 
 
-def _joined(values: Sequence[float]) -> str:
+def _numbers_text(values: Sequence[float]) -> str:
     return ", ".join(f"{value:g}" for value in values)
 
 
-def _numbers(text: str | None, what: str) -> list[float]:
+def _numbers(text: str | None, label: str) -> list[float]:
     """Raises InputError."""
     try:
         numbers = [float(word) for word in str(text or "").replace(",", " ").split()]
     except ValueError:
         numbers = [math.nan]
     if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{what}: expected numbers, with commas between; found {text!r}")
+        raise InputError(f"{label}: expected numbers, with commas between; found {text!r}")
     return numbers
 
 

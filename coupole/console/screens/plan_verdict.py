@@ -7,14 +7,14 @@ from coupole.console.screens.parts import table_html
 from coupole.viewing.terminal import bytes_text, duration_text
 
 
-def figures_of(found: Checked) -> dict[str, str]:
+def figures_of(checked_plan: Checked) -> dict[str, str]:
     """Return what the plan takes, by its preflight."""
-    report = found.report
+    report = checked_plan.report
     dose = f"{report['dose_lux_h']:.3f} lux h"
     if report["dose_before_lux_h"]:
         dose += f" after {report['dose_before_lux_h']:.3f}"
-    if found.budget_lux_h is not None:
-        dose += f" of {found.budget_lux_h:g} in its life"
+    if checked_plan.budget_lux_h is not None:
+        dose += f" of {checked_plan.budget_lux_h:g} in its life"
     figures = {
         "views, shots, frames": f"{report['views']}, {report['shots']}, {report['frames']}",
         "duration": duration_text(report["duration_s"]),
@@ -35,20 +35,21 @@ def figures_of(found: Checked) -> dict[str, str]:
     return figures
 
 
-def view_table(found: Checked) -> str:
+def view_table(checked_plan: Checked) -> str:
     """A line for each view, in the order of the visits."""
     framing_of_view = {
-        view_framing["view"]: view_framing for view_framing in (found.report["object"] or {}).get("views", [])
+        view_framing["view"]: view_framing
+        for view_framing in (checked_plan.report["object"] or {}).get("views", [])
     }
     rows = []
-    for view in found.views:
+    for view in checked_plan.views:
         framing = framing_of_view.get(view["name"])
         field = "-" if framing is None else f"{framing['in_field']:.0%}"
         sharp = "-" if framing is None or framing["in_focus"] is None else f"{framing['in_focus']:.0%}"
         times = duration_text(view["duration_s"]), f"{view['dose_lux_h']:.3f}"
-        rows.append((view["name"], *times, _judged(field), _judged(sharp)))
+        rows.append((view["name"], *times, _share_cell(field), _share_cell(sharp)))
     return table_html(("view", "time", "lux h", "object in field", "of it sharp"), rows)
 
 
-def _judged(share: str) -> str:
+def _share_cell(share: str) -> str:
     return share if share in ("-", "100%") else f"warm|{share}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from nicegui import ui
 
 from coupole.console.routes.messages import EntryNow, NewEntry, StateNow
-from coupole.console.screens.parts import Choice, button, labelled, named, panel
+from coupole.console.screens.parts import Choice, button, panel, with_label, with_name
 from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.viewing.terminal import bytes_text, duration_text
 
@@ -29,22 +29,22 @@ class _Screen:
             with ui.row().classes("bar"):
                 self._plan = Choice("Plan", {}, name="plan")
                 button("Put in the queue", self._enter, icon="playlist_add", name="enter", kind="main")
-                self._hold = named(
+                self._hold = with_name(
                     ui.input("Or what is to be done there", placeholder="change the object"), "hold"
                 )
                 self._hold.classes("field")
                 button("Hold there", self._enter_hold, icon="pan_tool", name="enter-hold")
             with ui.row().classes("bar") as self._checking:
-                self._checked = named(ui.label(), "checking").props("role=status")
+                self._checked = with_name(ui.label(), "checking").props("role=status")
                 button("Give it up", self._give_up, name="give-up", kind="flat")
             with ui.row().classes("bar") as self._halted:
-                self._why = named(ui.label(), "halted").classes("warm")
+                self._why = with_name(ui.label(), "halted").classes("warm")
                 button("Go on with the queue", self._go_on, icon="play_arrow", name="go-on", kind="main")
         with panel("Waiting and running"):
-            self._rows = named(ui.column().classes("rows"), "waiting").props("role=list")
-            self._sum = named(ui.label().classes("hint"), "sum")
+            self._rows = with_name(ui.column().classes("rows"), "waiting").props("role=list")
+            self._sum = with_name(ui.label().classes("hint"), "sum")
         with panel("Ended"):
-            self._ended = named(ui.column().classes("rows"), "ended").props("role=list")
+            self._ended = with_name(ui.column().classes("rows"), "ended").props("role=list")
         visit.follow(self._show)
 
     async def offer_plans(self) -> None:
@@ -107,7 +107,7 @@ class _Screen:
         with ui.row().classes("entry").props("role=listitem"):
             ui.icon("pan_tool" if entry.hold else "camera").props("aria-hidden=true")
             with ui.column().classes("entry-words"):
-                ui.label(f"hold: {entry.hold}" if entry.hold else _named(entry)).classes("entry-name")
+                ui.label(f"hold: {entry.hold}" if entry.hold else _entry_name(entry)).classes("entry-name")
                 ui.label(f"{state}{_times(entry)}, by {entry.by}").classes(f"small {_KINDS.get(state, '')}")
                 if entry.needs is not None:
                     ui.label(_needs(entry)).classes("small")
@@ -133,10 +133,10 @@ class _Screen:
             ("delete_outline", "take out", lambda: self._take_out(entry), True),
         ):
             move_button = button("", do, icon=icon, name=words.replace(" ", "-"), kind="flat")
-            labelled(move_button, f"{words}: {entry.words[:80]}").props("dense").set_enabled(possible)
+            with_label(move_button, f"{words}: {entry.words[:80]}").props("dense").set_enabled(possible)
 
 
-def _named(entry: EntryNow) -> str:
+def _entry_name(entry: EntryNow) -> str:
     name = Path(entry.plan).name if entry.plan else ""
     return f"resume {Path(entry.resume).name}" if entry.resume else name
 

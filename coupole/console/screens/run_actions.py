@@ -29,14 +29,14 @@ async def resume(visit: Visit, name: str) -> None:
 class RunActions:
     """Buttons for one run, and links to what there is of it."""
 
-    def __init__(self, visit: Visit, name: str, *, left: bool, frames: int) -> None:
-        """`left`: it can be resumed."""
+    def __init__(self, visit: Visit, name: str, *, can_resume: bool, frames: int) -> None:
+        """`can_resume`: frames of it are left."""
         self._visit, self._name = visit, name
         self._run: Run = visit.service.runs.run(name)
         self._cell = visit.service.cell
         self._frames = frames
         with ui.row().classes("actions"):
-            if left:
+            if can_resume:
                 button("Resume", lambda: resume(visit, name), name="resume", icon="play_arrow", kind="main")
             for words, icon, do in (
                 ("Verify", "fact_check", self._verify),
@@ -72,16 +72,16 @@ class RunActions:
                     link(words, f"/api/v1/runs/{self._name}/{page_name}", name=f"open-{page_name}")
 
     async def _begin(
-        self, what: str, command: Sequence[str | Path], then: Callable[[Task], object] = lambda _: None
+        self, action: str, command: Sequence[str | Path], then: Callable[[Task], object] = lambda _: None
     ) -> None:
         """Begin `coupole COMMAND` on this run; `then` is called when it has ended well."""
-        account, words = self._visit.account, f"{what} {self._name}"
+        account, words = self._visit.account, f"{action} {self._name}"
         by = account.name if account else ""
         task = await self._visit.act(
             words,
             lambda: self._visit.service.tasks.begin(words, list(map(str, command)), by),
             acts=False,
-            done=f"{words}: begun",
+            done_text=f"{words}: begun",
         )
         if task is not None:
             in_background(lambda: _when_done(task, then))

@@ -22,9 +22,9 @@ from coupole.console.screens.parts import (
     facts_html,
     heading,
     moment,
-    named,
     panel,
     table_html,
+    with_name,
 )
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.runs_screen import STATE_KINDS
@@ -61,7 +61,7 @@ def build(visit: Visit, name: str) -> None:
 
     async def fill() -> None:
         try:
-            run_facts = await in_thread(_read, visit.service, name)
+            run_facts = await in_thread(_read_run, visit.service, name)
         except CoupoleError as error:
             waiting.set_text(str(error))
             return
@@ -73,7 +73,7 @@ def build(visit: Visit, name: str) -> None:
     ui.timer(0.01, fill, once=True)
 
 
-def _read(service: Service, name: str) -> _Known:
+def _read_run(service: Service, name: str) -> _Known:
     run = service.runs.run(name)
     events = [(event.t, words) for event in journal.read_events(run.journal_path) if (words := words_of(event))]
     row = service.runs.row(name)
@@ -81,9 +81,9 @@ def _read(service: Service, name: str) -> _Known:
 
 
 class _Page:
-    def __init__(self, visit: Visit, known: _Known) -> None:
-        self._visit, self._known, self._name = visit, known, known.row.name
-        self._row = known.row
+    def __init__(self, visit: Visit, known_run: _Known) -> None:
+        self._visit, self._known, self._name = visit, known_run, known_run.row.name
+        self._row = known_run.row
         self._frames: list[SheetFrame] = []
         self._current = ""
         self._of_view: dict[str, list[SheetFrame]] = {}
@@ -111,10 +111,10 @@ class _Page:
                 ui.label(status.state).classes(f"chip {STATE_KINDS.get(status.state, '')}")
                 if row.simulated:
                     ui.label("simulated").classes("chip simulated")
-            self._facts = ui.html(facts_html(self._told(row)), sanitize=False).classes("two-columns")
+            self._facts = ui.html(facts_html(self._run_facts(row)), sanitize=False).classes("two-columns")
             self._facts.style("width:100%")
             ui.timer(_LOOK_EVERY_S, self._renew)
-            RunActions(self._visit, row.name, left=bool(status.frames_left), frames=row.proven)
+            RunActions(self._visit, row.name, can_resume=bool(status.frames_left), frames=row.proven)
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def _renew(self) -> None:
@@ -122,9 +122,9 @@ class _Page:
         row = await in_thread(self._visit.service.runs.row, self._name)
         if row != self._row:
             self._row = row
-            self._facts.set_content(facts_html(self._told(row)))
+            self._facts.set_content(facts_html(self._run_facts(row)))
 
-    def _told(self, row: RunRow) -> dict[str, str]:
+    def _run_facts(self, row: RunRow) -> dict[str, str]:
         status = self._known.status
         missing_count, duration_s = row.frames - row.proven, sum(session.duration_s for session in status.sessions)
         return {
@@ -161,7 +161,7 @@ class _Page:
         run, status, events = self._known.run, self._known.status, self._known.events
         with panel("What happened"):
             lines = [(moment(t) + t[16:19], words) for t, words in events[:_EVENTS_SHOWN]]
-            named(ui.html(table_html(("UTC", "what"), lines), sanitize=False), "events").style("width:100%")
+            with_name(ui.html(table_html(("UTC", "what"), lines), sanitize=False), "events").style("width:100%")
             if len(events) > _EVENTS_SHOWN:
                 ui.label(f"The newest {_EVENTS_SHOWN} of {len(events)}; all are in the report.").classes("hint")
             with ui.expansion("Numbers").classes("printed"):

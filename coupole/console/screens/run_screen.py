@@ -16,10 +16,10 @@ from coupole.console.screens.parts import (
     clipping_words,
     facts_html,
     histogram_svg,
-    named,
     panel,
     picture_address,
     table_html,
+    with_name,
 )
 from coupole.console.screens.visit import Visit, enter, in_thread
 from coupole.errors import CoupoleError
@@ -40,7 +40,7 @@ class _Screen:
         self._idle = panel()
         with self._idle:
             self._idle_words = ui.label()
-            self._after = named(ui.column(), "after").style("width:100%")
+            self._after = with_name(ui.column(), "after").style("width:100%")
             self._said = ""
         self._fault = FaultOfArm(visit)
         with ui.element("div").classes("columns") as self._work:
@@ -118,23 +118,23 @@ class _Screen:
         except CoupoleError as error:
             self._events.set_content(f'<p class="bad">{html.escape(str(error))}</p>')
 
-    def _show(self, now: StateNow, watched: Watched) -> None:
-        hot = "-" if watched.hottest_board_c is None else f"{watched.hottest_board_c:.1f} C"
+    def _show(self, now: StateNow, run_progress: Watched) -> None:
+        hot = "-" if run_progress.hottest_board_c is None else f"{run_progress.hottest_board_c:.1f} C"
         self._facts.set_content(
             facts_html(
                 {
-                    "run": watched.run,
+                    "run": run_progress.run,
                     "frames proven": f"{now.proven} of {now.frames}",
                     "time left": "-" if now.left_s is None else duration_text(now.left_s),
                     "light on the object": f"{now.dose:.3f} lux h in this run",
-                    "taken again": f"{watched.reshot} shots",
+                    "taken again": f"{run_progress.reshot} shots",
                     "hottest LED board": hot,
                 }
             )
         )
-        self._views.set_content(_bars(watched, now.view))
+        self._views.set_content(_bars(run_progress, now.view))
         self._events.set_content(
-            table_html(("UTC", "what"), [(t[11:19], words) for t, words in watched.events[:40]])
+            table_html(("UTC", "what"), [(t[11:19], words) for t, words in run_progress.events[:40]])
         )
 
     def _show_frame(self, name: str, frame: Frame) -> None:
@@ -155,9 +155,9 @@ class _Screen:
         )
 
 
-def _bars(watched: Watched, current: str | None) -> str:
+def _bars(run_progress: Watched, current: str | None) -> str:
     rows = []
-    for view, proven, frame_count in watched.views:
+    for view, proven, frame_count in run_progress.views:
         share = proven / frame_count if frame_count else 1.0
         mark = ' style="font-weight:650"' if view == current else ""
         rows.append(

@@ -8,7 +8,7 @@ from urllib.parse import quote
 from nicegui import events, ui
 
 from coupole.console.runs.run_files import RunRow
-from coupole.console.screens.parts import button, heading, labelled, link, moment, panel, picture_address
+from coupole.console.screens.parts import button, heading, link, moment, panel, picture_address, with_label
 from coupole.console.screens.run_actions import RunActions
 from coupole.console.screens.task_list import TaskList
 from coupole.console.screens.visit import Visit, in_thread
@@ -56,7 +56,7 @@ class _Screen:
 
     def _show(self) -> None:
         words = (self._search.value or "").lower().split()
-        rows = [row for row in self._rows if all(word in _searched(row) for word in words)]
+        rows = [row for row in self._rows if all(word in _searchable_text(row) for word in words)]
         self._count.text = f"{len(rows)} of {len(self._rows)} runs" if words else f"{len(rows)} runs"
         self._more.set_visibility(len(rows) > self._most)
         text = _table(rows[: self._most]) if rows else '<p class="hint">No run is found.</p>'
@@ -69,18 +69,18 @@ class _Screen:
         if row is None:
             return
         title = f"Actions of {row.name}"
-        with labelled(ui.dialog(value=True), title) as dialog, ui.column().classes("panel ask"):
+        with with_label(ui.dialog(value=True), title) as dialog, ui.column().classes("panel ask"):
             heading(row.name)
             link("Open the run", f"/runs/{quote(row.name)}", name="open-run", new_tab=False)
             try:
-                RunActions(self._visit, row.name, left=row.proven < row.frames, frames=row.proven)
+                RunActions(self._visit, row.name, can_resume=row.proven < row.frames, frames=row.proven)
             except CoupoleError as error:
                 ui.label(str(error)).classes("bad")
             button("Close", dialog.close, name="close")
         dialog.on("hide", dialog.delete)
 
 
-def _searched(row: RunRow) -> str:
+def _searchable_text(row: RunRow) -> str:
     return " ".join((row.name, row.state, row.object, row.operator, row.created[:10])).lower()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from coupole.console.screens.parts import button, named, panel
+from coupole.console.screens.parts import button, panel, with_name
 
 _KEPT = 120
 
@@ -16,8 +16,8 @@ class Sharpness:
         self._values: list[float] = []
         self._of: object = None
         with panel("Sharpness"):
-            self._now = named(ui.label("-").classes("large-figure"), "sharpness")
-            self._best = named(ui.label().classes("hint"), "best")
+            self._now = with_name(ui.label("-").classes("large-figure"), "sharpness")
+            self._best = with_name(ui.label().classes("hint"), "best")
             self._chart = ui.html("", sanitize=False).style("width:100%")
             button("Begin anew", self.reset, icon="restart_alt", name="reset-best", kind="flat")
         self.reset()

@@ -7,7 +7,7 @@ from typing import Any
 from nicegui import ui
 
 from coupole.console.people.accounts import Role
-from coupole.console.screens.parts import button, facts, moment, named, panel, table_html
+from coupole.console.screens.parts import button, facts, moment, panel, table_html, with_name
 from coupole.console.screens.people_panel import PeoplePanel
 from coupole.console.screens.task_list import TaskList
 from coupole.console.screens.visit import Visit, in_thread
@@ -39,7 +39,7 @@ def _disk(visit: Visit) -> None:
     service = visit.service
     with panel("Disk"):
         waiting = ui.label("Reading the runs …").classes("hint")
-        box = named(ui.column().style("width:100%"), "disk")
+        box = with_name(ui.column().style("width:100%"), "disk")
 
     async def fill() -> None:
         disk = await in_thread(lambda: disk_of(service.cell, service.runs.rows()))
@@ -96,7 +96,7 @@ def _rig(visit: Visit) -> None:
         if lines := to_measure(cell.document.path):
             ui.label(f"{len(lines)} lines of the rig are still to be measured:").classes("warm")
             rows = [(str(line.line), line.key, line.why) for line in lines]
-            named(ui.html(table_html(("line", "key", "what"), rows), sanitize=False), "measure").style(
+            with_name(ui.html(table_html(("line", "key", "what"), rows), sanitize=False), "measure").style(
                 "width:100%"
             )
         else:
@@ -116,7 +116,7 @@ class _Log:
                     "outlined dense clearable type=search data-name=search-log"
                 )
                 self._count = ui.label("").classes("hint").props("role=status")
-            self._table = named(ui.html("", sanitize=False), "log").style("width:100%")
+            self._table = with_name(ui.html("", sanitize=False), "log").style("width:100%")
         ui.timer(_LOOK_EVERY_S, self._look, immediate=True)
 
     async def _look(self) -> None:

@@ -22,9 +22,9 @@ class TaskList:
     """The newest first; it renews itself as long as the screen is open."""
 
     def __init__(
-        self, visit: Visit, wanted: Callable[[Task], bool], *, empty: str = _NONE, most: int = 10
+        self, visit: Visit, is_wanted: Callable[[Task], bool], *, empty: str = _NONE, most: int = 10
     ) -> None:
-        self._visit, self._wanted, self._most = visit, wanted, most
+        self._visit, self._wanted, self._most = visit, is_wanted, most
         self._rows: dict[str, _Row] = {}
         self._empty = ui.label(empty).classes("hint")
         self._box = ui.column().classes("gap").props("data-name=tasks").style("width:100%")
@@ -33,7 +33,7 @@ class TaskList:
 
     def look(self) -> None:
         """Show what is so now."""
-        tasks = [task for task in self._visit.service.tasks.listed if self._wanted(task)][: self._most]
+        tasks = [task for task in self._visit.service.tasks.newest_first if self._wanted(task)][: self._most]
         for task_id in set(self._rows) - {task.id for task in tasks}:
             self._rows.pop(task_id).box.delete()
         for task in reversed(tasks):
@@ -64,12 +64,12 @@ class _Row:
         words = "under way" if running else "done" if code == 0 else "failed"
         self._state.text = words
         self._state.props(f"data-state={_KINDS[words]}")
-        self._time.text = f"{task.by}, {moment(task.begun)} UTC, {duration_text(task.duration_s)}"
+        self._time.text = f"{task.by}, {moment(task.begun_at)} UTC, {duration_text(task.duration_s)}"
         self._stop.set_visibility(running and self._visit.may_act)
-        self._why.text = task.why or (f"in {task.found['out']}" if "out" in task.found else "")
+        self._why.text = task.why or (f"in {task.figures['out']}" if "out" in task.figures else "")
         self._why.classes(add="bad" if task.why else "hint", remove="hint" if task.why else "bad")
         self._why.set_visibility(bool(self._why.text))
-        output = task.said
+        output = task.output_text
         if output != self._shown:
             self._shown = output
             self._said.set_content(html.escape(output))

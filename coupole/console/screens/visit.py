@@ -38,7 +38,7 @@ class Visit:
     @property
     def account(self) -> Account | None:
         """None when the session is over."""
-        session = self.service.sessions.of(self._secret, script=False, used=False)
+        session = self.service.sessions.of(self._secret, script=False, counts_as_use=False)
         return account_here(session.account, of_this_machine=self._here) if session else None
 
     @property
@@ -106,7 +106,7 @@ class Visit:
         *,
         role: Role = Role.OPERATOR,
         acts: bool = True,
-        done: str = "",
+        done_text: str = "",
         urgent: bool = False,
     ) -> T | None:
         """Do something in a thread, if this person may; it is logged with its outcome, and the screen says why it
@@ -132,8 +132,8 @@ class Visit:
         finally:
             line = (account.name if account else "", f"screen: {action}", status, self.address)
             _LOGGING.submit(self.service.audit.note, *line)
-        if done:
-            self.say(done)
+        if done_text:
+            self.say(done_text)
         return answer
 
     def require(self, action: str, role: Role = Role.OPERATOR, *, acts: bool = True) -> None:
@@ -158,19 +158,19 @@ class Visit:
                 ui.notify(words, type=kind, multi_line=True, close_button="close", timeout=0 if bad else 4000)
 
 
-async def enter(visit: Visit, asked: NewEntry, words: str) -> bool:
+async def enter(visit: Visit, request: NewEntry, words: str) -> bool:
     """Put something in the queue; preflight is made first. Whether it is in."""
     entering, account = visit.service.entering, visit.account
     by = account.name if account else ""
 
     def do() -> Entry:
-        return entering.enter(asked, by, by_command_line=False, may_still=lambda: visit.require("queue"))
+        return entering.enter(request, by, by_command_line=False, may_still=lambda: visit.require("queue"))
 
-    if asked.hold:
-        return await visit.act(f"queue {words}", do, done=f"{words} is in the queue") is not None
+    if request.hold:
+        return await visit.act(f"queue {words}", do, done_text=f"{words} is in the queue") is not None
     visit.say(f"{words}: preflight is made, then it is in the queue")
     async with entering.one_at_a_time:
-        return await visit.act(f"queue {words}", do, done=f"{words} is in the queue") is not None
+        return await visit.act(f"queue {words}", do, done_text=f"{words} is in the queue") is not None
 
 
 async def in_thread(do: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

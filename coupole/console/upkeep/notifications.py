@@ -33,7 +33,7 @@ from pydantic import Field, model_validator
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
 from coupole.plan.plan import Model
-from coupole.plan.yamlfile import read
+from coupole.plan.yamlfile import read_document
 from coupole.storage.line_file import utc_now
 
 Kind = Literal["plan-ended", "fault", "hold", "arm-fault", "disk-low"]
@@ -123,7 +123,7 @@ def read_settings(folder: Path) -> Settings | None:
         return None
     if path.stat().st_mode & 0o077:
         raise InputError(f"{path}: expected a file that only its owner may read: chmod 600 {path}")
-    return read(path).validate(Settings)
+    return read_document(path).validate(Settings)
 
 
 def ways(settings: Settings) -> Mapping[str, Callable[[Message], None]]:

@@ -29,7 +29,7 @@ class Occurrences:
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
         self._ended = {entry.id for entry in plans.entries if entry.ended}
-        self._halted = plans.halted
+        self._halted = plans.halt_reason
         self._known_fault = self._newest_fault()
         self._disk_was_low = False
 
@@ -39,7 +39,7 @@ class Occurrences:
             if entry.ended and entry.id not in self._ended:
                 self._ended.add(entry.id)
                 yield self._ending(entry)
-        if (halt_reason := self._queue.halted) != self._halted:
+        if (halt_reason := self._queue.halt_reason) != self._halted:
             self._halted = halt_reason
             ended_words = [entry.words for entry in self._queue.entries if entry.ended]
             if halt_reason and not halt_reason.startswith(tuple(ended_words)):
@@ -118,10 +118,10 @@ class Notifier:
     def _deliver(self) -> None:
         assert self._settings is not None
         while (message := self._messages.get()) is not None:
-            troubles = [words for words in self._sent(message).values() if words]
+            troubles = [words for words in self._send_by_all_ways(message).values() if words]
             self.trouble = "; ".join(f"notification not sent: {words}" for words in troubles)
 
-    def _sent(self, message: Message) -> dict[str, str]:
+    def _send_by_all_ways(self, message: Message) -> dict[str, str]:
         assert self._settings is not None
         error_of_way = {}
         for way, send in ways(self._settings).items():

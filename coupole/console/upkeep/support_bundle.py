@@ -62,7 +62,7 @@ tokens are replaced by {left_out}; accounts and notifications are not in it at a
 def without_secrets(text: str) -> str:
     """The same text, with "(left out)" in place of values that let somebody in."""
     for secret in _SECRETS:
-        text = secret.sub(lambda found: f"{found[1]}{LEFT_OUT}", text)
+        text = secret.sub(lambda match: f"{match[1]}{LEFT_OUT}", text)
     if not _IS_KEY.search(text):
         return text
     if (whole := _json_without(text)) is not None:

@@ -98,7 +98,7 @@ def notifications(folder: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        data: dict[str, Any] = yamlfile.read(path).data
+        data: dict[str, Any] = yamlfile.read_document(path).data
         email, hooks = data.get("email") or {}, data.get("webhooks") or ()
         return {
             "of": ", ".join(map(str, data.get("events") or ())) or "everything",

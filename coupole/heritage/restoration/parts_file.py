@@ -132,7 +132,7 @@ def read_parts(path: Path) -> tuple[Document, PartsFile]:
         if document.data.get("kind") == "picked parts":
             return document, PartsFile(schema_version=1, rules=(PickedFile(kind="picked", path=path.resolve()),))
     else:
-        document = yamlfile.read(path)
+        document = yamlfile.read_document(path)
     return document, document.validate(PartsFile)
 
 

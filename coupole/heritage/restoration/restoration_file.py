@@ -137,7 +137,7 @@ class Stage(Scene):
 
 def read_restoration(path: Path) -> tuple[Document, RestorationFile]:
     """Checked; the files that it names are there. Raises InputError with file:line:column."""
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     restoration = document.validate(RestorationFile)
     missing = [
         document.problem(at, f"no such file: {document.resolve(file)}")

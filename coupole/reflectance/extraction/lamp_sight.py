@@ -57,7 +57,7 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
     codes = np.empty(len(facets.centres_mm), np.uint8)
     _away(facets.centres_mm, facets.normals, centre_mm, normal, np.cos(np.radians(MOST_INCIDENCE_DEG)), codes)
     starts_mm, lit = facets.ray_starts_mm, np.flatnonzero(codes == REACHED)
-    shaded_triangles = lit[mesh.blocked(starts_mm, lit, centre_mm)]
+    shaded_triangles = lit[mesh.blocked_rays(starts_mm, lit, centre_mm)]
     codes[shaded_triangles] = SHADED
     edge = _darken_beside(shaded_triangles, facets.neighbours, codes)
     corners_mm = led_corners_mm(centre_mm[None], normal[None], LED_SIDE_MM)[0]
@@ -65,7 +65,7 @@ def _codes_of_led(mesh: PacketMesh, facets: Facets, leds: Positions, led: int) -
         candidates = _darken_beside(edge, facets.neighbours, codes)
         partly = np.zeros(len(candidates), np.bool_)
         for corner_mm in corners_mm:
-            partly |= mesh.blocked(starts_mm, candidates, corner_mm)
+            partly |= mesh.blocked_rays(starts_mm, candidates, corner_mm)
         codes[candidates[~partly]] = REACHED
         edge = candidates[partly]
         if not len(edge):

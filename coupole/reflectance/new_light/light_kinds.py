@@ -108,7 +108,7 @@ class LightsFile(Model):
 
 def read_lights(path: Path) -> list[AnyLight]:
     """Read the lights of a file. Raises InputError with file:line:column."""
-    document = yamlfile.read(path)
+    document = yamlfile.read_document(path)
     lights = document.validate(LightsFile).lights
     return [
         light.model_copy(update={"file": document.resolve(light.file)})

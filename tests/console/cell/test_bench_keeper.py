@@ -41,8 +41,8 @@ class Kept:
         plans = PlanFiles(folder, cell.document.path, folder / "drawings")
         self.bench = Bench(cell, self.acquisitions, plans, folder / "bench", lambda: self.now_s)
         self.bench.open("Ada", "")
-        self.task = self.bench._tasks.listed[0]
-        cells.wait_until(lambda: "ready" in self.task.said, "its process")
+        self.task = self.bench._tasks.newest_first[0]
+        cells.wait_until(lambda: "ready" in self.task.output_text, "its process")
 
     def _ask(self, _: object, command: str, **fields: object) -> dict[str, Any]:
         if self.answers is None:
@@ -115,9 +115,9 @@ def test_whatever_the_cell_is_lent_for_is_interrupted_as_by_a_key() -> None:
 def test_live_pictures_end_with_the_page_with_a_stop_and_when_nobody_touches_it() -> None:
     from coupole.console.screens.focus_screen import LIVE_S, why_live_ends
 
-    usual: dict[str, Any] = {"watched": True, "untouched_s": 59.0, "stopped": False}
+    usual: dict[str, Any] = {"is_watched": True, "untouched_s": 59.0, "is_stopped": False}
     assert LIVE_S == 60.0
     assert why_live_ends(**usual) == ""
     assert "60 s" in why_live_ends(**{**usual, "untouched_s": 61.0})
-    assert "closed" in why_live_ends(**{**usual, "watched": False})
-    assert why_live_ends(**{**usual, "stopped": True}) == "stopped"
+    assert "closed" in why_live_ends(**{**usual, "is_watched": False})
+    assert why_live_ends(**{**usual, "is_stopped": True}) == "stopped"

@@ -20,7 +20,7 @@ from cells import CellFolder
 from served import BORROWER, Browser, Served, served
 
 from coupole.acquisition import runtime_folder
-from coupole.console.command_line.client import borrowed, call, is_served
+from coupole.console.command_line.client import borrowed_cell, call, is_served
 from coupole.errors import InputError
 from coupole.plan.cell import read_cell
 from sim.world.client import World
@@ -196,5 +196,5 @@ def test_a_machine_without_a_place_for_sockets_keeps_nobody_from_working(
 ) -> None:
     cell = read_cell(CellFolder(tmp_path).rig)
     monkeypatch.setattr(runtime_folder, "_BASE", tmp_path / "nowhere")
-    with borrowed(cell, "live"):
+    with borrowed_cell(cell, "live"):
         assert not is_served(cell)

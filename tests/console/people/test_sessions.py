@@ -24,7 +24,7 @@ def test_who_signs_in_while_the_account_is_removed_is_not_let_in_nor_later_as_it
     assert sessions.of(earlier, script=False) is not None
     accounts.remove("Tom")
     late = sessions.begin(known, script=False)
-    assert sessions.of(late, script=False, used=False) is None
+    assert sessions.of(late, script=False, counts_as_use=False) is None
     accounts.add("Tom", PASSWORD, Role.OPERATOR)
     assert sessions.of(earlier, script=False) is None, "another Tom"
     now = sessions.begin(_signed_in(accounts, "Tom"), script=False)

@@ -145,7 +145,7 @@ def test_after_a_plan_that_failed_another_begins_at_once_but_not_past_a_hold(des
     failed = desk.enter(plan="free.yaml", now=True)
     desk.queue.conclude(failed.id, state="failed", ended="2026-01-01T00:00:00.000Z", halt="free.yaml: no light")
     begun = desk.enter(plan="free.yaml", now=True)
-    assert (desk.queue.halted, desk.queue.following) == ("", begun)
+    assert (desk.queue.halt_reason, desk.queue.following) == ("", begun)
     desk.queue.remove(begun.id)
     hold = desk.enter(hold="turn it")
     desk.queue.conclude(hold.id, state="done", ended="2026-01-01T00:00:00.000Z", halt=hold.words)
@@ -157,17 +157,17 @@ def test_times_are_expected_up_to_what_a_person_decides(desk: Desk) -> None:
     now = datetime(2026, 1, 1, 12, tzinfo=UTC)
     first, second = desk.enter(plan="free.yaml"), desk.enter(plan="free.yaml")
     hold, last = desk.enter(hold="turn it"), desk.enter(plan="free.yaml")
-    found = expected_times(desk.queue.entries, now, left_s=None, halted=False)
+    found = expected_times(desk.queue.entries, now, left_s=None, is_halted=False)
     assert found[first.id][0] == now
     assert found[first.id][1] == found[second.id][0]
     assert timedelta(seconds=100) <= found[second.id][0] - now < timedelta(seconds=120)
     assert found[hold.id] == (found[second.id][1], None)
     assert found[last.id] == (None, None)
     desk.queue.change(first.id, state="running", begun="2026-01-01T11:59:00.000Z")
-    found = expected_times(desk.queue.entries, now, left_s=30.0, halted=False)
+    found = expected_times(desk.queue.entries, now, left_s=30.0, is_halted=False)
     assert found[first.id] == (now - timedelta(seconds=60), now + timedelta(seconds=30))
     assert found[second.id][0] == now + timedelta(seconds=30)
-    halted = expected_times(desk.queue.entries, now, left_s=30.0, halted=True)
+    halted = expected_times(desk.queue.entries, now, left_s=30.0, is_halted=True)
     assert (halted[first.id][1], halted[second.id]) == (now + timedelta(seconds=30), (None, None))
 
 

@@ -102,13 +102,13 @@ def test_a_plan_is_new_written_over_only_by_who_has_seen_it_and_stays_in_its_fol
         assert read_job(tmp_path / name).cell.document.path == cell.rig.resolve()
     assert {"new-round.yaml", "plan.yaml"} <= set(plans.names())
     assert "rig.yaml" not in plans.names()
-    before = plans.read("new-round.yaml")
+    before = plans.read_text("new-round.yaml")
     plans.write("new-round.yaml", before + "# mine\n", before)
     with pytest.raises(InputError, match="changed by somebody else"):
         plans.write("new-round.yaml", before, before)
     for name in ("../out.yaml", "/etc/passwd", "rig.json", ""):
         with pytest.raises(InputError):
-            plans.read(name)
+            plans.read_text(name)
     with pytest.raises(InputError, match="exists already"):
         plans.create("plan", "views")
     with pytest.raises(InputError, match="letters"):

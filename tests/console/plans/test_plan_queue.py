@@ -63,7 +63,7 @@ def test_a_plan_is_begun_once_with_the_cells_rig(
     queue.add("Ada", plan="one.yaml")
     queue.add("Ada", hold="change the object")
     queue.add("Ada", plan="two.yaml")
-    cells.wait_until(lambda: queue.halted, "the hold")
+    cells.wait_until(lambda: queue.halt_reason, "the hold")
     assert [entry.state for entry in queue.entries] == ["done", "done", "waiting"]
     queue.go_on()
     cells.wait_until(lambda: queue.entries[2].state == "done", "the second plan")
@@ -83,7 +83,7 @@ def test_a_queue_that_cannot_be_written_begins_nothing(
 
     monkeypatch.setattr(plan_queue, "write_synced", full)
     queue._kept = queue._kept.model_copy(update={"halted": ""})
-    cells.wait_until(lambda: "No space left" in queue.halted, "the halt")
+    cells.wait_until(lambda: "No space left" in queue.halt_reason, "the halt")
     count = len(begun)
     assert count <= 1
     with pytest.raises(StorageError):
@@ -100,9 +100,9 @@ def test_what_cannot_be_begun_is_told_and_the_watch_goes_on(
     monkeypatch.setattr(module, "subprocess", SimpleNamespace(Popen=none_left, DEVNULL=subprocess.DEVNULL))
     queue.add("Ada", plan="one.yaml")
     cells.wait_until(lambda: queue.entries[0].state == "failed", "the failure")
-    assert "temporarily unavailable" in queue.halted
+    assert "temporarily unavailable" in queue.halt_reason
     monkeypatch.setattr(module, "running", none_left)
-    cells.wait_until(lambda: "BlockingIOError" in queue.halted, "what went wrong in the watch")
+    cells.wait_until(lambda: "BlockingIOError" in queue.halt_reason, "what went wrong in the watch")
     assert running._thread.is_alive()
 
 
@@ -139,9 +139,9 @@ def test_a_queue_that_waits_for_something_else_by_now_does_not_go_on(tmp_path: P
     queue.halt("hold: change the object")
     with pytest.raises(InputError, match="change the object"):
         queue.go_on("small.yaml: stopped")
-    assert queue.halted
+    assert queue.halt_reason
     queue.go_on("hold: change the object")
-    assert not queue.halted
+    assert not queue.halt_reason
 
 
 def test_a_damaged_queue_is_refused(tmp_path: Path) -> None:
@@ -180,7 +180,11 @@ def test_control_passes_to_another_when_its_holder_is_gone_for_five_minutes(tmp_
     assert control.take(ida).name == "Ida", "an engineer's at any time"
     with pytest.raises(InputError, match="last engineer"):
         accounts.remove("Ida")
-    assert [account.name for account in Accounts(tmp_path / "accounts.json").listed()] == ["Ada", "Ida", "Max"]
+    assert [account.name for account in Accounts(tmp_path / "accounts.json").all_accounts()] == [
+        "Ada",
+        "Ida",
+        "Max",
+    ]
 
 
 def test_a_run_that_falls_silent_is_still_at_work_and_a_stop_interrupts_its_process(

@@ -52,5 +52,5 @@ def test_a_role_changes_but_one_engineer_stays(tmp_path: Path) -> None:
     accounts.change_role("Ada", Role.ENGINEER)
     accounts.change_role("Grace", Role.OBSERVER)
     kept = Accounts(tmp_path / "accounts.json")
-    assert {one.name: one.role for one in kept.listed()} == {"Ada": Role.ENGINEER, "Grace": Role.OBSERVER}
+    assert {one.name: one.role for one in kept.all_accounts()} == {"Ada": Role.ENGINEER, "Grace": Role.OBSERVER}
     assert kept.sign_in("Ada", "a long password", here=True) is not None

@@ -19,9 +19,9 @@ from cells import CellFolder
 BORROWER = """
 import sys, time
 from pathlib import Path
-from coupole.console.command_line.client import borrowed
+from coupole.console.command_line.client import borrowed_cell
 from coupole.plan.cell import read_cell
-with borrowed(read_cell(Path(sys.argv[1])), "look at the focus"):
+with borrowed_cell(read_cell(Path(sys.argv[1])), "look at the focus"):
     print("mine", flush=True)
     time.sleep(600)
 """

@@ -137,7 +137,7 @@ def _refuse_texels(texels: str | None, runs: list[Path], without: PicturesWithou
         return
     if texels != "auto":
         raise InputError(f"--texels: expected auto, each view's own pixels; got {texels!r}")
-    if not runs or without.uncalibrated:
+    if not runs or without.is_uncalibrated:
         raise InputError("--texels: is for calibrated runs; pixels of pictures are fitted one by one anyway")
 
 

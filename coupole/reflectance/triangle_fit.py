@@ -315,12 +315,12 @@ def _model(led_mm, view_of, cameras_mm, centres_mm, normals, kd, ks, alpha, mode
 @numba.njit(cache=True, nogil=True)
 def turned_normals(normals, tilts):  # type: ignore[no-untyped-def]
     """Unit normals [n, 3] after tilts [n, 2] along their tangents."""
-    turned = np.empty_like(normals)
+    new_normals = np.empty_like(normals)
     for n in range(len(normals)):
         t1, t2 = tangents(normals[n, 0], normals[n, 1], normals[n, 2])
         square = 0.0
         for k in range(3):
-            turned[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
-            square += turned[n, k] ** 2
-        turned[n] /= np.sqrt(square)
-    return turned
+            new_normals[n, k] = normals[n, k] + tilts[n, 0] * t1[k] + tilts[n, 1] * t2[k]
+            square += new_normals[n, k] ** 2
+        new_normals[n] /= np.sqrt(square)
+    return new_normals

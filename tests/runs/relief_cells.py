@@ -13,7 +13,7 @@ from cells import CellFolder
 
 sys.path.insert(0, str(cells.REPO / "tools"))
 
-from drawn_records import draw_records  # noqa: E402
+from drawn_records import draw_records
 
 RECORDS = cells.REPO / "configs/calibrations"
 DIFFUSE, F0, ROUGHNESS = (0.5, 0.35, 0.2), (0.05, 0.05, 0.05), 0.3

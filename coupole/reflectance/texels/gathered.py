@@ -63,13 +63,13 @@ def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
         for first in range(0, count, _BLOCK):
             part = slice(first, min(first + _BLOCK, count))
             _add_view(view, places_mm[part], normals[part], logs[part], information[part])
-    known = information[:, 0] > 0.0
-    weights = np.where(known[:, None], information, 1.0)
+    is_known = information[:, 0] > 0.0
+    weights = np.where(is_known[:, None], information, 1.0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     logs /= _by_columns(weights[:, 2:], channels)
-    values = np.where(known[:, None], np.exp(logs), 0.0)
+    values = np.where(is_known[:, None], np.exp(logs), 0.0)
     covariance = np.zeros((count, 15), np.float32)
-    covariance[:, _VARIANCES] = np.where(known[:, None], 1.0 / weights, 0.0)
+    covariance[:, _VARIANCES] = np.where(is_known[:, None], 1.0 / weights, 0.0)
     materials = TriangleMaterials(
         normals, values[:, :channels], values[:, channels:-1], values[:, -1], np.zeros(count)
     )
@@ -121,26 +121,17 @@ def _look_up(  # type: ignore[no-untyped-def]
     pixels, places_mm, texel_of_pixel, seen_mm, reach_mm, texel_normals, kd, ks, alpha, covariance, normals, logs,
     information
 ):  # fmt: skip
-    (height, width), channels = texel_of_pixel.shape, kd.shape[1]
+    channels = kd.shape[1]
     means, variances = np.empty(4 + 2 * channels), np.empty(5)
+    texels, weights = np.empty(4, np.int64), np.empty(4)
     for n in range(len(places_mm)):
-        x, y = pixels[n, 0], pixels[n, 1]
-        if not (x > -1.0 and y > -1.0 and x < width and y < height):
+        if not _corners(pixels[n], places_mm[n], texel_of_pixel, seen_mm, reach_mm, texels, weights):
             continue
-        left, top, weights = int(math.floor(x)), int(math.floor(y)), 0.0
         means[:], variances[:] = 0.0, 0.0
         for corner in range(4):
-            column, row = left + corner % 2, top + corner // 2
-            if column < 0 or row < 0 or column >= width or row >= height or texel_of_pixel[row, column] < 0:
+            texel, weight = texels[corner], weights[corner]
+            if weight == 0.0:
                 continue
-            square = 0.0
-            for k in range(3):
-                square += (seen_mm[row, column, k] - places_mm[n, k]) ** 2
-            if not square < reach_mm * reach_mm:
-                continue
-            texel = texel_of_pixel[row, column]
-            weight = (1.0 - abs(x - column)) * (1.0 - abs(y - row))
-            weights += weight
             for k in range(3):
                 means[k] += weight * texel_normals[texel, k]
             for channel in range(channels):
@@ -149,16 +140,39 @@ def _look_up(  # type: ignore[no-untyped-def]
             means[3 + 2 * channels] += weight * math.log(alpha[texel])
             for unknown in range(5):
                 variances[unknown] += weight * covariance[texel, unknown * (unknown + 3) // 2]
-        if weights < 0.5:
-            continue
         for unknown in range(5):
-            variances[unknown] = weights / max(variances[unknown], 1e-8 * weights)
+            variances[unknown] = 1.0 / max(variances[unknown], 1e-8)
             information[n, unknown] += variances[unknown]
         for k in range(3):
-            normals[n, k] += 0.5 * (variances[0] + variances[1]) * means[k] / weights
+            normals[n, k] += 0.5 * (variances[0] + variances[1]) * means[k]
         for number in range(2 * channels + 1):
-            own = variances[2 + min(number // channels, 2)]
-            logs[n, number] += own * means[3 + number] / weights
+            logs[n, number] += variances[2 + min(number // channels, 2)] * means[3 + number]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _corners(pixel, place_mm, texel_of_pixel, seen_mm, reach_mm, texels, weights):  # type: ignore[no-untyped-def]
+    """Fill the texels [4] around a pixel's place and their weights, which sum to 1; tell whether enough of them
+    see the place."""
+    height, width = texel_of_pixel.shape
+    x, y, total = pixel[0], pixel[1], 0.0
+    if not (x > -1.0 and y > -1.0 and x < width and y < height):
+        return False
+    first_column, first_row = math.floor(x), math.floor(y)
+    for corner in range(4):
+        column, row = first_column + corner % 2, first_row + corner // 2
+        weights[corner] = 0.0
+        if not (0 <= column < width and 0 <= row < height) or texel_of_pixel[row, column] < 0:
+            continue
+        square = 0.0
+        for k in range(3):
+            square += (seen_mm[row, column, k] - place_mm[k]) ** 2
+        if square < reach_mm * reach_mm:
+            texels[corner] = texel_of_pixel[row, column]
+            weights[corner] = (1.0 - abs(x - column)) * (1.0 - abs(y - row))
+            total += weights[corner]
+    for corner in range(4):
+        weights[corner] /= max(total, 1e-9)
+    return total >= 0.5
 
 
 def refuse_without_texels(result: RunResult) -> None:

@@ -22,22 +22,24 @@ _MOST_CHANGE = 1.0
 
 
 def all_channels(
-    deviation: Singles, channel: NDArray[np.int8], fitted: NDArray[np.bool_], channels: int
+    deviation: Singles, channel: NDArray[np.int8], is_fitted: NDArray[np.bool_], channels: int
 ) -> Singles:
     """[h, w, channels] of deviations [h, w] that pixels of a `channel` [h, w] show; 0 where none is fitted."""
     if channels == 1:
-        return np.where(fitted, deviation, np.float32(0.0))[..., None]
+        return np.where(is_fitted, deviation, np.float32(0.0))[..., None]
     means = []
     for number in range(channels):
-        here = fitted & (channel == number)
+        here = is_fitted & (channel == number)
         weight = cv2.GaussianBlur(here.astype(np.float32), (0, 0), _SPREAD_PX)
         total = cv2.GaussianBlur(np.where(here, deviation, np.float32(0.0)), (0, 0), _SPREAD_PX)
         means.append(np.where(weight > _LEAST_WEIGHT, total / np.maximum(weight, _LEAST_WEIGHT), np.nan))
     colour = np.stack(means, axis=-1)
-    has_all = fitted & np.isfinite(colour).all(axis=-1)
-    own = np.take_along_axis(colour, channel[..., None].astype(np.int64), axis=-1)
-    change = np.clip(np.where(has_all[..., None], colour - own, np.float32(0.0)), -_MOST_CHANGE, _MOST_CHANGE)
-    result: Singles = np.where(fitted[..., None], deviation[..., None] + change, np.float32(0.0)).astype(
+    has_all = is_fitted & np.isfinite(colour).all(axis=-1)
+    own_colour = np.take_along_axis(colour, channel[..., None].astype(np.int64), axis=-1)
+    change = np.clip(
+        np.where(has_all[..., None], colour - own_colour, np.float32(0.0)), -_MOST_CHANGE, _MOST_CHANGE
+    )
+    result: Singles = np.where(is_fitted[..., None], deviation[..., None] + change, np.float32(0.0)).astype(
         np.float32
     )
     return result

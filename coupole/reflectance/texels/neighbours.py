@@ -1,4 +1,4 @@
-"""What neighbours say of a pixel: its material lies about that of its triangle, and that one about those beside
+"""The word of neighbours on a pixel: its material lies about that of its triangle, and that one about those beside
 it, as far as all around it do.
 
 In a window the spread of materials is that of the surface and that of the fits; what the fits' covariances do
@@ -45,98 +45,100 @@ def lower_half(covariance: NDArray[np.float64]) -> Singles:
     return covariance[..., *LOWER].astype(np.float32)
 
 
-def settle(deviation: Singles, covariance: Singles, fitted: NDArray[np.bool_], centre_covariance: Singles) -> None:
+def settle(
+    deviation: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], centre_covariance: Singles
+) -> None:
     """Draw the deviations [h, w, 5] of a view's pixels from their triangles (tilts, logarithms) towards 0 as far
     as their neighbours say, and set their covariances [h, w, 15, lower half row by row] to what is left; in place.
-    Only pixels that are `fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of what they
-    are drawn to."""
-    covariance[...] = _mean_around(covariance, fitted, _ALIKE_PX)
+    Only pixels that are `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of what
+    they are drawn to."""
+    covariance[...] = _mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
-    np.minimum(square, np.float32(_OUTLIER) * _mean_around(square, fitted, WINDOW_PX), out=square)
-    surface = _surface(square, covariance[..., VARIANCES], fitted, WINDOW_PX)
-    _draw_rows(deviation, covariance, surface, fitted, centre_covariance)
+    np.minimum(square, np.float32(_OUTLIER) * _mean_around(square, is_fitted, WINDOW_PX), out=square)
+    surface = _surface(square, covariance[..., VARIANCES], is_fitted, WINDOW_PX)
+    _draw_rows(deviation, covariance, surface, is_fitted, centre_covariance)
 
 
-def settle_triangles(logs: Singles, covariance: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """Return the steps [h, w, 5] by which materials of triangles change, seen pixel by pixel, when ks and
     roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as those around say; set the
     covariances [h, w, 15] to what is left, in place."""
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
-    middle = _mean_around(weight * logs, fitted, side_px) / np.maximum(
-        _mean_around(weight, fitted, side_px), _LEAST
+    middle = _mean_around(weight * logs, is_fitted, side_px) / np.maximum(
+        _mean_around(weight, is_fitted, side_px), _LEAST
     )
-    deviation = np.zeros((*fitted.shape, UNKNOWNS), np.float32)
+    deviation = np.zeros((*is_fitted.shape, UNKNOWNS), np.float32)
     deviation[..., 3:] = logs - middle
     surface = np.full(deviation.shape, _FREE, np.float32)
-    around = _mean_around(deviation[..., 3:] ** 2, fitted, side_px)
+    around = _mean_around(deviation[..., 3:] ** 2, is_fitted, side_px)
     square = np.minimum(deviation[..., 3:] ** 2, np.float32(_OUTLIER) * around)
-    surface[..., 3:] = _surface(square, covariance[..., VARIANCES[3:]], fitted, side_px)
+    surface[..., 3:] = _surface(square, covariance[..., VARIANCES[3:]], is_fitted, side_px)
     before, of_middle = deviation.copy(), np.zeros_like(covariance)
     of_middle[..., VARIANCES[3:]] = 1.0 / (
-        np.maximum(_mean_around(weight, fitted, side_px), _LEAST) * TRIANGLES_AROUND
+        np.maximum(_mean_around(weight, is_fitted, side_px), _LEAST) * TRIANGLES_AROUND
     )
-    _draw_rows(deviation, covariance, surface, fitted, of_middle)
+    _draw_rows(deviation, covariance, surface, is_fitted, of_middle)
     step: Singles = np.clip(deviation - before, -_MOST_STEP, _MOST_STEP)
     return step
 
 
-def _surface(square: Singles, own: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+def _surface(square: Singles, own_covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """[h, w, k] variances of the surface: mean squares in a window, without those of the fits."""
-    return np.maximum(_mean_around(square - own, fitted, side_px), _LEAST).astype(np.float32)
+    return np.maximum(_mean_around(square - own_covariance, is_fitted, side_px), _LEAST).astype(np.float32)
 
 
 def _draw_rows(
-    deviation: Singles, covariance: Singles, surface: Singles, fitted: NDArray[np.bool_], centre: Singles
+    deviation: Singles, covariance: Singles, surface: Singles, is_fitted: NDArray[np.bool_], centre: Singles
 ) -> None:
     in_strips(
-        len(fitted),
-        lambda rows: _draw(deviation[rows], covariance[rows], surface[rows], fitted[rows], centre[rows]),
+        len(is_fitted),
+        lambda rows: _draw(deviation[rows], covariance[rows], surface[rows], is_fitted[rows], centre[rows]),
     )
 
 
-def _mean_around(values: Singles, fitted: NDArray[np.bool_], side_px: int) -> Singles:
+def _mean_around(values: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """[h, w, k] mean over the fitted pixels of a window; what is not fitted may be NaN."""
-    weight = cv2.boxFilter(fitted.astype(np.float32), -1, (side_px, side_px), normalize=False)
+    weight = cv2.boxFilter(is_fitted.astype(np.float32), -1, (side_px, side_px), normalize=False)
     means = np.empty_like(values)
     for k in range(values.shape[-1]):
-        plane = np.where(fitted, values[..., k], np.float32(0.0))
+        plane = np.where(is_fitted, values[..., k], np.float32(0.0))
         means[..., k] = cv2.boxFilter(plane, -1, (side_px, side_px), normalize=False)
     result: Singles = (means / np.maximum(weight, 1.0)[..., None]).astype(np.float32)
     return result
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw(deviation, covariance, surface, fitted, centre):  # type: ignore[no-untyped-def]
+def _draw(deviation, covariance, surface, is_fitted, centre):  # type: ignore[no-untyped-def]
     """A pixel's deviation and covariance, given the `surface`'s variances about 0: Kalman's; and what 0 may itself
     be off, as far as the pixel was drawn to it."""
-    own, both = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
-    rest, shared = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    own_covariance, whole = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    rest, of_centre = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     before = np.empty(UNKNOWNS)
-    for row in range(fitted.shape[0]):
-        for column in range(fitted.shape[1]):
-            if not fitted[row, column]:
+    for row in range(is_fitted.shape[0]):
+        for column in range(is_fitted.shape[1]):
+            if not is_fitted[row, column]:
                 continue
             place = 0
             for i in range(UNKNOWNS):
                 before[i] = deviation[row, column, i]
                 for j in range(i + 1):
-                    own[i, j] = own[j, i] = covariance[row, column, place]
-                    shared[i, j] = shared[j, i] = centre[row, column, place]
+                    own_covariance[i, j] = own_covariance[j, i] = covariance[row, column, place]
+                    of_centre[i, j] = of_centre[j, i] = centre[row, column, place]
                     place += 1
-            assign_rows(both, own)
+            assign_rows(whole, own_covariance)
             for i in range(UNKNOWNS):
-                both[i, i] += surface[row, column, i]
-            inverse = np.linalg.inv(both)
-            weighted = inverse @ before
+                whole[i, i] += surface[row, column, i]
+            inverse = np.linalg.inv(whole)
+            weighted_deviation = inverse @ before
             for i in range(UNKNOWNS):
                 for j in range(UNKNOWNS):
                     rest[i, j] = (1.0 if i == j else 0.0) - surface[row, column, i] * inverse[i, j]
-            assign_rows(both, rest @ shared @ rest.T)
+            assign_rows(whole, rest @ of_centre @ rest.T)
             place = 0
             for i in range(UNKNOWNS):
-                deviation[row, column, i] = surface[row, column, i] * weighted[i]
+                deviation[row, column, i] = surface[row, column, i] * weighted_deviation[i]
                 for j in range(i + 1):
-                    covariance[row, column, place] = rest[i, j] * surface[row, column, j] + both[i, j]
+                    covariance[row, column, place] = rest[i, j] * surface[row, column, j] + whole[i, j]
                     place += 1
 
 

@@ -60,14 +60,14 @@ def write_view_texels(
     are relative standard uncertainties of kd and ks: of single pixels' responses, and of the power of all LEDs."""
     with h5py.File(path, "w") as file:
         file.attrs["view"], file.attrs["size_px"], file.attrs["frame"] = view, size_px, "base of the robot"
-        for name, told in _TOLD.items():
-            _dataset(file, name, getattr(texels, name), told)
+        for name, description in _TOLD.items():
+            _dataset(file, name, getattr(texels, name), description)
         _dataset(file, "u_pixel", u_pixel, "relative standard uncertainty of kd and ks, of a pixel's own response")
         _dataset(file, "u_shared", u_shared, "the same, of the power of all LEDs")
 
 
-def _dataset(file: h5py.File, name: str, values: Any, told: str) -> None:
-    file.create_dataset(name, data=values, track_times=False).attrs["told"] = told
+def _dataset(file: h5py.File, name: str, values: Any, description: str) -> None:
+    file.create_dataset(name, data=values, track_times=False).attrs["told"] = description
 
 
 def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:

@@ -110,31 +110,30 @@ def _fit_part(  # type: ignore[no-untyped-def]
         for k in range(3):
             place[k] = places_mm[pixel, k]
         towards(place, camera_mm, views[0])
-        used = 0
+        sample_count = 0
         for led in range(leds):
             if not np.isfinite(values[pixel, led]):
                 continue
             towards(place, led_mm[led], lights[led])
             between(lights[led], views[0], half[led])
-            good[used], roots[used] = led, math.sqrt(max(values[pixel, led], 0.0))
-            used += 1
-        if used < FEWEST:
+            good[sample_count], roots[sample_count] = led, math.sqrt(max(values[pixel, led], 0.0))
+            sample_count += 1
+        if sample_count < FEWEST:
             continue
         assign(unknowns[:3], normal)
-        _begin(unknowns, roots[:used], good[:used], lights, half, views[0], prior_kd[pixel], prior_ks[pixel],
-               prior_alpha[pixel])  # fmt: skip
-        filled = pack(roots[:used], good[:used], lights, half, views, only_view, packs)
+        pixel_roots, pixel_leds = roots[:sample_count], good[:sample_count]
+        grey[0], grey[1], grey[2] = prior_kd[pixel], prior_ks[pixel], prior_alpha[pixel]
+        _begin(unknowns, pixel_roots, pixel_leds, lights, half, views[0], grey)
+        pack_count = pack(pixel_roots, pixel_leds, lights, half, views, only_view, packs)
         usual = (unknowns[4], unknowns[5], 1.0 / LOG_KS**2, 1.0 / LOG_ALPHA**2)
-        fit_packs(packs[:filled], views, unknowns, normal, stiffness, usual, _SETTLED)
+        fit_packs(packs[:pack_count], views, unknowns, normal, stiffness, usual, _SETTLED)
         assign(normals[pixel], unknowns[:3])
         assign(logs[pixel], unknowns[3:])
         for k in range(3):
             grey[k] = math.exp(unknowns[3 + k])
         grey[1] = max(grey[1], LEAST_KS * grey[0])
         bread, meat = np.zeros((UNKNOWNS, UNKNOWNS)), np.zeros((UNKNOWNS, UNKNOWNS))
-        add_scores(
-            roots[:used], good[:used], lights, half, views, only_view, group, unknowns[:3], grey, bread, meat
-        )
+        add_scores(pixel_roots, pixel_leds, lights, half, views, only_view, group, unknowns[:3], grey, bread, meat)
         for k, weight in enumerate((stiffness, stiffness, 1e-2, usual[2], usual[3])):
             bread[k, k] += weight
             meat[k, k] += weight
@@ -143,9 +142,10 @@ def _fit_part(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _begin(unknowns, roots, good, lights, half, view, kd, ks, alpha):  # type: ignore[no-untyped-def]
-    """Set the start: the prior's material, as bright as the samples say."""
-    both, square = 0.0, 0.0
+def _begin(unknowns, roots, good, lights, half, view, prior):  # type: ignore[no-untyped-def]
+    """Set the start: the prior's material (kd, ks, alpha), as bright as the samples say."""
+    kd, ks, alpha = prior[0], prior[1], prior[2]
+    products, squares = 0.0, 0.0
     n0, n1, n2 = unknowns[0], unknowns[1], unknowns[2]
     nv = max(n0 * view[0] + n1 * view[1] + n2 * view[2], 0.05)
     for number in range(len(good)):
@@ -155,8 +155,8 @@ def _begin(unknowns, roots, good, lights, half, view, kd, ks, alpha):  # type: i
             continue
         nh = n0 * middle[0] + n1 * middle[1] + n2 * middle[2]
         model = nl * (kd + ks * lobe(nl, nv, nh, alpha)[0])
-        both += roots[number] * math.sqrt(model)
-        square += model
-    ratio = max(both / square, 0.03) if square > 0.0 else 1.0
+        products += roots[number] * math.sqrt(model)
+        squares += model
+    ratio = max(products / squares, 0.03) if squares > 0.0 else 1.0
     unknowns[3] = math.log(kd) + 2.0 * math.log(ratio)
     unknowns[4], unknowns[5] = math.log(max(ks, LEAST_KS * kd)), math.log(alpha)

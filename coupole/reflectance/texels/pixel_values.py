@@ -86,7 +86,7 @@ class PixelReader:
             first = end
         return rows
 
-    def read(self, rows: slice, threads: int) -> PixelBlock:
+    def read_block(self, rows: slice, threads: int) -> PixelBlock:
         """Read all frames, for the pixels of some rows. Raises StorageError for a damaged frame."""
         lists, channels = self._reader.lists, self._reader.pixels.shape[1]
         first, end = (int(lists.starts[row * channels]) for row in (rows.start, rows.stop))

@@ -31,15 +31,17 @@ Singles = NDArray[np.float32]
 def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
     """Compare pictures by texels, and by the best fit of triangles, with those of the LEDs that were left out;
     write and return `texels/texels.json`."""
-    other = best_fit(result, FITS)
-    misses: dict[str, list[NDArray[np.float64]]] = {TEXELS: [], other: []}
+    triangle_fit = best_fit(result, FITS)
+    misses: dict[str, list[NDArray[np.float64]]] = {TEXELS: [], triangle_fit: []}
     measured_parts: list[Singles] = []
     for number, view in enumerate(result.views, start=1):
-        for measured, pictures in _pictures(result, view, (TEXELS, other)):
-            both = np.isfinite(measured) & np.logical_and.reduce([picture > 0.0 for picture in pictures.values()])
-            measured_parts.append(measured[both])
+        for measured_picture, pictures in _pictures(result, view, (TEXELS, triangle_fit)):
+            has_both = np.isfinite(measured_picture) & np.logical_and.reduce(
+                [picture > 0.0 for picture in pictures.values()]
+            )
+            measured_parts.append(measured_picture[has_both])
             for name, picture in pictures.items():
-                off = (picture - measured)[both]
+                off = (picture - measured_picture)[has_both]
                 misses[name].append(np.array([np.abs(off).sum(), np.square(off).sum(), off.size]))
         say("check of texels", number, len(result.views))
     values = np.concatenate(measured_parts) if measured_parts else np.empty(0, np.float32)
@@ -67,7 +69,7 @@ def _psnr_db(parts: list[NDArray[np.float64]], peak: float) -> float | None:
 def _pictures(
     result: RunResult, view: ViewSamples, names: tuple[str, ...]
 ) -> Iterator[tuple[Singles, dict[str, Singles]]]:
-    """For each LED that was kept for the check: the measured picture [h / 2, w / 2, channels] in shares of the
+    """Pictures of each LED that was kept for the check: the measured one [h / 2, w / 2, channels] in shares of the
     camera's range, and those that fits make."""
     frames = read_check_frames(result, view)
     scenes = {name: scene_of_view(result, view.view, name) for name in names}
@@ -75,9 +77,12 @@ def _pictures(
         offsets = file["offsets"][()]
     for number, led in enumerate(frames.leds):
         direct = result.direct_shares(view, slice(0, len(view.triangles)), view.leds == led)[:, 0]
-        measured = frames.share[number].astype(np.float32) * frames.picture(direct)
-        made = {name: scene.picture([LedLight(number=int(led))]) for name, scene in scenes.items()}
-        yield measured, {name: _of_blocks(picture, offsets, measured.shape) for name, picture in made.items()}
+        measured_picture = frames.share[number].astype(np.float32) * frames.picture(direct)
+        pictures = {name: scene.picture([LedLight(number=int(led))]) for name, scene in scenes.items()}
+        yield (
+            measured_picture,
+            {name: _of_blocks(picture, offsets, measured_picture.shape) for name, picture in pictures.items()},
+        )
 
 
 def _of_blocks(picture: Singles, offsets: NDArray[np.int64], shape: tuple[int, ...]) -> Singles:

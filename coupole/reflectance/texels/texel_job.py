@@ -105,7 +105,7 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
     reader = PixelReader(measured_run, geometry, radiometry, view, result, samples)
     texels = texels_of_view(
         result, samples, reader, task.left_out, task.memory_bytes,
-        threads or len(os.sched_getaffinity(0)), lambda done, of: say(f"texels of {task.view}", done, of),
+        threads or len(os.sched_getaffinity(0)), lambda count, of: say(f"texels of {task.view}", count, of),
     )  # fmt: skip
 
     def write(path: Path) -> None:

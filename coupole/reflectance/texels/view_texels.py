@@ -55,9 +55,9 @@ def texels_of_view(
     channel = np.zeros(shape, np.int8)
     normals = np.full((*shape, 3), np.nan, np.float32)
     deviation, covariance = np.full((*shape, UNKNOWNS), np.nan, np.float32), np.empty_like(centres.covariance)
-    fitted, count = np.zeros(shape, np.bool_), 0
+    is_fitted, count = np.zeros(shape, np.bool_), 0
     for rows in reader.blocks(memory_bytes):
-        block = reader.read(rows, threads)
+        block = reader.read_block(rows, threads)
         prior = centres.prior(block)
         fit = fit_pixels(block.values, block.places_mm, lights, prior, threads)
         off = np.empty((len(block.pixels), UNKNOWNS))
@@ -66,24 +66,24 @@ def texels_of_view(
         at = np.unravel_index(block.pixels, shape)
         channel[at], normals[at], deviation[at] = block.channel, fit.normals, off
         covariance[at] = lower_half(fit.covariance)
-        fitted[at] = np.isfinite(off).all(axis=1) & np.isfinite(covariance[at]).all(axis=1)
+        is_fitted[at] = np.isfinite(off).all(axis=1) & np.isfinite(covariance[at]).all(axis=1)
         count += len(block.pixels)
         say(count, reader.count)
-    before = deviation[fitted][:, :2]
-    settle(deviation, covariance, fitted, centres.covariance)
-    of_triangle = reader.triangle_of_pixel[fitted]
-    covariance[fitted, VARIANCES[_KD]] += _u_inter_reflection(view)[of_triangle] ** 2
-    texel_normals = turned_normals(normals[fitted].astype(np.float64), deviation[fitted][:, :2] - before)
-    kd, ks, alpha = centres.logs_of(fitted)
-    for unknown, logs in ((_KD, kd), (_KS, ks)):
-        logs += all_channels(deviation[..., unknown], channel, fitted, result.channels)[fitted]
+    before = deviation[is_fitted][:, :2]
+    settle(deviation, covariance, is_fitted, centres.covariance)
+    of_triangle = reader.triangle_of_pixel[is_fitted]
+    covariance[is_fitted, VARIANCES[_KD]] += _u_inter_reflection(view)[of_triangle] ** 2
+    texel_normals = turned_normals(normals[is_fitted].astype(np.float64), deviation[is_fitted][:, :2] - before)
+    kd, ks, alpha = centres.logs_of(is_fitted)
+    kd += all_channels(deviation[..., _KD], channel, is_fitted, result.channels)[is_fitted]
+    ks += all_channels(deviation[..., _KS], channel, is_fitted, result.channels)[is_fitted]
     return ViewTexels(
-        np.flatnonzero(fitted).astype(np.int32),
+        np.flatnonzero(is_fitted).astype(np.int32),
         texel_normals.astype(np.float32),
         np.exp(kd).astype(np.float32),
         np.minimum(np.exp(ks), MOST_KS).astype(np.float32),
-        np.clip(np.exp(alpha + deviation[fitted][:, _ALPHA]), LEAST_ALPHA, 1.0).astype(np.float32),
-        covariance[fitted],
+        np.clip(np.exp(alpha + deviation[is_fitted][:, _ALPHA]), LEAST_ALPHA, 1.0).astype(np.float32),
+        covariance[is_fitted],
     )
 
 
@@ -134,13 +134,13 @@ def _centres_of(result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray
     )
     kd = np.maximum(materials.kd, LEAST_KD)
     kd, ks, alpha = np.log(kd), np.log(np.maximum(materials.ks, LEAST_KS * kd)), np.log(materials.alpha)
-    known = np.isfinite(alpha) & np.isfinite(of_triangles).all(axis=(1, 2))
-    seen = (triangle_of_pixel >= 0) & np.append(known, False)[triangle_of_pixel]
-    covariance = np.zeros((*seen.shape, UNKNOWNS * (UNKNOWNS + 1) // 2), np.float32)
-    logs, triangle = np.zeros((*seen.shape, 2), np.float32), triangle_of_pixel[seen]
-    covariance[seen] = lower_half(of_triangles)[triangle]
-    logs[seen] = np.stack([ks.mean(axis=1), alpha], axis=1)[triangle]
-    step = settle_triangles(logs, covariance, seen, _window_px(triangle))
+    is_known = np.isfinite(alpha) & np.isfinite(of_triangles).all(axis=(1, 2))
+    is_seen = (triangle_of_pixel >= 0) & np.append(is_known, False)[triangle_of_pixel]
+    covariance = np.zeros((*is_seen.shape, UNKNOWNS * (UNKNOWNS + 1) // 2), np.float32)
+    logs, triangle = np.zeros((*is_seen.shape, 2), np.float32), triangle_of_pixel[is_seen]
+    covariance[is_seen] = lower_half(of_triangles)[triangle]
+    logs[is_seen] = np.stack([ks.mean(axis=1), alpha], axis=1)[triangle]
+    step = settle_triangles(logs, covariance, is_seen, _window_px(triangle))
     return _Centres(triangle_of_pixel, materials.normals, kd, ks, alpha, step, covariance)
 
 
@@ -159,9 +159,9 @@ def _u_inter_reflection(view: ViewSamples) -> Floats:
             return np.zeros(len(view.triangles))
         data = file[INTER_REFLECTION]
         parts = [u_inter_reflection(data[first : first + _ROWS]) for first in range(0, len(data), _ROWS)]
-    known = [np.where(np.isfinite(part), part, 0.0).sum(axis=(1, 2)) for part in parts]
+    sums = [np.where(np.isfinite(part), part, 0.0).sum(axis=(1, 2)) for part in parts]
     count = [np.isfinite(part).sum(axis=(1, 2)) for part in parts]
-    mean: Floats = np.concatenate(known) / np.maximum(np.concatenate(count), 1)
+    mean: Floats = np.concatenate(sums) / np.maximum(np.concatenate(count), 1)
     return mean
 
 

@@ -15,6 +15,7 @@ from coupole.appearance.spectra import light
 from coupole.geometry import Transform, inverse
 from sim.devices.arm_bodies import NONE, Capsules
 from sim.devices.camera_body import Exposed
+from sim.objects.plan_object import surface_of
 from sim.optics import panels
 from sim.optics.blur import defocus_blur_px, through
 from sim.optics.dome import as_built
@@ -30,18 +31,9 @@ from sim.render.interreflection import Neighbourhood, add_indirect, exchange, in
 from sim.render.lens import Lens, Sight, sight
 from sim.render.radiance import albedo, led_radiance, panel_radiance
 from sim.render.shadows import Shadows
-from sim.scene.scene import Scene, build_scene, load_surface, support_disk
-from sim.scene.surface import Material, Surface
+from sim.scene.scene import Scene, build_scene, support_disk
 from sim.scene.things import placed_surfaces
-from sim.world.config import (
-    CameraConfig,
-    MaterialConfig,
-    MeasuredConfig,
-    MeshConfig,
-    SceneConfig,
-    Settings,
-    SpecimenConfig,
-)
+from sim.world.config import CameraConfig, SceneConfig, Settings
 
 _POSE_TOLERANCE, _ARM_TOLERANCE_MM = 1e-6, 1e-3
 _SHADOW_BYTES = 512 << 20
@@ -95,7 +87,7 @@ class Photographer:
         base_from_support = np.array(scene.base_from_support)
         surfaces = [(support_disk(scene.support_diameter_mm), base_from_support)]
         surfaces += [
-            (_surface(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
+            (surface_of(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
             for mesh in scene.objects
         ]
         surfaces += placed_surfaces(settings.things, base_from_support, settings.strangers.target)
@@ -368,28 +360,3 @@ def _reference_lux(emitters: list[Emitter], base_from_support: Transform) -> flo
     """Median over the LEDs of the irradiance on a horizontal white target at the support's centre."""
     centre, up = base_from_support[:3, 3], base_from_support[:3, 2]
     return float(np.median(irradiance_of_each(emitters, centre, up)))
-
-
-def _surface(mesh: MeshConfig, settings: Settings) -> Surface:
-    config = mesh.material or settings.material
-    match config:
-        case None:
-            material = None
-        case SpecimenConfig():
-            from sim.objects.specimens import specimen
-
-            material = specimen(config.specimen)
-        case MeasuredConfig():
-            material = _measured_material(config)
-        case MaterialConfig():
-            material = Material(mesh.path.stem, config.diffuse, config.f0, config.roughness)
-    surface = load_surface(mesh.path, mesh.unit, material, settings.detail, mesh.pictures_beside)
-    return settings.stickers.on(surface) if settings.stickers else surface
-
-
-def _measured_material(config: MeasuredConfig) -> Material:
-    from sim.objects.measured_files import alta_material, bsdf_material, merl_material
-
-    if config.merl is not None:
-        return merl_material(config.merl)
-    return bsdf_material(config.bsdf) if config.bsdf is not None else alta_material(config.alta_files)

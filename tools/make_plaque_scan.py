@@ -2,10 +2,10 @@
 
     python tools/make_plaque_scan.py [--output configs/objects/plaque.ply]
 
-The true surface is `sim.objects.plaque`. Points of a jittered grid are measured along z with noise of 30 um, of which
-most is shared by neighbours, as where a scanner merges its sweeps; the sheet is triangulated by Delaunay. Where the
-black lacquer mirrors and where curls hide the ground, the scan has holes. Walls go down to the support; there is no
-back. The same code gives the same bytes.
+The true surface is `sim.objects.plaque`. Points of a jittered grid are measured along z with noise of 30 um.
+Most of it is shared by neighbours, as where a scanner merges its sweeps. The sheet is triangulated by Delaunay. It
+has holes where the black lacquer mirrors, and where curls and fringe hide the ground. Walls go down to the
+support; there is no back. The same code gives the same bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def scan(pitch_mm: float = PITCH_MM) -> tuple[NDArray[np.float32], NDArray[np.in
     x, y = _grid(random, pitch_mm)
     z = height_mm(x, y) + _noise_mm(random, x.shape, pitch_mm)
     sheet = np.stack([x, y, z], axis=-1)
-    faces = _triangulated(sheet.reshape(-1, 3))
+    faces = _triangles(sheet.reshape(-1, 3))
     faces = faces[~_in_hole(sheet.reshape(-1, 3)[faces].mean(axis=1))]
     index = np.arange(x.size).reshape(x.shape)
     rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
@@ -80,22 +80,22 @@ def _noise_mm(random: np.random.Generator, shape: tuple[int, ...], pitch_mm: flo
     """Errors [rows, columns] of heights, of standard deviation `NOISE_UM`."""
     from scipy.ndimage import gaussian_filter
 
-    own, shared = random.standard_normal((2, *shape))
-    shared = gaussian_filter(shared, SHARED_OVER_MM / pitch_mm, mode="wrap")
-    shared /= shared.std()
-    noise_mm = 1e-3 * NOISE_UM * (np.sqrt(SHARED) * shared + np.sqrt(1.0 - SHARED) * own)
+    alone, common = random.standard_normal((2, *shape))
+    common = gaussian_filter(common, SHARED_OVER_MM / pitch_mm, mode="wrap")
+    common /= common.std()
+    noise_mm = 1e-3 * NOISE_UM * (np.sqrt(SHARED) * common + np.sqrt(1.0 - SHARED) * alone)
     return np.asarray(noise_mm)
 
 
-def _triangulated(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def _triangles(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Triangles [m, 3] of points by Delaunay in x and y, counter-clockwise seen from above."""
     from scipy.spatial import Delaunay
 
-    faces = Delaunay(points[:, :2]).simplices.astype(np.int64)
+    faces: NDArray[np.int64] = Delaunay(points[:, :2]).simplices.astype(np.int64)
     a, b, c = (points[faces[:, k], :2] for k in range(3))
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     faces[area < 0.0] = faces[area < 0.0][:, ::-1]
-    return faces[np.abs(area) > 1e-9]
+    return np.asarray(faces[np.abs(area) > 1e-9])
 
 
 def _in_hole(places: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -113,8 +113,8 @@ def _without_loose_points(
     points: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """The mesh without points that no triangle has."""
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return points[used].astype("<f4"), renumbered.reshape(-1, 3).astype("<i4")
+    in_use, new_numbers = np.unique(faces, return_inverse=True)
+    return points[in_use].astype("<f4"), new_numbers.reshape(-1, 3).astype("<i4")
 
 
 def main(arguments: list[str] | None = None) -> None:

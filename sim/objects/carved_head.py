@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sim.objects.implicit_solid import Array, Form, ball, height_above_plane, mirrored
+from sim.objects.implicit_solid import Array, Form, ball, height_above_plane, mirror_pair
 
 TURN_DEG = (-5.0, 16.0, 3.0)
 """Pitch (down), yaw (towards +x) and roll of the head."""
@@ -20,7 +20,13 @@ _EYE, _EYE_RADIUS, _EYE_HALF_WIDTH = (0.268, -0.020, 0.490), 0.165, 0.142
 _LID_POINTS = 9
 _ROWS_OF_CURLS = ((11, 0.62, 0.62, 0.150), (13, 0.78, 0.80, 0.165), (13, 0.90, 0.97, 0.165))
 """Number of curls of a row, its half width and height over the eyes, and the radius of a curl."""
-_LOCKS = ((0.72, -0.24, -0.02), (0.70, -0.50, -0.10), (0.66, -0.76, -0.18), (0.61, -1.00, -0.26), (0.56, -1.22, -0.34))
+_LOCKS = (
+    (0.72, -0.24, -0.02),
+    (0.70, -0.50, -0.10),
+    (0.66, -0.76, -0.18),
+    (0.61, -1.00, -0.26),
+    (0.56, -1.22, -0.34),
+)
 
 
 def head_height(x: Array, y: Array) -> Array:
@@ -44,12 +50,12 @@ def _face() -> list[Form]:
         Form((0.27, 0.165, 0.610), (0.46, 0.06, 0.440), (0.060, 0.050), 0.10),
         ball((0.270, -0.035, 0.80), 0.16, 0.14, is_cut=True, stretch=(1.25, 0.75, 1.0)),
     ):
-        forms += mirrored(form)
+        forms += mirror_pair(form)
     forms += [
         Form((0.0, 0.12, 0.650), (0.0, -0.22, 0.840), (0.056, 0.070), 0.09),
         ball((0.0, -0.255, 0.845), 0.085, 0.06),
-        *mirrored(ball((0.090, -0.275, 0.735), 0.066, 0.05, stretch=(1.0, 0.85, 1.15))),
-        *mirrored(ball((0.050, -0.335, 0.79), 0.028, 0.03, is_cut=True)),
+        *mirror_pair(ball((0.090, -0.275, 0.735), 0.066, 0.05, stretch=(1.0, 0.85, 1.15))),
+        *mirror_pair(ball((0.050, -0.335, 0.79), 0.028, 0.03, is_cut=True)),
     ]
     return forms
 
@@ -60,7 +66,7 @@ def _eyes() -> list[Form]:
     for rise, thickness in ((0.088, 0.025), (-0.062, 0.017)):
         forms += _lid(rise, thickness)
     forms.append(ball((_EYE[0] + 0.005, _EYE[1], _EYE[2] + _EYE_RADIUS + 0.008), 0.028, 0.006, is_cut=True))
-    return [one for form in forms for one in mirrored(form)]
+    return [part for form in forms for part in mirror_pair(form)]
 
 
 def _lid(rise: float, thickness: float) -> list[Form]:
@@ -77,12 +83,12 @@ def _mouth() -> list[Form]:
     return [
         ball((0.0, -0.55, 0.475), 0.25, 0.18, stretch=(1.25, 0.9, 0.9)),
         Form((0.0, -0.39, 0.778), (0.0, -0.455, 0.755), (0.012, 0.018), 0.05, is_cut=True),
-        *mirrored(Form((0.035, -0.515, 0.712), (0.130, -0.535, 0.688), (0.050, 0.040), 0.025)),
-        *mirrored(Form((0.130, -0.535, 0.688), (0.225, -0.562, 0.630), (0.040, 0.016), 0.025)),
-        *mirrored(Form((0.025, -0.632, 0.690), (0.120, -0.612, 0.672), (0.060, 0.048), 0.025)),
-        *mirrored(Form((0.120, -0.612, 0.672), (0.225, -0.568, 0.630), (0.048, 0.014), 0.025)),
-        *mirrored(Form((0.0, -0.573, 0.772), (0.12, -0.566, 0.735), (0.012, 0.012), 0.014, is_cut=True)),
-        *mirrored(Form((0.12, -0.566, 0.735), (0.240, -0.558, 0.650), (0.012, 0.012), 0.014, is_cut=True)),
+        *mirror_pair(Form((0.035, -0.515, 0.712), (0.130, -0.535, 0.688), (0.050, 0.040), 0.025)),
+        *mirror_pair(Form((0.130, -0.535, 0.688), (0.225, -0.562, 0.630), (0.040, 0.016), 0.025)),
+        *mirror_pair(Form((0.025, -0.632, 0.690), (0.120, -0.612, 0.672), (0.060, 0.048), 0.025)),
+        *mirror_pair(Form((0.120, -0.612, 0.672), (0.225, -0.568, 0.630), (0.048, 0.014), 0.025)),
+        *mirror_pair(Form((0.0, -0.573, 0.772), (0.12, -0.566, 0.735), (0.012, 0.012), 0.014, is_cut=True)),
+        *mirror_pair(Form((0.12, -0.566, 0.735), (0.240, -0.558, 0.650), (0.012, 0.012), 0.014, is_cut=True)),
         Form((-0.06, -0.735, 0.715), (0.06, -0.735, 0.715), (0.022, 0.022), 0.08, is_cut=True),
     ]
 
@@ -95,9 +101,8 @@ def _hair() -> list[Form]:
             angle = np.pi * (number / (count - 1) * 1.14 - 0.07)
             x, y = across * np.cos(angle), 0.08 + up * np.sin(angle)
             forms.append(_curl(x, y, _on_skull(x, y), radius))
-    for number, (x, y, z) in enumerate(_LOCKS):
-        for side in (-1.0, 1.0):
-            forms.append(_curl(side * x, y, z, 0.185 - 0.01 * number))
+    sides = (-1.0, 1.0)
+    forms += [_curl(s * x, y, z, 0.185 - 0.01 * n) for n, (x, y, z) in enumerate(_LOCKS) for s in sides]
     return forms
 
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 _STEPS, _CAUTION = 200, 0.7
-"""Most steps of a ray, and the share of the stated distance that a step takes: blended distances are bounds only."""
+"""Most steps of a ray, and the share of the distance that a step takes: blended distances are bounds only."""
 _NEAR = 5e-5
 """Distance to the surface at which a ray has met it."""
 
@@ -51,21 +51,19 @@ def ball(centre: Point, radius: float, blend: float = 0.0, **more: object) -> Fo
     return Form(centre, centre, (radius, radius), blend, **more)  # type: ignore[arg-type]
 
 
-def mirrored(form: Form) -> list[Form]:
+def mirror_pair(form: Form) -> list[Form]:
     """The form and its mirror image at x = 0."""
     (ax, ay, az), (bx, by, bz), (depth, turns, hand) = form.start, form.end, form.groove
-    other = Form(
+    image = Form(
         (-ax, ay, az), (-bx, by, bz), form.radii, form.blend, form.is_cut, form.stretch, (depth, turns, -hand)
     )
-    return [form, other]
+    return [form, image]
 
 
-def height_above_plane(
-    solid: Sequence[Form], x: Array, y: Array, turn: Array, top: float, bottom: float
-) -> Array:
-    """Height [...] of the highest point of the solid above places `x`, `y` [...]; `bottom` where there is none.
+def height_above_plane(solid: Sequence[Form], x: Array, y: Array, turn: Array, top: float, bottom: float) -> Array:
+    """Height [...] of the solid's highest point above places `x`, `y` [...]; `bottom` where there is none.
 
-    `turn` [3, 3] is the rotation from the solid's axes to those of the plane (z away from it). Rays start at `top`.
+    `turn` [3, 3] is the rotation from the solid's axes to those of the plane, z away from it. Rays start at `top`.
     """
     table = np.array([form.row() for form in solid])
     places = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
@@ -112,8 +110,8 @@ def _forms_near_ray(table, foot, along, near_rows):  # type: ignore[no-untyped-d
         for k in range(3):
             away += (0.5 * (form[k] + form[k + 3]) - foot[k] - on_ray * along[k]) ** 2
             half_length += 0.25 * (form[k + 3] - form[k]) ** 2
-        longest = max(form[10], max(form[11], form[12]))
-        reach = max(form[6], form[7]) * longest + 1.25 * form[8] * longest / min(form[10], min(form[11], form[12]))
+        longest = max(form[10], form[11], form[12])
+        reach = max(form[6], form[7]) * longest + 1.25 * form[8] * longest / min(form[10], form[11], form[12])
         if np.sqrt(away) < np.sqrt(half_length) + reach:
             near_rows[count] = row
             count += 1
@@ -157,4 +155,4 @@ def _distance_to_form(form, x, y, z):  # type: ignore[no-untyped-def]
         across = np.sqrt(px * px + py * py) / form[6]
         phase = 2.0 * np.pi * form[14] * across + form[15] * np.arctan2(py, px)
         distance += 0.5 * form[13] * (1.0 + np.cos(phase)) * min(1.0, 4.0 * across)
-    return distance * min(sx, min(sy, sz))
+    return distance * min(sx, sy, sz)

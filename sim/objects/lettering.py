@@ -14,7 +14,9 @@ LETTER_GAP, WORD_GAP = 0.24, 0.62
 
 def _arc(centre: Place, radii: Place, from_deg: float, to_deg: float) -> tuple[Place, ...]:
     angles = np.radians(np.linspace(from_deg, to_deg, 25))
-    return tuple((float(centre[0] + radii[0] * np.cos(a)), float(centre[1] + radii[1] * np.sin(a))) for a in angles)
+    return tuple(
+        (float(centre[0] + radii[0] * np.cos(a)), float(centre[1] + radii[1] * np.sin(a))) for a in angles
+    )
 
 
 _BOWL = ((0.0, 1.0), (0.24, 1.0), *_arc((0.24, 0.75), (0.26, 0.25), 90.0, -90.0), (0.0, 0.5))
@@ -47,20 +49,22 @@ def strokes_distance(text: str, x: Array, y: Array, height_mm: float) -> Array:
     The line is `height_mm` high, stands on y = 0 and is centred on x = 0. Far from all letters it is infinite.
     """
     distance = np.full(x.shape, np.inf)
-    left = -0.5 * text_width(text)
+    start = -0.5 * text_width(text)
     for letter, advance in _advances(text):
         if letter != " ":
             width, strokes = CAPITALS[letter]
-            u, v = x / height_mm - left, y / height_mm
+            u, v = x / height_mm - start, y / height_mm
             near = (u > -0.1) & (u < width + 0.1) & (v > -0.1) & (v < 1.1)
             for stroke in strokes:
                 distance[near] = np.minimum(
                     distance[near], height_mm * distance_to_line(u[near], v[near], stroke)[0]
                 )
-        left += advance
+        start += advance
     return distance
 
 
 def _advances(text: str) -> list[tuple[str, float]]:
     """Letters, each with the way to the next one, in heights of a capital."""
-    return [(letter, WORD_GAP - LETTER_GAP if letter == " " else CAPITALS[letter][0] + LETTER_GAP) for letter in text]
+    return [
+        (letter, WORD_GAP - LETTER_GAP if letter == " " else CAPITALS[letter][0] + LETTER_GAP) for letter in text
+    ]

@@ -1,8 +1,8 @@
 """The showpiece: a carved and coloured plaque, as the true surface that simulated frames show.
 
-It carries what the seeds treat: stone, blue paint with losses, gold leaf over red bole that is worn on its heights,
-black lacquer with a drawing of gold powder, woven cloth, and an inscription of strokes 0.3 mm wide. The mesh that a
-plan names is a scan of it (`tools/make_plaque_scan.py`), which has none of what is finer than its triangles.
+It has what the seeds treat: stone, blue paint with losses, gold leaf over red bole that is worn where it stands
+out, black lacquer with a drawing of gold powder, woven cloth, and an inscription of strokes 0.3 mm wide. The mesh
+that a plan names is a scan of it (`tools/make_plaque_scan.py`), without anything that is finer than its triangles.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from coupole.appearance.optics import indices
 from coupole.appearance.shapes.triangles import Array, flat_normals, grid_faces
 from sim.objects import appearance, fabric, plum_branch
 from sim.objects import plaque_relief as relief
-from sim.objects.carving import noise
+from sim.objects.carving import NOISE_SPREAD, noise
 from sim.scene.surface import Material, Surface
 
 STEP_MM = 0.1
@@ -53,12 +53,14 @@ def plaque(step_mm: float = STEP_MM) -> Surface:
     """
     width, depth = relief.PLAQUE_MM
     columns, rows = round(width / step_mm), round(depth / step_mm)
-    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, columns + 1), np.linspace(-depth / 2, depth / 2, rows + 1))
+    x, y = np.meshgrid(
+        np.linspace(-width / 2, width / 2, columns + 1), np.linspace(-depth / 2, depth / 2, rows + 1)
+    )
     height = relief.height_mm(x, y)
     points = np.stack([x, y, height], axis=-1)
     corners, body = points.reshape(-1, 3)[grid_faces(rows, columns)], _body(points)
     middle_x, middle_y = (0.25 * (a[1:, 1:] + a[1:, :-1] + a[:-1, 1:] + a[:-1, :-1]).ravel() for a in (x, y))
-    material = materials_at(middle_x, middle_y, _worn(height, step_mm))
+    material = materials_at(middle_x, middle_y, _wear(height, step_mm))
     tint = tints_at(middle_x, middle_y, material)
     normals = np.repeat(_normals(height, step_mm), 2, axis=0)
     return Surface(
@@ -79,8 +81,8 @@ def _body(points: Array) -> Array:
     return np.concatenate([np.stack(corners, axis=1) for corners in walls])
 
 
-def materials_at(x: Array, y: Array, worn: Array) -> NDArray[np.int64]:
-    """Row of `materials()` [n] at places [n] of the plaque; `worn` [n] is 0 on average, and high on heights."""
+def materials_at(x: Array, y: Array, wear: Array) -> NDArray[np.int64]:
+    """Row of `materials()` [n] at places [n] of the plaque; `wear` [n] is 0 on average, and high on heights."""
     material = np.full(x.shape, STONE)
     in_roundel, on_flower = relief.in_roundel(x, y), relief.in_flower(x, y)
     in_bay = (np.abs(x) < 30.7) & (y > -25.6) & (y < 35.6)
@@ -91,9 +93,9 @@ def materials_at(x: Array, y: Array, worn: Array) -> NDArray[np.int64]:
     gilt |= relief.bead_mm(x, y)[1]
     material[in_roundel] = _in_roundel(x[in_roundel], y[in_roundel])
     gilt |= material == GOLD
-    loss = noise(x, y, 3.0, _LOSS_SEED) + 0.5 * noise(x, y, 0.7, _LOSS_SEED + 40) + 0.25 * worn
+    loss = noise(x, y, 3.0, _LOSS_SEED) + 0.5 * noise(x, y, 0.7, _LOSS_SEED + 40) + 0.25 * wear
     material[(material == BLUE) & (loss > _LOST)] = STONE
-    material[gilt] = np.select([worn[gilt] > _WORN_TO_STONE, worn[gilt] > _WORN_TO_BOLE], [STONE, BOLE], GOLD)
+    material[gilt] = np.select([wear[gilt] > _WORN_TO_STONE, wear[gilt] > _WORN_TO_BOLE], [STONE, BOLE], GOLD)
     in_lacquer = relief.in_lacquer(x, y)
     share = plum_branch.powder_share(*relief.panel_place(x[in_lacquer], y[in_lacquer]))
     material[in_lacquer] = np.where(_grains(x[in_lacquer], y[in_lacquer]) < share, POWDER, LACQUER)
@@ -104,10 +106,10 @@ def materials_at(x: Array, y: Array, worn: Array) -> NDArray[np.int64]:
 
 def tints_at(x: Array, y: Array, material: NDArray[np.int64]) -> Array:
     """[n, 3] factors of the diffuse reflectance: mottled stone and paint, dyed stripes of the cloth."""
-    mottled = 0.94 + 0.04 * noise(x, y, 4.0, _STONE_SEED) + 0.035 * noise(x, y, 0.6, _STONE_SEED + 40)
-    tint = np.repeat(np.clip(mottled, 0.6, 1.06)[:, None], 3, axis=1)
-    left, right, _, _ = relief.CLOTH_MM
-    from_middle = np.abs(x - 0.5 * (left + right)) / (0.5 * (right - left))
+    mottling = 0.94 + 0.04 * noise(x, y, 4.0, _STONE_SEED) + 0.035 * noise(x, y, 0.6, _STONE_SEED + 40)
+    tint = np.repeat(np.clip(mottling, 0.6, 1.06)[:, None], 3, axis=1)
+    west, east, _, _ = relief.CLOTH_MM
+    from_middle = np.abs(x - 0.5 * (west + east)) / (0.5 * (east - west))
     is_madder = (material == CLOTH) & (((from_middle > 0.55) & (from_middle < 0.80)) | (from_middle < 0.16))
     tint[is_madder] *= [0.85, 0.22, 0.22]
     is_indigo = (material == CLOTH) & (from_middle > 0.24) & (from_middle < 0.36)
@@ -131,11 +133,10 @@ def _in_roundel(x: Array, y: Array) -> NDArray[np.int64]:
 
 
 def _grains(x: Array, y: Array) -> Array:
-    """Even random values [n], 0 to 1, alike within a grain of powder: where they are below its share, gold lies."""
+    """Even random values [n], 0 to 1, alike within a grain of powder: gold lies where they are below its share."""
     from scipy.special import ndtr
 
-    value = noise(x, y, _GRAIN_MM, _POWDER_SEED)
-    return np.asarray(ndtr(value / value.std()))
+    return np.asarray(ndtr(noise(x, y, _GRAIN_MM, _POWDER_SEED) / NOISE_SPREAD))
 
 
 def _star(x: Array, y: Array) -> NDArray[np.bool_]:
@@ -147,7 +148,7 @@ def _star(x: Array, y: Array) -> NDArray[np.bool_]:
     return np.asarray(r < 0.30 + 0.55 * np.abs(np.cos(3.0 * phi)) ** 4)
 
 
-def _worn(height: Array, step_mm: float) -> Array:
+def _wear(height: Array, step_mm: float) -> Array:
     """Wear [cells] of a grid of heights: by how much a place stands out of its surroundings, and chance."""
     from scipy.ndimage import gaussian_filter
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim.objects import plum_branch
 from sim.objects.carved_head import DEEPEST, head_height
-from sim.objects.carving import Array, half_round, noise, smooth_step
+from sim.objects.carving import Array, Mask, half_round, noise, smooth_step
 from sim.objects.lettering import strokes_distance
 
 PLAQUE_MM = (112.0, 84.0)
@@ -53,9 +53,9 @@ def height_mm(x: Array, y: Array) -> Array:
     is_left = np.ones(flat_x.shape, bool)
     for where, _ in parts:
         is_left &= ~where
-    for where, carved in [*parts, (is_left, _ground)]:
-        height[where] = carved(flat_x[where], flat_y[where])
-    return height.reshape(np.shape(x))
+    for where, part in [*parts, (is_left, _ground)]:
+        height[where] = part(flat_x[where], flat_y[where])
+    return np.asarray(height.reshape(np.shape(x)))
 
 
 def edge_distance(x: Array, y: Array) -> Array:
@@ -63,19 +63,20 @@ def edge_distance(x: Array, y: Array) -> Array:
     return np.minimum(0.5 * PLAQUE_MM[0] - np.abs(x), 0.5 * PLAQUE_MM[1] - np.abs(y))
 
 
-def in_roundel(x: Array, y: Array) -> Array:
+def in_roundel(x: Array, y: Array) -> Mask:
     return np.hypot(x - ROUNDEL[0], y - ROUNDEL[1]) < ROUNDEL[2]
 
 
-def in_lacquer(x: Array, y: Array) -> Array:
+def in_lacquer(x: Array, y: Array) -> Mask:
     return _inside(x, y, LACQUER_MM) > 0.0
 
 
-def in_cloth(x: Array, y: Array) -> Array:
+def in_cloth(x: Array, y: Array) -> Mask:
     """True where the strip is; below its hem only the warp's threads hang."""
-    left, right, bottom, top = CLOTH_MM
-    fringe = (np.floor(x / (1.5 * THREAD_MM)) % 2 == 0) & (y > bottom - 3.0 + 0.8 * np.sin(7.0 * x))
-    return (x > left) & (x < right) & (y < top) & ((y > bottom) | fringe)
+    west, east, south, north = CLOTH_MM
+    fringe = (np.floor(x / (1.5 * THREAD_MM)) % 2 == 0) & (y > south - 3.0 + 0.8 * np.sin(7.0 * x))
+    inside = (x > west) & (x < east) & (y < north) & ((y > south) | fringe)
+    return np.asarray(inside)
 
 
 def head_mm(x: Array, y: Array) -> Array:
@@ -99,7 +100,7 @@ def cloak_mm(x: Array, y: Array) -> Array:
     return np.where((inside > 0.0) & (below < 2.6 - 0.020 * across**2), body, 0.0)
 
 
-def on_hem(x: Array, y: Array) -> Array:
+def on_hem(x: Array, y: Array) -> Mask:
     """True on the cloak's border at the neck."""
     inside = _below_neckline(x, y)
     return (inside > 0.3) & (inside < 2.0)
@@ -112,8 +113,8 @@ def _below_neckline(x: Array, y: Array) -> Array:
 
 def cloth_mm(x: Array, y: Array) -> Array:
     """Height [n] of the strip of cloth: folds, and each thread over and under the others (plain weave)."""
-    left, right, bottom, _ = CLOTH_MM
-    across = (x - 0.5 * (left + right)) / (right - left)
+    west, east, south, _ = CLOTH_MM
+    across = (x - 0.5 * (west + east)) / (east - west)
     folds = 1.1 * np.sin(0.27 * y + 2.2 * across) + 0.7 * np.cos(7.5 * across + 0.06 * y)
     u, v = x / THREAD_MM, y / THREAD_MM
     warp_up = (np.floor(u) + np.floor(v)) % 2 == 0
@@ -121,7 +122,7 @@ def cloth_mm(x: Array, y: Array) -> Array:
     across_thread, along_thread = np.where(warp_up, in_u, in_v), np.where(warp_up, in_v, in_u)
     thread = 0.30 * np.sqrt(np.maximum(0.0, 1.0 - across_thread**2)) * (1.0 - 0.45 * along_thread**2)
     hanging = 0.30 * np.sqrt(np.maximum(0.0, 1.0 - in_u**2))
-    return FIELD_MM + 2.2 + folds + np.where(y > bottom, thread, hanging)
+    return FIELD_MM + 2.2 + folds + np.where(y > south, thread, hanging)
 
 
 def cut_distance(x: Array, y: Array) -> Array:
@@ -129,7 +130,7 @@ def cut_distance(x: Array, y: Array) -> Array:
     return strokes_distance(INSCRIPTION, x, y - BASELINE_MM, LETTER_MM)
 
 
-def bead_mm(x: Array, y: Array) -> tuple[Array, Array]:
+def bead_mm(x: Array, y: Array) -> tuple[Array, Mask]:
     """Height [n] over the frame's foot of the beads and reels inside of it, and True where they are."""
     inset = edge_distance(x, y) - 5.0
     along = _along_edge(x, y) % 2.0 - 1.0
@@ -168,9 +169,9 @@ def _roundel(x: Array, y: Array) -> Array:
     angle = np.arctan2(y - NIMBUS[1], x - NIMBUS[0])
     rays = 0.16 * np.abs(np.sin(24.0 * angle)) * smooth_step((from_middle - 10.0) / 3.0)
     ring = 0.5 * half_round((from_middle - NIMBUS[2] + 0.7) / 0.7)
-    punched = np.hypot((from_middle - NIMBUS[2] + 2.3) / 0.55, (np.mod(angle * 24.0 / np.pi, 1.0) - 0.5) * 4.0)
+    to_punch = np.hypot((from_middle - NIMBUS[2] + 2.3) / 0.55, (np.mod(angle * 24.0 / np.pi, 1.0) - 0.5) * 4.0)
     nimbus = FIELD_MM + 0.15 + rays * (from_middle < NIMBUS[2] - 3.2) + ring
-    nimbus -= 0.25 * np.sqrt(np.maximum(0.0, 1.0 - punched**2))
+    nimbus -= 0.25 * np.sqrt(np.maximum(0.0, 1.0 - to_punch**2))
     field = FIELD_MM - 0.6 + 0.03 * noise(x, y, 0.8, 3)
     height = np.where(from_middle < NIMBUS[2], nimbus, field)
     return np.maximum(np.maximum(height, cloak_mm(x, y)), head_mm(x, y))
@@ -193,7 +194,7 @@ def _flowers(x: Array, y: Array) -> Array:
     return np.where(r < petal, FIELD_MM + np.maximum(leaf, 1.7 * half_round(r / 1.0)), 0.0)
 
 
-def in_flower(x: Array, y: Array) -> Array:
+def in_flower(x: Array, y: Array) -> Mask:
     """True on the flowers around the roundel."""
     r, phi = _flower_place(x, y)
     return r < 3.9 * (0.62 + 0.38 * np.abs(np.cos(2.5 * phi)))
@@ -212,7 +213,7 @@ def _bars(x: Array, y: Array) -> Array:
     return FIELD_MM + 1.5 * np.maximum(upright, lying)
 
 
-def on_bar(x: Array, y: Array) -> Array:
+def on_bar(x: Array, y: Array) -> Mask:
     """True on the bars between bays and band."""
     upright = (np.abs(np.abs(x) - _BAR_X_MM) < _BAR_HALF_MM) & (y > _BAR_Y_MM)
     return upright | (np.abs(y - _BAR_Y_MM) < _BAR_HALF_MM)
@@ -220,24 +221,24 @@ def on_bar(x: Array, y: Array) -> Array:
 
 def _lacquer(x: Array, y: Array) -> Array:
     """A flat panel with a rounded edge and a raised drawing."""
-    rounded = 1.6 * np.sqrt(1.0 - (1.0 - np.clip(_inside(x, y, LACQUER_MM) / 0.9, 0.0, 1.0)) ** 2)
+    edge_mm = 1.6 * np.sqrt(1.0 - (1.0 - np.clip(_inside(x, y, LACQUER_MM) / 0.9, 0.0, 1.0)) ** 2)
     swell = 0.03 * np.cos(0.21 * x) * np.cos(0.13 * y)
-    return FIELD_MM + rounded + swell + plum_branch.raised_mm(*panel_place(x, y))
+    return FIELD_MM + edge_mm + swell + plum_branch.raised_mm(*panel_place(x, y))
 
 
 def panel_place(x: Array, y: Array) -> tuple[Array, Array]:
     """Places about the middle of the panel of lacquer."""
-    left, right, bottom, top = LACQUER_MM
-    return x - 0.5 * (left + right), y - 0.5 * (bottom + top)
+    west, east, south, north = LACQUER_MM
+    return x - 0.5 * (west + east), y - 0.5 * (south + north)
 
 
 def _band(x: Array, y: Array) -> Array:
     """The raised band, with the strokes cut into it."""
-    raised = FIELD_MM + 1.3 * smooth_step(_inside(x, y, BAND_MM) / 0.8) + 0.008 * noise(x, y, 0.4, 4)
-    return raised - _cut(x, y)
+    face_mm = FIELD_MM + 1.3 * smooth_step(_inside(x, y, BAND_MM) / 0.8) + 0.008 * noise(x, y, 0.4, 4)
+    return face_mm - _cut_depth(x, y)
 
 
-def _cut(x: Array, y: Array) -> Array:
+def _cut_depth(x: Array, y: Array) -> Array:
     """Depth of the strokes, with a rounded bottom."""
     return STROKE_DEPTH_MM * half_round(np.minimum(cut_distance(x, y) / (0.5 * STROKE_MM), 2.0))
 
@@ -251,9 +252,11 @@ def _frame(x: Array, y: Array) -> Array:
     egg = 1.3 * np.sqrt(np.maximum(0.0, 1.0 - egg_squared))
     shell = 0.55 * half_round((np.sqrt(egg_squared) - 1.28) / 0.16) * (inset > 0.9)
     dart = 0.9 * np.maximum(0.0, 1.0 - (2.0 - np.abs(along)) / 0.34) * ((inset > 1.2) & (inset < 3.9))
-    carved = profile + np.where((inset > 0.9) & (inset < 4.2), np.maximum(np.maximum(egg, shell), dart) - 0.7, 0.0)
-    carved = np.where(inset > 4.2, FIELD_MM + 0.4 + bead_mm(x, y)[0], carved)
-    return carved + 0.02 * noise(x, y, 0.5, 5)
+    relief_mm = profile + np.where(
+        (inset > 0.9) & (inset < 4.2), np.maximum(np.maximum(egg, shell), dart) - 0.7, 0.0
+    )
+    relief_mm = np.where(inset > 4.2, FIELD_MM + 0.4 + bead_mm(x, y)[0], relief_mm)
+    return relief_mm + 0.02 * noise(x, y, 0.5, 5)
 
 
 def _along_edge(x: Array, y: Array) -> Array:
@@ -264,5 +267,5 @@ def _along_edge(x: Array, y: Array) -> Array:
 
 def _inside(x: Array, y: Array, box_mm: tuple[float, float, float, float]) -> Array:
     """Distance to the edge of a box (left, right, bottom, top), positive inside."""
-    left, right, bottom, top = box_mm
-    return np.minimum(np.minimum(x - left, right - x), np.minimum(y - bottom, top - y))
+    west, east, south, north = box_mm
+    return np.minimum(np.minimum(x - west, east - x), np.minimum(y - south, north - y))

@@ -91,5 +91,5 @@ def _with_blossom(share: Array, x: Array, y: Array, blossom: tuple[float, float,
     fill = np.where(r < petal_mm, 0.75 * np.clip(r / radius - 0.35, 0.0, 1.0), 0.0)
     ray = np.abs(r * np.sin(np.mod(phi + 0.1 * step, step / 3.0) - step / 6.0))
     stamens = _line(ray - 0.06) * (r < 0.45 * radius) + _line(r - 0.10 * radius)
-    drawn = np.maximum(np.maximum(outline, fill), np.minimum(stamens, 1.0))
-    return np.where(inside, drawn, share)
+    petals = np.maximum(np.maximum(outline, fill), np.minimum(stamens, 1.0))
+    return np.where(inside, petals, share)

@@ -187,8 +187,8 @@ class Settings(_Model):
     detail: tuple[Layer, ...] = ()
     """Detail of the plan's object: texture, bumps and turned normals that its mesh does not have."""
     true_surface: Literal["plaque"] | None = None
-    """What the plan's object is, where its mesh is a scan: `sim.objects.plaque`, in the frame of the scan. It has
-    materials of its own. None: the mesh itself."""
+    """The surface of which the plan's mesh is a scan: `sim.objects.plaque`, in the scan's frame, with its own
+    materials. None: the mesh itself."""
     stickers: Stickers | None = None
     """Stickers on the plan's object."""
     leds: LedModel = STEADY
@@ -215,7 +215,7 @@ class Settings(_Model):
         if self.detail and self.shading == "flat":
             raise ValueError("`detail` is finer than triangles: it needs `shading: pixel`")
         if self.true_surface is not None and (self.detail or self.material is not None):
-            raise ValueError("`true_surface` has materials and detail of its own: leave out `material` and `detail`")
+            raise ValueError("`true_surface` has its own materials and detail: leave out `material` and `detail`")
         for fault in self.faults:
             if why := (
                 impossible(fault, self.robot)

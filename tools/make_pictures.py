@@ -1,4 +1,4 @@
-"""The pictures of the README: the simulated cell (SVG) and a synthetic frame of the demo plan (PNG).
+"""The pictures of the README: the simulated cell (SVG) and a synthetic frame of the showpiece (PNG).
 
 `python tools/make_pictures.py` writes docs/pictures/cell.svg and docs/pictures/frame.png.
 """
@@ -23,7 +23,10 @@ from sim.world.config import Config
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs/pictures"
-SHOWN_VIEW, SHOWN_LED = 1, 640
+SHOWN_VIEW = 1
+"""View of the demo in which the arm is drawn."""
+FRAME_VIEW, FRAME_LED, FRAME_S = 0, 996, 8e-3
+"""View of the showpiece, LED, and exposure of the frame."""
 _WIDTH, _HEIGHT, _SCALE = 900, 600, 0.26
 _EYE_AZIMUTH_DEG, _EYE_ELEVATION_DEG = -62.0, 16.0
 ARM = shipped_arm("kr10_r1100_sixx").arm
@@ -51,10 +54,10 @@ def polyline(points: NDArray[np.float64], style: str) -> str:
     return f'<polyline points="{path}" {style}/>'
 
 
-def joints_of_shown_view(job: Job) -> NDArray[np.float64]:
+def joints_of_view(job: Job, number: int) -> NDArray[np.float64]:
     rig = job.cell.rig
     visits = plan_itinerary(job.schedule.views, rig, job.motion.bodies, rig.motion.home_joints_deg).visits
-    visit = visits[SHOWN_VIEW]
+    visit = visits[number]
     assert visit is not None
     return visit.joints_deg
 
@@ -63,7 +66,7 @@ def draw_cell(job: Job) -> str:
     """The dome, the disk, the arm in one view of the plan, and what its camera sees."""
     rig = job.cell.rig
     support_from_base = inverse(rig.support.base_from_support.matrix())
-    there = joints_of_shown_view(job)
+    there = joints_of_view(job, SHOWN_VIEW)
     arm = apply(support_from_base, elbow_points(there))
     flange = support_from_base @ kinematics.forward(ARM, there)
     camera = flange @ rig.flange_from_camera.matrix()
@@ -110,25 +113,28 @@ def draw_cell(job: Job) -> str:
 
 
 def synthetic_frame(job: Job) -> bytes:
-    """One frame of the demo at twice its resolution, developed, as PNG."""
-    rig = job.cell.rig
-    fine = {"width_px": 1024, "height_px": 768, "pixel_pitch_um": rig.sensor.pixel_pitch_um / 2}
-    config = Config.model_validate(world_config(job.cell, job, rig.sensor.model_copy(update=fine)))
-    fine_light = config.model_copy(update={"settings": config.settings.model_copy(update={"shading": "pixel"})})
-    photographer = Photographer(fine_light.scene, fine_light.rendered_camera, fine_light.settings)
-    flange = kinematics.forward(ARM, joints_of_shown_view(job))
-    raw = np.zeros((768, 1024), np.uint16)
-    photographer.render(raw, Exposed({SHOWN_LED: 8e-3}, [], 8e-3, 1.0, 0, flange))
-    sensor = photographer.sensor
-    return png(develop(raw, pattern=sensor.bayer_pattern, black_dn=sensor.black_dn, white_dn=sensor.white_dn))
+    """One frame of the showpiece at twice its resolution, developed to its resolution, as PNG."""
+    sensor = job.cell.rig.sensor
+    fine = {
+        "width_px": 2 * sensor.width_px,
+        "height_px": 2 * sensor.height_px,
+        "pixel_pitch_um": 0.5 * sensor.pixel_pitch_um,
+    }
+    config = Config.model_validate(world_config(job.cell, job, sensor.model_copy(update=fine)))
+    photographer = Photographer(config.scene, config.rendered_camera, config.settings)
+    flange = kinematics.forward(ARM, joints_of_view(job, FRAME_VIEW))
+    raw = np.zeros((2 * sensor.height_px, 2 * sensor.width_px), np.uint16)
+    photographer.render(raw, Exposed({FRAME_LED: FRAME_S}, [], FRAME_S, 1.0, 0, flange))
+    model = photographer.sensor
+    return png(develop(raw, pattern=model.bayer_pattern, black_dn=model.black_dn, white_dn=model.white_dn))
 
 
 def main() -> None:
     """Write both pictures."""
-    job = read_job(ROOT / "configs/plans/demo.yaml")
+    demo, showpiece = (read_job(ROOT / f"configs/plans/{name}.yaml") for name in ("demo", "showpiece"))
     PICTURES.mkdir(parents=True, exist_ok=True)
-    (PICTURES / "cell.svg").write_text(draw_cell(job), encoding="utf-8")
-    (PICTURES / "frame.png").write_bytes(synthetic_frame(job))
+    (PICTURES / "cell.svg").write_text(draw_cell(demo), encoding="utf-8")
+    (PICTURES / "frame.png").write_bytes(synthetic_frame(showpiece))
 
 
 if __name__ == "__main__":

@@ -171,6 +171,8 @@ def _fill(  # type: ignore[no-untyped-def]
         meat[3, 3] += USUAL / SPREAD_KS**2
         bread[4, 4] += USUAL
         meat[4, 4] += USUAL
+        if not (np.isfinite(bread).all() and np.isfinite(meat).all()):
+            continue  # a fit that ran off has no derivative: its uncertainty stays unknown
         inverse = np.linalg.inv(bread)
         assign_rows(covariance[triangle], inverse @ meat @ inverse.T)
         _colours(
@@ -190,10 +192,7 @@ def add_scores(roots, good, lights, half, views, view_of, group, normal, grey, b
     for number in range(len(good)):
         sample = good[number]
         light, view = lights[sample], views[view_of[sample]]
-        # A fitted normal may turn away from a light or a camera that the mesh's normal faces.
         if normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2] <= 0.0:
-            continue
-        if normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2] <= 0.0:
             continue
         root = _root(normal, t1, t2, light, half[sample], view, grey, row)
         off = (root - roots[number]) / scale
@@ -233,9 +232,9 @@ def _colours(  # type: ignore[no-untyped-def]
         sample = good[number]
         light, view = lights[sample], views[view_of[sample]]
         nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
-        nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
-        if nl <= 0.0 or nv <= 0.0:
+        if nl <= 0.0:
             continue
+        nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
         nh = normal[0] * half[sample, 0] + normal[1] * half[sample, 1] + normal[2] * half[sample, 2]
         row[0], row[1] = nl, nl * lobe(nl, nv, nh, grey[2])[0]
         weight = colour_weight(row[0] * grey[0] + row[1] * grey[1], sample_colours[sample], grey[0])

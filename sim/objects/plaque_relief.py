@@ -32,7 +32,7 @@ LACQUER_MM, CLOTH_MM = (-49.2, -33.2, -25.2, 35.2), (35.0, 47.6, -23.0, 36.0)
 """Left, right, bottom and top of the panel and of the strip."""
 BAND_MM = (-49.5, 49.5, -36.0, -27.6)
 INSCRIPTION, LETTER_MM, BASELINE_MM = "LA COVPOLE · MLXXX LVMINA", 4.6, -34.1
-STROKE_MM, STROKE_DEPTH_MM = 0.3, 0.12
+STROKE_MM, STROKE_DEPTH_MM = 0.3, 0.06
 """Width and depth of the cut strokes."""
 THREAD_MM = 0.7
 _FRAME_MM, _EGG_MM = 6.0, 4.0

@@ -67,8 +67,8 @@ def test_the_scan_has_a_few_holes_and_no_back(scan: Any) -> None:
 
 
 def test_what_is_finer_than_the_triangles_is_not_in_the_scan() -> None:
-    """Strokes 0.3 mm wide and 0.12 mm deep on 0.3 mm triangles: no section is as the true one."""
+    """Strokes 0.06 mm deep are lost in noise and pitch."""
     points, _ = TOOL["scan"](0.6)
     band = points[(np.abs(points[:, 1] + 31.8) < 2.0) & (np.abs(points[:, 0]) < 45.0)]
     depth_mm = plaque_relief.FIELD_MM + 1.3 - band[:, 2]
-    assert np.mean(depth_mm > 0.1) < 0.1
+    assert np.mean(depth_mm > 0.15) < 0.02

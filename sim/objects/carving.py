@@ -29,7 +29,7 @@ def half_round(offset: Array) -> Array:
 
 
 def noise(x: Array, y: Array, period_mm: float, seed: int) -> Array:
-    """Smooth random values of mean 0 and standard deviation `NOISE_SPREAD` over places [...]; repeats after 128 periods.
+    """Smooth random values [...] of mean 0 and standard deviation `NOISE_SPREAD`; they repeat after 128 periods.
 
     Random values at the nodes of a grid of `period_mm`, interpolated by a cubic spline.
     """

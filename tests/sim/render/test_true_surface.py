@@ -64,6 +64,7 @@ def electrons(tmp_path_factory: pytest.TempPathFactory) -> NDArray[np.float64]:
             "focus_distance_mm": 335.0,
             "f_number": 16.0,
             "blur": True,
+            "samples_per_side": 4,  # one ray each would round the width to whole pixels of 0.125 mm
             "flange_from_camera": np.eye(4).tolist(),
             "nominal_exposure_us": WHITE_US,
         }

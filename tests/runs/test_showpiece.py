@@ -27,4 +27,4 @@ def test_frames_of_the_scanned_plaque_show_its_true_surface(tmp_path: Path) -> N
     blue, red = brightest[::2, 1::2], brightest[1::2, ::2]
     lit = blue > 40.0
     assert np.mean(blue[lit] > 1.5 * red[lit]) > 0.05
-    assert np.mean(red[lit] > 1.2 * blue[lit]) > 0.3
+    assert np.mean(red[lit] > 1.2 * blue[lit]) > 0.1

@@ -52,9 +52,9 @@ def settle(
     as their neighbours say, and set their covariances [h, w, 15, lower half row by row] to what is left; in place.
     Only pixels that are `is_fitted` [h, w] are used and changed. `centre_covariance` [h, w, 15] is that of what
     they are drawn to."""
-    covariance[...] = _mean_around(covariance, is_fitted, _ALIKE_PX)
+    covariance[...] = mean_around(covariance, is_fitted, _ALIKE_PX)
     square = deviation**2
-    np.minimum(square, np.float32(_OUTLIER) * _mean_around(square, is_fitted, WINDOW_PX), out=square)
+    np.minimum(square, np.float32(_OUTLIER) * mean_around(square, is_fitted, WINDOW_PX), out=square)
     surface = _surface(square, covariance[..., VARIANCES], is_fitted, WINDOW_PX)
     _draw_rows(deviation, covariance, surface, is_fitted, centre_covariance)
 
@@ -64,18 +64,18 @@ def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.b
     roughness (`logs` [h, w, 2]) are drawn to their means in a window as far as those around say; set the
     covariances [h, w, 15] to what is left, in place."""
     weight = (1.0 / np.maximum(covariance[..., VARIANCES[3:]], _LEAST)).astype(np.float32)
-    middle = _mean_around(weight * logs, is_fitted, side_px) / np.maximum(
-        _mean_around(weight, is_fitted, side_px), _LEAST
+    middle = mean_around(weight * logs, is_fitted, side_px) / np.maximum(
+        mean_around(weight, is_fitted, side_px), _LEAST
     )
     deviation = np.zeros((*is_fitted.shape, UNKNOWNS), np.float32)
     deviation[..., 3:] = logs - middle
     surface = np.full(deviation.shape, _FREE, np.float32)
-    around = _mean_around(deviation[..., 3:] ** 2, is_fitted, side_px)
+    around = mean_around(deviation[..., 3:] ** 2, is_fitted, side_px)
     square = np.minimum(deviation[..., 3:] ** 2, np.float32(_OUTLIER) * around)
     surface[..., 3:] = _surface(square, covariance[..., VARIANCES[3:]], is_fitted, side_px)
     before, of_middle = deviation.copy(), np.zeros_like(covariance)
     of_middle[..., VARIANCES[3:]] = 1.0 / (
-        np.maximum(_mean_around(weight, is_fitted, side_px), _LEAST) * TRIANGLES_AROUND
+        np.maximum(mean_around(weight, is_fitted, side_px), _LEAST) * TRIANGLES_AROUND
     )
     _draw_rows(deviation, covariance, surface, is_fitted, of_middle)
     step: Singles = np.clip(deviation - before, -_MOST_STEP, _MOST_STEP)
@@ -84,7 +84,7 @@ def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.b
 
 def _surface(square: Singles, own_covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """[h, w, k] variances of the surface: mean squares in a window, without those of the fits."""
-    return np.maximum(_mean_around(square - own_covariance, is_fitted, side_px), _LEAST).astype(np.float32)
+    return np.maximum(mean_around(square - own_covariance, is_fitted, side_px), _LEAST).astype(np.float32)
 
 
 def _draw_rows(
@@ -96,15 +96,16 @@ def _draw_rows(
     )
 
 
-def _mean_around(values: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
-    """[h, w, k] mean over the fitted pixels of a window; what is not fitted may be NaN."""
-    weight = cv2.boxFilter(is_fitted.astype(np.float32), -1, (side_px, side_px), normalize=False)
+def mean_around(values: Singles, is_used: NDArray[np.bool_], side_px: int, *, default: float = 0.0) -> Singles:
+    """[h, w, k] mean over the pixels of a window that are used [h, w], whatever the others are; `default` where
+    there are none."""
+    weight = cv2.boxFilter(is_used.astype(np.float32), -1, (side_px, side_px), normalize=False)
     means = np.empty_like(values)
     for k in range(values.shape[-1]):
-        plane = np.where(is_fitted, values[..., k], np.float32(0.0))
-        means[..., k] = cv2.boxFilter(plane, -1, (side_px, side_px), normalize=False)
-    result: Singles = (means / np.maximum(weight, 1.0)[..., None]).astype(np.float32)
-    return result
+        plane = np.where(is_used, values[..., k], np.float32(0.0))
+        total = cv2.boxFilter(plane, -1, (side_px, side_px), normalize=False)
+        means[..., k] = np.where(weight > 0.5, total / np.maximum(weight, 1.0), default)
+    return means
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

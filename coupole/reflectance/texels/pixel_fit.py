@@ -30,6 +30,8 @@ TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
 its triangle: wider than any that was seen, so that they decide where the samples say nothing."""
 LEAST_KS = 1e-3
 """Least ks of a prior, as a share of kd."""
+LEAST_COSINE = 0.05
+"""Least cosine between view and prior normal: beyond it the triangle's normal was fitted from elsewhere."""
 _SETTLED = 1e-4
 _PART = 512
 
@@ -60,7 +62,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class PixelMaterials:
-    """Materials of n pixels in their own channels; NaN where there were too few samples."""
+    """Materials of n pixels in their own channels; NaN where there were too few samples, or a fit ran off."""
 
     normals: Floats
     """[n, 3]"""
@@ -110,6 +112,8 @@ def _fit_part(  # type: ignore[no-untyped-def]
         for k in range(3):
             place[k] = places_mm[pixel, k]
         towards(place, camera_mm, views[0])
+        if normal[0] * views[0, 0] + normal[1] * views[0, 1] + normal[2] * views[0, 2] < LEAST_COSINE:
+            continue
         sample_count = 0
         for led in range(leds):
             if not np.isfinite(values[pixel, led]):
@@ -137,8 +141,9 @@ def _fit_part(  # type: ignore[no-untyped-def]
         for k, weight in enumerate((stiffness, stiffness, 1e-2, usual[2], usual[3])):
             bread[k, k] += weight
             meat[k, k] += weight
-        inverse = np.linalg.inv(bread)
-        assign_rows(covariance[pixel], inverse @ meat @ inverse.T)
+        if np.isfinite(bread).all() and np.isfinite(meat).all():
+            inverse = np.linalg.inv(bread)
+            assign_rows(covariance[pixel], inverse @ meat @ inverse.T)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

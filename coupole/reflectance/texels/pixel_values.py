@@ -63,6 +63,8 @@ class PixelReader:
         self._samples = samples
         self.triangle_of_pixel = surface.triangle_of_pixel
         """[h, w] row of the view's file of what a pixel sees; -1 for none."""
+        self.mesh_normals = surface.normals
+        """[triangles, 3]"""
         self._places_mm = surface.places_mm.reshape(-1, 3)
         self._reader = SignalReader(radiometry, SeenSurface(surface.triangle_of_pixel, samples.triangles))
         self._pass = ViewPass(measured_run, view, geometry.of(samples.triangles), self._reader)

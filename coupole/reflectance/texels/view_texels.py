@@ -22,12 +22,13 @@ from coupole.reflectance.texels.neighbours import (
     VARIANCES,
     WINDOW_PX,
     lower_half,
+    mean_around,
     settle,
     settle_triangles,
     tilts_from,
 )
 from coupole.reflectance.texels.pixel_file import ViewTexels
-from coupole.reflectance.texels.pixel_fit import LEAST_KS, Lights, Prior, fit_pixels
+from coupole.reflectance.texels.pixel_fit import LEAST_KS, LOG_ALPHA, LOG_KS, TILT, Lights, Prior, fit_pixels
 from coupole.reflectance.texels.pixel_values import PixelBlock, PixelReader
 from coupole.reflectance.triangle_fit import LEAST_KD, MOST_KS, turned_normals
 
@@ -35,6 +36,12 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Say = Callable[[int, int], None]
 _KD, _KS, _ALPHA = 2, 3, 4
+MOST_OFF = 5.0
+"""Largest deviation from a triangle, of logarithms: farther away are fits that ran off."""
+MOST_KD = 1.0
+"""1/sr: three times that of white, for strong light from other surfaces. A fit with more ran off."""
+MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
+"""Largest variances of a fit that says anything: beyond the prior's."""
 _ROWS = 1 << 14
 """Triangles whose inter-reflection is read together."""
 
@@ -50,7 +57,8 @@ def texels_of_view(
 ) -> ViewTexels:
     """Fit all pixels of a view, under its LEDs but those `left_out`; frames are read once for each part of the
     pixels whose values fit into the memory. Raises StorageError for a damaged frame."""
-    centres, lights = _centres_of(result, view, reader.triangle_of_pixel), _lights(result, view, left_out)
+    centres = _centres_of(result, view, reader.triangle_of_pixel, reader.mesh_normals)
+    lights = _lights(result, view, left_out)
     shape = reader.triangle_of_pixel.shape
     channel = np.zeros(shape, np.int8)
     normals = np.full((*shape, 3), np.nan, np.float32)
@@ -66,7 +74,11 @@ def texels_of_view(
         at = np.unravel_index(block.pixels, shape)
         channel[at], normals[at], deviation[at] = block.channel, fit.normals, off
         covariance[at] = lower_half(fit.covariance)
-        is_fitted[at] = np.isfinite(off).all(axis=1) & np.isfinite(covariance[at]).all(axis=1)
+        is_fitted[at] = (
+            (np.abs(off) < MOST_OFF).all(axis=1)
+            & (fit.logs[:, 0] < math.log(MOST_KD))
+            & (covariance[at][:, VARIANCES] < MOST_VARIANCE).all(axis=1)
+        )
         count += len(block.pixels)
         say(count, reader.count)
     before = deviation[is_fitted][:, :2]
@@ -74,74 +86,77 @@ def texels_of_view(
     of_triangle = reader.triangle_of_pixel[is_fitted]
     covariance[is_fitted, VARIANCES[_KD]] += _u_inter_reflection(view)[of_triangle] ** 2
     texel_normals = turned_normals(normals[is_fitted].astype(np.float64), deviation[is_fitted][:, :2] - before)
-    kd, ks, alpha = centres.logs_of(is_fitted)
-    kd += all_channels(deviation[..., _KD], channel, is_fitted, result.channels)[is_fitted]
-    ks += all_channels(deviation[..., _KS], channel, is_fitted, result.channels)[is_fitted]
+    logs, channels = centres.logs[is_fitted].astype(np.float64), result.channels
+    for first, unknown in ((0, _KD), (channels, _KS)):
+        plane = all_channels(deviation[..., unknown], channel, is_fitted, channels)
+        logs[:, first : first + channels] += plane[is_fitted]
+    alpha = np.exp(logs[:, -1] + deviation[is_fitted][:, _ALPHA])
     return ViewTexels(
         np.flatnonzero(is_fitted).astype(np.int32),
         texel_normals.astype(np.float32),
-        np.exp(kd).astype(np.float32),
-        np.minimum(np.exp(ks), MOST_KS).astype(np.float32),
-        np.clip(np.exp(alpha + deviation[is_fitted][:, _ALPHA]), LEAST_ALPHA, 1.0).astype(np.float32),
+        np.minimum(np.exp(logs[:, :channels]), MOST_KD).astype(np.float32),
+        np.minimum(np.exp(logs[:, channels:-1]), MOST_KS).astype(np.float32),
+        np.clip(alpha, LEAST_ALPHA, 1.0).astype(np.float32),
         covariance[is_fitted],
     )
 
 
 @dataclass(frozen=True)
 class _Centres:
-    """Materials about which those of a view's pixels lie: those of triangles, drawn to each other."""
+    """Materials about which those of a view's pixels lie: those of triangles, drawn to each other; of triangles
+    without any, those around them."""
 
-    triangle_of_pixel: NDArray[np.int32]
-    """[h, w] -1 for none."""
-    normals: Floats
-    """[triangles, 3]"""
-    kd: Floats
-    """[triangles, channels] logarithms."""
-    ks: Floats
-    alpha: Floats
-    """[triangles]"""
-    step: Singles
-    """[h, w, 5] from the triangles' own materials: tilts, logarithms."""
+    normals: Singles
+    """[h, w, 3]"""
+    logs: Singles
+    """[h, w, 2 channels + 1] logarithms of kd, ks and alpha; NaN where nothing is known."""
     covariance: Singles
-    """[h, w, 15] of what lies at the end of the step."""
+    """[h, w, 15]"""
 
     def prior(self, block: PixelBlock) -> Prior:
         """Materials of a block's pixels in their own channels; NaN without any."""
-        at, triangle = np.unravel_index(block.pixels, self.triangle_of_pixel.shape), block.triangle
-        step = self.step[at].astype(np.float64)
+        at = np.unravel_index(block.pixels, self.logs.shape[:2])
+        logs, channels = self.logs[at].astype(np.float64), self.logs.shape[2] // 2
+        rows = np.arange(len(logs))
         return Prior(
-            turned_normals(self.normals[triangle], step[:, :2]),
-            np.exp(self.kd[triangle, block.channel] + step[:, _KD]),
-            np.exp(self.ks[triangle, block.channel] + step[:, _KS]),
-            np.clip(np.exp(self.alpha[triangle] + step[:, _ALPHA]), LEAST_ALPHA, 1.0),
-        )
-
-    def logs_of(self, pixels: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-        """Logarithms of kd and ks [n, channels], and of alpha [n], of some pixels [h, w]."""
-        triangle, step = self.triangle_of_pixel[pixels], self.step[pixels].astype(np.float64)
-        return (
-            self.kd[triangle] + step[:, _KD, None],
-            self.ks[triangle] + step[:, _KS, None],
-            np.clip(self.alpha[triangle] + step[:, _ALPHA], math.log(LEAST_ALPHA), 0.0),
+            self.normals[at].astype(np.float64),
+            np.exp(logs[rows, block.channel]),
+            np.exp(logs[rows, channels + block.channel]),
+            np.exp(logs[:, -1]),
         )
 
 
-def _centres_of(result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray[np.int32]) -> _Centres:
+def _centres_of(
+    result: RunResult, view: ViewSamples, triangle_of_pixel: NDArray[np.int32], mesh_normals: Floats
+) -> _Centres:
+    """Return the centres of a view; `mesh_normals` [triangles, 3] are those of triangles without a fit."""
     places = np.searchsorted(result.triangles, view.triangles)
-    materials, of_triangles = (
-        result.materials(GGX_NORMAL.name, places),
-        result.material_covariances(GGX_NORMAL.name, places),
-    )
-    kd = np.maximum(materials.kd, LEAST_KD)
-    kd, ks, alpha = np.log(kd), np.log(np.maximum(materials.ks, LEAST_KS * kd)), np.log(materials.alpha)
-    is_known = np.isfinite(alpha) & np.isfinite(of_triangles).all(axis=(1, 2))
-    is_seen = (triangle_of_pixel >= 0) & np.append(is_known, False)[triangle_of_pixel]
+    materials = result.materials(GGX_NORMAL.name, places)
+    of_triangles = result.material_covariances(GGX_NORMAL.name, places)
+    kd, alpha = np.maximum(materials.kd, LEAST_KD), materials.alpha
+    triangle_logs = np.log(np.column_stack([kd, np.maximum(materials.ks, LEAST_KS * kd), alpha]))
+    has_fit = np.isfinite(triangle_logs).all(axis=1) & np.isfinite(of_triangles).all(axis=(1, 2))
+    has_fit &= (triangle_logs[:, : kd.shape[1]] < math.log(MOST_KD)).all(axis=1)
+    has_fit &= (np.einsum("nii->ni", of_triangles)[:, :3] < MOST_VARIANCE[:3]).all(axis=1)
+    is_seen = triangle_of_pixel >= 0
+    is_known = is_seen & np.append(has_fit, False)[triangle_of_pixel]
+    triangle, channels = triangle_of_pixel[is_known], result.channels
     covariance = np.zeros((*is_seen.shape, UNKNOWNS * (UNKNOWNS + 1) // 2), np.float32)
-    logs, triangle = np.zeros((*is_seen.shape, 2), np.float32), triangle_of_pixel[is_seen]
-    covariance[is_seen] = lower_half(of_triangles)[triangle]
-    logs[is_seen] = np.stack([ks.mean(axis=1), alpha], axis=1)[triangle]
-    step = settle_triangles(logs, covariance, is_seen, _window_px(triangle))
-    return _Centres(triangle_of_pixel, materials.normals, kd, ks, alpha, step, covariance)
+    covariance[is_known] = lower_half(of_triangles)[triangle]
+    logs = np.full((*is_seen.shape, 2 * channels + 1), np.nan, np.float32)
+    logs[is_known] = triangle_logs[triangle]
+    side_px = _window_px(triangle)
+    shine = np.stack([logs[..., channels:-1].mean(axis=-1), logs[..., -1]], axis=-1)
+    step = settle_triangles(shine, covariance, is_known, side_px)
+    logs += np.repeat(step[..., _KD:], [channels, channels, 1], axis=-1)
+    logs[..., -1] = np.clip(logs[..., -1], math.log(LEAST_ALPHA), 0.0)
+    normals = np.zeros((*is_seen.shape, 3), np.float32)
+    normals[is_known] = turned_normals(materials.normals[triangle], step[is_known][:, :2].astype(np.float64))
+    is_missing = is_seen & ~is_known
+    normals[is_missing] = mesh_normals[triangle_of_pixel[is_missing]]
+    logs[is_missing] = mean_around(logs, is_known, side_px, default=np.nan)[is_missing]
+    covariance[is_missing] = lower_half(np.diag(np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA])))
+    return _Centres(normals, logs, covariance)
 
 
 def _window_px(triangle_of_pixel: NDArray[np.int32]) -> int:

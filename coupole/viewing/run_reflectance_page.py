@@ -68,6 +68,11 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
             psnr_db = about["held_out_psnr_db"][name]
             off = f"off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
             yield f"{FITS[name].title}: under the LEDs kept for the check {off}"
+    for name, mae in about.get("texels", {}).get("mae", {}).items():
+        if mae is not None:
+            title = FITS[name].title if name in FITS else name
+            psnr_db = about["texels"]["held_out_psnr_db"][name]
+            yield f"in the pixels that have texels, {title}: off by {100 * mae:.3f} % of range, {psnr_db:.1f} dB"
     if interval := about["median_interval_percent"]:
         yield (
             f"95 % interval of the median sample: {_bounds([interval['low'], interval['high']])}, if the mesh's "

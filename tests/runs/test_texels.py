@@ -234,6 +234,23 @@ def test_plain_materials_get_no_worse(tmp_path: Path) -> None:
     assert about["held_out_psnr_db"][TEXELS] > about["held_out_psnr_db"][other] - 0.2
 
 
+def test_both_errors_are_told(made: Made) -> None:
+    ended = cells.here(
+        "reflectance",
+        made[0].run_folder,
+        "--calibrations",
+        made[0].folder / "records",
+        "--out",
+        made[1],
+        "--texels",
+        "auto",
+    )
+    assert ended.code == 0, ended.err
+    said = " ".join((ended.out + ended.err).split())
+    for mae in made[2]["texels"]["mae"].values():
+        assert f"off by {100 * mae:.3f} % of range" in said
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [

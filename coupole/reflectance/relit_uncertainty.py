@@ -17,7 +17,7 @@ from coupole.reflectance.new_light.shading import Picture
 from coupole.reflectance.run_relighting import SAMPLES, RelitScene, Say, Texels, materials_of
 from coupole.reflectance.run_result import RunResult, whole_covariances
 from coupole.reflectance.run_result_files import refuse_without_uncertainty
-from coupole.reflectance.texels.pixel_file import texel_uncertainty
+from coupole.reflectance.texels.pixel_file import texel_uncertainty, views_with_texels
 from coupole.reflectance.triangle_fit import TriangleMaterials, turned_normals
 
 Floats = NDArray[np.float64]
@@ -103,7 +103,10 @@ def _uncertain(scene: RelitScene) -> Uncertain:
 def _uncertain_texels(scene: RelitScene) -> Uncertain:
     """Return the same for the picture's texels. Channels of a pixel are as uncertain as its own."""
     assert isinstance(scene.reflecting, Texels)
-    texels, (u_pixel, u_shared) = scene.reflecting.materials, texel_uncertainty(scene.result, scene.views[0])
+    texels, (u_pixel, u_shared) = (
+        scene.reflecting.materials,
+        texel_uncertainty(scene.result, views_with_texels(scene.result)[0]),
+    )
     covariance = whole_covariances(scene.reflecting.covariance)
     common = np.full(len(covariance), np.hypot(u_pixel, u_shared))
     return texels, covariance, np.ones((len(covariance), 2, texels.kd.shape[1])), common

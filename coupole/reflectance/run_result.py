@@ -39,6 +39,8 @@ U_OF_INTER_REFLECTION = 0.2
 """Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
 MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
+VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]
+"""Places of the variances in the lower half of a covariance."""
 _HEAD = ("triangles", "camera_mm", "leds", "led_positions_mm", "led_normals", "full_scales")
 _TOLD = {
     "software": dict,

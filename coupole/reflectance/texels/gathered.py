@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -16,10 +15,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
 from coupole.reflectance.new_light.pictured_surface import Surface, pixels_of_places, surface_of_view
-from coupole.reflectance.run_result import RunResult, ViewSamples
-from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, texels_path
+from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
+from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, views_with_texels
 from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
@@ -27,8 +25,6 @@ Floats = NDArray[np.float64]
 _REACH = 3.0
 """Largest distance of a place from what a pixel at its side sees, over the median distance of neighbouring pixels:
 farther away, the pixel sees something in front of it."""
-_VARIANCES = (0, 2, 5, 9, 14)
-"""Places of the variances in the lower half of a covariance."""
 _BLOCK, _PART = 1 << 20, 1 << 15
 """Places that are looked up together, and by a thread in one go."""
 
@@ -54,11 +50,10 @@ class _View:
 
 def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
     """Gather materials of places [n, 3] of the base frame. Raises InputError if no view has texels."""
-    refuse_without_texels(result)
-    views = list(_views_with_texels(result))
+    views = [_open_view(result, view) for view in views_with_texels(result)]
     count, channels = len(places_mm), result.channels
     normals, logs = np.zeros((count, 3)), np.zeros((count, 2 * channels + 1))
-    information = np.zeros((count, len(_VARIANCES)))
+    information = np.zeros((count, len(VARIANCES)))
     for view in views:
         for first in range(0, count, _BLOCK):
             part = slice(first, min(first + _BLOCK, count))
@@ -69,17 +64,11 @@ def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
     logs /= _by_columns(weights[:, 2:], channels)
     values = np.where(is_known[:, None], np.exp(logs), 0.0)
     covariance = np.zeros((count, 15), np.float32)
-    covariance[:, _VARIANCES] = np.where(is_known[:, None], 1.0 / weights, 0.0)
+    covariance[:, VARIANCES] = np.where(is_known[:, None], 1.0 / weights, 0.0)
     materials = TriangleMaterials(
         normals, values[:, :channels], values[:, channels:-1], values[:, -1], np.zeros(count)
     )
     return Gathered(materials, covariance)
-
-
-def _views_with_texels(result: RunResult) -> Iterator[_View]:
-    for view in result.views:
-        if texels_path(result, view).exists():
-            yield _open_view(result, view)
 
 
 def _open_view(result: RunResult, view: ViewSamples) -> _View:
@@ -173,12 +162,3 @@ def _corners(pixel, place_mm, texel_of_pixel, seen_mm, reach_mm, texels, weights
     for corner in range(4):
         weights[corner] /= max(total, 1e-9)
     return total >= 0.5
-
-
-def refuse_without_texels(result: RunResult) -> None:
-    """Raise InputError if no view has texels."""
-    if not any(texels_path(result, view).exists() for view in result.views):
-        raise InputError(
-            f"{result.folder}: has no texels; `coupole reflectance from RUN --out {result.folder} --texels auto` "
-            "makes them"
-        )

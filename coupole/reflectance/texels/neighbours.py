@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign_rows
 from coupole.reflectance.new_light.pictured_surface import in_strips
-from coupole.reflectance.run_result import LOWER
+from coupole.reflectance.run_result import LOWER, VARIANCES
 
 Singles = NDArray[np.float32]
 
@@ -30,8 +30,6 @@ _LEAST = 1e-6
 """Least variance of the surface, so that no triangle is taken for exact."""
 _FREE = 100.0
 """Variance of what is not drawn anywhere."""
-VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]
-"""Places of the variances in the lower half of a covariance."""
 TRIANGLES_AROUND = 64
 """Triangles of a window that say how ks and roughness vary from one to the other."""
 _MOST_STEP = 1.0

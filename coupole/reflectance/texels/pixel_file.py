@@ -55,11 +55,14 @@ def write_view_texels(
     size_px: tuple[int, int],
     u_pixel: NDArray[np.float64],
     u_shared: float,
+    *,
+    simulated: bool,
 ) -> None:
     """Write the pixels of a view whose pictures are `size_px` wide and high. `u_pixel` [channels] and `u_shared`
     are relative standard uncertainties of kd and ks: of single pixels' responses, and of the power of all LEDs."""
     with h5py.File(path, "w") as file:
         file.attrs["view"], file.attrs["size_px"], file.attrs["frame"] = view, size_px, "base of the robot"
+        file.attrs["simulated"] = simulated
         for name, description in _TOLD.items():
             _dataset(file, name, getattr(texels, name), description)
         _dataset(file, "u_pixel", u_pixel, "relative standard uncertainty of kd and ks, of a pixel's own response")
@@ -70,14 +73,24 @@ def _dataset(file: h5py.File, name: str, values: Any, description: str) -> None:
     file.create_dataset(name, data=values, track_times=False).attrs["told"] = description
 
 
+def views_with_texels(result: RunResult) -> list[ViewSamples]:
+    """Return the views that have texels. Raises InputError if none has."""
+    views = [view for view in result.views if texels_path(result, view).exists()]
+    if not views:
+        raise _none_of(result)
+    return views
+
+
+def _none_of(result: RunResult, of: str = "") -> InputError:
+    command = f"coupole reflectance from RUN --out {result.folder} --texels auto"
+    return InputError(f"{result.folder}: has no texels{of}; `{command}` makes them")
+
+
 def read_view_texels(result: RunResult, view: ViewSamples) -> ViewTexels:
     """Raises InputError if the view has none."""
     path = texels_path(result, view)
     if not path.exists():
-        raise InputError(
-            f"{result.folder}: has no texels of the view {view.view}; `coupole reflectance from RUN --out "
-            f"{result.folder} --texels auto` makes them"
-        )
+        raise _none_of(result, f" of the view {view.view}")
     with h5py.File(path, "r") as file:
         return ViewTexels(*(file[name][()] for name in _TOLD))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,8 +99,8 @@ class PixelReader:
         pixels = lists.places[first:end]
         values = np.full((end - first, len(self._samples.leds)), NO_VALUE, np.uint16)
         places_mm = self._places_mm[pixels]
-        with ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
-            batches = self._pass.batches()
+        batches = self._pass.batches()
+        with closing(batches), ThreadPoolExecutor(threads) as pool, h5py.File(self._samples.path, "r") as file:
             for part, batch in zip(self._pass.parts, batches, strict=True):
                 codes, direct = _light_of(file, rows, part, channels)
                 blocks = _parts_of(rows)

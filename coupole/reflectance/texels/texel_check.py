@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coupole.reflectance.block_work import Said, silent
 from coupole.reflectance.fits import FITS, TEXELS
 from coupole.reflectance.new_light.light_kinds import LedLight
+from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_check import PEAK_QUANTILE
 from coupole.reflectance.run_pictures import read_check_frames
 from coupole.reflectance.run_relighting import best_fit, scene_of_view
@@ -25,6 +26,8 @@ from coupole.reflectance.texels.pixel_file import ABOUT, FOLDER, read_view_texel
 from coupole.storage.durable import write_synced
 
 SCHEMA = "coupole-texels/1"
+_BLOCK_BYTES = 500_000_000
+"""Memory for shares of light that are read together."""
 Singles = NDArray[np.float32]
 
 
@@ -48,6 +51,7 @@ def check_texels(result: RunResult, say: Said = silent) -> dict[str, Any]:
     peak = float(np.quantile(values, PEAK_QUANTILE)) if len(values) else float("nan")
     about = {
         "schema": SCHEMA,
+        "simulated": read_settings(result.folder)["simulated"],
         "pixels": {view.view: len(read_view_texels(result, view).pixels) for view in result.views},
         "mae": {name: _mean(parts, 0) for name, parts in misses.items()},
         "held_out_psnr_db": {name: _psnr_db(parts, peak) for name, parts in misses.items()},
@@ -75,9 +79,11 @@ def _pictures(
     scenes = {name: scene_of_view(result, view.view, name) for name in names}
     with h5py.File(result.folder / FRAMES / view.path.name, "r") as file:
         offsets = file["offsets"][()]
+    is_checked = np.isin(view.leds, frames.leds)
+    blocks = [result.direct_shares(view, rows, is_checked) for rows in result.view_blocks(view, _BLOCK_BYTES)]
+    direct = dict(zip(view.leds[is_checked], np.concatenate(blocks).swapaxes(0, 1), strict=True))
     for number, led in enumerate(frames.leds):
-        direct = result.direct_shares(view, slice(0, len(view.triangles)), view.leds == led)[:, 0]
-        measured_picture = frames.share[number].astype(np.float32) * frames.picture(direct)
+        measured_picture = frames.share[number].astype(np.float32) * frames.picture(direct[led])
         pictures = {name: scene.picture([LedLight(number=int(led))]) for name, scene in scenes.items()}
         yield (
             measured_picture,

@@ -110,7 +110,8 @@ def _texels_of_one(token: str, sources: Sources, threads: int | None, say: Said,
 
     def write(path: Path) -> None:
         write_view_texels(
-            path, texels, samples.view, measured_run.frames.size_px, radiometry.u_pixel, result.u_shared
-        )
+            path, texels, samples.view, measured_run.frames.size_px, radiometry.u_pixel, result.u_shared,
+            simulated=measured_run.run.is_simulated,
+        )  # fmt: skip
 
     complete(texels_path(result, samples), write)

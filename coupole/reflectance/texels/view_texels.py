@@ -15,11 +15,16 @@ from coupole.reflectance.fits import GGX_NORMAL
 from coupole.reflectance.ggx import UNKNOWNS
 from coupole.reflectance.material_uncertainty import groups_of_leds
 from coupole.reflectance.normal_fit import LEAST_ALPHA
-from coupole.reflectance.run_result import INTER_REFLECTION, RunResult, ViewSamples, u_inter_reflection
+from coupole.reflectance.run_result import (
+    INTER_REFLECTION,
+    VARIANCES,
+    RunResult,
+    ViewSamples,
+    u_inter_reflection,
+)
 from coupole.reflectance.texels.mosaic import all_channels
 from coupole.reflectance.texels.neighbours import (
     TRIANGLES_AROUND,
-    VARIANCES,
     WINDOW_PX,
     lower_half,
     mean_around,
@@ -42,7 +47,7 @@ MOST_KD = 1.0
 """1/sr: three times that of white, for strong light from other surfaces. A fit with more ran off."""
 MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
 """Largest variances of a fit that says anything: beyond the prior's."""
-_ROWS = 1 << 14
+_ROWS = 1 << 12
 """Triangles whose inter-reflection is read together."""
 
 

@@ -109,7 +109,7 @@ def _image(comparison: Comparison, colours: Points, caption: str) -> str:
     if len(state.triangles):
         solid = Solid("state", state.points_mm, state.triangles)
         of_faces = colours[state.triangles].mean(axis=1)
-        sheet = sheet_of_sides(state.points_mm, lambda canvas: canvas.fill([solid], [of_faces], outlined=False))
+        sheet = sheet_of_sides(state.points_mm, lambda canvas: canvas.fill([solid], [of_faces], has_outline=False))
     else:
         some = np.random.default_rng(0).permutation(len(state.points_mm))[:40_000]
         sheet = sheet_of_sides(

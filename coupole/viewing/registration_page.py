@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +74,10 @@ def scans_drawn(registration: Registered) -> Any:
 
 def solid_drawn(solid: Solid, colours: Any) -> Any:
     """A solid in one colour, or one for each face, from three sides."""
-    return sheet_of_sides(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], outlined=False))
+    return sheet_of_sides(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], has_outline=False))
 
 
-def sheet_of_sides(points: Points, draw: Any) -> Any:
+def sheet_of_sides(points: Points, draw: Callable[[Canvas], None]) -> Any:
     """A PIL image from three sides; `draw` draws on a canvas."""
     from PIL import Image, ImageDraw
 

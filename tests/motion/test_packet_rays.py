@@ -47,5 +47,6 @@ def test_the_first_triangle_on_a_ray_is_found_and_how_far_it_is() -> None:
     assert np.array_equal(number, np.asarray(alone["primID"]))
     met = number >= 0
     assert 100 < met.sum() < 900
-    np.testing.assert_array_equal(distance[met], np.asarray(alone["tfar"])[met])
+    # Embree rounds packets and single rays alike on some processors only: 3 units in the last place were seen.
+    np.testing.assert_array_max_ulp(distance[met], np.asarray(alone["tfar"], np.float32)[met], maxulp=8)
     assert np.isnan(distance[~met]).all()

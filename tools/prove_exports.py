@@ -35,7 +35,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests/runs")]
 from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, shipped_cell  # noqa: E402
 
 from coupole.exchange.of_results.export_result import export_result  # noqa: E402
-from coupole.exchange.of_results.measured_surface import MeasuredSurface, read_surface  # noqa: E402
+from coupole.exchange.of_results.measured_surface import ExportChoice, MeasuredSurface, read_surface  # noqa: E402
 from coupole.exchange.of_results.merl import SCALES, SIZE  # noqa: E402
 from coupole.reflectance.run_job import RunRequest, reflectance_of  # noqa: E402
 from export_models import Lit, Materials, ggx, gltf, lab_differences, openpbr  # noqa: E402
@@ -116,12 +116,13 @@ def _compare_exports(result: Path, folder: Path, count: int) -> dict[str, Row]:
         ("merl", "merl", None, _merl),
     ):
         with console.status(name):
-            export_result(result, to, folder / name, triangles=sampled_triangles, most_error=most_error)
+            choice = ExportChoice(sampled_triangles, most_error)
+            export_result(result, to, folder / name, options=choice)
             rows = [_of_table(surface, folder / name, number, evaluate, random) for number in sampled_triangles]
             values, true = zip(*rows, strict=True)
             row_of_export[name] = np.concatenate(values), np.concatenate(true)
     for to in ("alta", "bird"):
-        export_result(result, to, folder / to, triangles=sampled_triangles)
+        export_result(result, to, folder / to, options=ExportChoice(sampled_triangles))
         row_of_export[to] = _of_samples(surface, folder / to, sampled_triangles, to)
     return row_of_export
 

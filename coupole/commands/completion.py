@@ -25,9 +25,9 @@ def fits(incomplete: str) -> list[tuple[str, str]]:
 
 def materials(incomplete: str) -> list[tuple[str, str]]:
     """Fits that `coupole export --fit` takes."""
-    from coupole.reflectance.fits import MATERIALS
+    from coupole.reflectance.fits import MATERIALS, TEXELS
 
-    return [(name, title) for name, title in fits(incomplete) if name in MATERIALS]
+    return [(name, title) for name, title in fits(incomplete) if name in (*MATERIALS, TEXELS)]
 
 
 def templates(incomplete: str) -> list[str]:

@@ -10,10 +10,11 @@ import typer
 
 from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats, materials
-from coupole.exchange.formats import FORMATS, Source, formats_of
+from coupole.exchange.formats import FORMATS, MAP_SIZE, Source, formats_of
 
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
 _OF_MATERIALS = [name for name, export_format in FORMATS.items() if "triangle" in export_format.options]
+_WITH_MAPS = [name for name, export_format in FORMATS.items() if MAP_SIZE[0] in export_format.options]
 _SHOWN = "How views are shown (relight, iiif)"
 
 ToOption = Annotated[
@@ -44,7 +45,8 @@ FitOption = Annotated[
     typer.Option(
         "--fit",
         autocompletion=materials,
-        help="For results: ggx or ggx_normal; by default the fit with the smaller error in the check.",
+        help="For results: ggx, ggx_normal, or texels for formats with maps; by default the fit with the smaller "
+        "error in the check.",
         rich_help_panel=_PARTS,
     ),
 ]
@@ -67,6 +69,30 @@ AdaptiveOption = Annotated[
         "of 17 MB.",
         min=1e-5,
         max=0.5,
+        show_default=False,
+        rich_help_panel=_PARTS,
+    ),
+]
+TexelOption = Annotated[
+    float | None,
+    typer.Option(
+        "--texel-mm",
+        metavar="MM",
+        help=f"For {', '.join(_WITH_MAPS)}: width of the maps' texels on the object; by default that of the "
+        "finest view's pixels, or more if the maps would be too large.",
+        min=1e-4,
+        show_default=False,
+        rich_help_panel=_PARTS,
+    ),
+]
+MapOption = Annotated[
+    int | None,
+    typer.Option(
+        "--map-px",
+        metavar="PX",
+        help="For the same: greatest width and height of the maps, 256 to 16384 (default).",
+        min=256,
+        max=16384,
         show_default=False,
         rich_help_panel=_PARTS,
     ),
@@ -177,6 +203,8 @@ class ExportOptions:
     fit: FitOption = None
     triangle: TriangleOption = None
     adaptive: AdaptiveOption = None
+    texel_mm: TexelOption = None
+    map_px: MapOption = None
     refined: RefinedOption = None
     calibrations: RecordsOption = None
     sensor_spectra: SensorOption = None

@@ -51,6 +51,14 @@ class Asked:
         option = self.options.get(name)
         return option if isinstance(option, Path) else None
 
+    def number(self, name: str) -> float | None:
+        option = self.options.get(name)
+        return float(option) if isinstance(option, int | float) else None
+
+    def whole_number(self, name: str) -> int | None:
+        option = self.options.get(name)
+        return option if isinstance(option, int) else None
+
     @property
     def records(self) -> tuple[Path, ...]:
         return records_named([Path(text) for text in self.texts("calibrations")])
@@ -132,16 +140,23 @@ def _refuse_unknown_planes(request: Asked) -> None:
 
 def _export_result(request: Asked, console: Console) -> Found:
     from coupole.exchange.of_results.export_result import export_result
+    from coupole.exchange.of_results.measured_surface import ExportChoice
+    from coupole.viewing.terminal import step_bars
 
-    triangles, most_error = tuple(map(int, request.texts("triangle"))), request.options.get("adaptive")
-    with console.status(f"writing {request.to}"):
+    with step_bars(console) as say:
+        choice = ExportChoice(
+            tuple(map(int, request.texts("triangle"))),
+            request.number("adaptive"),
+            request.number("texel-mm"),
+            request.whole_number("map-px"),
+            say,
+        )
         paths = export_result(
             request.source,
             request.to,
             request.out,
             fit=request.text("fit"),
-            triangles=triangles,
-            most_error=most_error if isinstance(most_error, float) else None,
+            options=choice,
             overwrite=request.overwrite,
         )
     return _sizes(paths)

@@ -48,7 +48,7 @@ from coupole.reflectance.new_light.shading import (
 from coupole.reflectance.new_light.shadow_edges import trace_beam
 from coupole.reflectance.pair_harmonics import pair_values
 from coupole.reflectance.run_result import RunResult, ViewSamples, read_about
-from coupole.reflectance.texels.gathered import gather
+from coupole.reflectance.texels.gathered import gather, open_views
 from coupole.reflectance.texels.pixel_file import read_texel_errors, read_view_texels
 from coupole.reflectance.triangle_fit import TriangleMaterials, TriangleSamples, model_values
 
@@ -282,7 +282,7 @@ def _texels_of(result: RunResult, view: ViewSamples, surface: Surface) -> Texels
 def _gathered_texels(result: RunResult, surface: Surface) -> Texels:
     """Texels of a picture from anywhere: a material for each of its pixels."""
     seen = surface.triangle_of_pixel >= 0
-    gathered = gather(result, surface.places_mm[seen])
+    gathered = gather(open_views(result), surface.places_mm[seen])
     of_pixel = np.full(seen.shape, -1, np.int32)
     of_pixel[seen] = np.arange(np.count_nonzero(seen))
     return Texels(gathered.materials, gathered.covariance, of_pixel)

@@ -26,14 +26,14 @@ THETAS, SIDE = 64, 128
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`NAME.bsdf` for each material: some 17 MB, or what `surface.most_error` needs."""
+    """`NAME.bsdf` for each material: some 17 MB, or what `surface.options.most_error` needs."""
     paths = []
     for material in materials_of(surface):
         paths.append(folder / f"{material.name}.bsdf")
-        if surface.most_error is None:
+        if surface.options.most_error is None:
             write_synced(paths[-1], encode(material, surface.remark))
         else:
-            write_synced(paths[-1], encode_adaptive(material, surface.most_error, surface.remark))
+            write_synced(paths[-1], encode_adaptive(material, surface.options.most_error, surface.remark))
     return paths
 
 

@@ -41,9 +41,9 @@ def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
     """Give the materials of the chosen triangles, else those of all clusters. Raises InputError if a triangle has
     none, or if nothing is chosen and there are no clusters, or too many."""
     chosen_triangles(surface, optional=True)
-    for number in surface.chosen_triangles:
+    for number in surface.options.triangles:
         yield Material(f"triangle{number}", surface.kd[number], surface.ks[number], float(surface.alpha[number]))
-    if surface.chosen_triangles:
+    if surface.options.triangles:
         return
     folder = surface.result.folder
     how = "name triangles with --triangle"
@@ -61,14 +61,14 @@ def materials_of(surface: MeasuredSurface) -> Iterator[Material]:
 
 def chosen_triangles(surface: MeasuredSurface, *, optional: bool = False) -> NDArray[np.int64]:
     """Raises InputError for one that is not there or has no material, or if none is named."""
-    if not surface.chosen_triangles and not optional:
-        raise InputError("--triangle: expected the numbers of triangles whose samples are wanted")
-    for number in surface.chosen_triangles:
+    if not surface.options.triangles and not optional:
+        raise InputError("--triangle: expected the numbers of triangles whose samples are options")
+    for number in surface.options.triangles:
         if number >= len(surface.triangles):
             raise InputError(f"--triangle {number}: the mesh has {len(surface.triangles)}, counted from 0")
         if not surface.has_material[number]:
             raise InputError(f"--triangle {number}: has no material; no view, or too few lights, have seen it")
-    return np.array(surface.chosen_triangles, np.int64)
+    return np.array(surface.options.triangles, np.int64)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,4 +1,5 @@
-"""MaterialX 1.39: a document with OpenPBR's surface model, textures of one texel for each triangle, and the mesh.
+"""MaterialX 1.39: a document with OpenPBR's surface model, textures, and the mesh. A material of triangles has one
+texel for each; of texels there are maps with a normal too.
 
 OpenPBR (Academy Software Foundation, 1.1): colour of the base is pi kd and what the layer keeps from it at normal
 incidence, roughness the square root of GGX's alpha. The specular weight scales the reflectance of an index of 1.5
@@ -11,36 +12,57 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
+from numpy.typing import NDArray
 
 from coupole.errors import StorageError, reason
-from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, Floats, MeasuredSurface
+from coupole.exchange.atlas.flat_surface import flatten
+from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, MeasuredSurface, under_a_layer
+from coupole.exchange.of_results.obj import mesh_text
 from coupole.exchange.of_results.texel_layout import middles, texture
+from coupole.reflectance.fits import TEXELS
 from coupole.storage.durable import write_synced
 
 DOCUMENT, MESH = "surface.mtlx", "surface.obj"
 _IOR, _F0 = 1.5, 0.04
-_SURFACE = "measured_surface"
+_SURFACE, _NORMAL = "measured_surface", "normal_of_surface"
 
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
-    """`surface.mtlx`, its textures (OpenEXR, float32, linear) and `surface.obj` (metres, y up, one texture
-    coordinate and one normal for each triangle). Triangles without a material are left out."""
-    rows = np.flatnonzero(surface.has_material)
-    ks = surface.ks[rows]
+    """`surface.mtlx`, its textures (OpenEXR, float32, linear) and `surface.obj` (metres, y up). Triangles without
+    a material are left out."""
+    if surface.fit == TEXELS:
+        flat = flatten(surface)
+        mesh = mesh_text(flat.mesh, surface.remark, None)
+        columns = _columns(under_a_layer(flat.kd, flat.ks), flat.ks, flat.alpha) | {
+            "normal": 0.5 * flat.normals + 0.5
+        }
+        textures = {name: flat.map_of(values.astype(np.float32)) for name, values in columns.items()}
+    else:
+        rows = np.flatnonzero(surface.has_material)
+        mesh = _mesh(surface, rows)
+        columns = _columns(
+            under_a_layer(surface.kd[rows], surface.ks[rows]), surface.ks[rows], surface.alpha[rows]
+        )
+        textures = {name: texture(values).astype(np.float32) for name, values in columns.items()}
+    paths = [_write_texture(folder / f"{name}.exr", texels) for name, texels in textures.items()]
+    write_synced(folder / DOCUMENT, _document(surface))
+    write_synced(folder / MESH, mesh)
+    return [folder / DOCUMENT, folder / MESH, *paths]
+
+
+def _columns(colours: NDArray[Any], ks: NDArray[Any], alpha: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """[n, 1 or 3] values of texels by OpenPBR's names."""
     most = ks.max(axis=1, keepdims=True)
-    textures = {
-        "base_color": surface.under_a_layer(rows),
+    return {
+        "base_color": colours,
         "specular_color": np.where(most > 0.0, ks / np.maximum(most, 1e-12), 1.0),
         "specular_weight": most / _F0,
-        "specular_roughness": np.sqrt(surface.alpha[rows])[:, None],
+        "specular_roughness": np.sqrt(alpha)[:, None],
     }
-    paths = [_write_texture(folder / f"{name}.exr", values) for name, values in textures.items()]
-    write_synced(folder / DOCUMENT, _document(surface))
-    write_synced(folder / MESH, _mesh(surface, rows))
-    return [folder / DOCUMENT, folder / MESH, *paths]
 
 
 def _document(surface: MeasuredSurface) -> bytes:
@@ -53,15 +75,22 @@ def _document(surface: MeasuredSurface) -> bytes:
         "specular_weight": "float",
         "specular_roughness": "float",
     }
-    for name, kind in inputs.items():
-        image = ET.SubElement(root, "image", name=f"{name}_of_triangles", type=kind)
+    has_maps = surface.fit == TEXELS
+    suffix, filtering = ("of_texels", "linear") if has_maps else ("of_triangles", "closest")
+    for name, kind in (inputs | ({"normal": "vector3"} if has_maps else {})).items():
+        image = ET.SubElement(root, "image", name=f"{name}_{suffix}", type=kind)
         ET.SubElement(image, "input", name="file", type="filename", value=f"{name}.exr")
-        ET.SubElement(image, "input", name="filtertype", type="string", value="closest")
+        ET.SubElement(image, "input", name="filtertype", type="string", value=filtering)
         for axis in ("uaddressmode", "vaddressmode"):
             ET.SubElement(image, "input", name=axis, type="string", value="clamp")
+    if has_maps:
+        frame = ET.SubElement(root, "normalmap", name=_NORMAL, type="vector3")
+        ET.SubElement(frame, "input", name="in", type="vector3", nodename=f"normal_{suffix}")
     shader = ET.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
     for name, kind in inputs.items():
-        ET.SubElement(shader, "input", name=name, type=kind, nodename=f"{name}_of_triangles")
+        ET.SubElement(shader, "input", name=name, type=kind, nodename=f"{name}_{suffix}")
+    if has_maps:
+        ET.SubElement(shader, "input", name="geometry_normal", type="vector3", nodename=_NORMAL)
     ET.SubElement(shader, "input", name="specular_ior", type="float", value=str(_IOR))
     material = ET.SubElement(root, "surfacematerial", name=f"{_SURFACE}_material", type="material")
     ET.SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=_SURFACE)
@@ -87,8 +116,7 @@ def _mesh(surface: MeasuredSurface, known_triangles: np.ndarray[tuple[int], np.d
     return "\n".join(lines) + "\n"
 
 
-def _write_texture(path: Path, values: Floats) -> Path:
-    texels = texture(values).astype(np.float32)
+def _write_texture(path: Path, texels: NDArray[np.float32]) -> Path:
     channels = {"RGB": texels} if texels.shape[2] == 3 else {"Y": texels[..., 0].copy()}
     partial = path.with_name(f".{path.name}.part")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

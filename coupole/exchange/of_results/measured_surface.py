@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,14 +14,35 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
 from coupole.geometry import apply, inverse
-from coupole.reflectance.fits import MATERIALS
+from coupole.reflectance.fits import MATERIALS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
+from coupole.reflectance.texels.pixel_file import read_texel_errors
 
 Floats = NDArray[np.float64]
+Said = Callable[[str, int, int], None]
 _LEAST_PASSED = 0.05
 Y_UP_FROM_SUPPORT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Rotation for the programs of computer graphics, in which y is up."""
+
+
+def _say_nothing(_step: str, _count: int, _total: int) -> None:
+    """Progress that nobody watches."""
+
+
+@dataclass(frozen=True)
+class ExportChoice:
+    """Options of an export, beside its format."""
+
+    triangles: tuple[int, ...] = ()
+    """Triangles that are asked for by name."""
+    most_error: float | None = None
+    """Relative, of tables that adapt to their material; None: plain ones."""
+    texel_mm: float | None = None
+    """Side of a map's texels; None: as the views have it."""
+    map_px: int | None = None
+    """Greatest width of maps; None: as large as need be."""
+    say: Said = _say_nothing
 
 
 @dataclass(frozen=True)
@@ -29,7 +51,8 @@ class MeasuredSurface:
 
     result: RunResult
     fit: str
-    """The materials are those of this fit, one of `fits.MATERIALS`."""
+    """The materials are those of this fit, one of `fits.MATERIALS`; with `TEXELS`, triangles have those of the
+    best."""
     about: dict[str, Any]
     """result.json"""
     vertices_mm: Floats
@@ -47,21 +70,12 @@ class MeasuredSurface:
     uncertain: dict[str, Floats]
     """[n] standard uncertainties, all parts together: `u_kd`, `u_ks`, `u_alpha` relative (the channels' mean),
     `u_normal` rad."""
-    chosen_triangles: tuple[int, ...] = ()
-    """Triangles that are asked for by name."""
-    most_error: float | None = None
-    """Relative, of tables that adapt to their material; None: plain ones."""
+    options: ExportChoice = ExportChoice()
 
     @cached_property
     def has_material(self) -> NDArray[np.bool_]:
         """[n] triangles that have a material."""
         return np.isfinite(self.alpha) & np.isfinite(self.kd).all(axis=1)
-
-    def under_a_layer(self, triangle_numbers: NDArray[np.int64]) -> Floats:
-        """[n, 3] colour, 0 to 1, of the diffuse part of triangles where a model's specular layer keeps light from
-        it: pi kd, and more by what a layer of the brightest ks reflects at normal incidence."""
-        passes = np.maximum(1.0 - self.ks[triangle_numbers].max(axis=1, keepdims=True), _LEAST_PASSED)
-        return np.asarray(np.clip(np.pi * self.kd[triangle_numbers] / passes, 0.0, 1.0))
 
     @property
     def remark(self) -> str:
@@ -71,17 +85,29 @@ class MeasuredSurface:
         return f"{kind} with Coupole {version}; fit {self.fit} of {runs}"
 
 
-def read_surface(folder: Path, fit: str | None = None, chosen_triangles: tuple[int, ...] = ()) -> MeasuredSurface:
-    """Read the surface of a whole result, with the material fit that missed least unless a fit is named. Raises
-    InputError if there is no such fit."""
+def under_a_layer(kd: NDArray[np.floating], ks: NDArray[np.floating]) -> Floats:
+    """[n, 3] colour, 0 to 1, of the diffuse part where a model's specular layer keeps light from it: pi kd, and
+    more by what a layer of the brightest ks reflects at normal incidence."""
+    passes = np.maximum(1.0 - ks.max(axis=1, keepdims=True), _LEAST_PASSED)
+    return np.asarray(np.clip(np.pi * kd / passes, 0.0, 1.0))
+
+
+def read_surface(
+    folder: Path, fit: str | None = None, options: ExportChoice | None = None, *, takes_texels: bool = False
+) -> MeasuredSurface:
+    """Read the surface of a whole result, with the material that missed least unless a fit is named;
+    `takes_texels` if that may be `TEXELS`. Raises InputError if there is no such fit."""
     about = read_about(folder)
     result = RunResult(folder)
-    name = fit or best_fit(result, MATERIALS)
-    if name not in MATERIALS:
+    name = fit or _best(result, takes_texels=takes_texels)
+    if name not in (*MATERIALS, TEXELS):
         raise InputError(f"--fit: expected {' or '.join(MATERIALS)}, which hold from everywhere; got {name}")
-    path = result.materials_path(name)
+    if name == TEXELS and not takes_texels:
+        raise InputError("--fit texels: is for formats with maps; this one has one material for each triangle")
+    of_triangles = best_fit(result, MATERIALS) if name == TEXELS else name
+    path = result.materials_path(of_triangles)
     if not path.exists():
-        raise InputError(f"{folder}: has no fit {name}; `coupole reflectance fit {folder}` makes it")
+        raise InputError(f"{folder}: has no fit {of_triangles}; `coupole reflectance fit {folder}` makes it")
     support_from_base = inverse(result.base_from_support)
     vertices, number = np.unique(result.corners_mm.reshape(-1, 3), axis=0, return_inverse=True)
     vertices_mm = apply(support_from_base, vertices.astype(np.float64))
@@ -89,7 +115,7 @@ def read_surface(folder: Path, fit: str | None = None, chosen_triangles: tuple[i
     corners = vertices_mm[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    materials = result.materials(name)
+    materials = result.materials(of_triangles)
     is_fitted = np.isfinite(materials.alpha)
     normals[result.triangles[is_fitted]] = materials.normals[is_fitted] @ support_from_base[:3, :3].T
 
@@ -109,5 +135,16 @@ def read_surface(folder: Path, fit: str | None = None, chosen_triangles: tuple[i
         everywhere(red_green_blue(materials.ks)),
         everywhere(materials.alpha),
         {key: everywhere(values) for key, values in standard_uncertainties(path).items()},
-        chosen_triangles,
+        options or ExportChoice(),
     )
+
+
+def _best(result: RunResult, *, takes_texels: bool) -> str:
+    """The material that missed least in the check; texels unless they were compared with it there, and missed
+    more."""
+    of_triangles = best_fit(result, MATERIALS)
+    mae = read_texel_errors(result.folder)
+    texels_miss, triangles_miss = mae.get(TEXELS), mae.get(of_triangles)
+    if not takes_texels or texels_miss is None:
+        return of_triangles
+    return TEXELS if triangles_miss is None or texels_miss < triangles_miss else of_triangles

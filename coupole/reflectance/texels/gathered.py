@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -39,7 +40,9 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class _View:
+class TexelView:
+    """A view with texels, open for look-ups."""
+
     texels: ViewTexels
     surface: Surface
     texel_of_pixel: NDArray[np.int32]
@@ -48,10 +51,14 @@ class _View:
     """Median distance of what neighbouring pixels see."""
 
 
-def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
-    """Gather materials of places [n, 3] of the base frame. Raises InputError if no view has texels."""
-    views = [_open_view(result, view) for view in views_with_texels(result)]
-    count, channels = len(places_mm), result.channels
+def open_views(result: RunResult) -> list[TexelView]:
+    """Open the views that have texels. Raises InputError if none has."""
+    return [_open_view(result, view) for view in views_with_texels(result)]
+
+
+def gather(views: Sequence[TexelView], places_mm: NDArray[np.floating]) -> Gathered:
+    """Gather materials of places [n, 3] of the base frame."""
+    count, channels = len(places_mm), views[0].texels.kd.shape[1]
     normals, logs = np.zeros((count, 3)), np.zeros((count, 2 * channels + 1))
     information = np.zeros((count, len(VARIANCES)))
     for view in views:
@@ -71,12 +78,12 @@ def gather(result: RunResult, places_mm: NDArray[np.floating]) -> Gathered:
     return Gathered(materials, covariance)
 
 
-def _open_view(result: RunResult, view: ViewSamples) -> _View:
+def _open_view(result: RunResult, view: ViewSamples) -> TexelView:
     texels, surface = read_view_texels(result, view), surface_of_view(result, view)
     texel_of_pixel = np.full(surface.triangle_of_pixel.shape, -1, np.int32)
     texel_of_pixel.reshape(-1)[texels.pixels] = np.arange(len(texels.pixels))
     steps = np.linalg.norm(surface.places_mm[:, 1:] - surface.places_mm[:, :-1], axis=2)
-    return _View(texels, surface, texel_of_pixel, float(np.nanmedian(steps)))
+    return TexelView(texels, surface, texel_of_pixel, float(np.nanmedian(steps)))
 
 
 def _by_columns(of_unknowns: Floats, channels: int) -> Floats:
@@ -85,7 +92,7 @@ def _by_columns(of_unknowns: Floats, channels: int) -> Floats:
 
 
 def _add_view(
-    view: _View, places_mm: NDArray[np.floating], normals: Floats, logs: Floats, information: Floats
+    view: TexelView, places_mm: NDArray[np.floating], normals: Floats, logs: Floats, information: Floats
 ) -> None:
     """Add what a view shows of places [n, 3], times its weights, to sums."""
     pixels = pixels_of_places(view.surface, places_mm)

@@ -1,0 +1,193 @@
+"""The place of each triangle of a mesh lies in a texture, and what triangle each texel shows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.atlas.charts import Floats, Integers, chart_axes, cut_charts, neighbours_of, split_off
+
+PADDING_PX = 4
+"""Texels around a chart that continue it: mipmaps of three levels see nothing else."""
+_MOST_ROUNDS = 12
+_FILL = 0.85
+"""Share of a texture that rectangles may be expected to fill; the side grows if they do not fit."""
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """A texture of n triangles. Places in it are in px, rightwards and downwards from its top left corner, so the
+    first texel's centre is at (0.5, 0.5)."""
+
+    side_px: int
+    texel_mm: float
+    """Side of a texel on a surface that faces its chart's direction."""
+    chart: Integers
+    """[n] of the triangles."""
+    corners_px: Floats
+    """[n, 3, 2]"""
+    triangle_of_texel: Integers
+    """[side, side] -1 for none. Padding shows the nearest triangle, as if it went on."""
+    is_inside: NDArray[np.bool_]
+    """[side, side] texels whose centre is on a triangle: no padding."""
+
+    def places_mm(self, corners_mm: Floats, texels: NDArray[np.int64]) -> Floats:
+        """[k, 3] places on triangles [n, 3, 3] that texels [k] show, counted row by row."""
+        places = np.empty((len(texels), 3))
+        _places(texels, self.triangle_of_texel, self.corners_px, corners_mm, places)
+        return places
+
+    def barycentric(self, texels: NDArray[np.int64]) -> Floats:
+        """[k, 3] weights of the corners of the triangles that texels [k] show, counted row by row."""
+        return self.places_mm(np.broadcast_to(np.eye(3), (len(self.chart), 3, 3)), texels)
+
+
+def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], texel_mm: float, most_side_px: int) -> Atlas:
+    """Lay out triangles [n, 3, 3], whose corners are rows of vertices [n, 3]. No two places of the surface share a
+    texel. Raises InputError if the texture would be wider than `most_side_px`."""
+    neighbours = neighbours_of(triangles)
+    chart = cut_charts(corners_mm, neighbours)
+    for round_number in range(_MOST_ROUNDS):
+        flat_px, sizes_px = _flatten(corners_mm, chart, texel_mm)
+        side_px, origins_px = _pack(sizes_px)
+        if side_px > most_side_px:
+            raise InputError(_too_large(texel_mm, side_px, most_side_px))
+        corners_px = flat_px + origins_px[chart][:, None, :]
+        triangle_of_texel = np.full((side_px, side_px), -1, np.int32)
+        is_expelled = np.zeros(len(chart), np.bool_)
+        _rasterise(corners_px, triangle_of_texel, is_expelled)
+        if not is_expelled.any() or round_number == _MOST_ROUNDS - 1:
+            break
+        chart = split_off(neighbours, chart, is_expelled)
+    is_inside = triangle_of_texel >= 0
+    return Atlas(side_px, texel_mm, chart, corners_px, _pad(triangle_of_texel), is_inside)
+
+
+def _too_large(texel_mm: float, side_px: int, most_side_px: int) -> str:
+    enough_mm = texel_mm * side_px / most_side_px * 1.01
+    return (
+        f"texels of {texel_mm:.3g} mm need a texture {side_px:,} px wide, and {most_side_px:,} is the most; "
+        f"give --texel-mm {enough_mm:.2g} or more"
+    )
+
+
+def _flatten(corners_mm: Floats, chart: Integers, texel_mm: float) -> tuple[Floats, NDArray[np.int64]]:
+    """[n, 3, 2] px of the corners in their charts' rectangles, and [charts, 2] widths and heights of these, px."""
+    axes = chart_axes(corners_mm, chart)
+    helper = np.where(np.abs(axes[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    right = np.cross(helper, axes)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    up = np.cross(axes, right)
+    flat = np.stack([np.einsum("nck,nk->nc", corners_mm, way[chart]) for way in (right, -up)], axis=2) / texel_mm
+    order = np.argsort(chart, kind="stable")
+    bounds = np.searchsorted(chart[order], np.arange(len(axes) + 1))
+    sizes = np.empty((len(axes), 2), np.int64)
+    for number in range(len(axes)):
+        rows = order[bounds[number] : bounds[number + 1]]
+        flat[rows], sizes[number] = _turn_to_fit(flat[rows])
+    return flat, sizes
+
+
+def _turn_to_fit(corners_px: Floats) -> tuple[Floats, tuple[int, int]]:
+    """Turn a chart [n, 3, 2] so that its rectangle is small and lies; its size, with padding around."""
+    (_, _), (width, height), angle_deg = cv2.minAreaRect(corners_px.reshape(-1, 2).astype(np.float32))
+    angle = math.radians(angle_deg if width >= height else angle_deg + 90.0)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    fitted_px = corners_px @ turn
+    fitted_px += PADDING_PX - fitted_px.reshape(-1, 2).min(axis=0)
+    width, height = np.ceil(fitted_px.reshape(-1, 2).max(axis=0)).astype(int) + PADDING_PX
+    return fitted_px, (int(width), int(height))
+
+
+def _pack(sizes_px: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+    """Side of a square for rectangles [charts, 2], and [charts, 2] their left upper corners: in rows, the highest
+    first."""
+    order = np.argsort(-sizes_px[:, 1], kind="stable")
+    side = max(int(math.sqrt(sizes_px.prod(axis=1).sum() / _FILL)), int(sizes_px.max()))
+    while True:
+        side = -(-side // 4) * 4
+        origins = _shelves(sizes_px[order], side)
+        if len(origins):
+            places = np.empty_like(origins)
+            places[order] = origins
+            return side, places
+        side += max(side // 64, 4)
+
+
+@numba.njit(cache=True)
+def _shelves(sizes_px, side_px):  # type: ignore[no-untyped-def]
+    """Left upper corners of rectangles in rows; none if they do not fit."""
+    origins = np.empty((len(sizes_px), 2), np.int64)
+    at_px, top_px, height_px = 0, 0, 0
+    for number in range(len(sizes_px)):
+        if at_px + sizes_px[number, 0] > side_px:
+            at_px, top_px, height_px = 0, top_px + height_px, 0
+        height_px = max(height_px, sizes_px[number, 1])
+        if top_px + height_px > side_px:
+            return origins[:0]
+        origins[number, 0], origins[number, 1] = at_px, top_px
+        at_px += sizes_px[number, 0]
+    return origins
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-untyped-def]
+    """Write each triangle into the texels whose centres it has; mark those that meet others there."""
+    side = len(triangle_of_texel)
+    for triangle in range(len(corners_px)):
+        a, b, c = corners_px[triangle, 0], corners_px[triangle, 1], corners_px[triangle, 2]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0.0:
+            continue
+        low, high = min(a[1], b[1], c[1]), max(a[1], b[1], c[1])
+        for row in range(max(math.ceil(low - 0.5), 0), min(math.floor(high - 0.5) + 1, side)):
+            least_px, most_px = min(a[0], b[0], c[0]), max(a[0], b[0], c[0])
+            for column in range(max(math.ceil(least_px - 0.5), 0), min(math.floor(most_px - 0.5) + 1, side)):
+                x, y = column + 0.5 - a[0], row + 0.5 - a[1]
+                v = (x * (c[1] - a[1]) - y * (c[0] - a[0])) / area
+                w = (y * (b[0] - a[0]) - x * (b[1] - a[1])) / area
+                if v < 0.0 or w < 0.0 or v + w > 1.0:
+                    continue
+                if triangle_of_texel[row, column] < 0:
+                    triangle_of_texel[row, column] = triangle
+                elif min(v, w, 1.0 - v - w) > 1e-6:
+                    is_expelled[triangle] = True
+
+
+def _pad(triangle_of_texel: Integers) -> Integers:
+    """The same with the nearest triangle in the texels around charts."""
+    is_outside = (triangle_of_texel < 0).astype(np.uint8)
+    if is_outside.all() or not is_outside.any():
+        return triangle_of_texel
+    distance, label = cv2.distanceTransformWithLabels(
+        is_outside, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.full(int(label.max()) + 1, -1, np.int32)
+    inside = is_outside == 0
+    of_label[label[inside]] = triangle_of_texel[inside]
+    return np.where(distance <= PADDING_PX, of_label[label], -1).astype(np.int32)
+
+
+@numba.njit(cache=True, error_model="numpy", parallel=False)
+def _places(texels, triangle_of_texel, corners_px, corners_mm, places_mm):  # type: ignore[no-untyped-def]
+    side = triangle_of_texel.shape[1]
+    for number in range(len(texels)):
+        row, column = texels[number] // side, texels[number] % side
+        triangle = triangle_of_texel[row, column]
+        a, b, c = corners_px[triangle, 0], corners_px[triangle, 1], corners_px[triangle, 2]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        x, y = column + 0.5 - a[0], row + 0.5 - a[1]
+        v = (x * (c[1] - a[1]) - y * (c[0] - a[0])) / area
+        w = (y * (b[0] - a[0]) - x * (b[1] - a[1])) / area
+        for k in range(3):
+            places_mm[number, k] = (
+                (1.0 - v - w) * corners_mm[triangle, 0, k]
+                + v * corners_mm[triangle, 1, k]
+                + w * corners_mm[triangle, 2, k]
+            )

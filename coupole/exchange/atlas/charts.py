@@ -1,0 +1,193 @@
+"""Charts: parts of a mesh that a plane each shows without folds, as textures want them.
+
+A chart grows from a triangle to its neighbours as long as their directions stay near its own. Directions are means
+over some rings of neighbours, or the noise of a scan would cut it into single triangles. A chart is seen along its
+direction, so lengths shrink by the cosine of a triangle's slope at most (`_LEAST_FACING`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int32]
+
+_ROUNDS = 12
+"""Rings of neighbours over which directions are means."""
+_MOST_TURN = math.cos(math.radians(40.0))
+_LEAST_FACING = math.cos(math.radians(70.0))
+_LEAST_FACING_MERGED = math.cos(math.radians(86.0))
+"""Cosines: how far mean directions may turn within a chart, and how steep single triangles may stand on its plane,
+as it grows and as small charts are given to their neighbours."""
+_LEAST_TRIANGLES = 64
+"""Smallest number of triangles in a chart that is not given to its neighbours."""
+_MOST_SHARE = 1 / 100
+"""Largest share of all triangles in a chart, so that charts are round and rectangles have little beside them."""
+_MERGE_PASSES, _ROUNDINGS = 6, 3
+
+
+def neighbours_of(triangles: NDArray[np.integer]) -> Integers:
+    """[n, 3] the triangle beyond each edge of triangles [n, 3] (from corner k to the next); -1 at a border, and
+    where more than two meet."""
+    count = len(triangles)
+    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    edges = ends[:, 0].astype(np.int64) * (int(triangles.max(initial=0)) + 1) + ends[:, 1]
+    order = np.argsort(edges, kind="stable")
+    sorted_edges = edges[order]
+    same = sorted_edges[1:] == sorted_edges[:-1]
+    is_pair = same & ~np.append(False, same[:-1]) & ~np.append(same[1:], False)
+    first, second = order[:-1][is_pair], order[1:][is_pair]
+    beyond = np.full(3 * count, -1, np.int32)
+    beyond[first], beyond[second] = second // 3, first // 3
+    return beyond.reshape(count, 3)
+
+
+def face_normals(corners_mm: Floats) -> Floats:
+    """[n, 3] unit normals of triangles [n, 3, 3]; 0 for those without an area."""
+    return _unit(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
+
+
+def cut_charts(corners_mm: Floats, neighbours: Integers) -> Integers:
+    """[n] the chart of each triangle [n, 3, 3], from 0. Charts are round, as rectangles around them are to be
+    full: they grow one by one, and then `_ROUNDINGS` times all together from their middles (Lloyd, 1982)."""
+    normals, means = face_normals(corners_mm), _mean_normals(corners_mm, neighbours)
+    most = max(int(_MOST_SHARE * len(normals)), _LEAST_TRIANGLES)
+    no_seeds = np.empty(0, np.int64)
+    chart, axes = _grow(normals, means, neighbours, no_seeds, most)
+    for _ in range(_ROUNDINGS):
+        chart, axes = _grow(normals, means, neighbours, _middles(corners_mm, chart), most)
+    _merge(normals, neighbours, chart, axes)
+    parts: Integers = _numbered_parts(neighbours, chart)
+    return parts
+
+
+def _middles(corners_mm: Floats, chart: Integers) -> NDArray[np.int64]:
+    """The triangle of each larger chart that is nearest to its middle."""
+    centres_mm, sizes = corners_mm.mean(axis=1), np.bincount(chart)
+    middles = np.stack([np.bincount(chart, column) for column in centres_mm.T], axis=1) / sizes[:, None]
+    distance = np.linalg.norm(centres_mm - middles[chart], axis=1)
+    order = np.lexsort((distance, chart))
+    firsts = order[np.searchsorted(chart[order], np.arange(len(sizes)))]
+    return np.asarray(firsts[sizes >= _LEAST_TRIANGLES])
+
+
+def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
+    """[charts, 3] unit directions: the mean of each chart's triangles, by area."""
+    areas = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    sums = [np.bincount(chart, column) for column in areas.T]
+    return _unit(np.stack(sums, axis=1))
+
+
+def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
+    """The charts [n] anew, where expelled triangles [n] are charts of their own, as far as they hang together."""
+    apart = np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32)
+    parts: Integers = _numbered_parts(neighbours, apart)
+    return parts
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
+
+
+def _mean_normals(corners_mm: Floats, neighbours: Integers) -> Floats:
+    sums = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    has_neighbour = (neighbours >= 0)[..., None]
+    for _ in range(_ROUNDS):
+        sums = sums + np.where(has_neighbour, sums[neighbours], 0.0).sum(axis=1)
+        sums /= max(float(np.abs(sums).max(initial=0.0)), 1e-300)
+    return _unit(sums)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _grow(normals, means, neighbours, seeds, most):  # type: ignore[no-untyped-def]
+    """Charts [n] of triangles, and the directions [charts, 3] along which they grew: from all seeds together, and
+    then one by one from what is left, each up to `most` triangles."""
+    count = len(normals)
+    chart, axes = np.full(count, -1, np.int32), np.empty_like(normals)
+    queue, last = np.empty(count, np.int32), 0
+    for charts in range(len(seeds)):
+        last = _begin(seeds[charts], charts, normals, means, chart, axes, queue, last)
+    _fill_charts(normals, means, neighbours, chart, axes, queue, last, count)
+    charts = len(seeds)
+    for seed in range(count):
+        if chart[seed] < 0:
+            _begin(seed, charts, normals, means, chart, axes, queue, 0)
+            _fill_charts(normals, means, neighbours, chart, axes, queue, 1, most)
+            charts += 1
+    return chart, axes[:charts].copy()
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _begin(seed, number, normals, means, chart, axes, queue, last):  # type: ignore[no-untyped-def]
+    """Begin a chart with a triangle; the length of the queue."""
+    axes[number] = means[seed]
+    if _dot(means[seed], normals[seed]) <= _LEAST_FACING:
+        axes[number] = normals[seed]
+    chart[seed], queue[last] = number, seed
+    return last + 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill_charts(normals, means, neighbours, chart, axes, queue, last, most):  # type: ignore[no-untyped-def]
+    """Give the neighbours of queued triangles to their charts, until `most` have been queued."""
+    first = 0
+    while first < last:
+        triangle = queue[first]
+        axis = axes[chart[triangle]]
+        first += 1
+        for k in range(3):
+            neighbour = neighbours[triangle, k]
+            if neighbour < 0 or chart[neighbour] >= 0 or last >= most:
+                continue
+            if _dot(axis, means[neighbour]) > _MOST_TURN and _dot(axis, normals[neighbour]) > _LEAST_FACING:
+                chart[neighbour], queue[last] = chart[triangle], neighbour
+                last += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _merge(normals, neighbours, chart, axes):  # type: ignore[no-untyped-def]
+    """Give triangles of small charts to the largest neighbouring chart that they face."""
+    for _ in range(_MERGE_PASSES):
+        sizes = np.bincount(chart)
+        for triangle in range(len(chart)):
+            if sizes[chart[triangle]] >= _LEAST_TRIANGLES:
+                continue
+            best = chart[triangle]
+            for k in range(3):
+                neighbour = neighbours[triangle, k]
+                if neighbour < 0 or sizes[chart[neighbour]] < max(_LEAST_TRIANGLES, sizes[best]):
+                    continue
+                if _dot(axes[chart[neighbour]], normals[triangle]) > _LEAST_FACING_MERGED:
+                    best = chart[neighbour]
+            chart[triangle] = best
+
+
+@numba.njit(cache=True)
+def _numbered_parts(neighbours, chart):  # type: ignore[no-untyped-def]
+    """[n] charts from 0, where each part of one that hangs together is one."""
+    parts = np.full(len(chart), -1, np.int32)
+    queue = np.empty(len(chart), np.int32)
+    count = 0
+    for seed in range(len(chart)):
+        if parts[seed] >= 0:
+            continue
+        queue[0], parts[seed], first, last = seed, count, 0, 1
+        while first < last:
+            triangle = queue[first]
+            first += 1
+            for k in range(3):
+                neighbour = neighbours[triangle, k]
+                if neighbour >= 0 and parts[neighbour] < 0 and chart[neighbour] == chart[triangle]:
+                    parts[neighbour], queue[last] = count, neighbour
+                    last += 1
+        count += 1
+    return parts
+
+
+@numba.njit(inline="always")
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,317 @@
+"""A measured surface as programs of computer graphics take it: a mesh with smooth normals, and maps of its
+materials.
+
+The frame in which a normal map is written belongs to the mesh: at each vertex the mean normal N of the triangles
+around it, the tangent T along the map's columns, and N x T, which points up in the map. Within a triangle N and T
+are interpolated and made unit. Programs that make tangents themselves, from a triangle's places in the map, find
+the same T on flat parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.exchange.atlas.atlas_layout import Atlas, lay_out
+from coupole.exchange.atlas.open_sky import open_sky
+from coupole.exchange.material_values import red_green_blue
+from coupole.exchange.of_results.measured_surface import MeasuredSurface
+from coupole.geometry import apply
+from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.run_result import VARIANCES
+from coupole.reflectance.texels.gathered import TexelView, gather, open_views
+from coupole.reflectance.triangle_fit import TriangleMaterials
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+MOST_SIDE_PX = 16384
+_MOST_U = 0.4
+"""Relative standard uncertainty of kd from which on a material is no material."""
+_BLOCK = 1 << 20
+"""Texels that are looked up together."""
+
+
+@dataclass(frozen=True)
+class FlatMesh:
+    """A mesh of v vertices, each in one chart. Support frame, mm."""
+
+    places_mm: Floats
+    """[v, 3]"""
+    normals: Floats
+    """[v, 3] unit; the same for all vertices of one place."""
+    tangents: Floats
+    """[v, 3] unit, along the columns of the maps."""
+    map_places: Floats
+    """[v, 2] 0 to 1, rightwards and downwards from the maps' top left corner."""
+    triangles: NDArray[np.int64]
+    """[m, 3]"""
+    open_sky: Floats
+    """[v] share of the light of an even sky that nothing of the object hides."""
+
+
+@dataclass(frozen=True)
+class FlatSurface:
+    """A mesh, and the materials of the k texels that have one."""
+
+    mesh: FlatMesh
+    side_px: int
+    texel_mm: float
+    texel_of_place: NDArray[np.int32]
+    """[side, side] the texel that stands for a place of the maps: the nearest, within padding; -1 for none."""
+    kd: Singles
+    """[k, 3] 1/sr, red, green, blue."""
+    ks: Singles
+    """[k, 3]"""
+    alpha: Singles
+    """[k]"""
+    normals: Singles
+    """[k, 3] unit, in the frames of the mesh: along the map's columns, up in the map, outwards."""
+    open_sky: Singles
+    """[k]"""
+    measured_share: float
+    """Share of the texels on triangles that pixels of a view gave; the others have their triangle's material."""
+
+    def map_of(self, values: NDArray[Any], nothing: Any = 0) -> NDArray[Any]:
+        """[side, side, c] of values of texels [k, c], of their type; `nothing` where there is none."""
+        last = np.broadcast_to(np.asarray(nothing, values.dtype), (1, values.shape[1]))
+        return np.asarray(np.concatenate([values, last])[self.texel_of_place])
+
+
+def flatten(surface: MeasuredSurface) -> FlatSurface:
+    """Lay a surface out in maps. Texels are as wide as its options say; or as what neighbouring pixels of the
+    finest view see, or as a map of the width that they allow.
+
+    Raises InputError if the maps would be wider than the options say, or than `MOST_SIDE_PX`, or if nothing has a
+    material.
+    """
+    views = open_views(surface.result) if surface.fit == TEXELS else []
+    rows = _rows_to_show(surface, views)
+    corners_mm = surface.vertices_mm[surface.triangles[rows]]
+    options = surface.options
+    options.say("charts", 0, 1)
+    atlas = _lay_out(
+        corners_mm,
+        surface.triangles[rows],
+        options.texel_mm,
+        options.map_px or MOST_SIDE_PX,
+        _finest_mm(views, corners_mm),
+    )
+    options.say("charts", 1, 1)
+    return _fill(surface, rows, atlas, views)
+
+
+def _rows_to_show(surface: MeasuredSurface, views: list[TexelView]) -> NDArray[np.int64]:
+    """Triangles with a certain material, or with a certain texel at their middle or near a corner."""
+    if not views:
+        return np.flatnonzero(surface.has_material)
+    is_shown = _has_certain_material(surface)
+    rows = np.flatnonzero(~is_shown & np.isin(np.arange(len(is_shown)), surface.result.triangles))
+    corners_mm = surface.vertices_mm[surface.triangles[rows]]
+    middles_mm = corners_mm.mean(axis=1)
+    for places_mm in (middles_mm, *(0.8 * corners_mm[:, n] + 0.2 * middles_mm for n in range(3))):
+        _, is_certain = _seen_there(surface, views, places_mm)
+        is_shown[rows[is_certain]] = True
+    return np.flatnonzero(is_shown)
+
+
+def _has_certain_material(surface: MeasuredSurface) -> NDArray[np.bool_]:
+    return np.asarray(surface.has_material & (surface.uncertain["u_kd"] < _MOST_U))
+
+
+def _seen_there(
+    surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
+) -> tuple[TriangleMaterials, NDArray[np.bool_]]:
+    """Materials that views show at places [k, 3] of the support frame, with normals of the base frame; where they
+    are certain."""
+    places_seen = gather(views, apply(surface.result.base_from_support, places_mm))
+    is_certain = (places_seen.materials.alpha > 0.0) & (places_seen.covariance[:, VARIANCES[2]] < _MOST_U**2)
+    return places_seen.materials, is_certain
+
+
+def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
+    """Distance of places that neighbouring pixels see, in the finest view; of triangles, half their edge."""
+    if views:
+        return min(view.step_mm for view in views)
+    return float(np.median(np.linalg.norm(corners_mm[:, 1] - corners_mm[:, 0], axis=1))) / 2.0
+
+
+def _lay_out(
+    corners_mm: Floats, triangles: NDArray[np.int64], asked_mm: float | None, most_px: int, finest_mm: float
+) -> Atlas:
+    if asked_mm is not None:
+        return lay_out(corners_mm, triangles, asked_mm, most_px)
+    area_mm2 = float(np.linalg.norm(_areas(corners_mm), axis=1).sum()) / 2.0
+    texel_mm = max(finest_mm, np.sqrt(area_mm2) / most_px)
+    while True:
+        atlas = lay_out(corners_mm, triangles, texel_mm, MOST_SIDE_PX)
+        if atlas.side_px <= most_px:
+            return atlas
+        texel_mm *= 1.02 * atlas.side_px / most_px
+
+
+def _areas(corners_mm: Floats) -> Floats:
+    return np.asarray(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
+
+
+def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, views: list[TexelView]) -> FlatSurface:
+    texels = np.flatnonzero(atlas.triangle_of_texel.reshape(-1) >= 0)
+    values = _Values.empty(len(texels))
+    for first in range(0, len(texels), _BLOCK):
+        part = slice(first, min(first + _BLOCK, len(texels)))
+        _look_up(surface, rows, atlas, views, texels[part], values.rows(part))
+        surface.options.say("texels", part.stop, len(texels))
+    is_known = values.alpha > 0.0
+    if not is_known.any():
+        raise InputError(f"{surface.result.folder}: has no material to show")
+    is_inside = atlas.is_inside.reshape(-1)[texels]
+    measured_share = float(np.mean(values.is_measured[is_inside])) if is_inside.any() else 0.0
+    mesh = _mesh(surface, rows, atlas, texels[is_known])
+    texels, values = texels[is_known], values.rows(is_known)
+    normals, sky = _in_frames(mesh, atlas, texels, values.normals)
+    return FlatSurface(
+        mesh.flat, atlas.side_px, atlas.texel_mm, _nearest(atlas, texels), values.kd, values.ks, values.alpha,
+        normals, sky, measured_share,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Values:
+    """Materials of texels; roughness is 0 where there is none."""
+
+    normals: Singles
+    kd: Singles
+    ks: Singles
+    alpha: Singles
+    is_measured: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, count: int) -> _Values:
+        normals, kd, ks = (np.zeros((count, 3), np.float32) for _ in range(3))
+        return cls(normals, kd, ks, np.zeros(count, np.float32), np.zeros(count, np.bool_))
+
+    def rows(self, part: slice | NDArray[np.bool_]) -> _Values:
+        return _Values(self.normals[part], self.kd[part], self.ks[part], self.alpha[part], self.is_measured[part])
+
+
+def _look_up(
+    surface: MeasuredSurface,
+    rows: NDArray[np.int64],
+    atlas: Atlas,
+    views: list[TexelView],
+    texels: NDArray[np.int64],
+    values: _Values,
+) -> None:
+    """Fill what is known of texels: from the views' pixels, or else from their triangles."""
+    triangle = rows[atlas.triangle_of_texel.reshape(-1)[texels]]
+    has_material = _has_certain_material(surface)[triangle] if views else surface.has_material[triangle]
+    of_triangles = triangle[has_material]
+    values.normals[has_material] = surface.normals[of_triangles]
+    values.kd[has_material], values.ks[has_material] = surface.kd[of_triangles], surface.ks[of_triangles]
+    values.alpha[has_material] = surface.alpha[of_triangles]
+    if not views:
+        return
+    materials, is_seen = _seen_there(
+        surface, views, atlas.places_mm(surface.vertices_mm[surface.triangles[rows]], texels)
+    )
+    values.is_measured[:] = is_seen
+    values.normals[is_seen] = materials.normals[is_seen] @ surface.result.base_from_support[:3, :3]
+    values.kd[is_seen], values.ks[is_seen] = (
+        red_green_blue(materials.kd)[is_seen],
+        red_green_blue(materials.ks)[is_seen],
+    )
+    values.alpha[is_seen] = materials.alpha[is_seen]
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    """A flat mesh, and the corners of all of the atlas' triangles in it."""
+
+    flat: FlatMesh
+    corners: NDArray[np.int64]
+    """[n, 3] vertices."""
+
+
+def _mesh(
+    surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known_texels: NDArray[np.int64]
+) -> _Mesh:
+    """The mesh, without the triangles of which nothing is known."""
+    triangles = surface.triangles[rows]
+    keys = triangles * (int(atlas.chart.max()) + 1) + atlas.chart[:, None]
+    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
+    corners = number.reshape(-1, 3)
+    vertices = triangles.reshape(-1)[first]
+    normals = _vertex_normals(surface)[vertices]
+    map_places = atlas.corners_px.reshape(-1, 2)[first] / atlas.side_px
+    tangents = _tangents(surface.vertices_mm[triangles], atlas.corners_px, corners, normals)
+    is_shown = np.zeros(len(rows), np.bool_)
+    is_shown[atlas.triangle_of_texel.reshape(-1)[known_texels]] = True
+    places_mm = surface.vertices_mm[vertices]
+    sky = open_sky(surface.vertices_mm[surface.triangles], places_mm, normals)
+    return _Mesh(FlatMesh(places_mm, normals, tangents, map_places, corners[is_shown], sky), corners)
+
+
+def _vertex_normals(surface: MeasuredSurface) -> Floats:
+    """[vertices, 3] means of the triangles around, by area."""
+    areas = _areas(surface.vertices_mm[surface.triangles])
+    count = len(surface.vertices_mm)
+    sums = [np.bincount(surface.triangles.reshape(-1), np.repeat(column, 3), count) for column in areas.T]
+    return _unit(np.stack(sums, axis=1))
+
+
+def _tangents(corners_mm: Floats, corners_px: Floats, corners: NDArray[np.int64], normals: Floats) -> Floats:
+    """[v, 3] means over a vertex's triangles of the way on them that is along the map's columns, at right angles
+    to its normal."""
+    ab_mm, ac_mm = corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
+    ab_px, ac_px = corners_px[:, 1] - corners_px[:, 0], corners_px[:, 2] - corners_px[:, 0]
+    turn = np.sign(ab_px[:, 0] * ac_px[:, 1] - ab_px[:, 1] * ac_px[:, 0])
+    ways = _unit(turn[:, None] * (ab_mm * ac_px[:, 1:] - ac_mm * ab_px[:, 1:]))
+    sums = [np.bincount(corners.reshape(-1), np.repeat(column, 3), len(normals)) for column in ways.T]
+    means = np.stack(sums, axis=1)
+    across = means - np.einsum("vk,vk->v", means, normals)[:, None] * normals
+    is_lost = np.linalg.norm(across, axis=1) < 1e-6
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    across[is_lost] = np.cross(normals, helper)[is_lost]
+    return _unit(across)
+
+
+def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Singles) -> tuple[Singles, Singles]:
+    """Normals of texels in the frames of the mesh, turned to its outer side; and the open sky there."""
+    local = np.empty_like(normals)
+    sky = np.empty(len(texels), np.float32)
+    for first in range(0, len(texels), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        weights = np.clip(atlas.barycentric(texels[part]), 0.0, 1.0)
+        weights /= weights.sum(axis=1, keepdims=True)
+        corners = mesh.corners[atlas.triangle_of_texel.reshape(-1)[texels[part]]]
+        outward = _unit(np.einsum("kc,kcx->kx", weights, mesh.flat.normals[corners]))
+        along = _unit(np.einsum("kc,kcx->kx", weights, mesh.flat.tangents[corners]))
+        frames = np.stack([along, np.cross(outward, along), outward], axis=2)
+        components = np.linalg.solve(frames, normals[part].astype(np.float64)[..., None])[..., 0]
+        components[:, 2] = np.maximum(components[:, 2], 0.0)
+        local[part] = _unit(components)
+        sky[part] = np.einsum("kc,kc->k", weights, mesh.flat.open_sky[corners])
+    return local, sky
+
+
+def _nearest(atlas: Atlas, known_texels: NDArray[np.int64]) -> NDArray[np.int32]:
+    """[side, side] the nearest known texel, for all that triangles or padding show; -1 elsewhere."""
+    number = np.full(atlas.side_px**2, -1, np.int32)
+    number[known_texels] = np.arange(len(known_texels), dtype=np.int32)
+    picture = number.reshape(atlas.side_px, atlas.side_px)
+    is_unknown = (picture < 0).astype(np.uint8)
+    _, label = cv2.distanceTransformWithLabels(
+        is_unknown, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.full(int(label.max()) + 1, -1, np.int32)
+    of_label[label[is_unknown == 0]] = picture[is_unknown == 0]
+    return np.where(atlas.triangle_of_texel >= 0, of_label[label], -1).astype(np.int32)
+
+
+def _unit(vectors: NDArray[np.floating]) -> Floats:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from coupole.commands.common import JsonOption, fail
+from coupole.commands.completion import materials
+from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
@@ -44,17 +47,43 @@ EnvironmentOption = Annotated[
     Path | None,
     typer.Option("--environment", help="For a result: environment map, .exr or .hdr, twice as wide as high."),
 ]
+FitOption = Annotated[
+    str | None,
+    typer.Option(
+        "--fit",
+        autocompletion=materials,
+        help="For a result of runs: texels, ggx or ggx_normal; by default texels if it has any, else the best fit "
+        "with its residual.",
+        show_default=False,
+    ),
+]
+MapOption = Annotated[
+    int | None,
+    typer.Option(
+        "--map-px",
+        metavar="PX",
+        help="For texels: greatest width and height of the page's maps, 256 to 16384; by default 4096.",
+        min=256,
+        max=16384,
+        show_default=False,
+    ),
+]
 
 
-def show(
-    source: SourceArgument,
-    out: OutOption,
-    view: ViewOption = None,
-    samples: SamplesOption = False,
-    environment: EnvironmentOption = None,
-    residual_planes: PlanesOption = None,
-    as_json: JsonOption = False,
-) -> None:
+@dataclass(frozen=True)
+class ShowOptions:
+    """Options that only some sources take."""
+
+    view: ViewOption = None
+    samples: SamplesOption = False
+    environment: EnvironmentOption = None
+    residual_planes: PlanesOption = None
+    fit: FitOption = None
+    map_px: MapOption = None
+
+
+@flatten_options
+def show(source: SourceArgument, out: OutOption, options: ShowOptions, as_json: JsonOption = False) -> None:
     """Make a page to look at a measured object: turn it, light it anew, measure it, see how well it is known."""
     from coupole.exchange.look.look_page import write_page
     from coupole.viewing.terminal import make_console, step_bars
@@ -67,7 +96,7 @@ def show(
             )
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            look = _look(source, view or [], samples, environment, residual_planes, bars)
+            look = _look(source, options, bars)
             bars("write", 0, 1)
             title = source.stem if source.is_file() else source.resolve().name
             files = write_page(look, title, out)
@@ -90,39 +119,39 @@ def show(
             console.print(f"residual: {share_text}{where}")
 
 
-def _look(
-    source: Path,
-    views: list[str],
-    samples: bool,
-    environment: Path | None,
-    planes: int | None,
-    say: Callable[[str, int, int], None],
-) -> Look:
+def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], None]) -> Look:
     """Build it by the kind of the source. Raises InputError if it is neither a scene, a run nor a whole result."""
     from coupole.exchange.look.look_environment import with_environment
     from coupole.exchange.look.look_of_frames import look_of_run
     from coupole.exchange.look.look_of_pictures import look_of_pictures
-    from coupole.exchange.look.look_of_runs import look_of_result
-    from coupole.exchange.look.residual_planes import PLANES
+    from coupole.exchange.look.look_of_runs import PageChoice, look_of_result
+    from coupole.exchange.look.look_texels import MOST_PX
     from coupole.reflectance import picture_result, run_result
     from coupole.reflectance.new_light.environment import OF_PICTURES, OF_RUNS
     from coupole.storage.run_json import RUN_JSON
 
-    of_runs: dict[str, object] = {"--samples": samples, "--residual-planes": planes is not None}
+    environment: dict[str, object] = {"--environment": options.environment}
+    views: dict[str, object] = {"--view": options.view}
+    of_runs: dict[str, object] = {
+        "--samples": options.samples,
+        "--residual-planes": options.residual_planes is not None,
+        "--fit": options.fit,
+        "--map-px": options.map_px,
+    }
     if source.is_file():
-        _refuse({"--view": views, **of_runs, "--environment": environment}, f"{source} is a scene")
+        _refuse(views | of_runs | environment, f"{source} is a scene")
         return _look_of_scene(source)
     try:
         if (source / RUN_JSON).exists():
-            _refuse({**of_runs, "--environment": environment}, f"{source} is a run")
-            return look_of_run(source, views, say)
+            _refuse(of_runs | environment, f"{source} is a run")
+            return look_of_run(source, options.view or [], say)
         if (source / picture_result.SAMPLES).exists():
-            _refuse({"--view": views, **of_runs}, f"{source} is a result of pictures")
-            return with_environment(look_of_pictures(source), environment, OF_PICTURES)
+            _refuse(views | of_runs, f"{source} is a result of pictures")
+            return with_environment(look_of_pictures(source), options.environment, OF_PICTURES)
         if (source / run_result.OBJECT).exists():
-            _refuse({"--view": views}, f"{source} is a result")
-            look = look_of_result(source, say, with_samples=samples, planes=PLANES if planes is None else planes)
-            return with_environment(look, environment, OF_RUNS)
+            _refuse(views, f"{source} is a result")
+            choice = PageChoice(options.fit, options.residual_planes, options.samples, options.map_px or MOST_PX)
+            return with_environment(look_of_result(source, say, choice), options.environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")

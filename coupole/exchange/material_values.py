@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from coupole.reflectance.run_result_files import refuse_without_uncertainty
 
 Floats = NDArray[np.float64]
+UNCERTAIN = ("u_kd", "u_ks", "u_normal", "u_alpha")
+"""Names of standard uncertainties, in the order in which files and pages have them."""
 _FIRST_TILT, _SECOND_TILT, _ALPHA = 0, 2, 14
 """Variances in the lower half of the covariance, row by row."""
 

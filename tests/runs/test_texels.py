@@ -309,13 +309,16 @@ def exported(made: Made, to: str, folder: Path, *options: str) -> Path:
 
 
 def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(made: Made, tmp_path: Path) -> None:
-    """Under five lights, in CIEDE2000; with the map's green turned round, they do not."""
+    """Under five lights, in CIEDE2000, where both show something lit, which they do nearly everywhere; with the
+    map's green turned round, they do not."""
     maps = ExportedMaps.read(exported(made, "obj", tmp_path / "obj"))
     camera = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
-    scene = scene_from(RunResult(made[1]), camera, TEXELS)
+    scene = scene_from(RunResult(made[1]), replace(camera, size_px=(480, 360)), TEXELS)
 
     def difference(theirs: np.ndarray, ours: np.ndarray) -> float:
-        known = (ours > 0.0).any(axis=2)
+        known, shared = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
+        assert (known & ~shared).sum() < 0.05 * known.sum()
+        known &= shared
         white = np.percentile(ours[known], 99)
         colours = [rgb2lab(srgb(np.clip(picture / white, 0.0, 1.0))) for picture in (ours, theirs)]
         return float(np.mean(deltaE_ciede2000(*colours)[known]))
@@ -323,7 +326,7 @@ def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(made: M
     found = []
     for towards in ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0)):
         way = np.array(towards) / np.linalg.norm(towards)
-        ours = scene.picture([DistantLight(towards=towards)])
+        ours = scene.picture([DistantLight(towards=towards)]).reshape(180, 2, 240, 2, 3).mean(axis=(1, 3))
         found.append(difference(maps.render(camera, way, 16), ours))
     assert np.mean(found) < 1.5, found
     turned = replace(maps, normal=maps.normal * [1.0, -1.0, 1.0] + [0.0, 1.0, 0.0])

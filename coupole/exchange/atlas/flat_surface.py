@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 from coupole.exchange.atlas.atlas_layout import Atlas, lay_out
 from coupole.exchange.atlas.open_sky import open_sky
-from coupole.exchange.material_values import red_green_blue
+from coupole.exchange.material_values import UNCERTAIN, red_green_blue
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.geometry import apply
 from coupole.reflectance.fits import TEXELS
 from coupole.reflectance.run_result import VARIANCES
-from coupole.reflectance.texels.gathered import TexelView, gather, open_views
-from coupole.reflectance.triangle_fit import TriangleMaterials
+from coupole.reflectance.texels.gathered import Gathered, TexelView, gather, open_views
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 MOST_SIDE_PX = 16384
-_MOST_U = 0.4
-"""Relative standard uncertainty of kd from which on a material is no material."""
+_MOST_U, _MOST_U_OF_TRIANGLE, _MOST_U_OF_WHITE = 0.4, 0.15, 0.03
+"""Standard uncertainties of kd from which on a material is no material: relative, of texels and of triangles,
+which may be off in one channel alone; and beside a white diffuser's kd."""
 _BLOCK = 1 << 20
 """Texels that are looked up together."""
 
@@ -51,6 +51,8 @@ class FlatMesh:
     """[v, 2] 0 to 1, rightwards and downwards from the maps' top left corner."""
     triangles: NDArray[np.int64]
     """[m, 3]"""
+    numbers: NDArray[np.int64]
+    """[m] of the triangles in the result's mesh."""
     open_sky: Floats
     """[v] share of the light of an even sky that nothing of the object hides."""
 
@@ -71,7 +73,14 @@ class FlatSurface:
     alpha: Singles
     """[k]"""
     normals: Singles
+    """[k, 3] unit, support frame."""
+    normals_in_frames: Singles
     """[k, 3] unit, in the frames of the mesh: along the map's columns, up in the map, outwards."""
+    uncertain: Singles
+    """[k, 4] standard uncertainties, all parts together: of kd and ks (relative), normal (rad), alpha (relative).
+    """
+    numbers: NDArray[np.int64]
+    """[k] of the triangles that texels are on, in the result's mesh."""
     open_sky: Singles
     """[k]"""
     measured_share: float
@@ -121,17 +130,26 @@ def _rows_to_show(surface: MeasuredSurface, views: list[TexelView]) -> NDArray[n
 
 
 def _has_certain_material(surface: MeasuredSurface) -> NDArray[np.bool_]:
-    return np.asarray(surface.has_material & (surface.uncertain["u_kd"] < _MOST_U))
+    return np.asarray(
+        surface.has_material & _is_certain(surface.uncertain["u_kd"], surface.kd, _MOST_U_OF_TRIANGLE)
+    )
+
+
+def _is_certain(u_kd: NDArray[np.floating], kd: NDArray[np.floating], most_u: float) -> NDArray[np.bool_]:
+    """[n] of relative standard uncertainties [n] and kd [n, channels], 1/sr."""
+    of_white = np.pi * u_kd * kd.mean(axis=1)
+    return np.asarray((u_kd < most_u) | (of_white < _MOST_U_OF_WHITE))
 
 
 def _seen_there(
     surface: MeasuredSurface, views: list[TexelView], places_mm: Floats
-) -> tuple[TriangleMaterials, NDArray[np.bool_]]:
+) -> tuple[Gathered, NDArray[np.bool_]]:
     """Materials that views show at places [k, 3] of the support frame, with normals of the base frame; where they
     are certain."""
-    places_seen = gather(views, apply(surface.result.base_from_support, places_mm))
-    is_certain = (places_seen.materials.alpha > 0.0) & (places_seen.covariance[:, VARIANCES[2]] < _MOST_U**2)
-    return places_seen.materials, is_certain
+    gathered_there = gather(views, apply(surface.result.base_from_support, places_mm))
+    u_kd = np.sqrt(gathered_there.covariance[:, VARIANCES[2]])
+    is_certain = (gathered_there.materials.alpha > 0.0) & _is_certain(u_kd, gathered_there.materials.kd, _MOST_U)
+    return gathered_there, is_certain
 
 
 def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
@@ -176,7 +194,8 @@ def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, views
     normals, sky = _in_frames(mesh, atlas, texels, values.normals)
     return FlatSurface(
         mesh.flat, atlas.side_px, atlas.texel_mm, _nearest(atlas, texels), values.kd, values.ks, values.alpha,
-        normals, sky, measured_share,
+        values.normals, normals, values.uncertain, rows[atlas.triangle_of_texel.reshape(-1)[texels]], sky,
+        measured_share,
     )  # fmt: skip
 
 
@@ -188,15 +207,17 @@ class _Values:
     kd: Singles
     ks: Singles
     alpha: Singles
+    uncertain: Singles
     is_measured: NDArray[np.bool_]
 
     @classmethod
     def empty(cls, count: int) -> _Values:
         normals, kd, ks = (np.zeros((count, 3), np.float32) for _ in range(3))
-        return cls(normals, kd, ks, np.zeros(count, np.float32), np.zeros(count, np.bool_))
+        alpha, uncertain = np.zeros(count, np.float32), np.zeros((count, 4), np.float32)
+        return cls(normals, kd, ks, alpha, uncertain, np.zeros(count, np.bool_))
 
     def rows(self, part: slice | NDArray[np.bool_]) -> _Values:
-        return _Values(self.normals[part], self.kd[part], self.ks[part], self.alpha[part], self.is_measured[part])
+        return _Values(*(values[part] for values in vars(self).values()))
 
 
 def _look_up(
@@ -214,18 +235,26 @@ def _look_up(
     values.normals[has_material] = surface.normals[of_triangles]
     values.kd[has_material], values.ks[has_material] = surface.kd[of_triangles], surface.ks[of_triangles]
     values.alpha[has_material] = surface.alpha[of_triangles]
-    if not views:
-        return
-    materials, is_seen = _seen_there(
-        surface, views, atlas.places_mm(surface.vertices_mm[surface.triangles[rows]], texels)
-    )
-    values.is_measured[:] = is_seen
-    values.normals[is_seen] = materials.normals[is_seen] @ surface.result.base_from_support[:3, :3]
-    values.kd[is_seen], values.ks[is_seen] = (
-        red_green_blue(materials.kd)[is_seen],
-        red_green_blue(materials.ks)[is_seen],
-    )
-    values.alpha[is_seen] = materials.alpha[is_seen]
+    for column, name in enumerate(UNCERTAIN):
+        values.uncertain[has_material, column] = surface.uncertain[name][of_triangles]
+    if views:
+        corners_mm = surface.vertices_mm[surface.triangles[rows]]
+        _look_up_views(surface, views, atlas.places_mm(corners_mm, texels), values)
+
+
+def _look_up_views(surface: MeasuredSurface, views: list[TexelView], places_mm: Floats, values: _Values) -> None:
+    """Fill what views are certain of at places [k, 3]."""
+    gathered_there, is_certain = _seen_there(surface, views, places_mm)
+    materials = gathered_there.materials
+    values.is_measured[:] = is_certain
+    values.normals[is_certain] = materials.normals[is_certain] @ surface.result.base_from_support[:3, :3]
+    values.kd[is_certain] = red_green_blue(materials.kd)[is_certain]
+    values.ks[is_certain] = red_green_blue(materials.ks)[is_certain]
+    values.alpha[is_certain] = materials.alpha[is_certain]
+    first, second, kd, ks, alpha = gathered_there.covariance[is_certain][:, VARIANCES].T
+    common = np.mean([view.u_common**2 for view in views])
+    columns = (np.sqrt(kd + common), np.sqrt(ks + common), np.sqrt(first + second), np.sqrt(alpha))
+    values.uncertain[is_certain] = np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
@@ -253,7 +282,8 @@ def _mesh(
     is_shown[atlas.triangle_of_texel.reshape(-1)[known_texels]] = True
     places_mm = surface.vertices_mm[vertices]
     sky = open_sky(surface.vertices_mm[surface.triangles], places_mm, normals)
-    return _Mesh(FlatMesh(places_mm, normals, tangents, map_places, corners[is_shown], sky), corners)
+    flat = FlatMesh(places_mm, normals, tangents, map_places, corners[is_shown], rows[is_shown], sky)
+    return _Mesh(flat, corners)
 
 
 def _vertex_normals(surface: MeasuredSurface) -> Floats:

@@ -48,7 +48,7 @@ def normal_map(flat: FlatSurface, bits: int) -> NDArray[np.uint8 | np.uint16]:
     most = 2**bits - 1
     kind = np.uint8 if bits == 8 else np.uint16
     return flat.map_of(
-        _normal_codes(flat.normals, most).astype(kind), _normal_codes(np.array([_UPRIGHT]), most)[0]
+        _normal_codes(flat.normals_in_frames, most).astype(kind), _normal_codes(np.array([_UPRIGHT]), most)[0]
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.exchange.atlas.flat_surface import flatten
 from coupole.exchange.look.coarse_mesh import MOST_TRIANGLES, coarse_mesh
 from coupole.exchange.look.look_blocks import Block, Look, block_of, halves, log_coded, octahedral
 from coupole.exchange.look.look_frames import frames_of_view
 from coupole.exchange.look.look_samples import samples_of_result
+from coupole.exchange.look.look_texels import MOST_PX, NOWHERE, LookTexels, look_texels
 from coupole.exchange.look.residual_planes import PLANES, residual_blocks, residual_fit
 from coupole.exchange.material_values import red_green_blue, standard_uncertainties
+from coupole.exchange.of_results.measured_surface import ExportChoice, read_surface
 from coupole.geometry import apply, inverse
-from coupole.reflectance.fits import MATERIALS
+from coupole.reflectance.fits import MATERIALS, TEXELS
 from coupole.reflectance.run_relighting import best_fit
 from coupole.reflectance.run_result import RunResult, read_about
+from coupole.reflectance.texels.pixel_file import has_texels
 
 Floats = NDArray[np.float64]
 Said = Callable[[str, int, int], None]
@@ -30,34 +35,42 @@ PLACES = 65535
 """Steps of a coordinate along the longest side of the object."""
 
 
-def look_of_result(
-    folder: Path,
-    say: Said = lambda *_: None,
-    *,
-    with_samples: bool = False,
-    coarse_over: int = MOST_TRIANGLES,
-    planes: int = PLANES,
-) -> Look:
-    """Return the page's contents for a whole result. A mesh of more than `coarse_over` triangles has a coarse one
-    for the first picture. With `planes` of the residual, if there is one, the material is the one that the
-    residual is added to.
+@dataclass(frozen=True)
+class PageChoice:
+    """Choices of what a page shows of a result of runs."""
 
-    Raises InputError if it is none, or has no material.
+    fit: str | None = None
+    """The material; None: texels if there are any, else the best, or the one that a residual is added to."""
+    planes: int | None = None
+    """Planes of the residual, 0 for none; None: `PLANES` if triangles are shown, and if there is one."""
+    with_samples: bool = False
+    map_px: int = MOST_PX
+    """Greatest width of maps."""
+    coarse_over: int = MOST_TRIANGLES
+    """Triangles of a mesh above which a coarse one is shown first."""
+
+
+def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
+    """Return the page's contents for a whole result.
+
+    Raises InputError if it is none, or has no material, or a residual is asked for with texels.
     """
+    choice = choice or PageChoice()
     source_about = read_about(folder)
     result = RunResult(folder)
-    left_of = residual_fit(result) if planes else None
-    fit = left_of or best_fit(result, MATERIALS)
-    path = result.materials_path(fit)
-    if not path.exists():
-        raise InputError(f"{folder}: has no fit {fit}; `coupole reflectance fit {folder}` makes it")
+    texels = _texels_of(result, choice, say)
+    planes = 0 if texels else PLANES if choice.planes is None else choice.planes
+    left_of = residual_fit(result) if planes and choice.fit is None else None
+    fit = TEXELS if texels else choice.fit or left_of or best_fit(result, MATERIALS)
     support_from_base = inverse(result.base_from_support)
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
     places, triangles, origin_mm, step_mm = weld_corners(corners_mm)
     count = len(triangles)
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
-    of_triangles, count_measured = _materials(result, fit, support_from_base)
-    blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles).items())
+    of_triangles = texels.of_triangles if texels else _materials(result, fit, support_from_base)
+    count_measured = int(np.count_nonzero(of_triangles["gloss"][:, 0]))
+    maps = {"map_places": texels.map_places} if texels else {}
+    blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles | maps).items())
     views = [frames for view in result.views if (frames := frames_of_view(result, view, support_from_base))]
     about: dict[str, Any] = {
         "kind": "mesh",
@@ -82,15 +95,39 @@ def look_of_result(
         "step_mm": step_mm,
     }
     later = _residuals(result, fit, planes, about, say) if left_of else []
+    if texels:
+        about["texels"], later = texels.about, texels.blocks
+        about["told"]["Texels"] = texels.remark
     later += [block for _, pictures in views for block in pictures]
-    errors = _ERRORS | {"places": f"{0.5e3 * step_mm:.2g} um in each coordinate"}
-    if with_samples:
+    errors = (_ERRORS_OF_TEXELS if texels else _ERRORS) | {
+        "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
+    }
+    if choice.with_samples:
         errors["samples"] = "2.3 % of their value, and of how far the ends of their intervals are from it"
         samples = samples_of_result(result, support_from_base, source_about["scan_noise_um"], say)
         about["samples"], later = samples[0], later + samples[1]
-    return Look(about, blocks, tuple(later), _first(places, triangles, of_triangles, coarse_over), errors)
+    coarse = _coarse_blocks(places, triangles, of_triangles, choice.coarse_over, has_maps=bool(maps))
+    return Look(about, blocks, tuple(later), coarse, errors)
 
 
+def _texels_of(result: RunResult, choice: PageChoice, say: Said) -> LookTexels | None:
+    """Texels, unless triangles are to be shown."""
+    if choice.fit not in (None, TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
+        return None
+    if choice.planes:
+        raise InputError("--residual-planes: a residual is what triangles leave; texels have none")
+    options = ExportChoice(map_px=choice.map_px, say=say)
+    flat = flatten(read_surface(result.folder, TEXELS, options, takes_texels=True))
+    return look_texels(flat, len(result.corners_mm))
+
+
+_ERRORS_OF_TEXELS = {
+    "normals": "0.03 degrees",
+    "kd, ks": "8 bit of the root of what the brightest have, in JPEG",
+    "roughness": "0.4 % of the root of alpha",
+    "uncertainties": "2.3 % of their value; means over triangles",
+    "measured frames": "8 bit, at most 640 pixels wide, as sRGB has it up to their brightest thousandth",
+}
 _ERRORS = {
     "normals": "0.004 degrees",
     "kd, ks, roughness": "0.05 % or 3e-8",
@@ -109,8 +146,13 @@ def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], 
     return blocks
 
 
-def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[dict[str, NDArray[Any]], int]:
-    """Numbers of all triangles by name, 0 of those without a material; how many have one."""
+def _materials(result: RunResult, fit: str, support_from_base: Floats) -> dict[str, NDArray[Any]]:
+    """Numbers of all triangles by name, 0 of those without a material. Raises InputError if there is no such fit."""
+    if fit not in MATERIALS:
+        raise InputError(f"--fit: expected {', '.join((*MATERIALS, TEXELS))}; got {fit}")
+    path = result.materials_path(fit)
+    if not path.exists():
+        raise InputError(f"{result.folder}: has no fit {fit}; `coupole reflectance fit {result.folder}` makes it")
     materials, count = result.materials(fit), len(result.corners_mm)
     finite = np.isfinite(materials.alpha) & np.isfinite(materials.kd).all(axis=1)
     at, rows = result.triangles[finite], finite.nonzero()[0]
@@ -120,20 +162,27 @@ def _materials(result: RunResult, fit: str, support_from_base: Floats) -> tuple[
         "kd": halves(red_green_blue(materials.kd[rows])),
         "ks": halves(red_green_blue(materials.ks[rows])),
         "gloss": halves(_pair(materials.alpha, materials.residual)[rows]),
-        "uncertainty": _uncertainty(result.materials_path(fit))[rows],
+        "uncertainty": _uncertainty(path)[rows],
     }
-    return {name: _spread_values(numbers, at, count) for name, numbers in values.items()}, len(at)
+    return {name: _spread_values(numbers, at, count) for name, numbers in values.items()}
 
 
-def _first(
-    places: NDArray[np.uint16], triangles: NDArray[np.uint32], of_triangles: dict[str, NDArray[Any]], over: int
+def _coarse_blocks(
+    places: NDArray[np.uint16],
+    triangles: NDArray[np.uint32],
+    of_triangles: dict[str, NDArray[Any]],
+    over: int,
+    *,
+    has_maps: bool,
 ) -> tuple[Block, ...]:
-    """Blocks of a coarse mesh; none of a mesh that is not larger than `over`."""
+    """Blocks of a coarse mesh, which has no maps; none of a mesh that is not larger than `over`."""
     if len(triangles) <= over:
         return ()
     coarse = coarse_mesh(places, triangles, over)
     arrays: dict[str, NDArray[Any]] = {"places": coarse.places, "triangles": coarse.triangles}
     arrays |= {name: values[coarse.stands_for] for name, values in of_triangles.items()}
+    if has_maps:
+        arrays["map_places"] = np.full((len(coarse.triangles), 3), NOWHERE, np.uint32)
     return tuple(block_of(f"first-{name}", values) for name, values in arrays.items())
 
 

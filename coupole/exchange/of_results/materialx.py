@@ -38,7 +38,7 @@ def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
         flat = flatten(surface)
         mesh = mesh_text(flat.mesh, surface.remark, None)
         columns = _columns(under_a_layer(flat.kd, flat.ks), flat.ks, flat.alpha) | {
-            "normal": 0.5 * flat.normals + 0.5
+            "normal": 0.5 * flat.normals_in_frames + 0.5
         }
         textures = {name: flat.map_of(values.astype(np.float32)) for name, values in columns.items()}
     else:

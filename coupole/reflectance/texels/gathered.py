@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 
 from coupole.reflectance.new_light.pictured_surface import Surface, pixels_of_places, surface_of_view
 from coupole.reflectance.run_result import VARIANCES, RunResult, ViewSamples
-from coupole.reflectance.texels.pixel_file import ViewTexels, read_view_texels, views_with_texels
+from coupole.reflectance.texels.pixel_file import (
+    ViewTexels,
+    read_view_texels,
+    texel_uncertainty,
+    views_with_texels,
+)
 from coupole.reflectance.triangle_fit import TriangleMaterials
 
 Floats = NDArray[np.float64]
@@ -49,6 +54,9 @@ class TexelView:
     """[h, w] -1 for none."""
     step_mm: float
     """Median distance of what neighbouring pixels see."""
+    u_common: float
+    """Relative standard uncertainty of kd and ks that covariances do not have: of responses, and of the LEDs'
+    power."""
 
 
 def open_views(result: RunResult) -> list[TexelView]:
@@ -83,7 +91,8 @@ def _open_view(result: RunResult, view: ViewSamples) -> TexelView:
     texel_of_pixel = np.full(surface.triangle_of_pixel.shape, -1, np.int32)
     texel_of_pixel.reshape(-1)[texels.pixels] = np.arange(len(texels.pixels))
     steps = np.linalg.norm(surface.places_mm[:, 1:] - surface.places_mm[:, :-1], axis=2)
-    return TexelView(texels, surface, texel_of_pixel, float(np.nanmedian(steps)))
+    u_common = math.hypot(*texel_uncertainty(result, view))
+    return TexelView(texels, surface, texel_of_pixel, float(np.nanmedian(steps)), u_common)
 
 
 def _by_columns(of_unknowns: Floats, channels: int) -> Floats:

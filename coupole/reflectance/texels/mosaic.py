@@ -16,23 +16,26 @@ Singles = NDArray[np.float32]
 _SPREAD_PX = 2.5
 """Standard deviation of the weights of neighbours: stripes of five pixels are nearly gone from a mean, so that the
 channels' places in them are not taken for colours."""
-_LEAST_WEIGHT = 1e-3
+_LEAST_SHARE = 1e-2
+"""Least share of a channel in the certainty around a pixel."""
 _MOST_CHANGE = 1.0
 """Largest difference of channels' logarithms that is believed; fits that failed are farther apart."""
 
 
-def all_channels(
-    deviation: Singles, channel: NDArray[np.int8], is_fitted: NDArray[np.bool_], channels: int
-) -> Singles:
-    """[h, w, channels] of deviations [h, w] that pixels of a `channel` [h, w] show; 0 where none is fitted."""
+def all_channels(deviation: Singles, certainty: Singles, channel: NDArray[np.int8], channels: int) -> Singles:
+    """[h, w, channels] of deviations [h, w] that pixels of a `channel` [h, w] show, weighted by their `certainty`
+    [h, w]; 0 where that is 0, as nothing is fitted."""
+    is_fitted = certainty > 0.0
     if channels == 1:
         return np.where(is_fitted, deviation, np.float32(0.0))[..., None]
+    around = cv2.GaussianBlur(certainty, (0, 0), _SPREAD_PX)
     means = []
     for number in range(channels):
-        here = is_fitted & (channel == number)
-        weight = cv2.GaussianBlur(here.astype(np.float32), (0, 0), _SPREAD_PX)
-        total = cv2.GaussianBlur(np.where(here, deviation, np.float32(0.0)), (0, 0), _SPREAD_PX)
-        means.append(np.where(weight > _LEAST_WEIGHT, total / np.maximum(weight, _LEAST_WEIGHT), np.nan))
+        here = np.where(channel == number, certainty, np.float32(0.0))
+        weight = cv2.GaussianBlur(here, (0, 0), _SPREAD_PX)
+        total = cv2.GaussianBlur(np.where(here > 0.0, here * deviation, np.float32(0.0)), (0, 0), _SPREAD_PX)
+        is_enough = weight > _LEAST_SHARE * around
+        means.append(np.where(is_enough, total / np.where(is_enough, weight, np.float32(1.0)), np.nan))
     colour = np.stack(means, axis=-1)
     has_all = is_fitted & np.isfinite(colour).all(axis=-1)
     own_colour = np.take_along_axis(colour, channel[..., None].astype(np.int64), axis=-1)

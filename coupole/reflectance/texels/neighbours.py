@@ -80,6 +80,21 @@ def settle_triangles(logs: Singles, covariance: Singles, is_fitted: NDArray[np.b
     return step
 
 
+def settle_colours(colours: Singles, variance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
+    """Return colours of triangles [h, w, channels] (logarithms, any sum), seen pixel by pixel and drawn to their
+    means in a window as far as those around say. `variance` [h, w] is that of kd's logarithm, which colours have
+    too."""
+    own_variance = np.maximum(variance, _LEAST)[..., None]
+    weight = (1.0 / own_variance).astype(np.float32)
+    total = np.maximum(mean_around(weight, is_fitted, side_px), _LEAST)
+    middle = mean_around(weight * colours, is_fitted, side_px) / total
+    deviation = np.where(is_fitted[..., None], colours - middle, np.float32(0.0))
+    square = np.minimum(deviation**2, np.float32(_OUTLIER) * mean_around(deviation**2, is_fitted, side_px))
+    surface = np.maximum(mean_around(weight * (square - own_variance), is_fitted, side_px) / total, _LEAST)
+    drawn_colours: Singles = (middle + deviation * surface / (surface + own_variance)).astype(np.float32)
+    return drawn_colours
+
+
 def _surface(square: Singles, own_covariance: Singles, is_fitted: NDArray[np.bool_], side_px: int) -> Singles:
     """[h, w, k] variances of the surface: mean squares in a window, without those of the fits."""
     return np.maximum(mean_around(square - own_covariance, is_fitted, side_px), _LEAST).astype(np.float32)

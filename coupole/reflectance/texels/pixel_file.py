@@ -73,6 +73,11 @@ def _dataset(file: h5py.File, name: str, values: Any, description: str) -> None:
     file.create_dataset(name, data=values, track_times=False).attrs["told"] = description
 
 
+def has_texels(result: RunResult) -> bool:
+    """Tell whether any view has texels."""
+    return any(texels_path(result, view).exists() for view in result.views)
+
+
 def views_with_texels(result: RunResult) -> list[ViewSamples]:
     """Return the views that have texels. Raises InputError if none has."""
     views = [view for view in result.views if texels_path(result, view).exists()]

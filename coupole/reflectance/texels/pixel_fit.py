@@ -21,13 +21,15 @@ from coupole.reflectance.ggx_fit import ROWS, fit_packs, pack
 from coupole.reflectance.kernel_arrays import assign, assign_rows
 from coupole.reflectance.lanes import LANES
 from coupole.reflectance.material_uncertainty import add_scores
-from coupole.reflectance.triangle_fit import FEWEST, between, towards
+from coupole.reflectance.triangle_fit import between, towards
 
 Floats = NDArray[np.float64]
 
 TILT, LOG_KS, LOG_ALPHA = math.radians(20.0), 1.5, 0.7
 """Standard deviations of a pixel's normal (each of two tilts) and of the logarithms of ks and alpha about those of
 its triangle: wider than any that was seen, so that they decide where the samples say nothing."""
+FEWEST_OF_PIXEL = 8
+"""Samples that a pixel needs: its triangle's material says the rest, and its uncertainty how much that is."""
 LEAST_KS = 1e-3
 """Least ks of a prior, as a share of kd."""
 LEAST_COSINE = 0.05
@@ -122,7 +124,7 @@ def _fit_part(  # type: ignore[no-untyped-def]
             between(lights[led], views[0], half[led])
             good[sample_count], roots[sample_count] = led, math.sqrt(max(values[pixel, led], 0.0))
             sample_count += 1
-        if sample_count < FEWEST:
+        if sample_count < FEWEST_OF_PIXEL:
             continue
         assign(unknowns[:3], normal)
         pixel_roots, pixel_leds = roots[:sample_count], good[:sample_count]

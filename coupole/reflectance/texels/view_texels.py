@@ -29,6 +29,7 @@ from coupole.reflectance.texels.neighbours import (
     lower_half,
     mean_around,
     settle,
+    settle_colours,
     settle_triangles,
     tilts_from,
 )
@@ -47,6 +48,8 @@ MOST_KD = 1.0
 """1/sr: three times that of white, for strong light from other surfaces. A fit with more ran off."""
 MOST_VARIANCE = np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA]) * 4.0
 """Largest variances of a fit that says anything: beyond the prior's."""
+_ALIKE = 1e-3
+"""Variance of logarithms below which pixels are equally certain of colours."""
 _ROWS = 1 << 12
 """Triangles whose inter-reflection is read together."""
 
@@ -92,8 +95,11 @@ def texels_of_view(
     covariance[is_fitted, VARIANCES[_KD]] += _u_inter_reflection(view)[of_triangle] ** 2
     texel_normals = turned_normals(normals[is_fitted].astype(np.float64), deviation[is_fitted][:, :2] - before)
     logs, channels = centres.logs[is_fitted].astype(np.float64), result.channels
+    logs[:, :channels] = _with_colours(logs[:, :channels], centres.colours[is_fitted], channel[is_fitted])
     for first, unknown in ((0, _KD), (channels, _KS)):
-        plane = all_channels(deviation[..., unknown], channel, is_fitted, channels)
+        variance = covariance[..., VARIANCES[unknown]]
+        certainty = np.where(is_fitted, 1.0 / (variance + _ALIKE), 0.0).astype(np.float32)
+        plane = all_channels(deviation[..., unknown], certainty, channel, channels)
         logs[:, first : first + channels] += plane[is_fitted]
     alpha = np.exp(logs[:, -1] + deviation[is_fitted][:, _ALPHA])
     return ViewTexels(
@@ -115,6 +121,8 @@ class _Centres:
     """[h, w, 3]"""
     logs: Singles
     """[h, w, 2 channels + 1] logarithms of kd, ks and alpha; NaN where nothing is known."""
+    colours: Singles
+    """[h, w, channels] logarithms of kd without their mean, drawn to those around."""
     covariance: Singles
     """[h, w, 15]"""
 
@@ -160,8 +168,18 @@ def _centres_of(
     is_missing = is_seen & ~is_known
     normals[is_missing] = mesh_normals[triangle_of_pixel[is_missing]]
     logs[is_missing] = mean_around(logs, is_known, side_px, default=np.nan)[is_missing]
+    colours = logs[..., :channels] - logs[..., :channels].mean(axis=-1, keepdims=True)
+    colours = settle_colours(colours, covariance[..., VARIANCES[_KD]], is_known, side_px)
     covariance[is_missing] = lower_half(np.diag(np.square([TILT, TILT, 1.0, LOG_KS, LOG_ALPHA])))
-    return _Centres(normals, logs, covariance)
+    return _Centres(normals, logs, colours, covariance)
+
+
+def _with_colours(logs: Floats, colours: Singles, channel: NDArray[np.int8]) -> Floats:
+    """Logarithms of kd [n, channels] whose own `channel` [n] stays, and whose others differ from it as `colours`
+    do."""
+    column = channel[:, None].astype(np.int64)
+    own_logs, own_colour = np.take_along_axis(logs, column, 1), np.take_along_axis(colours, column, 1)
+    return np.asarray(own_logs + colours - own_colour)
 
 
 def _window_px(triangle_of_pixel: NDArray[np.int32]) -> int:

@@ -17,7 +17,7 @@ from relight_cases import GLOSSY, waves, write_result
 from shown_page import SMALL, Page
 
 from coupole.exchange.look.look_blocks import block_of
-from coupole.exchange.look.look_of_runs import look_of_result
+from coupole.exchange.look.look_of_runs import PageChoice, look_of_result
 from coupole.exchange.look.look_page import write_page
 
 pytestmark = needs_chromium
@@ -97,7 +97,9 @@ def test_data_that_are_gone_from_beside_the_page_are_named(page: Page, tmp_path:
 
 
 def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: Page, folder: Path) -> None:
-    write_page(look_of_result(folder / "result", coarse_over=500), "waves", folder / "coarse.html")
+    write_page(
+        look_of_result(folder / "result", choice=PageChoice(coarse_over=500)), "waves", folder / "coarse.html"
+    )
     page.open(folder / "coarse.html")
     assert page.run("performance.getEntriesByName('coupole: first picture').length") == 1
     page.small()
@@ -110,7 +112,7 @@ def test_a_coarse_picture_comes_first_and_the_whole_mesh_takes_its_place(page: P
 
 
 def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: Path, tmp_path: Path) -> None:
-    look = look_of_result(folder / "result", coarse_over=500)
+    look = look_of_result(folder / "result", choice=PageChoice(coarse_over=500))
     files = write_page(look, "waves", tmp_path / "look.html", most_bytes=1000)
     next(file for file in files if file.name == "kd.js").unlink()
     page.opened = None

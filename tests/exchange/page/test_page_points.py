@@ -17,7 +17,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from shown_page import FIELD_DEG, Page
 
-from coupole.exchange.look.look_of_runs import look_of_result
+from coupole.exchange.look.look_of_runs import PageChoice, look_of_result
 from coupole.exchange.look.look_page import MOST_BYTES, write_page
 
 pytestmark = needs_chromium
@@ -41,7 +41,7 @@ def test_a_point_tells_its_measured_samples_beside_the_fit(page: Page, tmp_path:
     with h5py.File(result.views[0].path, "a") as file:
         file["f"][...] = 1.2 * np.array(Coat().kd)
         write_sources(file, {"u_own": 0.02, "led_u_shared": 0.03})
-    look = look_of_result(tmp_path / "result", with_samples=True)
+    look = look_of_result(tmp_path / "result", choice=PageChoice(with_samples=True))
     files = write_page(look, "sheet", tmp_path / "look.html", most_bytes)
     page.open(tmp_path / "look.html", "#")
     page.look(-90.0, 80.0, 200.0)

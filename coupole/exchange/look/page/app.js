@@ -97,7 +97,7 @@ class App {
     this.changed("light");
   }
 
-  /** The frame or the residual that is shown and has yet to come, and how. */
+  /** The frame, the residual or the texels that are shown and have yet to come, and how. */
   missing() {
     const { renderer } = this, found = renderer.frameOf(this.state), view = renderer.missingResidual(this.state);
     const wanted = [];
@@ -106,7 +106,15 @@ class App {
       wanted.push({ name, bring: async () => renderer.keepFrame(frame, await laterBlock(this.about, name)) });
     }
     if (view) wanted.push({ name: view.blocks[0], bring: () => renderer.residual.bring(view) });
+    const tile = renderer.missingTexels;
+    if (tile) wanted.push({ name: tile.blocks[0], bring: () => this.bringTexels(tile) });
     return wanted.find(({ name }) => !this.lost.has(name)) ?? null;
+  }
+
+  async bringTexels(tile) {
+    const { texels } = this.renderer;
+    await texels.bring(tile);
+    this.say(texels.told());
   }
 
   /** More of the picture has come, or has failed to. */

@@ -45,12 +45,16 @@ uniform vec2 residual_cosines;  // between the eye and that camera: all of it, n
 
 out uvec4 mean;
 
-struct Material {
-  vec3 normal;
-  vec3 kd;
-  vec3 ks;
-  float alpha;
-};
+// What a place of a triangle is made of: of texels where there are any, else of the triangle.
+Material material_at(int triangle, vec3 at_mm) {
+  Material material = texels_at(triangle, at_mm);
+  if (material.alpha > 0.0) return material;
+  float alpha = texelFetch(gloss, cell(triangle), 0).x;
+  if (alpha == 0.0) return material;
+  return Material(
+    normal_of(triangle), texelFetch(kd, cell(triangle), 0).rgb, texelFetch(ks, cell(triangle), 0).rgb, alpha
+  );
+}
 
 // 1/m^2, times a power of the cosine to the LED's axis.
 float led_reach(vec3 at_mm, vec3 way) {
@@ -144,27 +148,24 @@ vec3 in_relief(vec3 normal) {
     float reach = RELIEF_PX * sqrt((float(tap) + 0.5) / float(TAPS)), angle = 2.39996323 * float(tap);
     ivec2 at = ivec2(gl_FragCoord.xy + reach * vec2(cos(angle), sin(angle)));
     if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, textureSize(seen, 0)))) continue;
-    uint other = texelFetch(seen, at, 0).w;
-    around += other > 0u ? normal_of(int(other) - 1) : vec3(0.0);
+    uvec4 other = texelFetch(seen, at, 0);
+    around += other.w > 0u ? material_at(int(other.w) - 1, uintBitsToFloat(other.xyz)).normal : vec3(0.0);
   }
   return normalize(normal + relief * (normal - normalize(around + 1e-6 * normal)));
 }
 
 vec4 looked_at(int triangle, vec3 at_mm) {
   if (led && mode <= UNSHARP && gl_FragCoord.x < split_px) return measured_at(at_mm);
-  vec2 shine = texelFetch(gloss, cell(triangle), 0).xy;
-  if (shine.x == 0.0) return vec4(0.0);
-  Material material = Material(
-    normal_of(triangle), texelFetch(kd, cell(triangle), 0).rgb, texelFetch(ks, cell(triangle), 0).rgb, shine.x
-  );
+  Material material = material_at(triangle, at_mm);
+  if (material.alpha == 0.0) return vec4(0.0);
   if (mode == UNSHARP) material.normal = in_relief(material.normal);
   if (mode == NORMALS) return vec4(view_from_object * material.normal * 0.5 + 0.5, 1.0);
-  if (mode == ROUGHNESS) return vec4(vec3(shine.x), 1.0);
+  if (mode == ROUGHNESS) return vec4(vec3(material.alpha), 1.0);
   if (mode == UNCERTAINTY) {
     uint code = texelFetch(uncertainty, cell(triangle), 0)[quantity];
     return code == 0u ? vec4(0.0) : vec4(vec3(1e-4 * pow(1e5, (float(code) - 1.0) / 254.0)), 1.0);
   }
-  if (mode > UNCERTAINTY) return vec4(vec3(shine.y), 1.0);
+  if (mode > UNCERTAINTY) return vec4(vec3(texelFetch(gloss, cell(triangle), 0).y), 1.0);
   return vec4(radiance(material, triangle, at_mm, flat_one ? material.normal : face_of(triangle)), 1.0);
 }
 

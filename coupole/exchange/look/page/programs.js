@@ -3,7 +3,7 @@
 const ROW = 4096;
 
 /** What stands before a shader. */
-const BEFORE = { "light.frag": ["shade.glsl"], "scene.vert": ["face.glsl"], "scene.frag": ["shade.glsl", "face.glsl"] };
+const BEFORE = { "light.frag": ["shade.glsl", "texels.glsl"], "scene.vert": ["face.glsl"], "scene.frag": ["shade.glsl", "face.glsl"] };
 
 function compiled(gl, kind, name) {
   const shader = gl.createShader(kind);

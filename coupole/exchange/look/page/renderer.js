@@ -5,12 +5,13 @@ const SHADOW_PX = [512, 2048];  // least and most
 const MODE_NUMBERS = {
   relit: 0, diffuse: 1, specular: 2, unsharp: 3, normals: 4, roughness: 5, uncertainty: 6, residual: 7,
 };
-const ARRAYS = ["shadows", "planes", "residual", "residual_planes"];
+const ARRAYS = ["shadows", "planes", "residual", "residual_planes", "texel_colours"];
 const RAMP = ["#2a2140", "#3b4f8f", "#2f8f8c", "#8fbf5a", "#f0c24b", "#fff4cf"];
 const TEXTURES = {
   places: ["uint16", 3], triangles: ["uint32", 3], normals: ["uint16", 2], kd: ["float16", 3], ks: ["float16", 3],
   gloss: ["float16", 2], uncertainty: ["uint8", 4],
 };
+const TEXTURES_OF_TEXELS = { ...TEXTURES, map_places: ["uint32", 3] };
 
 /** How numbers of a mode are shown: by a ramp from and to, in steps or in ratios. */
 function rangeOf(mode, quantity) {
@@ -39,6 +40,7 @@ class Renderer {
     this.measure();
     this.prepare(arrays);
     this.residual = new Residual(this.gl, about, this.middle);
+    this.texels = new Texels(this.gl, about);
     this.drawnShadows = [];
     this.frames = {};
   }
@@ -87,6 +89,11 @@ class Renderer {
     return view && !this.residual.texturesOf(view) ? view : null;
   }
 
+  /** The tile of texels that is wanted next; null for none, and while a coarse mesh is shown. */
+  get missingTexels() {
+    return this.triangles === this.about.triangles ? this.texels.wanted : null;
+  }
+
   keepFrame(frame, bytes) {
     this.frames[frame.block] = bytesTexture(this.gl, bytes, ...frame.size_px);
   }
@@ -130,7 +137,7 @@ class Renderer {
 
   /** Type and count of the numbers of each texture. */
   get fields() {
-    return TEXTURES;
+    return this.about.texels ? TEXTURES_OF_TEXELS : TEXTURES;
   }
 
   /** Show these numbers of the object from now on. */
@@ -282,9 +289,10 @@ class Renderer {
     const compared = this.frameOf(state);
     const at = this.use("light", {
       ...this.textures, seen: seen.texture, before: mean.texture, shadows: this.depths.texture,
-      measured: compared?.texture ?? this.textures.kd, ...this.residualTextures(),
+      measured: compared?.texture ?? this.textures.kd, ...this.residualTextures(), ...this.texelTextures(),
     });
     this.setResidual(at);
+    this.setTexels(at);
     this.setLed(at, compared, state.split);
     gl.uniform1i(at("quantity"), Object.keys(UNCERTAIN).indexOf(state.quantity));
     gl.uniform1f(at("relief"), state.relief);
@@ -296,6 +304,16 @@ class Renderer {
   residualTextures() {
     const wanted = this.shownResidual, none = this.depths.texture;
     return wanted && this.residual.texturesOf(wanted.view) || { residual: none, residual_planes: none };
+  }
+
+  texelTextures() {
+    const { map_places = this.textures.triangles } = this.textures;
+    return { map_places, ...this.texels.textures ?? { texel_shape: this.textures.kd, texel_colours: this.depths.texture } };
+  }
+
+  setTexels(at) {
+    this.gl.uniform1i(at("has_texels"), this.texels.textures ? 1 : 0);
+    if (this.texels.textures) this.gl.uniform2fv(at("texel_peaks"), this.about.texels.peaks);
   }
 
   setResidual(at) {

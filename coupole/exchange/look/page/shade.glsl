@@ -8,12 +8,16 @@ uniform sampler2DArray shadows;
 uniform mat4 shadow_from_object[MOST];
 uniform float offset_mm[MOST];  // from a surface to where its shadow is looked for
 
-vec3 normal_of(int triangle) {
-  vec2 square = vec2(texelFetch(normals, cell(triangle), 0).xy) / 65535.0 * 2.0 - 1.0;
+// The unit vector that a place in the square of an unfolded octahedron stands for.
+vec3 unfolded(vec2 square) {
   vec3 normal = vec3(square, 1.0 - abs(square.x) - abs(square.y));
   vec2 folded = (1.0 - abs(normal.yx)) * vec2(normal.x >= 0.0 ? 1.0 : -1.0, normal.y >= 0.0 ? 1.0 : -1.0);
   normal.xy = normal.z < 0.0 ? folded : normal.xy;
   return normalize(normal);
+}
+
+vec3 normal_of(int triangle) {
+  return unfolded(vec2(texelFetch(normals, cell(triangle), 0).xy) / 65535.0 * 2.0 - 1.0);
 }
 
 vec3 face_of(int triangle) {

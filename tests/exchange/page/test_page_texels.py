@@ -1,0 +1,111 @@
+"""Detail finer than the triangles, on the page: as the command relight shows it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import needs_chromium
+from relight_cases import BASE_FROM_SUPPORT, GLOSSY, unit, waves, write_result
+from scipy.ndimage import gaussian_filter
+from shown_page import Page, difference
+
+from coupole.errors import InputError
+from coupole.exchange.look.look_of_runs import PageChoice, look_of_result
+from coupole.exchange.look.look_page import write_page
+from coupole.geometry import apply, inverse
+from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.new_light.light_kinds import DistantLight
+from coupole.reflectance.new_light.pictured_surface import surface_of_view
+from coupole.reflectance.run_relighting import scene_from
+from coupole.reflectance.run_result import RunResult
+from coupole.reflectance.texels.pixel_file import ViewTexels, texels_path, write_view_texels
+
+pytestmark = needs_chromium
+LIGHT = (-0.4, -0.3, 0.8)
+
+
+@pytest.fixture(scope="module")
+def detailed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result of triangles of 2 mm, whose texels have stripes of 5 mm and bumps across them, both of our own
+    making."""
+    folder = tmp_path_factory.mktemp("texels")
+    result = write_result(folder / "result", waves(30), GLOSSY)
+    (view,) = result.views
+    surface = surface_of_view(result, view)
+    pixels = np.flatnonzero((surface.triangle_of_pixel >= 0).reshape(-1))
+    triangle, places_mm = surface.triangle_of_pixel.reshape(-1)[pixels], surface.places_mm.reshape(-1, 3)[pixels]
+    x, y, _ = apply(inverse(BASE_FROM_SUPPORT), places_mm.astype(float)).T
+    kd = np.array(GLOSSY.kd) * (2.0 + 1.5 * np.sin(2 * np.pi * x / 5.0))[:, None]
+    along = BASE_FROM_SUPPORT[:3, 1]
+    normals = unit(surface.normals[triangle] + 0.15 * np.cos(2 * np.pi * y / 6.0)[:, None] * along)
+    covariance = np.full((len(pixels), 15), 0.0)
+    covariance[:, [0, 2, 5, 9, 14]] = 1e-4
+    texels = ViewTexels(
+        pixels.astype(np.int32),
+        *(values.astype(np.float32) for values in (normals, kd, np.full_like(kd, 0.1))),
+        np.full(len(pixels), 0.2, np.float32),
+        covariance.astype(np.float32),
+    )
+    path = texels_path(result, view)
+    path.parent.mkdir()
+    write_view_texels(path, texels, "top", surface.triangle_of_pixel.shape[::-1], np.zeros(3), 0.0, simulated=True)
+    (path.parent / "texels.json").write_text(json.dumps({"mae": {TEXELS: 0.01, "ggx": 0.1}}))
+    return folder
+
+
+def test_texels_look_as_the_command_relight_shows_them(page: Page, detailed: Path) -> None:
+    write_page(look_of_result(detailed / "result"), "stripes", detailed / "texels.html")
+    page.open(detailed / "texels.html")
+    page.wait_for_all()
+    page.small()
+    camera = page.look(-70.0, 50.0, 150.0)
+    page.run(f"coupole.setLight({', '.join(map(str, LIGHT))})")
+    mine = page.picture(1)[..., :3]
+    assert "(texels)" in page.browser.text("#banner")
+    light = [DistantLight(towards=LIGHT)]
+    theirs = scene_from(RunResult(detailed / "result"), camera, TEXELS).picture(light)
+    plain = scene_from(RunResult(detailed / "result"), camera, "ggx").picture(light)
+    both = (mine > 0.0).all(axis=2) & (theirs > 0.0).all(axis=2)
+    assert both.mean() > 0.2
+    white = float(np.quantile(theirs[both], 0.99))
+    assert difference(mine, theirs, white)[both].mean() < 1.5
+    fine, wanted, of_triangles = (
+        (one - gaussian_filter(one, (4, 4, 0)))[gaussian_filter(both.astype(float), 4.0) > 0.999]
+        for one in (mine, theirs, plain)
+    )
+    assert np.sum(fine * wanted) / np.sum(wanted**2) == pytest.approx(1.0, abs=0.07)
+    assert np.sum(of_triangles * wanted) / np.sum(wanted**2) < 0.5
+
+
+def test_a_page_shows_triangles_until_its_texels_have_come(page: Page, detailed: Path, tmp_path: Path) -> None:
+    """And says so of a tile that is missing."""
+    files = write_page(look_of_result(detailed / "result"), "stripes", tmp_path / "look.html", most_bytes=1000)
+    (lost,) = (file for file in files if file.name.endswith("-shape.js"))
+    lost.unlink()
+    page.open(tmp_path / "look.html")
+    page.wait_for_all()
+    assert f"{lost.stem} is missing" in page.browser.text("#status")
+    page.small()
+    page.look(-70.0, 50.0, 150.0)
+    assert (page.picture(1)[..., :3] > 0.0).all(axis=2).mean() > 0.2
+
+
+def test_what_is_clicked_is_told_of_the_triangle_as_the_mean_of_its_texels(detailed: Path) -> None:
+    look = look_of_result(detailed / "result")
+    assert look.about["fit"] == TEXELS
+    assert look.about["measured"] > 0.7 * look.about["triangles"]
+    assert "% from pixels of the views" in look.about["told"]["Texels"]
+    assert {"map_places", "kd"} <= {block.name for block in look.blocks}
+
+
+def test_other_choices(detailed: Path) -> None:
+    assert look_of_result(detailed / "result", choice=PageChoice("ggx")).about["fit"] == "ggx"
+    small = look_of_result(detailed / "result", choice=PageChoice(map_px=256))
+    assert small.about["texels"]["side_px"] <= 256
+    with pytest.raises(InputError, match="--residual-planes"):
+        look_of_result(detailed / "result", choice=PageChoice(TEXELS, planes=9))
+    with pytest.raises(InputError, match="--fit: expected"):
+        look_of_result(detailed / "result", choice=PageChoice("best"))

@@ -17,7 +17,7 @@ from coupole.errors import CoupoleError, InputError
 
 
 def calibrate_all(
-    rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("configs/rigs/sim-imperfect.yaml"),
+    rig: Annotated[Path, typer.Option("--rig", help="The rig (YAML).")] = Path("sim-imperfect"),
     out: Annotated[Path, typer.Option("--out", help="Folder for plans, runs, records and reports.")] = Path(
         "calibrations"
     ),
@@ -44,8 +44,10 @@ def calibrate_all(
     from coupole.console.command_line.client import borrowed_cell
     from coupole.plan.cell import read_cell
     from coupole.plan.rig_devices import in_world
+    from coupole.plan.shipped_files import file_of
     from coupole.viewing.terminal import make_console
 
+    rig = file_of(rig, "rigs")
     console, cell = make_console(quiet=as_json), read_cell(rig)
     names = [step.name for step in STEPS]
     if unknown := [name for name in only or [] if name not in names]:

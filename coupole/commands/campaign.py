@@ -102,17 +102,11 @@ class Campaign:
         """The step's run, complete."""
         from coupole.acquisition.session import acquire_plan
         from coupole.preflight.job import read_job
-        from coupole.storage.durable import sha256
-        from coupole.storage.run import Run
-        from coupole.storage.run_status import status
+        from coupole.storage.run_status import is_complete, newest_run
 
         plan = self._plan(step)
-        run_folders = sorted((self._out / "runs").glob(f"*-{step.name}"))
-        resumed_run = run_folders[-1] if run_folders and (run_folders[-1] / "run.json").is_file() else None
-        if resumed_run is not None and Run(resumed_run).about["plan"]["sha256"] != sha256(plan):
-            self._console.print(f"{plan} was changed since {resumed_run.name}: a new run is acquired")
-            resumed_run = None
-        if resumed_run is not None and not status(Run(resumed_run)).missing:
+        resumed_run = newest_run(self._out / "runs", step.name, plan, self._console.print)
+        if resumed_run is not None and is_complete(resumed_run):
             return resumed_run
         self._console.rule(f"acquire {step.name}")
         if self._ask:

@@ -19,7 +19,19 @@ from coupole.bounded import leave
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
-AT_A_CELL = {"acquire", "meter", "live", "devices", "bench", "arm", "commission", "confirm", "calibrate", "sim"}
+AT_A_CELL = {
+    "acquire",
+    "demo",
+    "meter",
+    "live",
+    "devices",
+    "bench",
+    "arm",
+    "commission",
+    "confirm",
+    "calibrate",
+    "sim",
+}
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
 """Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
 
@@ -27,6 +39,7 @@ COMMANDS = {
     "check": "planning.check",
     "view": "planning.view",
     "simulate": "planning.simulate",
+    "demo": "demo.demo",
     "acquire": "running.acquire",
     "pause": "run_controls.pause",
     "stop": "run_controls.stop",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -17,7 +16,10 @@ if TYPE_CHECKING:
     from coupole.plan.cell import Cell
 
 PlanPath = Annotated[Path, typer.Argument(help="The plan (YAML).", show_default=False, autocompletion=plans)]
-RigOption = Annotated[Path | None, typer.Option("--rig", help="A rig other than the one that the plan names.")]
+RigOption = Annotated[
+    Path | None,
+    typer.Option("--rig", help="A rig other than the one that the plan names: a file, or a name such as sim."),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output.")]
 ResultArgument = Annotated[Path, typer.Argument(help="Folder of a result.", show_default=False)]
 MeshOption = Annotated[
@@ -49,16 +51,6 @@ class JobOrStep(TyperGroup):
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
             args = [self.job, *args]
         return super().parse_args(ctx, args)
-
-
-def shipped_rig() -> Path:
-    """The simulated cell that comes with a checkout of Coupole, from wherever one is. Raises InputError: an
-    installed package has none."""
-    project = Path(__file__).resolve().parent.parent.parent
-    path = project / "configs" / "rigs" / "sim.yaml"
-    if not path.is_file():
-        raise InputError("name a rig with --rig: the simulated cell comes with a checkout of Coupole only")
-    return Path(os.path.relpath(path)) if Path.cwd().is_relative_to(project) else path
 
 
 def plan_of(resumed_run: Path | None) -> Path:

@@ -70,17 +70,26 @@ def serve(
         if service_facts["token"]:
             console.print(f"sign in once as engineer with the token {service_facts['token']}", markup=False)
 
-    beside = rig.resolve().parent.parent / "plans"
-    folder = plans or (beside if beside.is_dir() else rig.resolve().parent)
+    cell = read_cell(rig)
     serve_cell(
-        read_cell(rig),
+        cell,
         host=host,
         port=port,
         names=[*(name or []), socket.gethostname()],
-        plans=folder,
+        plans=plans or _plans_beside(cell.document.path),
         tls=tls,
         tell=tell,
     )
+
+
+def _plans_beside(rig: Path) -> Path:
+    """The folder of plans beside a rig's; of a rig in an installed package the working folder."""
+    from coupole.plan.shipped_files import place_to_write
+
+    rig_folder = rig.resolve().parent
+    beside = rig_folder.parent / "plans"
+    folder = beside if beside.is_dir() else rig_folder
+    return folder if place_to_write(folder) == folder else Path.cwd()
 
 
 def _test_notifications(rig: Path, *, as_json: bool) -> None:

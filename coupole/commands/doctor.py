@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from coupole.commands.common import JsonOption, shipped_rig
+from coupole.commands.common import JsonOption
 from coupole.errors import InputError, PreflightRefused
+from coupole.plan.shipped_files import SIMULATED_CELL
 
 SLOWER_MS = 12
 """RSI's other cycle (#IPO)."""
@@ -37,7 +38,7 @@ def doctor(
     from coupole.plan.rig_devices import robot_settings_here
     from coupole.viewing.terminal import make_console
 
-    cell = read_cell(rig or shipped_rig())
+    cell = read_cell(rig or SIMULATED_CELL)
     driver = cell.rig.robot.driver
     if driver not in ANSWER_JITTER:
         raise InputError(

@@ -10,9 +10,10 @@ from typing import Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of, shipped_rig
+from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of
 from coupole.commands.completion import plans, runs, schemas, templates
 from coupole.errors import InputError, PreflightRefused
+from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
 plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
 
@@ -188,8 +189,9 @@ def plan_new(
             f"{name!r}: expected a name of letters, digits, dots, hyphens and underscores that begins with a "
             "letter or digit: it becomes part of file names"
         )
-    rig = rig or shipped_rig()
-    if not rig.is_file():
+    rig = rig or SIMULATED_CELL
+    rig_path = file_of(rig, "rigs")
+    if not rig_path.is_file():
         raise InputError(f"{rig}: no such file; name a rig with --rig")
     path = Path(f"{name}.yaml")
     if path.exists():
@@ -199,15 +201,16 @@ def plan_new(
         from coupole.plan.cell import read_cell
 
         with make_console(quiet=False).status("reading the rig") as status:
-            text = led_plan(read_cell(rig), name=name, rig=str(rig), seed=seed, tell=status.update)
+            text = led_plan(read_cell(rig_path), name=name, rig=str(rig), seed=seed, tell=status.update)
     else:
-        text = TEMPLATES[template].format(name=name, rig=_on_the_support(template, rig, name))
+        text = TEMPLATES[template].format(name=name, rig=_on_the_support(template, rig_path, name) or rig)
     path.write_text(text, encoding="utf-8")
     print(path)
 
 
-def _on_the_support(template: str, rig: Path, name: str) -> Path:
-    """The rig; for a simulated cell whose support a calibration needs something on, a copy that has it."""
+def _on_the_support(template: str, rig: Path, name: str) -> Path | None:
+    """A copy of the rig of a simulated cell, with what a calibration needs on its support; None if it needs
+    nothing, or if the cell is real."""
     from coupole.calibration.campaign_steps import STEPS
     from coupole.commands.simulated_support import place_for
     from coupole.plan.cell import read_cell
@@ -216,7 +219,7 @@ def _on_the_support(template: str, rig: Path, name: str) -> Path:
 
     step = next((step for step in STEPS if step.name == template and step.things), None)
     if step is None or not in_world(read_cell(rig).rig, dry_run=False):
-        return rig
+        return None
     paths = place_for(template, step.things, rig, name)
     make_console(quiet=False).print(
         f"this cell is simulated: {paths[0]} has on its support {step.stands}"

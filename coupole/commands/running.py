@@ -16,10 +16,10 @@ from coupole.commands.common import (
     person_named,
     plan_of,
     served_cell,
-    shipped_rig,
 )
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError
+from coupole.plan.shipped_files import SIMULATED_CELL
 
 
 def acquire(
@@ -99,7 +99,7 @@ def devices(
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
-    cell = read_cell(rig or shipped_rig())
+    cell = read_cell(rig or SIMULATED_CELL)
     document: dict[str, Any] = {}
     table = Table("device", "identity", "self-test", box=None)
     with borrowed_cell(cell, "devices"), open_cell(cell) as open_devices:

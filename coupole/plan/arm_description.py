@@ -1,7 +1,6 @@
 """Description of an arm: chain of joints, their limits and speeds, bodies of the links.
 
-The files included with Coupole are in `configs/robots` of the project and in `coupole/robots` of an installed
-wheel (pyproject.toml puts them there); `shipped_arm` finds them in either. A rig names its arm's file under
+The files included with Coupole are in `configs/robots`; `shipped_arm` finds them. A rig names its arm's file under
 `arm:`; otherwise it is the default arm of the robot's driver.
 """
 
@@ -22,14 +21,12 @@ from coupole.kinematics import Arm, structure_of
 from coupole.plan import yamlfile
 from coupole.plan.plan import Degrees, FilePath, Length, Model, Pose, Vector
 from coupole.plan.registry import ARMS_OF_DRIVERS, UR
+from coupole.plan.shipped_files import shipped_folder, shipped_names
 from coupole.plan.validation_messages import KeyPath
 from coupole.plan.yamlfile import Document
 
 TOOL = "tool"
 """Name for everything mounted on the flange."""
-_PACKAGE = Path(__file__).resolve().parents[1]
-FOLDERS = (_PACKAGE / "robots", _PACKAGE.parent / "configs" / "robots")
-"""Folders of the included arms: in a wheel, and in a checkout."""
 UR_MODEL = "ur10e"
 """The default arm of a UR's driver."""
 
@@ -204,10 +201,9 @@ def _body_problems(document: Document, description: ArmDescription, at: KeyPath)
 @cache
 def shipped_arm(name: str) -> ArmDescription:
     """The included arm of this name. Raises InputError if there is none."""
-    for folder in FOLDERS:
-        if (path := folder / f"{name}.yaml").is_file():
-            return read_arm(path)
-    names = sorted(path.stem for folder in FOLDERS for path in folder.glob("*.yaml"))
+    names = shipped_names("robots")
+    if name in names:
+        return read_arm(shipped_folder() / "robots" / f"{name}.yaml")
     why = f"expected one of {', '.join(names)}; another arm is named by its file, under the rig's `arm:`"
     raise InputError(f"no description of the arm `{name}` comes with Coupole: {why}")
 

@@ -14,6 +14,7 @@ from coupole.plan.led_table import LedTable, read_led_table
 from coupole.plan.link_meshes import missing_link_meshes
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import described_arm, driver_problems, renamed_drivers
+from coupole.plan.shipped_files import file_of, place_to_write
 from coupole.plan.yamlfile import Document
 
 
@@ -47,7 +48,7 @@ class Cell:
 
     @property
     def storage_folder(self) -> Path:
-        return self.document.resolve(self.rig.storage.folder)
+        return place_to_write(self.document.resolve(self.rig.storage.folder))
 
     @property
     def state_folder(self) -> Path:
@@ -85,9 +86,10 @@ def users_data_folder() -> Path:
 
 
 def read_cell(path: Path, files: InputFiles | None = None) -> Cell:
-    """Read a rig and its dome, into `files` if they are given. Raises InputError with all problems."""
+    """Read a rig (by its path, or a shipped one by its name) and its dome, into `files` if they are given. Raises
+    InputError with all problems."""
     files = InputFiles() if files is None else files
-    document = yamlfile.read_document(path, files)
+    document = yamlfile.read_document(file_of(path, "rigs"), files)
     rig, problems = document.problems(Rig)
     if rig is None:
         raise InputError(problems)

@@ -13,6 +13,7 @@ from coupole.plan.light_selection import missing_lights
 from coupole.plan.plan import Plan, possible_path
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import names_too_long, too_large
+from coupole.plan.shipped_files import file_of
 from coupole.plan.yamlfile import Document
 
 
@@ -30,13 +31,14 @@ class PlanFiles:
 
 
 def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None = None) -> PlanFiles:
-    """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Raises InputError
-    with all problems of all files."""
+    """Read a plan with its rig, or with another one; `text` is read in place of the plan's file. Shipped ones may
+    be named. Raises InputError with all problems of all files."""
     files = InputFiles()
+    plan_path = file_of(plan_path, "plans")
     document = yamlfile.read_document(plan_path, files) if text is None else yamlfile.parse(plan_path, text)
     plan, problems = document.problems(Plan)
     cell: Cell | None = None
-    rig_path = rig_path or _named_rig(document)
+    rig_path = file_of(rig_path, "rigs") if rig_path else _named_rig(document)
     if rig_path is not None and not rig_path.is_file():
         problems.append(document.problem(("rig",), f"expected a rig file; there is no {rig_path}"))
     elif rig_path is not None:
@@ -70,9 +72,13 @@ def read_plan(plan_path: Path, rig_path: Path | None = None, *, text: str | None
 def _named_rig(document: Document) -> Path | None:
     rig_name = document.data.get("rig")
     try:
-        return document.resolve(possible_path(Path(rig_name))) if isinstance(rig_name, str) else None
+        named_path = possible_path(Path(rig_name)) if isinstance(rig_name, str) else None
     except ValueError:  # the plan's own problems say so
         return None
+    if named_path is None or (beside := document.resolve(named_path)).is_file():
+        return beside if named_path else None
+    shipped_path = file_of(named_path, "rigs")
+    return beside if shipped_path == named_path else shipped_path
 
 
 def _named_records(document: Document, plan: Plan, cell: Cell) -> tuple[tuple[Path, ...] | None, list[Problem]]:

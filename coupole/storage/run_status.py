@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
+from pathlib import Path
 from typing import Any, assert_never
 
 from coupole.storage import journal, run_dose
+from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
     ArmSettled,
     BurstBegun,
@@ -30,6 +33,7 @@ from coupole.storage.journal_events import (
     ViewSealed,
 )
 from coupole.storage.run import Run
+from coupole.storage.run_json import RUN_JSON
 from coupole.storage.stopped_process import is_stopped
 
 RUNNING, PAUSED, CREATED = "running", "paused", "created"
@@ -173,3 +177,20 @@ def _seconds(begin_time: str, end_time: str) -> float:
     if not begin_time or not end_time:
         return 0.0
     return (datetime.fromisoformat(end_time) - datetime.fromisoformat(begin_time)).total_seconds()
+
+
+def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]) -> Path | None:
+    """The newest run in `parent` of the plan with this name; None if there is none, or if the plan's file was
+    changed since it began, which is said."""
+    folders = [folder for folder in sorted(parent.glob(f"*-{name}")) if (folder / RUN_JSON).is_file()]
+    if not folders:
+        return None
+    if Run(folders[-1]).about["plan"]["sha256"] != sha256(plan):
+        say(f"{plan} was changed since {folders[-1].name}: a new run is acquired")
+        return None
+    return folders[-1]
+
+
+def is_complete(folder: Path) -> bool:
+    """Tell whether all frames of a run are proven."""
+    return not status(Run(folder)).missing

@@ -1,0 +1,120 @@
+"""The command `coupole demo`: from a plan to a page, on the simulated cell, from anywhere."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coupole.commands.common import JsonOption, fail
+from coupole.errors import CoupoleError, InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+RUNS, RESULT, PAGE = "runs", "reflectance", "page.html"
+"""Contents of the demo's folder."""
+_BESIDE_THE_PAGE = "page.data"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Results of the demo, by their paths."""
+
+    run: str
+    result: str
+    page: str
+
+
+def demo(
+    folder: Annotated[Path, typer.Argument(help="Folder that is made; or one of an interrupted demo.")] = Path(
+        "coupole-demo"
+    ),
+    short: Annotated[
+        bool, typer.Option("--short", help="One view under 54 LEDs, in place of three under 1080.")
+    ] = (False),
+    open_page: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a relief on the simulated cell, find its reflectance, and make a page to relight it.
+
+    No device is needed. An interrupted demo goes on when it is called again.
+    """
+    from coupole.viewing.terminal import make_console
+
+    console = make_console(quiet=as_json)
+    try:
+        _refuse_foreign(folder)
+        made = _make(folder, "demo-short" if short else "demo", console)
+    except CoupoleError as error:
+        fail(error, as_json=as_json)
+        raise
+    console.print(f"page {made.page}")
+    if as_json:
+        print(json.dumps({**asdict(made), "simulated": True}))
+    if open_page:
+        typer.launch(made.page)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Raise InputError if the folder holds anything that no demo has made."""
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file; name a folder for the demo")
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if foreign := names - {RUNS, RESULT, PAGE, _BESIDE_THE_PAGE}:
+        raise InputError(f"{folder}: is not empty ({sorted(foreign)[0]}); name a folder that the demo may make")
+
+
+def _make(folder: Path, plan_name: str, console: Console) -> Demo:
+    """Take the steps that are missing."""
+    console.print(f"1 of 3: the plan {plan_name} is acquired on the simulated cell")
+    run = _acquire(folder / RUNS, plan_name, console)
+    console.print("2 of 3: the reflectance of the relief is found from the frames")
+    result = _find_reflectance(run, folder / RESULT, console)
+    console.print("3 of 3: a page shows it under any light")
+    page = _write_page(result, folder / PAGE, console)
+    return Demo(*(str(path.resolve()) for path in (run, result, page)))
+
+
+def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
+    """The plan's run, complete."""
+    from coupole.acquisition.session import acquire_plan
+    from coupole.preflight.job import read_job
+    from coupole.storage.run_status import is_complete, newest_run
+
+    job = read_job(Path(plan_name))
+    run = newest_run(parent, plan_name, job.document.path, console.print)
+    if run is not None and is_complete(run):
+        return run
+    figures: dict[str, Any] = {}
+    acquire_plan(job, console, parent=parent, resume=run, confirm=False, figures=figures)
+    return Path(figures["run"])
+
+
+def _find_reflectance(run: Path, out: Path, console: Console) -> Path:
+    """The result of the run, which goes on where it was."""
+    from coupole.reflectance.run_job import RunRequest, reflectance_of
+    from coupole.viewing import run_reflectance_page
+    from coupole.viewing.terminal import step_bars
+
+    with step_bars(console) as say:
+        reflectance_of(RunRequest((run,)), out, say=say)
+    run_reflectance_page.write(out)
+    return out
+
+
+def _write_page(result: Path, page: Path, console: Console) -> Path:
+    """The page of the result; one that is there stays."""
+    if page.exists():
+        return page
+    from coupole.exchange.look.look_of_runs import look_of_result
+    from coupole.exchange.look.look_page import write_page
+    from coupole.exchange.look.residual_planes import PLANES
+    from coupole.viewing.terminal import step_bars
+
+    with step_bars(console) as say:
+        write_page(look_of_result(result, say, with_samples=False, planes=PLANES), "demo", page)
+    return page

@@ -1,0 +1,124 @@
+"""The wheel in an environment without a checkout: it has its simulated cell, and the demo runs from anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from places import REPO
+
+DEPENDENCIES = next(path for path in map(Path, sys.path) if path.name == "site-packages")
+PACKAGES = ("coupole", "drivers", "sim")
+MOST_BYTES = 15_000_000
+
+
+@dataclass(frozen=True)
+class Installed:
+    """A virtual environment with the wheel, and a working folder with a space and an umlaut."""
+
+    wheel: Path
+    environment: Path
+    folder: Path
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        home = self.folder / "home"
+        home.mkdir(exist_ok=True)
+        surroundings = {"HOME": str(home), "PATH": "/usr/bin:/bin", "LANG": "C.UTF-8"}
+        command = [self.environment / "bin" / words[0], *words[1:]]
+        return subprocess.run(
+            command, cwd=self.folder, env=surroundings, capture_output=True, text=True, check=False
+        )
+
+
+def uv() -> str:
+    """The uv that set up this checkout."""
+    own = REPO / ".tools/uv-venv/bin/uv"
+    return (
+        str(own) if own.exists() else shutil.which("uv") or pytest.skip("there is no uv to build the wheel with")
+    )
+
+
+def share_kernels(site_packages: Path) -> None:
+    """Give the installed modules, which are the checkout's byte for byte, its compiled kernels: numba takes them
+    for those of a file of the same size and time."""
+    for package in PACKAGES:
+        for kernel in (REPO / package).rglob("*.nb[ic]"):
+            place = site_packages / kernel.relative_to(REPO)
+            place.parent.mkdir(exist_ok=True)
+            shutil.copy2(kernel, place)
+        for source in (REPO / package).rglob("*.py"):
+            time_s = source.stat().st_mtime
+            os.utime(site_packages / source.relative_to(REPO), (time_s, time_s))
+
+
+@pytest.fixture(
+    scope="module",
+    params=["dependencies shared", pytest.param("dependencies installed", marks=pytest.mark.full)],
+)
+def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    folder = tmp_path_factory.mktemp("ein Prüfstand")
+    environment = folder / "venv"
+
+    def call(*words: str | Path) -> None:
+        subprocess.run([uv(), *map(str, words)], cwd=REPO, check=True, capture_output=True)
+
+    call("build", "--wheel", "--out-dir", folder / "dist", REPO)
+    call("venv", "--python", sys.executable, environment)
+    (wheel,) = (folder / "dist").glob("*.whl")
+    shared = request.param == "dependencies shared"
+    call("pip", "install", "--python", environment, *(["--no-deps"] if shared else []), wheel)
+    (site_packages,) = environment.glob("lib/python*/site-packages")
+    if shared:
+        (site_packages / "dependencies.pth").write_text(f"{DEPENDENCIES}\n")
+        share_kernels(site_packages)
+    (folder / "Kuppel ä").mkdir()
+    return Installed(wheel, environment, folder / "Kuppel ä")
+
+
+def test_the_demo_ends_with_a_page(installed: Installed) -> None:
+    ended = installed.run("coupole", "demo", "mein Versuch", "--short", "--json")
+    assert ended.returncode == 0, ended.stderr
+    document = json.loads(ended.stdout)
+    page, run = Path(document["page"]), Path(document["run"])
+    assert page == installed.folder / "mein Versuch/page.html"
+    assert "<canvas" in page.read_text(encoding="utf-8")
+    assert run.parent == installed.folder / "mein Versuch/runs"
+    assert str(REPO) not in (run / "run.json").read_text()
+
+
+def test_a_demo_that_was_made_is_not_made_again_and_no_other_folder_is_touched(installed: Installed) -> None:
+    first = installed.run("coupole", "demo", "mein Versuch", "--short", "--json")
+    assert first.returncode == 0, first.stderr
+    assert len(list((installed.folder / "mein Versuch/runs").iterdir())) == 1
+    other = installed.folder / "Briefe"
+    other.mkdir()
+    (other / "brief.txt").write_text("von Hand")
+    refused = installed.run("coupole", "demo", "Briefe", "--json")
+    assert refused.returncode == 2
+    assert "is not empty (brief.txt)" in json.loads(refused.stdout)["error"]
+
+
+def test_a_new_plan_names_the_shipped_cell_and_can_be_run(installed: Installed) -> None:
+    assert installed.run("coupole", "plan", "new", "meiner").returncode == 0
+    assert "rig: sim\n" in (installed.folder / "meiner.yaml").read_text()
+    ended = installed.run("coupole", "check", "meiner.yaml", "--no-paths", "--json")
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout)["ok"]
+    other = installed.run("coupole", "check", "meiner.yaml", "--rig", "sim-gige", "--no-paths", "--json")
+    assert json.loads(other.stdout)["ok"], other.stderr
+
+
+def test_runs_of_a_shipped_cell_go_to_the_working_folder(installed: Installed) -> None:
+    program = "import pathlib, coupole.plan.cell as c; print(c.read_cell(pathlib.Path('sim')).storage_folder)"
+    ended = installed.run("python", "-c", program)
+    assert Path(ended.stdout.strip()) == installed.folder / "runs", ended.stderr
+
+
+def test_the_wheel_is_small(installed: Installed) -> None:
+    assert installed.wheel.stat().st_size < MOST_BYTES

@@ -26,8 +26,9 @@ A message names what was expected, what happened and what to do next.
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 class CoupoleError(Exception):
@@ -186,3 +187,12 @@ class Interrupted(CoupoleError):
 def reason(error: BaseException) -> str:
     """Say why something failed: of the system's errors without their numbers."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def error_as_told(figures: Mapping[str, Any]) -> CoupoleError:
+    """The error that the figures of another process's `--json` tell: `kind`, `error` and `exit_code`."""
+    kind = globals().get(figures["kind"], CoupoleError)
+    error: CoupoleError = kind.__new__(kind)
+    Exception.__init__(error, figures["error"])
+    error.exit_code = figures["exit_code"]
+    return error

@@ -14,7 +14,9 @@ _.export_scan, _.Stills, _.measure_jitter  # named in coupole/plan/registry.py
 _._do_limits, _._do_memory, _._do_trigger, _._do_statistics, _._do_disarm  # CameraServer, by the message's verb
 _._write_command, _._write_enumeration, _._write_string, _._write_boolean  # Features, by the node's kind
 _._write_integer, _._write_float  # the same
+_.relight_uncertainty, _.PicturesResult, _.Acquisition, _.__dir__  # users of the Python face
 _.__getattr__  # drivers/kuka/rsi, drivers/ur: Python, for names that are imported on first use
+_.open_run, _.open_result, _.open_cell  # coupole/__init__.py, by its table
 _.residual_rms_us, _.residual_max_us  # the report, coupole/viewing/report_facts.py
 _.white_at_us  # coupole/preflight/simulated_world.py, in the rig's settings
 _.adaptive, _.author, _.refined  # ExportOptions.given_options, which lists all fields
@@ -29,7 +31,7 @@ _.colour_index  # read_classes refuses a name with two of them
 
 # ---- by libraries ----
 _.pix_fmt, _.color_primaries, _.colorspace, _.color_range, _.color_trc  # PyAV
-_.preserve_quotes, _.warn_double_anchors  # ruamel.yaml
+_.preserve_quotes, _.warn_double_anchors, _.default_flow_style, _.sort_base_mapping_type_on_output  # ruamel.yaml
 _.__signature__, _.__annotations__  # typer
 _.ssl_context_factory, _.should_exit  # uvicorn
 _.decorations  # CodeMirror's options

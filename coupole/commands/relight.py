@@ -14,8 +14,8 @@ from coupole.commands.common import JsonOption, ResultArgument, fail
 from coupole.commands.completion import fits
 from coupole.commands.option_groups import flatten_options
 from coupole.commands.relight_for_the_eye import PEAK_QUANTILE, EyeColours, bright, write_relit_for_the_eye
-from coupole.commands.relit_result import Relit, open_result
 from coupole.errors import CoupoleError, InputError
+from coupole.scripting.relit_result import Relit, open_result
 
 if TYPE_CHECKING:
     import numpy as np

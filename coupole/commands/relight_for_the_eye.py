@@ -15,9 +15,9 @@ from coupole.errors import InputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from coupole.commands.relit_result import Relit
     from coupole.exchange.camera_colour import CameraColour
     from coupole.reflectance.new_light.light_kinds import AnyLight
+    from coupole.scripting.relit_result import Relit
 
 PEAK_QUANTILE = 0.999
 

@@ -15,6 +15,7 @@ import pytest
 from picture_cases import Case, write_case
 from places import SHARED_DATA
 
+import coupole
 from coupole.reflectance.light_interpolation import weights
 
 LEFT_OUT = [3, 12, 21, 30]
@@ -280,3 +281,20 @@ def test_real_objects_are_measured_and_relit(tmp_path: Path, name: str, most_deg
     assert document["held_out_psnr_db"] >= linear_db + 0.5
     faulty = {f"{number:03}.png" for number in range(1, 21) if number - 1 not in HELD_OUT} - {"020.png"}
     assert set(document["suspect_pictures"]) == (faulty if name == "bear" else set())
+
+
+def test_python_has_the_same_normals_materials_and_light(made: Made, tmp_path: Path) -> None:
+    case, out, _ = made
+    result = coupole.open_result(out)
+    assert isinstance(result, coupole.PicturesResult)
+    np.testing.assert_array_equal(result.normals(), np.load(out / "normals.npy"))
+    np.testing.assert_allclose(result.light_directions, case.directions, atol=1e-6)
+    assert result.materials()["kd"].shape == case.normals.shape
+    to, direction = tmp_path / "lit.npy", (0.3, 0.2, 1.0)
+    words = ",".join(map(str, direction))
+    assert cells.here("reflectance", "relight", out, "--direction", words, "--to", to).code == 0
+    np.testing.assert_allclose(result.relight(direction=direction), np.load(to), rtol=1e-5, atol=1e-6)
+    (path,) = result.to("ptm", tmp_path / "out")
+    assert path.read_bytes().startswith(b"PTM_1.2")
+    with pytest.raises(coupole.errors.InputError, match="found ply"):
+        result.to("ply", tmp_path / "out")

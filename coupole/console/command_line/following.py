@@ -15,13 +15,12 @@ from typing import Any
 
 from rich.console import Console
 
-from coupole import errors
 from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import ask_to_begin, refuse
 from coupole.acquisition.run_control import State, ask
 from coupole.acquisition.signals import obeyed_by
 from coupole.console.command_line.client import GivenUp, NoAnswer, NotServed, call
-from coupole.errors import CoupoleError, DeviceError, DeviceLost, InputError, Interrupted, reason
+from coupole.errors import DeviceError, DeviceLost, InputError, Interrupted, error_as_told, reason
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.checking import preflight_of
@@ -216,7 +215,7 @@ class _Followed:
             number = self._control.signal_number
             raise Interrupted(figures.get("error") or "stopped before it began", number)
         if "error" in figures:
-            raise _as_raised(figures)
+            raise error_as_told(figures)
         run = self._entry["run"]
         raise DeviceError(
             "cell",
@@ -225,12 +224,3 @@ class _Followed:
             remedy="Look at the cell: without it lights and arm stop by their own watchdogs"
             + (f"; go on with `coupole acquire --resume {run}`." if run else "."),
         )
-
-
-def _as_raised(figures: dict[str, Any]) -> CoupoleError:
-    """The error that the figures of a process's `--json` tell."""
-    kind = getattr(errors, figures["kind"], CoupoleError)
-    error: CoupoleError = kind.__new__(kind)
-    Exception.__init__(error, figures["error"])
-    error.exit_code = figures["exit_code"]
-    return error

@@ -1,0 +1,1 @@
+"""The Python face, `import coupole`: runs, results, plans, acquisitions and cells for scripts and notebooks."""

@@ -1,0 +1,191 @@
+"""A plan acquired from a script or a notebook, as an iterator of events.
+
+The run is a process of its own, `coupole acquire`. So the caller's pauses, its garbage collection and its debugger
+never hold the thread that watches the arm; nor do its signal handlers. This module reads the run's journal.
+However the loop ends, the process is interrupted as by Ctrl-C and makes the cell safe; it is interrupted by the
+kernel if the thread that began it dies (docs/decisions/0058-python-face.md).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from coupole.acquisition.run_control import running
+from coupole.console.processes import bound_process
+from coupole.errors import DeviceError, InputError, Interrupted, error_as_told
+from coupole.scripting.plans import Plan
+from coupole.storage.journal import Follower
+from coupole.storage.journal_events import Event
+from coupole.storage.run import Run
+
+AnyPath = str | os.PathLike[str]
+_LOOK_EVERY_S = 0.1
+_ENDS_WITHIN_S = 600.0
+"""Longer than a session whose every call hangs, and than a slow report."""
+
+
+class Acquisition(Iterator[Event]):
+    """A run that is being acquired: its journal's events, as they come. Use it `with` a context: it is over, and
+    the cell is safe, when the context ends."""
+
+    run: Path | None
+    """The run's folder, absolute; None until it is made."""
+    figures: Mapping[str, Any]
+    """Figures of the run as of `coupole acquire --json`, when it is over; empty before."""
+
+    def __init__(self, arguments: list[str], plan: Plan | None, run: Path | None) -> None:
+        self.run, self.figures = None, {}
+        self._events: deque[Event] = deque()
+        self._follower: Follower | None = None
+        self._words = ""
+        self._folder = tempfile.TemporaryDirectory(prefix="coupole-")
+        if plan is not None:
+            arguments = [str(plan.write(Path(self._folder.name) / "plan.yaml")), *arguments]
+        if run is not None:
+            self._follow(run, skip_old=True)
+        self._process = self._begin(arguments)
+
+    def _begin(self, arguments: list[str]) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "coupole.commands.cli", "acquire", *arguments, "--json"]
+        with self._output_path("errors").open("wb") as errors, self._output_path("figures").open("wb") as figures:
+            return subprocess.Popen(
+                [sys.executable, bound_process.__file__, str(os.getpid()), *command],
+                stdin=subprocess.DEVNULL,
+                stdout=figures,
+                stderr=errors,
+                start_new_session=True,  # the terminal's Ctrl-C is passed on once, by `close`
+            )
+
+    def __enter__(self) -> Acquisition:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_process"):
+            self.close()
+
+    def __next__(self) -> Event:
+        """The next event; waits for it. Raises what the command would end with (InputError, PreflightRefused,
+        DeviceError, UnprovenError, StorageError, Interrupted), after the last event."""
+        while not self._events:
+            is_over = self._process.poll() is not None
+            self._look()
+            if not self._events:
+                if is_over:
+                    self._conclude()
+                    raise StopIteration
+                time.sleep(_LOOK_EVERY_S)
+        return self._events.popleft()
+
+    def close(self) -> None:
+        """Stop the run, if it is not over: lights off, arm still, camera disarmed. Returns when its process has
+        ended; the run can be resumed. Raises DeviceError if it is not sure that the cell is safe."""
+        was_over = self._process.poll() is not None
+        if not was_over:
+            self._process.send_signal(signal.SIGINT)
+        self._take_in_the_end()
+        if not was_over and (trouble := self.figures.get("unsafe")):
+            raise unsafe_end("; ".join(trouble))
+
+    def _look(self) -> None:
+        """Take in what the journal has gained."""
+        if self._follower is None:
+            self._find_run()
+        if self._follower is not None:
+            self._events += self._follower.news()
+
+    def _find_run(self) -> None:
+        if self._process.poll() is None:
+            runs = [state["run"] for state in running() if state["pid"] == self._process.pid]
+        else:
+            self._take_in_the_end()
+            runs = [self.figures["run"]] if "run" in self.figures else []
+        if runs:
+            self._follow(Path(runs[0]), skip_old=False)
+
+    def _follow(self, run: Path, *, skip_old: bool) -> None:
+        self.run = run.resolve()
+        self._follower = Follower(Run(run).journal_path)
+        if skip_old:
+            self._follower.news()
+
+    def _conclude(self) -> None:
+        """Raise what the process ended with, if it did not end well."""
+        self._take_in_the_end()
+        code = self._process.returncode
+        if code == 0:
+            return
+        if "error" in self.figures:
+            raise error_as_told(self.figures)
+        if code > 0:
+            raise Interrupted(self._words or f"ended with exit code {code}", code - 128)
+        raise unsafe_end(f"its process was killed (signal {-code}); lights and arm stop by their own watchdogs")
+
+    def _take_in_the_end(self) -> None:
+        """Wait for the end of the process, and take what it has printed."""
+        self._process.wait(_ENDS_WITHIN_S)
+        if not self._output_path("figures").exists():
+            return
+        self._words = self._output_path("errors").read_text(errors="replace").strip()
+        document = self._output_path("figures").read_text().strip()
+        self.figures = json.loads(document) if document else {}
+        self._folder.cleanup()
+
+    def _output_path(self, name: str) -> Path:
+        return Path(self._folder.name) / name
+
+
+def acquire(
+    plan: Plan | AnyPath | None = None,
+    *,
+    rig: AnyPath | None = None,
+    output: AnyPath | None = None,
+    resume: AnyPath | None = None,
+    yes: bool = False,
+) -> Acquisition:
+    """Acquire a plan (a `Plan`, a file, or the name of a shipped one), or resume a run; an iterator of events.
+
+    `rig` is another rig than the plan's, `output` the parent folder of the run. A real cell moves only with `yes`.
+    Events are those of the journal (`coupole.events`), such as `FrameProven` with `shot`, `file` and `index`.
+    Raises InputError for arguments that do not go together; later as `Acquisition.__next__` says.
+
+    with coupole.acquire("demo-short") as events:
+        for event in events:
+            print(event.event)
+    """
+    if (plan is None) == (resume is None):
+        raise InputError("expected a plan, or `resume` with a run's folder, and not both")
+    if resume is not None and output is not None:
+        raise InputError("a resumed run keeps its folder: `resume` excludes `output`")
+    options = {"--rig": rig, "--output": output, "--resume": resume}
+    arguments = [word for name, path in options.items() if path is not None for word in (name, os.fspath(path))]
+    arguments += ["--yes"] if yes else []
+    if isinstance(plan, Plan):
+        return Acquisition(arguments, plan, None)
+    plan_words = [] if plan is None else [os.fspath(plan)]
+    return Acquisition([*plan_words, *arguments], None, None if resume is None else Path(resume))
+
+
+def unsafe_end(what_happened: str) -> DeviceError:
+    """The error of a cell that may not be safe."""
+    return DeviceError(
+        "cell",
+        expected="lights off, the arm at rest and the camera disarmed at the end",
+        happened=what_happened,
+        remedy="Look at the cell; all proven frames are stored.",
+    )

@@ -1,0 +1,37 @@
+"""The devices of a cell for a script of one's own: opened by their contracts, safe on exit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from coupole.acquisition import opened_cell
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.operator import refuse_uncommissioned
+from coupole.plan.cell import read_cell
+from coupole.scripting.acquisition import unsafe_end
+from coupole.storage.arm_faults import faults_of
+
+
+@contextmanager
+def open_cell(rig: str | os.PathLike[str] = "sim") -> Iterator[OpenedCell]:
+    """Open the devices of a rig (a file, or the name of a shipped one), with its simulated world if it has one.
+
+    `cell.ledbox`, `cell.camera` and `cell.robot` keep the contracts of `coupole.devices`; `cell.clock` is the
+    rig's clock and `cell.identities` says who they are. At the end, also by an exception or Ctrl-C, the lights are
+    switched off, the arm is stopped, the camera is disarmed, and the devices are closed. No path is checked for
+    you: only a plan moves the arm along a path that is known to be free.
+
+    Raises InputError: the rig is wrong, or another process has its devices; DeviceError: one cannot be opened, the
+    arm is in a fault, or (at the end) it is not sure that all is off and at rest; PreflightRefused: a real cell
+    that was not commissioned.
+    """
+    cell = read_cell(Path(rig))
+    faults_of(cell).refuse(cell.document.path)
+    with opened_cell.open_cell(cell) as devices:
+        refuse_uncommissioned(cell, devices.identities)
+        yield devices
+    if devices.trouble:
+        raise unsafe_end("; ".join(devices.trouble))

@@ -1,17 +1,20 @@
-"""Lists the public names of `import coupole` with their signatures: docs/reference/python-names.txt.
+"""Lists the public names of `import coupole` with their signatures (docs/reference/python-names.txt), and
+describes them by their docstrings (docs/reference/python.md).
 
-    python tools/list_public_names.py [--output docs/reference/python-names.txt]
+    python tools/list_public_names.py
 
-Whoever changes the list says what changed in CHANGELOG.md and ends that line with `(Python names DIGEST)`, which
-this prints; a test compares both.
+Whoever changes the list says what changed in CHANGELOG.md, and ends that line with the words that this prints; a
+test compares them.
 """
 
 from __future__ import annotations
 
-import argparse
+import ast
 import hashlib
 import inspect
+import textwrap
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,11 +22,19 @@ from typing import Any
 import coupole
 from coupole.plan.plan import Model
 
-NAMES = Path(__file__).resolve().parent.parent / "docs" / "reference" / "python-names.txt"
+REFERENCE = Path(__file__).resolve().parent.parent / "docs" / "reference"
+NAMES, PAGE = REFERENCE / "python-names.txt", REFERENCE / "python.md"
+HEAD = """\
+# Python
+
+All public names of `import coupole`, written by `tools/list_public_names.py` from the docstrings.
+[Work from Python](../how-to/from-python.md) shows them at work. The base frame is the robot's; the support frame
+has its origin at the disk's centre and z up.
+"""
 
 
 def public_names() -> list[str]:
-    """Names of the table in coupole/__init__.py, sorted."""
+    """Names of the tables in coupole/__init__.py, sorted."""
     return sorted([*coupole._NAMES, *coupole._MODULES], key=str.lower)
 
 
@@ -32,51 +43,91 @@ def listing() -> str:
     return "".join(f"{line}\n" for name in public_names() for line in _lines(name, getattr(coupole, name)))
 
 
+def page() -> str:
+    """The text of the page."""
+    return HEAD + "".join(_section(name, getattr(coupole, name)) for name in public_names())
+
+
 def undocumented() -> list[str]:
-    """Public names without a docstring; fields are looked for in the source of their class."""
-    return [name for name, entry in _entries() if not inspect.getdoc(entry)]
+    """Public names without a docstring, those of fields included."""
+    return [name for name, docstring in _documented() if not docstring]
 
 
-def _entries() -> Iterator[tuple[str, Any]]:
+def _documented() -> Iterator[tuple[str, str]]:
     for name in public_names():
         entry = getattr(coupole, name)
-        yield name, entry
+        yield name, inspect.getdoc(entry) or ""
         if inspect.isclass(entry):
-            yield from ((f"{name}.{member}", value) for member, value in _members(entry) if callable(value))
+            yield from ((f"{name}.{member}", docstring) for member, _, docstring in _members(entry))
 
 
 def _lines(name: str, entry: Any) -> Iterator[str]:
-    """A name, and below it what belongs to it."""
+    """A name, and below it the names that belong to it."""
+    yield f"coupole.{name}{_signature(entry)}"
     if isinstance(entry, ModuleType):
-        yield f"coupole.{name}"
-        classes = inspect.getmembers(entry, inspect.isclass)
-        yield from (f"    {member}" for member, value in classes if value.__module__ == entry.__name__)
+        yield from (f"    {member}" for member, _ in _classes(entry))
     elif inspect.isclass(entry):
-        yield f"coupole.{name}"
-        yield from (f"    {member}{_signature(value)}" for member, value in _members(entry))
-    else:
-        yield f"coupole.{name}{_signature(entry)}"
+        yield from (f"    {member}{signature}" for member, signature, _ in _members(entry))
 
 
-def _members(entry: type) -> list[tuple[str, Any]]:
-    """Public members that this class has itself; fields of a file's format stand in the reference of that file."""
-    fields = [] if issubclass(entry, Model) else inspect.get_annotations(entry)
-    members = {**dict.fromkeys(fields), **vars(entry)}
-    return sorted((name, value) for name, value in members.items() if not name.startswith(("_", "model_")))
+def _section(name: str, entry: Any) -> str:
+    """A name's part of the page."""
+    text = f"\n## `coupole.{name}`\n\n"
+    if signature := _signature(entry):
+        text += f"```python\n{name}{signature}\n```\n\n"
+    text += f"{inspect.getdoc(entry)}\n"
+    rows: list[tuple[str, str, str]] = []
+    if isinstance(entry, ModuleType):
+        rows = [(member, "", inspect.getdoc(value) or "") for member, value in _classes(entry)]
+    elif inspect.isclass(entry):
+        rows = _members(entry)
+    if rows:
+        text += "\n| name | is |\n|---|---|\n"
+    cells = ((f"`{member}{signature}`", " ".join(docstring.split())) for member, signature, docstring in rows)
+    return text + "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in cells)
+
+
+def _classes(module: ModuleType) -> list[tuple[str, type]]:
+    members = inspect.getmembers(module, inspect.isclass)
+    return [(name, value) for name, value in members if value.__module__ == module.__name__]
+
+
+def _members(entry: type) -> list[tuple[str, str, str]]:
+    """Name, signature and docstring of each public member that this class has itself; keys of a file's format
+    stand in the reference of that format."""
+    fields = {} if issubclass(entry, Model) else _fields(entry)
+    members: dict[str, tuple[str, str]] = {name: ("", docstring) for name, docstring in fields.items()}
+    for name, value in vars(entry).items():
+        if name not in fields and not name.startswith("model_"):
+            members[name] = _signature(value), inspect.getdoc(value) or ""
+    shown = {"__next__"} | {name for name in members if not name.startswith("_")}
+    return [(name, *members[name]) for name in sorted(members) if name in shown]
+
+
+def _fields(entry: type) -> dict[str, str]:
+    """Docstrings under the annotated names of a class; empty ones for those without."""
+    (node,) = ast.parse(textwrap.dedent(inspect.getsource(entry))).body
+    assert isinstance(node, ast.ClassDef)
+    docstrings: dict[str, str] = {}
+    for statement, below in pairwise([*node.body, ast.Pass()]):
+        match statement, below:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as text)):
+                docstrings[name] = inspect.cleandoc(text)
+            case ast.AnnAssign(target=ast.Name(id=name)), _:
+                docstrings[name] = ""
+    return docstrings
 
 
 def _signature(value: Any) -> str:
+    """Signature of a function as it is written, without quotes."""
     function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
-    return str(inspect.signature(function)) if inspect.isfunction(function) else ""
+    return str(inspect.signature(function)).replace("'", "") if inspect.isfunction(function) else ""
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="List the public names of Python.")
-    parser.add_argument("--output", type=Path, default=NAMES, help="the list")
-    options = parser.parse_args()
-    text = listing()
-    options.output.write_text(text, encoding="utf-8")
-    print(f"(Python names {hashlib.sha256(text.encode()).hexdigest()[:8]})")
+    NAMES.write_text(listing(), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")
+    print(f"(Python names {hashlib.sha256(NAMES.read_bytes()).hexdigest()[:8]})")
 
 
 if __name__ == "__main__":

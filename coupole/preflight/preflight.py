@@ -82,21 +82,31 @@ class Report:
     views: list[ViewReport] = field(default_factory=list)
     """Views in the order of the visits; unreachable ones last."""
     shots: int = 0
+    """Frames under a light."""
     frames: int = 0
+    """Shots and dark frames."""
     bytes: int = 0
+    """Size of all frames on the disk."""
     duration_s: float = 0.0
+    """Expected duration, s."""
     ideal_s: float = 0.0
     """Duration of the tables plus motion and settling: a lower bound for any controller."""
     dose_lux_h: float = 0.0
+    """Light at the object's point that receives most, lux h."""
     dose_before_lux_h: float = 0.0
+    """Light that the object has received before, by its ledger, lux h."""
     dose_budget_lux_h: float | None = None
+    """Light that it may receive in its life, lux h; None without a limit."""
     peak_board_c: float = 0.0
+    """Temperature of the hottest LED board, C."""
     too_hot: bool = False
     """Boards beyond their limit, or LEDs with too short dark times: a slower pace may help."""
     timings: tuple[BurstTiming, ...] = ()
     """Timing of each exposure, with the limit that determines its period."""
     asked_bytes_s: float = 0.0
+    """Rate at which frames come in a burst, bytes per second."""
     disk_bytes_s: float = 0.0
+    """Measured speed of the disk, bytes per second; 0 if it was not measured."""
     exposure_scale: str | None = None
     """Record or rig setting from which it is known how bright white will be; None: it is not known."""
     white: tuple[ExposedWhite, ...] = ()
@@ -104,7 +114,9 @@ class Report:
     object_check: ObjectCheck | None = None
     """None without a mesh."""
     refusals: list[str] = field(default_factory=list)
+    """Reasons why the plan must not be run, a sentence each."""
     warnings: list[str] = field(default_factory=list)
+    """Remarks for the operator, a sentence each."""
 
 
 def check(

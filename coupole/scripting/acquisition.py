@@ -31,6 +31,8 @@ from coupole.storage.run import Run
 
 AnyPath = str | os.PathLike[str]
 _LOOK_EVERY_S = 0.1
+_SIGNALLED = 128
+"""Exit codes above this are of a signal."""
 _ENDS_WITHIN_S = 600.0
 """Longer than a session whose every call hangs, and than a slow report."""
 
@@ -132,8 +134,10 @@ class Acquisition(Iterator[Event]):
             return
         if "error" in self.figures:
             raise error_as_told(self.figures)
+        if code > _SIGNALLED:
+            raise Interrupted(self._words or "stopped before it began", code - _SIGNALLED)
         if code > 0:
-            raise Interrupted(self._words or f"ended with exit code {code}", code - 128)
+            raise RuntimeError(f"`coupole acquire` ended with exit code {code}: {self._words}")
         raise unsafe_end(f"its process was killed (signal {-code}); lights and arm stop by their own watchdogs")
 
     def _take_in_the_end(self) -> None:
@@ -164,9 +168,11 @@ def acquire(
     Events are those of the journal (`coupole.events`), such as `FrameProven` with `shot`, `file` and `index`.
     Raises InputError for arguments that do not go together; later as `Acquisition.__next__` says.
 
-    with coupole.acquire("demo-short") as events:
-        for event in events:
-            print(event.event)
+    ::
+
+        with coupole.acquire("demo-short") as events:
+            for event in events:
+                print(event.event)
     """
     if (plan is None) == (resume is None):
         raise InputError("expected a plan, or `resume` with a run's folder, and not both")

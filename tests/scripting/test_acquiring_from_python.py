@@ -130,6 +130,14 @@ def test_a_dataset_has_all_frames_of_a_view_with_units(
     assert int(dataset.is_dark.sum()) == len(run["top"].darks)
 
 
+def test_without_the_extra_a_dataset_says_what_to_install(
+    acquired: tuple[list[coupole.events.Event], Path, World], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'coupole\[xarray\]'"):
+        coupole.open_run(acquired[1]).dataset("top")
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, -signal.SIGINT), (signal.SIGKILL, -signal.SIGKILL)])
 def test_a_script_that_ends_leaves_the_cell_safe(
     standing: tuple[CellFolder, World], number: signal.Signals, code: int
@@ -163,6 +171,11 @@ def test_what_the_command_would_refuse_is_raised_with_its_kind(tmp_path: Path) -
     with refused, pytest.raises(coupole.errors.PreflightRefused, match=r"its budget is 1e-06 lux\.h"):
         list(refused)
     assert refused.run is None
+    with (
+        coupole.acquire(tmp_path / "none.yaml") as none,
+        pytest.raises(coupole.errors.InputError, match=r"none\.yaml"),
+    ):
+        next(none)
     with pytest.raises(coupole.errors.InputError, match="excludes `output`"):
         coupole.acquire(resume=tmp_path, output=tmp_path)
 

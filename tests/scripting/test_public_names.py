@@ -15,13 +15,14 @@ import coupole
 
 sys.path.insert(0, str(REPO / "tools"))
 
-from list_public_names import NAMES, listing, undocumented
+from list_public_names import NAMES, PAGE, listing, page, undocumented
 
 CHEAP = "import coupole, json, sys; print(json.dumps([sorted(sys.modules), dir(coupole)]))"
 
 
 def test_the_list_is_that_of_the_code() -> None:
     assert NAMES.read_text() == listing(), "run tools/list_public_names.py and say in CHANGELOG.md what changed"
+    assert PAGE.read_text() == page(), "run tools/list_public_names.py"
 
 
 def test_a_change_of_the_list_is_in_the_changelog() -> None:

@@ -72,7 +72,7 @@ def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     call("venv", "--python", sys.executable, environment)
     (wheel,) = (folder / "dist").glob("*.whl")
     shared = request.param == "dependencies shared"
-    call("pip", "install", "--python", environment, *(["--no-deps"] if shared else []), wheel)
+    call("pip", "install", "--python", environment, *(["--no-deps", wheel] if shared else [f"{wheel}[xarray]"]))
     (site_packages,) = environment.glob("lib/python*/site-packages")
     if shared:
         (site_packages / "dependencies.pth").write_text(f"{DEPENDENCIES}\n")

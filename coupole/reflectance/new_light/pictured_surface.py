@@ -79,6 +79,7 @@ class FreeCamera:
     """A pinhole camera anywhere, in the support frame; z is up in the picture, y if it looks along z."""
 
     at_mm: Floats
+    """[3] its projection centre."""
     look_at_mm: Floats | None = None
     """The middle of the object without it."""
     size_px: tuple[int, int] = (1024, 768)

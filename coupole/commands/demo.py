@@ -47,8 +47,9 @@ def demo(
 
     console = make_console(quiet=as_json)
     try:
-        _refuse_foreign(folder)
-        made = _make(folder, "demo-short" if short else "demo", console)
+        plan_name = "demo-short" if short else "demo"
+        _refuse_foreign(folder, plan_name)
+        made = _make(folder, plan_name, console)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -59,13 +60,16 @@ def demo(
         typer.launch(made.page)
 
 
-def _refuse_foreign(folder: Path) -> None:
-    """Raise InputError if the folder holds anything that no demo has made."""
+def _refuse_foreign(folder: Path, plan_name: str) -> None:
+    """Raise InputError if the folder holds anything that no demo of this plan has made."""
     if folder.is_file():
         raise InputError(f"{folder}: is a file; name a folder for the demo")
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if foreign := names - {RUNS, RESULT, PAGE, _BESIDE_THE_PAGE}:
         raise InputError(f"{folder}: is not empty ({sorted(foreign)[0]}); name a folder that the demo may make")
+    for run in (folder / RUNS).glob("*"):
+        if not run.name.endswith(f"Z-{plan_name}"):
+            raise InputError(f"{folder}: holds another run ({run.name}); name another folder for this demo")
 
 
 def _make(folder: Path, plan_name: str, console: Console) -> Demo:

@@ -142,7 +142,11 @@ class Acquisition(Iterator[Event]):
 
     def _take_in_the_end(self) -> None:
         """Wait for the end of the process, and take what it has printed."""
-        self._process.wait(_ENDS_WITHIN_S)
+        try:
+            self._process.wait(_ENDS_WITHIN_S)
+        except subprocess.TimeoutExpired as error:
+            what = f"its process {self._process.pid} has not ended within {_ENDS_WITHIN_S:g} s"
+            raise unsafe_end(what) from error
         if not self._output_path("figures").exists():
             return
         self._words = self._output_path("errors").read_text(errors="replace").strip()

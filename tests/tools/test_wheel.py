@@ -96,6 +96,8 @@ def test_a_demo_that_was_made_is_not_made_again_and_no_other_folder_is_touched(i
     first = installed.run("coupole", "demo", "coupole-demo", "--short", "--json")
     assert first.returncode == 0, first.stderr
     assert len(list((installed.folder / "coupole-demo/runs").iterdir())) == 1
+    whole = installed.run("coupole", "demo", "coupole-demo", "--json")
+    assert (whole.returncode, "holds another run" in json.loads(whole.stdout)["error"]) == (2, True)
     other = installed.folder / "Briefe"
     other.mkdir()
     (other / "brief.txt").write_text("von Hand")

@@ -97,7 +97,14 @@ UncertaintyOption = Annotated[
     Path | None,
     _option(
         "--uncertainty",
-        "For a result of runs: write the picture's standard uncertainty (68 %) too; .npy, .exr or .png, as --to.",
+        "Write the picture's standard uncertainty (68 %) too; .npy, .exr or .png, as --to.",
+    ),
+]
+IntervalOption = Annotated[
+    str | None,
+    _option(
+        "--interval",
+        "LOW,HIGH: two files, .npy or .exr, of the bounds of each pixel's 95 % interval, in the unit of --to.",
     ),
 ]
 TurnOption = Annotated[
@@ -161,6 +168,7 @@ class MoreOutput:
     """Other files that are written, and the white of pictures."""
 
     uncertainty: UncertaintyOption = None
+    interval: IntervalOption = None
     turn: TurnOption = None
     white: WhiteOption = None
 
@@ -185,7 +193,7 @@ def relight(
         camera = _camera(viewpoint)
         with step_bars(console) as bars:
             bars("read", 0, 1)
-            uncertain = more.uncertainty is not None
+            uncertain = more.uncertainty is not None or more.interval is not None
             relit = open_result(
                 result, viewpoint.view, viewpoint.fit, camera, lighting.samples, uncertain=uncertain
             )
@@ -195,6 +203,8 @@ def relight(
                 document = _write(relit, lights, to, more.turn, more.white, bars)
             if more.uncertainty is not None:
                 document |= _write_uncertainty(relit, lights, more.uncertainty, bars)
+            if more.interval is not None:
+                document |= _write_interval(relit, lights, _low_and_high(more.interval), bars)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
@@ -207,6 +217,10 @@ def relight(
 def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
     from coupole.exchange import picture_files, picture_for_the_eye, video_files
 
+    if more.interval is not None:
+        _low_and_high(more.interval)
+        if more.turn is not None:
+            raise InputError("--interval: belongs to a picture, not to a video (--turn)")
     if more.uncertainty is not None:
         picture_files.refuse_unknown(more.uncertainty)
         if more.turn is not None:
@@ -223,6 +237,17 @@ def _refuse_target(to: Path, more: MoreOutput, *, for_the_eye: bool) -> None:
             )
     else:
         video_files.refuse_unknown(to)
+
+
+def _low_and_high(option: str) -> tuple[Path, Path]:
+    """Return the two files of `--interval`. Raises InputError if these are not two files that hold all values."""
+    names = option.split(",")
+    paths = [Path(name) for name in names]
+    if len(names) != 2 or any(path.suffix.lower() not in (".npy", ".exr") for path in paths):
+        raise InputError(f"--interval: expected LOW,HIGH, two files .npy or .exr; got {option!r}")
+    if paths[0].resolve() == paths[1].resolve():
+        raise InputError(f"--interval: expected two files; got {names[0]} twice")
+    return paths[0], paths[1]
 
 
 def _camera(viewpoint: Viewpoint) -> FreeCamera | None:
@@ -307,3 +332,19 @@ def _write_uncertainty(
     assert relit.uncertainty is not None
     write_picture(to, relit.uncertainty(lights, lambda count, of: bars("uncertainty", count, of)))
     return {"uncertainty": str(to.resolve())}
+
+
+def _write_interval(
+    relit: Relit, lights: Sequence[AnyLight], bounds: tuple[Path, Path], bars: Callable[[str, int, int], None]
+) -> dict[str, Any]:
+    """Make and write the bounds of the picture's 95 % interval, not below 0; what `--json` says of them."""
+    import numpy as np
+
+    from coupole.exchange.picture_files import write_picture
+
+    assert relit.half_width_95 is not None
+    picture = relit.picture(lights, lambda count, of: bars("light", count, of))
+    half_width = relit.half_width_95(lights, lambda count, of: bars("interval", count, of))
+    write_picture(bounds[0], np.maximum(picture - half_width, np.float32(0.0)))
+    write_picture(bounds[1], picture + half_width)
+    return {"interval": [str(path.resolve()) for path in bounds]}

@@ -98,17 +98,17 @@ def look(
         most - first_sum,
         np.broadcast_to(first_sum.mean(axis=1, keepdims=True), first_sum.shape),
     ]
-    parts += [_mean_around(strip.mask, first_sum, width) - first_sum for width in SURROUNDINGS_PX[:2]]
+    parts += [mean_around(strip.mask, first_sum, width) - first_sum for width in SURROUNDINGS_PX[:2]]
     for place in near[:AROUND]:
         light_picture = strip.values[place] / strip.level[:, None]
-        parts.append(_mean_around(strip.mask, light_picture, SURROUNDINGS_PX[2]) - light_picture)
+        parts.append(mean_around(strip.mask, light_picture, SURROUNDINGS_PX[2]) - light_picture)
         distance = np.float32(_DISTANCE_SCALE * np.linalg.norm(directions[place] - direction))
         parts.append(np.broadcast_to(distance, first_sum.shape))
     features = np.stack(parts, axis=-1).astype(np.float32).reshape(count * 3, -1)
     return Sight(first_sum, features, np.minimum(least, sums.min(axis=0)), np.maximum(most, sums.max(axis=0)))
 
 
-def _mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
+def mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
     """[pixels, 3] means over squares, of what the mask holds."""
     picture = np.zeros((*mask.shape, values.shape[-1]), np.float32)
     picture[mask] = values
@@ -212,6 +212,15 @@ def lessons(
         targets = (strip.values[light] / strip.level[:, None] - sight.kernel_sum).ravel()
         pixels = np.flatnonzero(generator.random(len(targets)) < share)
         yield Lesson(sight.features[pixels], targets[pixels], np.repeat(strip.level**2, 3)[pixels])
+
+
+def join_lessons(parts: Sequence[Lesson]) -> Lesson:
+    """Return the lessons of one light in several strips as one."""
+    return Lesson(
+        np.concatenate([part.features for part in parts]),
+        np.concatenate([part.targets for part in parts]),
+        np.concatenate([part.importance for part in parts]),
+    )
 
 
 def train(

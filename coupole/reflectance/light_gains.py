@@ -18,7 +18,8 @@ SUSPECT = 0.05
 """A gain that differs from 1 by more than this is told."""
 _LIT = 0.2
 """Least cosine of the light at pixels that count."""
-_NEIGHBOURS = 3
+GAIN_NEIGHBOURS = 3
+"""Number of nearest pictures whose median gain a new picture has."""
 
 
 def gains(
@@ -50,7 +51,7 @@ def gain_between(
 ) -> float:
     """The gain that a picture from another direction would have had: the median of the nearest ones', so that one
     faulty picture among good ones does not count."""
-    return float(np.median(gains_of_lights[nearest(light_directions, direction, _NEIGHBOURS)]))
+    return float(np.median(gains_of_lights[nearest(light_directions, direction, GAIN_NEIGHBOURS)]))
 
 
 @numba.njit(cache=True, nogil=True)

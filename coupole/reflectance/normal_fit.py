@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 RANKS = (0.2, 0.8)
 _STARTS = (0.08, 0.2, 0.45)
 """Values of alpha from which fits start; the best end is kept."""
-_LEAST_SHARE, _OF_QUANTILE = 0.05, 0.9
+SHADOW_SHARE, SHADOW_QUANTILE = 0.05, 0.9
 """Samples below this share of a pixel's quantile are in shadow."""
 CAUCHY = 0.05
 """Scale of the weights, as a share of sqrt(kd)."""
@@ -83,7 +83,7 @@ def fit_materials(values: Floats, lights: Floats, view: Floats, *, threads: int 
 
     def fit(begin: int) -> None:
         part = slice(begin, begin + _BLOCK)
-        least = _LEAST_SHARE * np.quantile(ordered_values[part], _OF_QUANTILE, axis=1)
+        least = SHADOW_SHARE * np.quantile(ordered_values[part], SHADOW_QUANTILE, axis=1)
         of_part = normals[part], albedo[part], least, parameters[part]
         _fit_all(ordered_values[part], lights, half, view[None], only_view, *of_part)
 

@@ -21,12 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
+from coupole.reflectance import normal_cones, relit_intervals
 from coupole.reflectance.light_gains import SUSPECT, gains
 from coupole.reflectance.normal_fit import PointMaterials, colours, fit_materials
 from coupole.reflectance.picture_result import (
     ABOUT,
     AXES,
+    CONES,
     INTERPOLATION,
+    INTERVALS,
     MATERIALS,
     NORMALS,
     SAMPLES,
@@ -99,6 +102,13 @@ def _fit_pictures(pictures: PictureSet, out: Path, left_out: Sequence[int], say:
         )
         complete(out / INTERPOLATION, interpolation.write)
     interpolation = read_interpolation(out)
+    if not (out / CONES).exists():
+        _write_cones(result, materials, say)
+    if not (out / INTERVALS).exists() and len(lights) >= relit_intervals.FEWEST_LIGHTS:
+        intervals = relit_intervals.calibrate(
+            result, interpolation, say=lambda count, of: say("intervals", count, of)
+        )
+        complete(out / INTERVALS, intervals.write)
     peak = peak_of(result)
     checks = [check(result, interpolation, light, peak) for light in settings["left_out"]]
     about_settings = {**settings, "simulated": pictures.simulated}
@@ -179,6 +189,29 @@ def read_materials(path: Path) -> PointMaterials:
     with open_result_file(path) as file:
         names = ("normal", "grey_kd", "grey_ks", "alpha", "residual")
         return PointMaterials(*(np.asarray(file[name], dtype=np.float64) for name in names))
+
+
+def _write_cones(result: PictureResult, materials: PointMaterials, say: Said) -> None:
+    """Half angles of the normals' 95 % cones; NaN under too few lights."""
+    with open_result_file(result.folder / MATERIALS) as file:
+        lights = np.asarray(file.attrs["lights"])
+    cones_deg = np.full(len(materials.kd), np.nan)
+    if len(lights) >= normal_cones.FEWEST_LIGHTS:
+        spreads = []
+        for begin in range(0, len(cones_deg), BLOCK):
+            block = slice(begin, min(begin + BLOCK, len(cones_deg)))
+            say("cones of normals", begin, len(cones_deg))
+            grey = result.values(lights, block).mean(axis=2).T.astype(np.float64)
+            spreads.append(normal_cones.spreads_deg(grey, materials.at(block), result.directions[lights], VIEW))
+        fit_deg, jackknife_deg = (np.concatenate(parts) for parts in zip(*spreads, strict=True))
+        cones_deg = normal_cones.cones_deg(fit_deg, jackknife_deg)
+    picture = result.picture(cones_deg.astype(np.float32), np.nan)
+
+    def write(path: Path) -> None:
+        with path.open("wb") as file:
+            np.save(file, picture)
+
+    complete(result.folder / CONES, write)
 
 
 def _gains(result: PictureResult, lights: NDArray[np.int64], materials: PointMaterials) -> NDArray[np.float64]:

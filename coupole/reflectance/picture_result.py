@@ -23,6 +23,9 @@ Floats = NDArray[np.float32]
 
 SCHEMA = "coupole-reflectance-pictures/1"
 SAMPLES, MATERIALS, INTERPOLATION = "samples/pictures.h5", "fits/materials.h5", "fits/interpolation.h5"
+INTERVALS = "fits/intervals.h5"
+"""Coefficients and factors by which intervals of relit pictures are predicted; missing under too few lights."""
+CONES = "normals_95_deg.npy"
 NORMALS, ABOUT, REPORT = "normals.npy", "result.json", "report.html"
 AXES = "x to the right of the picture, y up, z to the camera"
 

@@ -21,6 +21,8 @@ from coupole.reflectance.new_light.light_kinds import AnyLight, DistantLight, En
 from coupole.reflectance.picture_result import INTERPOLATION, PictureResult, open_result_file
 
 Floats = NDArray[np.float32]
+Beams = Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]
+"""Directions [3] to distant lights, and their strengths [3]."""
 
 STRIP_PIXELS = 60_000
 """Pixels of a strip in which pictures are made; more only if a row has more."""
@@ -103,17 +105,9 @@ def learn(
         lessons_of_strips.append(
             list(learned.lessons(strip, directions, sound.tolist(), kernels, share=share, generator=generator))
         )
-    by_light = [_join_lessons(parts) for parts in zip(*lessons_of_strips, strict=True)]
+    by_light = [learned.join_lessons(parts) for parts in zip(*lessons_of_strips, strict=True)]
     network = learned.train(by_light, say=say) if by_light else None
     return Interpolation(lights, gains, kernel, rms, peak, network)
-
-
-def _join_lessons(parts: Sequence[learned.Lesson]) -> learned.Lesson:
-    return learned.Lesson(
-        np.concatenate([part.features for part in parts]),
-        np.concatenate([part.targets for part in parts]),
-        np.concatenate([part.importance for part in parts]),
-    )
 
 
 def left_out_rms(values: Floats, directions: NDArray[np.float64]) -> dict[str, float]:
@@ -156,7 +150,17 @@ def relit_by(
     *,
     say: Callable[[int, int], None] = lambda done, of: None,
 ) -> Floats:
-    """The same under several lights, with `samples` directions of each environment; of these, what is behind the
+    """The same under several lights, as `beams_of` has them."""
+    picture = np.zeros((*result.mask.shape, 3), np.float32)
+    beams = beams_of(lights, samples)
+    for number, (way, rgb) in enumerate(beams):
+        picture += relit(result, interpolation, way) * rgb.astype(np.float32)
+        say(number + 1, len(beams))
+    return picture
+
+
+def beams_of(lights: Sequence[AnyLight], samples: int) -> Beams:
+    """Return distant lights of lights, with `samples` directions of each environment; of these, what is behind the
     object gives none. Raises InputError for lights that have places: pictures tell no distances."""
     beams: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     for light in lights:
@@ -175,11 +179,7 @@ def relit_by(
                     f"a light of the kind {light.kind}: a result of pictures has no distances, so its lights are "
                     "distant; expected direction or environment"
                 )
-    picture = np.zeros((*result.mask.shape, 3), np.float32)
-    for number, (way, rgb) in enumerate(beams):
-        picture += relit(result, interpolation, way) * rgb.astype(np.float32)
-        say(number + 1, len(beams))
-    return picture
+    return beams
 
 
 def strip_between(result: PictureResult, interpolation: Interpolation, top: int, bottom: int) -> Strip:

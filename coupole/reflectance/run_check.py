@@ -26,6 +26,7 @@ from coupole.reflectance.fits import FITS, GGX, MATERIALS
 from coupole.reflectance.material_uncertainty import relative_uncertainty
 from coupole.reflectance.result_folder import read_settings
 from coupole.reflectance.run_fits import predict_samples
+from coupole.reflectance.run_intervals import WideningSamples
 from coupole.reflectance.run_pictures import held_out, read_check_frames
 from coupole.reflectance.run_result import ABOUT, SCHEMA, RunResult, ViewSamples
 from coupole.reflectance.run_uncertainty import QUANTILE, uncertainty_of
@@ -73,6 +74,10 @@ class _Check:
     """Number of values of the pictures at each level."""
     inside: dict[str, list[int]] = field(default_factory=lambda: {name: [0, 0] for name in MATERIALS})
     """Number of triangles' samples that lie in the interval of what the material gives, and of how many."""
+    ratios: dict[str, WideningSamples] = field(
+        default_factory=lambda: {name: WideningSamples() for name in MATERIALS}
+    )
+    """Errors of pictures over their stated uncertainty."""
 
     @property
     def peak(self) -> float:
@@ -118,11 +123,14 @@ def _check_view(
     for part in held_out(result, view, settings, memory_bytes):
         some = part.samples
         values_of_fits = _modelled_values(result, view, part.rows, some, part.share)
+        common = np.hypot(result.u_triangles(slice(None))[part.places], result.u_shared)[:, None]
         _compare(values_of_fits, some.values * part.share, check.triangles)
         noise = result.view_noise(view, part.rows, np.isin(view.leds, settings["left_out"]))
         for name, inside in check.inside.items():
             covariance = result.material_covariances(name, part.places)
-            relative = relative_uncertainty(some, result.materials(name, part.places), covariance)
+            materials = result.materials(name, part.places)
+            relative = relative_uncertainty(some, materials, covariance)
+            check.ratios[name].add(part, values_of_fits[name], np.hypot(relative, common), materials.residual)
             in_interval = _inside(values_of_fits[name] / part.share, relative, some.values, noise)
             inside[0] += int(np.count_nonzero(in_interval))
             inside[1] += in_interval.size
@@ -227,6 +235,7 @@ def _about(
         "held_out_psnr_db": {name: fit_errors.psnr_db(check.peak) for name, fit_errors in check.pictures.items()},
         "mae_of_triangles": {name: fit_errors.mae for name, fit_errors in check.triangles.items()},
         "held_out_inside": {name: n / of if of else None for name, (n, of) in check.inside.items()},
+        "widening": {name: samples.widening() for name, samples in check.ratios.items()},
         "material_uncertainty": {name: _typical(result, name) for name in MATERIALS},
         "mae_of_noise": float(np.nanmean(check.noise)) if np.isfinite(check.noise).any() else None,
         "median_interval_percent": _interval_percent(uncertainty),

@@ -29,6 +29,8 @@ class Relit:
     """Description for `--json` and for a video's comment."""
     uncertainty: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
     """[h, w, 3] standard uncertainty of the picture of lights, if it can be stated."""
+    half_width_95: Callable[[Sequence[AnyLight], Say], NDArray[np.float32]] | None = None
+    """[h, w, 3] half width of the 95 % interval of the picture of lights, if it can be stated."""
     has_colours: bool = True
     """False of a camera with one channel."""
 
@@ -45,17 +47,17 @@ def open_result(
             fit = fit or run_relighting.best_with_texels(run_result.RunResult(result), fits.MATERIALS)
             relit_uncertainty.refuse_uncertain(run_result.RunResult(result), fit)
         return _of_runs(result, view, fit, camera, samples)
-    options = (("--view", view), ("--fit", fit), ("--from", camera), ("--uncertainty", uncertain or None))
+    options = (("--view", view), ("--fit", fit), ("--from", camera))
     for option, value in options:
         if value is not None:
             raise InputError(f"{option}: a result of pictures has one view and one way to relight it")
-    return _of_pictures(result, samples)
+    return _of_pictures(result, samples, uncertain=uncertain)
 
 
 def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int) -> Relit:
     import numpy as np
 
-    from coupole.reflectance import relit_uncertainty, run_relighting, run_result
+    from coupole.reflectance import relit_uncertainty, run_intervals, run_relighting, run_result
 
     if camera is not None and view is not None:
         raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
@@ -73,18 +75,29 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
         lambda lights, say: of_three(scene.picture(lights, samples, say=say)),
         {"fit": scene.fit, "simulated": is_simulated},
         lambda lights, say: of_three(relit_uncertainty.uncertainty_of_picture(scene, lights, samples, say=say)),
+        lambda lights, say: of_three(run_intervals.half_width_of_picture(scene, lights, samples, say=say)),
         has_colours=folder.channels == 3,
     )
 
 
-def _of_pictures(result: Path, samples: int) -> Relit:
-    from coupole.reflectance import picture_result, relighting
+def _of_pictures(result: Path, samples: int, *, uncertain: bool) -> Relit:
+    from coupole.reflectance import relighting, relit_intervals
+    from coupole.reflectance.picture_result import PictureResult
 
-    picture_folder = picture_result.PictureResult(result)
+    picture_folder = PictureResult(result)
     picture_folder.about  # noqa: B018  refuses what is no result
     interpolation = relighting.read_interpolation(result)
+    if uncertain:
+        relit_intervals.refuse_uncalibrated(picture_folder)
 
     def picture(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
         return relighting.relit_by(picture_folder, interpolation, lights, samples, say=say)
 
-    return Relit(picture, {})
+    def half_width(level: str) -> Callable[[Sequence[AnyLight], Say], NDArray[np.float32]]:
+        def of_lights(lights: Sequence[AnyLight], say: Say) -> NDArray[np.float32]:
+            beams = relighting.beams_of(lights, samples)
+            return relit_intervals.half_width_picture(picture_folder, interpolation, beams, level, say=say)
+
+        return of_lights
+
+    return Relit(picture, {}, half_width("68"), half_width("95"))

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from coupole.calibration.report import HEAD
 from coupole.errors import StorageError
 from coupole.reflectance.picture_job import PEAK_QUANTILE
-from coupole.reflectance.picture_result import MATERIALS, REPORT, PictureResult
+from coupole.reflectance.picture_result import CONES, INTERVALS, MATERIALS, REPORT, PictureResult
 from coupole.reflectance.relighting import read_interpolation, relit
+from coupole.reflectance.relit_intervals import FEWEST_LIGHTS
 from coupole.storage.durable import write_synced
 from coupole.viewing.raw_preview import png
 
@@ -93,7 +94,21 @@ def _page(result: PictureResult) -> Iterator[str]:
     for row in about["held_out"]:
         yield f"<tr><th>light {row['light']}<td>{row['psnr_db']:.2f} dB, mean absolute error {row['mae']:.5f}"
     yield f"<tr><th>time<td>{about['seconds']:.1f} s</table>"
-    yield "<p>No uncertainty is stated for these normals and materials yet."
+    yield from _intervals(result)
+
+
+def _intervals(result: PictureResult) -> Iterator[str]:
+    """Yield what is known of normals and relit pictures, and what is not."""
+    cones_deg = np.load(result.folder / CONES)[result.mask]
+    if np.isfinite(cones_deg).any():
+        yield f"<p>Cones that hold 95 % of the normals: half angle {np.nanmedian(cones_deg):.1f} degrees (median)."
+        shares = result.picture(cones_deg / np.float32(30.0))
+        yield figure("half angle of the normals' 95 % cones, white 30 degrees", grey(shares))
+    if (result.folder / INTERVALS).exists():
+        yield "<p>Relit pictures have intervals: coupole reflectance relight with --interval or --uncertainty."
+    else:
+        yield f"<p>No interval is stated for relit pictures: these need at least {FEWEST_LIGHTS} lights."
+    yield "<p>No uncertainty is stated for the materials."
 
 
 def _checks(result: PictureResult) -> Iterator[str]:

@@ -70,6 +70,114 @@ def test_left_out_lights_are_made_better_than_by_interpolation_alone(
     assert [one["light"] for one in document["held_out"]] == LEFT_OUT
 
 
+def interval_of(out: Path, direction: np.ndarray, folder: Path, *more: str | Path) -> tuple[np.ndarray, ...]:
+    """Return the picture of a light, and the bounds of its interval."""
+    way = ",".join(map(str, direction))
+    low, high = folder / "low.npy", folder / "high.npy"
+    options = (f"--direction={way}", "--to", folder / "a.npy", "--interval", f"{low},{high}", *more)
+    ended = cells.here("reflectance", "relight", out, *options)
+    assert ended.code == 0, ended.err
+    return np.load(folder / "a.npy"), np.load(low), np.load(high)
+
+
+def test_intervals_hold_what_left_out_lights_show(made: Made, tmp_path: Path) -> None:
+    case, out, _ = made
+    inside, dark = [], []
+    for light in LEFT_OUT:
+        _, low, high = interval_of(out, case.directions[light], tmp_path)
+        measured = cv2.imread(str(case.folder / f"{light:03}.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
+        inside.append((low <= measured) & (measured <= high))
+        dark.append(measured < 0.05)
+        assert (high - low).mean() < 0.2
+    assert 0.9 < np.mean(inside) < 0.995
+    assert np.mean(np.stack(inside)[np.stack(dark)]) > 0.85
+
+
+def test_an_interval_is_wider_than_the_standard_uncertainty(made: Made, tmp_path: Path) -> None:
+    case, out, _ = made
+    direction = case.directions[LEFT_OUT[0]]
+    picture, low, high = interval_of(out, direction, tmp_path, "--uncertainty", tmp_path / "u.npy")
+    uncertainty = np.load(tmp_path / "u.npy")
+    measured = cv2.imread(str(case.folder / f"{LEFT_OUT[0]:03}.png"), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
+    assert (low >= 0).all()
+    assert ((low <= picture) & (picture <= high)).all()
+    assert np.median((high - picture) / uncertainty) > 1.3
+    assert 0.5 < np.mean(np.abs(measured - picture) <= uncertainty) < 0.85
+
+
+def test_an_interval_is_written_as_exr(made: Made, tmp_path: Path) -> None:
+    case, out, _ = made
+    _, low, _ = interval_of(out, case.directions[3], tmp_path)
+    way = ",".join(map(str, case.directions[3]))
+    bounds = f"{tmp_path / 'low.exr'},{tmp_path / 'high.exr'}"
+    ended = cells.here(
+        "reflectance",
+        "relight",
+        out,
+        f"--direction={way}",
+        "--to",
+        tmp_path / "a.png",
+        "--interval",
+        bounds,
+        "--json",
+    )
+    assert ended.code == 0, ended.err
+    assert ended.document["interval"] == bounds.split(",")
+    with OpenEXR.File(str(tmp_path / "low.exr")) as file:
+        np.testing.assert_array_equal(file.channels()["RGB"].pixels, low)
+
+
+def test_half_widths_of_lights_together_are_added(made: Made, tmp_path: Path) -> None:
+    out = made[1]
+    for name, directions in (("a", ["0,0,1"]), ("b", ["1,0,2"]), ("c", ["0,0,1", "1,0,2"])):
+        lights = [f"--direction={direction}" for direction in directions]
+        to = ("--to", tmp_path / f"{name}.npy", "--interval", f"{tmp_path}/{name}l.npy,{tmp_path}/{name}h.npy")
+        ended = cells.here("reflectance", "relight", out, *lights, *to)
+        assert ended.code == 0, ended.err
+    one, other, both = (np.load(tmp_path / f"{name}h.npy") - np.load(tmp_path / f"{name}.npy") for name in "abc")
+    np.testing.assert_allclose(both, one + other, rtol=1e-3, atol=1e-6)
+
+
+def test_nothing_is_known_far_from_all_lights(made: Made, tmp_path: Path) -> None:
+    picture, low, high = interval_of(made[1], np.array([1.0, 0.0, -0.5]), tmp_path)
+    assert np.isfinite(picture).all()
+    assert np.isnan(low).all()
+    assert np.isnan(high).all()
+
+
+@pytest.mark.parametrize(
+    ("interval", "message"),
+    [
+        ("low.npy", "expected LOW,HIGH"),
+        ("low.npy,high.png", "expected LOW,HIGH"),
+        ("low.npy,low.npy", "low.npy twice"),
+    ],
+)
+def test_bounds_that_are_not_two_files_are_refused(made: Made, interval: str, message: str) -> None:
+    ended = cells.here(
+        "reflectance", "relight", made[1], "--direction", "0,0,1", "--to", "a.npy", "--interval", interval
+    )
+    assert ended.code == 2
+    assert message in ended.err
+
+
+def test_a_video_has_no_interval(made: Made) -> None:
+    options = ("--direction", "1,0,1", "--turn", "8", "--to", "a.mp4", "--interval", "low.npy,high.npy")
+    ended = cells.here("reflectance", "relight", made[1], *options)
+    assert ended.code == 2
+    assert "--interval: belongs to a picture" in ended.err
+
+
+def test_cones_hold_the_normals_of_a_ball(made: Made) -> None:
+    case, out, _ = made
+    cones_deg, normals = np.load(out / "normals_95_deg.npy"), np.load(out / "normals.npy")
+    assert cones_deg.dtype == np.float32
+    assert cones_deg.shape == case.normals.shape[:2]
+    ball = (case.normals[..., 2] < 0.999) & (case.normals[..., 2] > 0.5)
+    off_deg = np.degrees(np.arccos(np.clip(np.sum(normals * case.normals, axis=-1)[ball], -1, 1)))
+    assert np.mean(off_deg <= cones_deg[ball]) > 0.93
+
+
 def test_pictures_are_written_as_exr_and_png(made: Made, tmp_path: Path) -> None:
     _, out, _ = made
     for name in ("a.npy", "a.exr", "a.png"):
@@ -101,9 +209,10 @@ def test_the_result_is_read_by_plain_h5py(made: Made) -> None:
 def test_the_report_shows_what_was_made(made: Made) -> None:
     _, out, _ = made
     page = (out / "report.html").read_text()
-    assert page.count("<img") == 5 + 3 * len(LEFT_OUT)
+    assert page.count("<img") == 6 + 3 * len(LEFT_OUT)
     assert "left-out lights are made with" in page
-    assert "No uncertainty is stated" in page
+    assert "half angle" in page
+    assert "--interval" in page
 
 
 def test_a_job_that_was_killed_goes_on_where_it_was(made: Made) -> None:
@@ -135,6 +244,13 @@ def test_six_lights_are_enough_for_sums(made: Made, tmp_path: Path) -> None:
         "reflectance", "relight", tmp_path / "out", "--direction", "0,0,1", "--to", tmp_path / "a.npy"
     )
     assert ended.code == 0, ended.err
+    assert np.isnan(np.load(tmp_path / "out" / "normals_95_deg.npy")).all()
+    for option in (("--interval", "low.npy,high.npy"), ("--uncertainty", "u.npy")):
+        ended = cells.here(
+            "reflectance", "relight", tmp_path / "out", "--direction", "0,0,1", "--to", tmp_path / "a.npy", *option
+        )
+        assert ended.code == 2
+        assert "has no intervals: they need 12 lights" in ended.err
 
 
 def test_a_disk_that_takes_nothing_is_told_with_six(made: Made) -> None:
@@ -245,6 +361,22 @@ def normal_error_deg(name: str, out: Path, mask: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(np.sum(truth * found, axis=-1)[mask], -1, 1))).mean())
 
 
+def held_share(name: str, out: Path, mask: np.ndarray, folder: Path) -> tuple[float, float]:
+    """Return the share of the left-out lights' values that lie in their intervals, over all and of the darkest
+    tenth."""
+    given = DILIGENT / name
+    directions, intensities = (np.loadtxt(given / f"light_{kind}.txt") for kind in ("directions", "intensities"))
+    names = (given / "filenames.txt").read_text().split()
+    inside, values = [], []
+    for light in HELD_OUT:
+        _, low, high = interval_of(out, directions[light], folder)
+        codes = cv2.imread(str(given / names[light]), cv2.IMREAD_UNCHANGED)[..., ::-1][mask]
+        values.append(codes / 65535 / intensities[light])
+        inside.append((low[mask] <= values[-1]) & (values[-1] <= high[mask]))
+    is_dark = np.array(values) < np.quantile(values, 0.1)
+    return float(np.mean(inside)), float(np.mean(np.array(inside)[is_dark]))
+
+
 def by_linear_sums_db(name: str, mask: np.ndarray) -> float:
     """PSNR of the linear kernel alone, reckoned here (facts: 32.8 dB for bear, 34.0 for cat)."""
     given = DILIGENT / name
@@ -269,6 +401,9 @@ def test_part_of_a_real_cat_is_measured_and_relit_better_than_by_sums(tmp_path: 
     assert normal_error_deg("cat", out, mask) < 5.3  # of these rows; the whole has 4.7
     assert document["held_out_psnr_db"] > by_linear_sums_db("cat", mask) + 0.3
     assert len(document["suspect_pictures"]) <= 1  # a corner light, by 5 %
+    over_all, dark = held_share("cat", out, mask, tmp_path)
+    assert 0.91 < over_all < 0.98  # of these rows; the whole has 0.951
+    assert dark > 0.88
 
 
 @real
@@ -279,6 +414,12 @@ def test_real_objects_are_measured_and_relit(tmp_path: Path, name: str, most_deg
     assert normal_error_deg(name, out, mask) <= most_deg
     assert by_linear_sums_db(name, mask) == pytest.approx(linear_db, abs=0.1)
     assert document["held_out_psnr_db"] >= linear_db + 0.5
+    over_all, dark = held_share(name, out, mask, tmp_path)
+    assert 0.93 <= over_all <= 0.97
+    assert 0.88 <= dark <= 0.99
+    truth, normals = np.load(DILIGENT / name / "normal_gt.npy")[mask], np.load(out / "normals.npy")[mask]
+    off_deg = np.degrees(np.arccos(np.clip(np.sum(truth * normals, axis=1), -1, 1)))
+    assert 0.93 < np.mean(off_deg <= np.load(out / "normals_95_deg.npy")[mask]) < 0.98
     faulty = {f"{number:03}.png" for number in range(1, 21) if number - 1 not in HELD_OUT} - {"020.png"}
     assert set(document["suspect_pictures"]) == (faulty if name == "bear" else set())
 

@@ -60,6 +60,31 @@ def test_under_an_led_kept_for_the_check_a_view_looks_as_it_was_photographed(mad
             assert np.abs(relit - taken)[seen].mean() < 0.009  # of range; noise of one pixel is 0.006
 
 
+@pytest.mark.parametrize("view", ["top", "side"])
+def test_an_interval_holds_the_frame_of_an_led_kept_for_the_check(made: Made, tmp_path: Path, view: str) -> None:
+    cell, out, document = made
+    led, low, high = document["left_out"][1], tmp_path / "low.npy", tmp_path / "high.npy"
+    with h5py.File(cell.run_folder / f"views/{view}.h5") as file:
+        number = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == led)[0])
+        raw = file["entry/instrument/detector/data"][number].astype(float)
+    with h5py.File(RECORDS / "flat-field.h5") as file:
+        share = (raw - cells.BLACK_DN) / (4095 - cells.BLACK_DN) / file["g"][()]
+    options = ("--led", led, "--view", view, "--fit", "ggx_normal", "--to", tmp_path / "a.npy")
+    bounds = ("--interval", f"{low},{high}", "--uncertainty", tmp_path / "u.npy")
+    ended = cells.here("reflectance", "relight", out, *map(str, options), *bounds)
+    assert ended.code == 0, ended.err
+    picture, lower, upper = np.load(tmp_path / "a.npy"), np.load(low), np.load(high)
+    assert np.isnan(lower[picture == 0]).all()
+    inside, plain = [], []
+    for channel, row, column in ((1, 0, 0), (2, 0, 1), (0, 1, 0)):  # GBRG
+        at = np.s_[row::2, column::2, channel]
+        seen, frame = picture[at] > 0.05, share[row::2, column::2]
+        inside.append(((lower[at] <= frame) & (frame <= upper[at]))[seen])
+        plain.append((np.abs(frame - picture[at]) <= 1.96 * np.load(tmp_path / "u.npy")[at])[seen])
+    assert 0.9 < np.concatenate(inside).mean() < 0.99
+    assert np.concatenate(plain).mean() < np.concatenate(inside).mean()
+
+
 def test_slices_show_an_environment_as_materials_do(made: Made) -> None:
     out = made[1]
     OpenEXR.File({}, {"RGB": np.ones((8, 16, 3), np.float32)}).write(str(out / "white.exr"))

@@ -74,6 +74,11 @@ class Sources:
         """The same with one more input file."""
         return self if path is None else replace(self, inputs=(*self.inputs, (path.name, sha256(path))))
 
+    def with_words(self, words: str) -> Sources:
+        """The same with one more input, which stood on the command line."""
+        digest = hashlib.sha256(words.encode()).hexdigest()
+        return replace(self, inputs=(*self.inputs, (words, digest)))
+
 
 def open_sources(paths: Sequence[Path], poses: Path | None) -> Sources:
     """Runs, or one folder of pictures with poses in `poses` or its own `poses.yaml`.

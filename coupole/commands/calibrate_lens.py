@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +29,23 @@ if TYPE_CHECKING:
 BoardOption = Annotated[
     Path | None, typer.Option("--board", help="The board's description (YAML); FOLDER/board.yaml if not given.")
 ]
+PlainBoardOption = Annotated[
+    str | None,
+    typer.Option(
+        "--board",
+        help="The board's description (YAML), FOLDER/board.yaml if not given; or COLUMNSxROWS, inner corners of a "
+        "plain chessboard, with --square.",
+        show_default=False,
+    ),
+]
+SquareOption = Annotated[
+    float | None,
+    typer.Option(
+        "--square", help="Side of a plain chessboard's squares, mm.", min=0.01, max=1000.0, show_default=False
+    ),
+]
+_PRINTED_U_PPM = 5000.0
+"""Standard uncertainty of the scale of a board of which nothing but a nominal side is known."""
 PosesOption = Annotated[
     Path | None, typer.Option("--poses", help="Robot poses of pictures (YAML); FOLDER/poses.yaml if not given.")
 ]
@@ -37,7 +55,8 @@ ModelOption = Annotated[str, typer.Option("--model", help="pinhole, radial (k1),
 @calibration("camera", limits=CAMERA)
 def camera(
     paths: Paths,
-    board: BoardOption = None,
+    board: PlainBoardOption = None,
+    square: SquareOption = None,
     model: ModelOption = "brown5",
 ) -> Work:
     """Lens and distortion from 8 to 60 images of a board, tilted to all sides, corners over the whole field."""
@@ -45,7 +64,9 @@ def camera(
 
     def work(console: Console, request: Request) -> Outcome:
         _refuse_unknown_model(model)
-        sources, _, sightings = _look(paths, board, None, console)
+        plain_board = _plain_board(board, square)
+        path = Path(board) if board is not None and plain_board is None else None
+        sources, _, sightings = _look(paths, path, None, console, plain_board)
         return _outcome_with_drawing(camera_from(sightings, sources, model, request)[1])
 
     return work
@@ -142,8 +163,26 @@ def _refuse_unknown_model(model: str) -> None:
         raise InputError(f"--model: expected one of {', '.join(MODELS)}; found {model}")
 
 
+def _plain_board(text: str | None, square_mm: float | None) -> Board | None:
+    """The plain chessboard COLUMNSxROWS of squares of a stated side; None if `text` names a file, or nothing.
+    Raises InputError if only one of the two is given, or for a board that none can be."""
+    from coupole.calibration.lens.board import Board
+
+    match = re.fullmatch(r"([0-9]{1,3})x([0-9]{1,3})", text or "")
+    if match is None:
+        if square_mm is not None:
+            raise InputError(f"--square: belongs to a plain board, --board COLUMNSxROWS; got --board {text}")
+        return None
+    corners = int(match[1]), int(match[2])
+    if square_mm is None:
+        raise InputError(f"--board {text}: expected the side of its squares too, --square MM")
+    if not all(3 <= count <= 200 for count in corners):
+        raise InputError(f"--board {text}: expected 3 to 200 inner corners each way")
+    return Board(kind="chessboard", corners=corners, square_mm=square_mm, scale_u_ppm=_PRINTED_U_PPM)
+
+
 def _look(
-    paths: list[Path], board: Path | None, poses: Path | None, console: Console
+    paths: list[Path], board: Path | None, poses: Path | None, console: Console, plain_board: Board | None = None
 ) -> tuple[Sources, Board, Found]:
     """Open the images and find the board in them."""
     from coupole.calibration.lens.board import read_board
@@ -151,10 +190,16 @@ def _look(
     from coupole.calibration.sources import BOARD_NAME, open_sources
 
     beside = paths[0] / BOARD_NAME
-    if board is None and not beside.is_file():
+    named_file = board or (beside if beside.is_file() else None)
+    if plain_board is None and named_file is None:
         raise InputError(f"expected the board's description: give --board, or put it at {beside}")
-    target = read_board(board or beside)
-    sources = open_sources(paths, poses).with_file(board or beside)
+    description = None if plain_board is not None else named_file
+    target = plain_board if description is None else read_board(description)
+    assert target is not None  # as was refused above
+    sources = open_sources(paths, poses).with_file(description)
+    if description is None:
+        across, down = target.corners
+        sources = sources.with_words(f"--board {across}x{down} --square {target.square_mm:g}")
     with bar(console, "looking for the board") as progress:
         sightings = find_board(target, sources, progress)
     for line in sightings.left_out:

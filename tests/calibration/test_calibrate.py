@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import boards
+import cv2
 import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
@@ -79,6 +81,39 @@ def test_a_folder_of_pictures_gives_the_lens(folder: Path, tmp_path: Path) -> No
     record = read_record(tmp_path / "lens.yaml")
     assert record.validity.size_px == SIZE_PX
     assert [i.name for i in record.inputs][-2:] == ["pictures/poses.yaml", "board.yaml"]
+
+
+def test_pictures_of_a_plain_board_need_no_description(tmp_path: Path) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for seed in range(9):
+        codes = np.rint(20 + 200 * boards.picture_of(boards.CHESS, seed).pixels).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{seed}.png"), codes)
+    document = found(
+        calibrate("camera", folder, "--board", "9x6", "--square", 16, "--model", "brown4", "--out", tmp_path)
+    )
+    record = read_record(Path(document["record"]))
+    values = {parameter.name: parameter for parameter in record.parameters}
+    for name, true in zip(("fx_px", "fy_px"), boards.LENS.focal_px, strict=True):
+        assert abs(values[name].value - true) < 3 * values[name].u + 0.5
+    assert [one.name.removeprefix("photographs/") for one in record.inputs] == [
+        *(f"{seed}.png" for seed in range(9)),
+        "--board 9x6 --square 16",
+    ]
+    assert not any("wider than high" in remark for remark in record.remarks)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--board", "9x6"), "expected the side of its squares too, --square MM"),
+        (("--square", 16), "--square: belongs to a plain board"),
+        (("--board", "board.yaml", "--square", 16), "--square: belongs to a plain board"),
+        (("--board", "2x6", "--square", 16), "expected 3 to 200 inner corners"),
+    ],
+)
+def test_half_of_a_plain_board_is_refused(tmp_path: Path, words: tuple[object, ...], message: str) -> None:
+    assert message in refused("camera", tmp_path, *words, "--out", tmp_path / "out")
 
 
 def test_a_folder_of_pictures_gives_the_hand_eye(folder: Path, tmp_path: Path) -> None:

@@ -8,12 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from synthesis import Cell, make_cell
+from synthesis import Cell, TrueLens, board_points, looking_at_board, make_cell
 
 from coupole.calibration.adjustment import Block
 from coupole.calibration.cross_validation import left_out
+from coupole.calibration.lens.board import Sighting
 from coupole.calibration.lens.camera import CameraCalibration, calibrate_camera
-from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, Field
+from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, PRINT, PRINT_UNIT, Field
 from coupole.calibration.model_error import Suspect, with_suspects
 
 GROUPS, EACH = 30, 12
@@ -124,6 +125,62 @@ def test_a_focal_length_that_changes_from_view_to_view_is_named() -> None:
     evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
     assert max(evidence, key=lambda name: evidence[name]) == FOCUS
     assert evidence[FOCUS] > 20
+
+
+def with_print(cell: Cell, wider: float) -> Cell:
+    """The cell of a board that is `wider` than its description says, as a share of its width."""
+    as_described = [
+        replace(one, board_mm=one.board_mm / np.array([1.0 + wider, 1.0, 1.0])) for one in cell.sightings
+    ]
+    return replace(cell, sightings=tuple(as_described))
+
+
+@pytest.mark.parametrize("wider", [0.006, -0.002])
+def test_a_board_that_is_wider_than_high_is_named_and_fitted(wider: float) -> None:
+    cell = with_print(make_cell(35, images=20), wider)
+    plain, fit = (calibrate_camera(cell.sightings, cell.size_px, with_doubts=doubted) for doubted in (False, True))
+    assert fit.doubts is not None
+    evidence = {one.name: one.evidence for one in fit.doubts.error.suspects}
+    assert max(evidence, key=lambda name: evidence[name]) == PRINT
+    suspect = fit.doubts.error.of(PRINT)
+    u = PRINT_UNIT * np.sqrt(suspect.coefficient_covariance[0, 0])
+    assert PRINT_UNIT * suspect.coefficients[0] == pytest.approx(wider, abs=3 * u + 0.02 * abs(wider))
+    off = [(one.intrinsics.vector() - cell.lens.vector())[:2] for one in (plain, fit)]
+    assert np.abs(off[1]).max() < 0.3 * np.abs(off[0]).max()
+    assert np.all(np.abs(off[1]) < 3 * np.sqrt(np.diag(fit.covariance))[:2])
+    words = "wider than high" if wider > 0 else "higher than wide"
+    assert any(words in line for line in fit.doubts.sentences())
+
+
+def test_of_a_printed_board_the_lens_is_that_of_opencv_s_calibration_that_frees_the_board() -> None:
+    """`calibrateCameraRO` (Strobl and Hirzinger 2011) needs all corners in all views, and adjusts their places."""
+    lens = make_cell(36).lens
+    sightings, random = whole_boards(lens, 20), np.random.default_rng(5)
+    described = board_points() / np.array([1.006, 1.0, 1.0])
+    seen = [replace(one, board_mm=described) for one in sightings]
+    seen = [replace(one, pixels=one.pixels + random.normal(0.0, 0.05, one.pixels.shape)) for one in seen]
+    fit = calibrate_camera(seen, (1024, 768), with_doubts=True)
+    released = cv2.calibrateCameraRO(
+        [described.astype(np.float32)] * len(seen),
+        [one.pixels.astype(np.float32) for one in seen],
+        (1024, 768), 10, np.eye(3), np.zeros(5),
+    )[1]  # fmt: skip
+    u = np.sqrt(np.diag(fit.covariance))[:2]
+    ours, theirs = fit.intrinsics.vector()[:2], np.array([released[0, 0], released[1, 1]])
+    plain = calibrate_camera(seen, (1024, 768)).intrinsics.vector()[:2]
+    assert np.all(np.abs(ours - theirs) < 3 * u + 0.3)
+    assert np.abs(plain - theirs).max() > 3 * np.abs(ours - theirs).max()
+
+
+def whole_boards(lens: TrueLens, images: int) -> list[Sighting]:
+    """Sightings in which every corner is inside the field, without noise."""
+    random, points, sightings = np.random.default_rng(4), board_points(), []
+    while len(sightings) < images:
+        board_from_camera = looking_at_board(random, points.max(axis=0)[:2], 480.0)
+        pixels = lens.see((points - board_from_camera[:3, 3]) @ board_from_camera[:3, :3])
+        if np.all((pixels > 4) & (pixels < (1020, 764))):
+            sightings.append(Sighting(f"image {len(sightings)}", np.arange(len(points)), points, pixels))
+    return sightings
 
 
 def test_a_bent_board_is_named_and_no_longer_bends_the_lens() -> None:

@@ -15,8 +15,8 @@ from coupole.calibration import optics
 from coupole.calibration.adjustment import Adjusted, Block
 from coupole.calibration.cross_validation import LeftOut, left_out
 from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
-from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, Field, suspects_of
-from coupole.calibration.model_error import ModelError, with_suspects
+from coupole.calibration.lens.suspects import BOARD, FOCUS, LENS, PRINT, PRINT_UNIT, Field, suspects_of
+from coupole.calibration.model_error import ModelError, Suspected, with_suspects
 from coupole.calibration.rotations import Floats
 
 CLEAR = 15.0
@@ -65,13 +65,28 @@ class Doubts:
             if suspect.evidence >= CLEAR:
                 pattern_px = PIXEL_SIGMA_PX * suspect.pattern
                 yield (
-                    f"{_WORDS[suspect.name]}: its pattern in the residuals is {pattern_px:.2g} px "
+                    f"{_words_of(suspect)}: its pattern in the residuals is {pattern_px:.2g} px "
                     f"(log-likelihood ratio {suspect.evidence:.0f}); values and uncertainties account for it"
                 )
         yield (
             f"views left out in turn are predicted to {self.predicted_px:.2g} px, {self.predictions.ratio:.2f} of "
             "the stated uncertainty"
         )
+
+
+def _words_of(suspect: Suspected) -> str:
+    """Name a suspect; of a print, with how far it is off."""
+    if suspect.name != PRINT:
+        return _WORDS[suspect.name]
+    percent, u_percent = (
+        100.0 * PRINT_UNIT * float(value)
+        for value in (suspect.coefficients[0], np.sqrt(suspect.coefficient_covariance[0, 0]))
+    )
+    words = "wider than high" if percent > 0.0 else "higher than wide"
+    return (
+        f"the board's squares are {abs(percent):.3f} % {words} (u {u_percent:.3f} %), sheared by "
+        f"{PRINT_UNIT * float(suspect.coefficients[1]):.5f}; measure the board, or print it on a better printer"
+    )
 
 
 def doubts_of(

@@ -1,4 +1,5 @@
-"""Suspected errors in the model of a board's images: the lens's form, the board's shape, a focus that changes.
+"""Suspected errors in the model of a board's images: the lens's form, the board's shape and its print, a focus
+that changes.
 
 Modes of the lens are polynomials over the field less the best lens of the record's own form, so that what a record
 says of its lens is the best of that form over the whole field, and its modes are the rest (orthogonal in the sense
@@ -18,7 +19,9 @@ from coupole.calibration.lens.corners import PIXEL_SIGMA_PX, Corners
 from coupole.calibration.model_error import Suspect
 from coupole.calibration.rotations import Floats
 
-LENS, BOARD, FOCUS = "lens", "board", "focus"
+LENS, BOARD, PRINT, FOCUS = "lens", "board", "print", "focus"
+PRINT_UNIT = 1e-3
+"""Unit of the print's coefficients: width over height less 1, and shear."""
 _LENS_DEGREE, _BOARD_DEGREE = 6, 3
 _GRID = 13
 
@@ -97,16 +100,28 @@ def _products(x: Floats, y: Floats, least: int, most: int) -> Floats:
 def suspects_of(
     field: Field, corners: Corners, camera_from_board: Floats, by_point: Floats, pixels: Floats
 ) -> list[Suspect]:
-    """The lens, the board and the focus as suspects. `by_point` [n, 2, 3] and `pixels` [n, 2] are those of the
-    corners computed in the camera frames `camera_from_board` [views, 4, 4]."""
+    """The lens, the board, its print and the focus as suspects. `by_point` [n, 2, 3] and `pixels` [n, 2] are those
+    of the corners computed in the camera frames `camera_from_board` [views, 4, 4]."""
     off = pixels - field.lens[2:4]
     focus = np.zeros((len(pixels), 2, len(camera_from_board)))
     focus[np.arange(len(pixels)), :, corners.view] = 2.0 * off / field.size_px[0]
     return [
         Suspect(LENS, field.modes(pixels) / PIXEL_SIGMA_PX),
         Suspect(BOARD, _of_board(corners, camera_from_board, by_point) / PIXEL_SIGMA_PX),
+        Suspect(PRINT, _of_print(corners, camera_from_board, by_point) / PIXEL_SIGMA_PX),
         Suspect(FOCUS, focus.reshape(2 * len(pixels), -1) / PIXEL_SIGMA_PX),
     ]
+
+
+def _of_print(corners: Corners, camera_from_board: Floats, by_point: Floats) -> Floats:
+    """[2 n, 2] px for a board that is wider than high, and for one that is sheared, by `PRINT_UNIT` (unequal
+    scales of printers: Strobl and Hirzinger, ICCV workshops 2011)."""
+    places_mm = corners.board_mm - corners.board_mm.mean(axis=0)
+    moves_mm = np.zeros((len(places_mm), 3, 2))
+    moves_mm[:, 0, 0], moves_mm[:, 1, 0] = 0.5 * places_mm[:, 0], -0.5 * places_mm[:, 1]
+    moves_mm[:, 0, 1] = places_mm[:, 1]
+    in_camera = camera_from_board[corners.view, :3, :3] @ (PRINT_UNIT * moves_mm)
+    return np.asarray((by_point @ in_camera).reshape(2 * len(places_mm), -1))
 
 
 def _of_board(corners: Corners, camera_from_board: Floats, by_point: Floats) -> Floats:

@@ -119,9 +119,8 @@ def _write_page(result: Path, page: Path, console: Console) -> Path:
         return page
     from coupole.exchange.look.look_of_runs import look_of_result
     from coupole.exchange.look.look_page import write_page
-    from coupole.exchange.look.residual_planes import PLANES
     from coupole.viewing.terminal import step_bars
 
     with step_bars(console) as say:
-        write_page(look_of_result(result, say, with_samples=False, planes=PLANES), "demo", page)
+        write_page(look_of_result(result, say), "demo", page)
     return page

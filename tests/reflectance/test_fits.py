@@ -14,7 +14,17 @@ from residual_cases import write_backscatter
 
 from coupole.commands import completion
 from coupole.reflectance import run_fits
-from coupole.reflectance.fits import FITS, GGX, MATERIALS, RELIT, SLICES, MaterialFit, ViewFit, fitted_together
+from coupole.reflectance.fits import (
+    FITS,
+    GGX,
+    MATERIALS,
+    RELIT,
+    SLICES,
+    TEXELS,
+    MaterialFit,
+    ViewFit,
+    fitted_together,
+)
 from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices
@@ -100,7 +110,7 @@ def test_help_and_shell_know_all_fits(tmp_path: Path) -> None:
     assert [name for name in RELIT if name not in told] == []
     assert [name for name, _ in completion.fits("")] == list(RELIT)
     assert completion.fits("ggx_r") == [("ggx_rbf", FITS["ggx_rbf"].title)]
-    assert [name for name, _ in completion.materials("")] == list(MATERIALS)
+    assert [name for name, _ in completion.materials("")] == [*MATERIALS, TEXELS]
     told = cells.here("export", "--help").out
     assert [name for name in MATERIALS if name not in told] == []
     assert GGX.name in MATERIALS

@@ -147,7 +147,7 @@ def _residuals(result: RunResult, fit: str, planes: int, about: dict[str, Any], 
 
 
 def _materials(result: RunResult, fit: str, support_from_base: Floats) -> dict[str, NDArray[Any]]:
-    """Numbers of all triangles by name, 0 of those without a material. Raises InputError if there is no such fit."""
+    """Numbers of all triangles by name, 0 of those without a material. Raises InputError for an unknown fit."""
     if fit not in MATERIALS:
         raise InputError(f"--fit: expected {', '.join((*MATERIALS, TEXELS))}; got {fit}")
     path = result.materials_path(fit)

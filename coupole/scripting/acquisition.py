@@ -8,7 +8,6 @@ kernel if the thread that began it dies (docs/decisions/0058-python-face.md).
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from typing import Any
 from coupole.acquisition.run_control import running
 from coupole.console.processes import bound_process
 from coupole.errors import DeviceError, InputError, Interrupted, error_as_told
+from coupole.intake.plain_data import read_json
 from coupole.scripting.plans import Plan
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import Event
@@ -150,8 +150,8 @@ class Acquisition(Iterator[Event]):
         if not self._output_path("figures").exists():
             return
         self._words = self._output_path("errors").read_text(errors="replace").strip()
-        document = self._output_path("figures").read_text().strip()
-        self.figures = json.loads(document) if document else {}
+        figures = self._output_path("figures")
+        self.figures = read_json(figures) if figures.stat().st_size else {}
         self._folder.cleanup()
 
     def _output_path(self, name: str) -> Path:

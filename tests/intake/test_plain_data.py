@@ -99,6 +99,8 @@ READERS = {
     "coupole/console/plans/plan_fields.py",
     "coupole/preflight/exposure_advice.py",
     "coupole/appearance/matter/paint_file.py",
+    # writes the YAML of a model
+    "coupole/scripting/plans.py",
 }
 
 

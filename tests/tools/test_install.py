@@ -40,7 +40,7 @@ def run(home: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
         (["st"], "stop status"),
         pytest.param(["export", "somewhere", "--to", "pt"], "ptm", marks=pytest.mark.full),
         pytest.param(["plan", "new", "ch"], "charuco", marks=pytest.mark.full),
-        (["acquire", "configs/plans/dem"], "configs/plans/demo.yaml"),
+        (["acquire", "configs/plans/demo."], "configs/plans/demo.yaml"),
         (["acquire", "configs/rigs/sim-ur5"], ""),
     ],
     ids=["command", "format", "template", "plan", "a rig is no plan"],

@@ -45,6 +45,33 @@ def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> Non
     assert page.browser.text("#notes li span") == "a worn <edge>"
 
 
+@pytest.mark.parametrize(
+    ("preset", "across", "up"), [("raking 0", 1.0, 0.0), ("raking 3", -0.71, 0.71), ("candle", -0.82, -0.57)]
+)
+def test_presets_light_from_where_they_say_as_the_picture_has_it(
+    page: Page, folder: Path, preset: str, across: float, up: float
+) -> None:
+    """Whatever the camera: its right is where the sum of azimuth and 90 degrees points."""
+    page.open(folder / "look.html")
+    page.small()
+    for azimuth in (-90.0, 20.0):
+        page.look(azimuth, 60.0, 150.0)
+        page.driver.execute_script(
+            "const chosen = document.getElementById('preset'); chosen.value = arguments[0];"
+            "chosen.dispatchEvent(new Event('change'))",
+            preset,
+        )
+        (light,) = page.run("coupole.state.lights")
+        x, y, z = light["direction"]
+        right = np.radians(azimuth + 90.0)
+        level = np.hypot(x, y)
+        assert (x * np.cos(right) + y * np.sin(right)) / level == pytest.approx(across, abs=0.01)
+        assert (y * np.cos(right) - x * np.sin(right)) / level == pytest.approx(up, abs=0.01)
+        assert np.degrees(np.arctan2(z, level)) == pytest.approx(12.0 if "raking" in preset else 20.0, abs=0.1)
+        assert page.run("document.getElementById('preset').value") == ""
+    assert (page.picture(1)[..., :3] > 0.0).any()
+
+
 def test_tab_reaches_every_control(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
     page.wide()

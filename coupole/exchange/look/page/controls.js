@@ -113,6 +113,9 @@ class Controls {
       this.state.adapted = input.value === "yes";
       this.changed("screen");
     });
+    byId("preset-row").hidden = this.app.about.kind === "scene" || this.isRun;
+    byId("preset").append(...Object.entries(PRESETS).map(([name, { told }]) => new Option(told, name)));
+    this.on("preset", "change", (input) => this.lightAs(PRESETS[input.value]));
     for (const name of ["azimuth", "height"]) {
       this.on(name, "input", () => {
         this.light.direction = wayOf(byId("azimuth").valueAsNumber, byId("height").valueAsNumber);
@@ -120,6 +123,14 @@ class Controls {
       });
     }
     byId("lights").addEventListener("click", (event) => this.pressed(event.target.dataset.act));
+  }
+
+  /** Put a preset's light in the place of all lights. */
+  lightAs(preset) {
+    byId("preset").value = "";
+    if (!preset) return;
+    Object.assign(this.state, { lights: [presetLight(preset, this.state.camera)], chosen: 0, sky: preset.sky });
+    this.changed("light");
   }
 
   pressed(act) {

@@ -65,6 +65,25 @@ function adaptation(xy) {
   });
 }
 
+const RAKING_DEG = 12;
+
+/** Lights that conservators ask for; `side` is in degrees from the right, as the picture has it, turning to the left. */
+const PRESETS = {
+  ...Object.fromEntries([
+    "the right", "the upper right", "above", "the upper left", "the left", "the lower left", "below", "the lower right",
+  ].map((from, number) => [`raking ${number}`, {
+    told: `Raking from ${from}`, side: 45 * number, height: RAKING_DEG, strength: 4, softness: 0.5, kelvin: NEUTRAL_KELVIN, sky: 0,
+  }])),
+  day: { told: "Day, under a bright sky", side: 120, height: 45, strength: 0.5, softness: 15, kelvin: NEUTRAL_KELVIN, sky: 0.8 },
+  candle: { told: "Candle, from the lower left", side: 215, height: 20, strength: 2, softness: 3, kelvin: 2000, sky: 0 },
+};
+
+/** The one light of a preset, for a camera. */
+function presetLight({ side, height, strength, softness, kelvin }, camera) {
+  const direction = wayOf(camera.azimuth + 90 + side, height);
+  return { ...startLight(), direction, strength, softness, kelvin };
+}
+
 /** Irradiance by channel of a light on what faces it, `whole` for strength 1 and neutral colour. */
 function irradiance(light, whole) {
   const colour = [1, 3, 5].map((at) => toLinear(parseInt(light.colour.slice(at, at + 2), 16) / 255));

@@ -96,15 +96,16 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-TOGETHER = "tests/exchange/page/"
-"""A folder whose tests share a browser: one worker has them all."""
+TOGETHER = ("tests/exchange/page/", "tests/reflectance/test_picture", "tests/runs/test_texel")
+"""Beginnings of the names of tests that share a browser, or a result: one worker has them all."""
 
 
 class _Scopes(LoadScopeScheduling):
     """Modules and classes, each for one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return TOGETHER if nodeid.startswith(TOGETHER) else super()._split_scope(nodeid)
+        shared_scope = next((begin for begin in TOGETHER if nodeid.startswith(begin)), None)
+        return shared_scope or super()._split_scope(nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -86,10 +86,11 @@ def _make(folder: Path, plan_name: str, console: Console) -> Demo:
 def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
     """The plan's run, complete."""
     from coupole.acquisition.session import acquire_plan
+    from coupole.plan.shipped_files import shipped_folder
     from coupole.preflight.job import read_job
     from coupole.storage.run_status import is_complete, newest_run
 
-    job = read_job(Path(plan_name))
+    job = read_job(shipped_folder() / "plans" / f"{plan_name}.yaml")  # never a file of that name that lies here
     run = newest_run(parent, plan_name, job.document.path, console.print)
     if run is not None and is_complete(run):
         return run

@@ -11,7 +11,7 @@ from places import REPO
 
 from coupole.errors import InputError
 from coupole.exchange.atlas.atlas_layout import PADDING_PX, Atlas, lay_out
-from coupole.exchange.atlas.charts import chart_axes, cut_charts, face_normals, neighbours_of
+from coupole.exchange.atlas.charts import chart_axes, cut_charts, double_areas, neighbours_of, unit
 from coupole.exchange.atlas.open_sky import open_sky
 
 
@@ -78,7 +78,7 @@ def test_charts_are_faced_and_hang_together(mesh: trimesh.Trimesh) -> None:
     corners_mm, neighbours = np.asarray(mesh.triangles), neighbours_of(np.asarray(mesh.faces))
     chart = cut_charts(corners_mm, neighbours)
     assert (chart >= 0).all()
-    facing = np.einsum("nk,nk->n", face_normals(corners_mm), chart_axes(corners_mm, chart)[chart])
+    facing = np.einsum("nk,nk->n", unit(double_areas(corners_mm)), chart_axes(corners_mm, chart)[chart])
     assert (facing > 0.0).mean() > 0.999
     within = [(a, b) for a, three in enumerate(neighbours) for b in three if b >= 0 and chart[a] == chart[b]]
     parts = trimesh.graph.connected_components(np.array(within), nodes=np.arange(len(chart)))
@@ -123,6 +123,19 @@ def test_what_is_too_large_says_what_would_do() -> None:
     enough = re.search(r"give --texel-mm ([0-9.]+)", str(refused.value))
     assert enough is not None
     assert lay_out(np.asarray(ball.triangles), np.asarray(ball.faces), float(enough[1]), 2048).side_px <= 2048
+
+
+def test_texels_become_coarser_until_a_map_is_as_small_as_asked() -> None:
+    """And a map in which not even padding has room says how large it has to be."""
+    relief = MESHES["relief"]
+    corners_mm, triangles = np.asarray(relief.triangles), np.asarray(relief.faces)
+    small = lay_out(corners_mm, triangles, 0.01, 1024, may_be_coarser=True)
+    assert 900 < small.side_px <= 1024
+    assert small.texel_mm > 0.05
+    with pytest.raises(InputError, match=r"charts need a map (\d+) px wide; give --map-px \1") as refused:
+        lay_out(corners_mm, triangles, 0.5, 64, may_be_coarser=True)
+    enough = int(str(refused.value).rpartition(" ")[2])
+    assert lay_out(corners_mm, triangles, 0.5, enough, may_be_coarser=True).side_px <= enough
 
 
 def test_the_open_sky_of_a_corner_and_of_a_groove() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cells
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -87,3 +89,29 @@ def write_case(folder: Path, *, seed: int = 0) -> Case:
         cv2.imwrite(str(folder / f"{number:03}.png"), values[..., ::-1])
     np.savetxt(folder / "light_directions.txt", directions)
     return Case(folder, directions, normals, pictures)
+
+
+LEFT_OUT = [3, 12, 21, 30]
+Made = tuple[Case, Path, dict[str, Any]]
+"""A case, the folder of its result, and what `--json` said."""
+
+
+def made_result(folder: Path) -> Made:
+    """Write a case's pictures, and make its result without the lights `LEFT_OUT`."""
+    case = write_case(folder / "pictures")
+    out = folder / "result"
+    ended = cells.here(
+        "reflectance", *case.arguments(), "--leave-out", ",".join(map(str, LEFT_OUT)), "--out", out, "--json"
+    )
+    assert ended.code == 0, ended.err
+    return case, out, ended.document
+
+
+def interval_of(out: Path, direction: np.ndarray, folder: Path, *more: str | Path) -> tuple[np.ndarray, ...]:
+    """Return the picture of a light, and the bounds of its interval."""
+    way = ",".join(map(str, direction))
+    low, high = folder / "low.npy", folder / "high.npy"
+    options = (f"--direction={way}", "--to", folder / "a.npy", "--interval", f"{low},{high}", *more)
+    ended = cells.here("reflectance", "relight", out, *options)
+    assert ended.code == 0, ended.err
+    return np.load(folder / "a.npy"), np.load(low), np.load(high)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
+import h5py
 import numpy as np
 import trimesh
 from cells import CellFolder
@@ -90,3 +91,13 @@ def detailed_result(folder: Path) -> Made:
     )
     assert ended.code == 0, ended.err
     return cell, out, ended.document
+
+
+def frame_share(cell: CellFolder, view: str, led: int) -> np.ndarray:
+    """[h, w] the frame of an LED, in shares of the camera's range."""
+    with h5py.File(cell.run_folder / f"views/{view}.h5") as file:
+        number = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == led)[0])
+        raw = file["entry/instrument/detector/data"][number].astype(float)
+    with h5py.File(RECORDS / "flat-field.h5") as file:
+        share: np.ndarray = (raw - cells.BLACK_DN) / (4095 - cells.BLACK_DN) / file["g"][()]
+    return share

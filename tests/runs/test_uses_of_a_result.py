@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from arms import KR10_R1100_SIXX
 from lazily import lazily
-from relief_cells import DIFFUSE, RECORDS, Made, glossy_result, unit, walter
+from relief_cells import DIFFUSE, RECORDS, Made, frame_share, glossy_result, unit, walter
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
@@ -42,11 +42,7 @@ def test_under_an_led_kept_for_the_check_a_view_looks_as_it_was_photographed(mad
     """In shares of the camera's range, pixel by pixel of the frame itself."""
     cell, out, document = made
     led, to = document["left_out"][1], out / "led.npy"
-    with h5py.File(cell.run_folder / f"views/{view}.h5") as file:
-        number = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == led)[0])
-        raw = file["entry/instrument/detector/data"][number].astype(float)
-    with h5py.File(RECORDS / "flat-field.h5") as file:
-        share = (raw - cells.BLACK_DN) / (4095 - cells.BLACK_DN) / file["g"][()]
+    share = frame_share(cell, view, led)
     for fit in ("ggx_normal", "ggx_rbf"):
         options = ("--led", led, "--view", view, "--fit", fit, "--to", to)
         ended = cells.here("reflectance", "relight", out, *map(str, options))
@@ -64,11 +60,7 @@ def test_under_an_led_kept_for_the_check_a_view_looks_as_it_was_photographed(mad
 def test_an_interval_holds_the_frame_of_an_led_kept_for_the_check(made: Made, tmp_path: Path, view: str) -> None:
     cell, out, document = made
     led, low, high = document["left_out"][1], tmp_path / "low.npy", tmp_path / "high.npy"
-    with h5py.File(cell.run_folder / f"views/{view}.h5") as file:
-        number = int(np.flatnonzero(file["entry/instrument/detector/frames"]["led"] == led)[0])
-        raw = file["entry/instrument/detector/data"][number].astype(float)
-    with h5py.File(RECORDS / "flat-field.h5") as file:
-        share = (raw - cells.BLACK_DN) / (4095 - cells.BLACK_DN) / file["g"][()]
+    share = frame_share(cell, view, led)
     options = ("--led", led, "--view", view, "--fit", "ggx_normal", "--to", tmp_path / "a.npy")
     bounds = ("--interval", f"{low},{high}", "--uncertainty", tmp_path / "u.npy")
     ended = cells.here("reflectance", "relight", out, *map(str, options), *bounds)

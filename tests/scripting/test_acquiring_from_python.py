@@ -18,6 +18,15 @@ from cells import CellFolder
 import coupole
 from sim.world.client import World
 
+LIGHTING = """
+import sys, time, coupole
+with coupole.open_cell(sys.argv[1]) as cell:
+    cell.ledbox.panel(1, on=True)
+    print("lit", flush=True)
+    while True:
+        cell.ledbox.self_test()
+        time.sleep(0.05)
+"""
 SCRIPT = """
 import sys, coupole
 for event in coupole.acquire(sys.argv[1]):
@@ -198,3 +207,32 @@ def test_devices_of_a_cell_are_off_when_the_context_ends(standing: tuple[CellFol
     with pytest.raises(ZeroDivisionError):
         use()
     assert cells.safe(world)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_script_with_devices_that_freezes_or_dies_leaves_no_lamp_on(
+    standing: tuple[CellFolder, World], number: signal.Signals
+) -> None:
+    """By the box's own watchdog: nobody else is left."""
+    cell, world = standing
+    command = [sys.executable, "-c", LIGHTING, str(cell.rig)]
+    script = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    with script:
+        try:
+            assert script.stdout is not None
+            assert script.stdout.readline().strip() == "lit"
+            assert world.ask("state")["panels"]
+            os.kill(script.pid, number)
+            cells.wait_until(lambda: not world.ask("state")["panels"], "dark panels")
+        finally:
+            script.kill()
+    assert cells.safe(world)
+
+
+def test_a_real_cell_opens_only_with_the_word_that_its_support_is_empty() -> None:
+    real = coupole.open_cell("la-coupole")
+    with pytest.raises(coupole.errors.InputError, match="support_is_empty=True"), real:
+        pass
+    with_the_word = coupole.open_cell("la-coupole", support_is_empty=True)
+    with pytest.raises(coupole.errors.PreflightRefused, match="commission"), with_the_word:
+        pass

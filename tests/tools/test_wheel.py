@@ -82,7 +82,10 @@ def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 
 
 def test_the_demo_ends_with_a_page(installed: Installed) -> None:
+    """Whatever lies here under its plan's name: that could be the plan of a real cell, and nobody is asked."""
+    (installed.folder / "demo-short").write_text("name: another plan")
     ended = installed.run("coupole", "demo", "coupole-demo", "--short", "--json")
+    (installed.folder / "demo-short").unlink()
     assert ended.returncode == 0, ended.stderr
     document = json.loads(ended.stdout)
     page, run = Path(document["page"]), Path(document["run"])

@@ -48,17 +48,23 @@ class Atlas:
         return self.places_mm(np.broadcast_to(np.eye(3), (len(self.chart), 3, 3)), texels)
 
 
-def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], texel_mm: float, most_side_px: int) -> Atlas:
+def lay_out(
+    corners_mm: Floats,
+    triangles: NDArray[np.integer],
+    texel_mm: float,
+    most_side_px: int,
+    *,
+    may_be_coarser: bool = False,
+) -> Atlas:
     """Lay out triangles [n, 3, 3], whose corners are rows of vertices [n, 3]. No two places of the surface share a
-    texel. Raises InputError if the texture would be wider than `most_side_px`."""
+    texel. With `may_be_coarser` texels become larger until the texture is no wider than `most_side_px`.
+
+    Raises InputError if the texture would be wider.
+    """
     neighbours = neighbours_of(triangles)
     chart = cut_charts(corners_mm, neighbours)
     for round_number in range(_MOST_ROUNDS):
-        flat_px, sizes_px = _flatten(corners_mm, chart, texel_mm)
-        side_px, origins_px = _pack(sizes_px)
-        if side_px > most_side_px:
-            raise InputError(_too_large(texel_mm, side_px, most_side_px))
-        corners_px = flat_px + origins_px[chart][:, None, :]
+        texel_mm, corners_px, side_px = _pack_charts(corners_mm, chart, texel_mm, most_side_px, may_be_coarser)
         triangle_of_texel = np.full((side_px, side_px), -1, np.int32)
         is_expelled = np.zeros(len(chart), np.bool_)
         _rasterise(corners_px, triangle_of_texel, is_expelled)
@@ -69,8 +75,25 @@ def lay_out(corners_mm: Floats, triangles: NDArray[np.integer], texel_mm: float,
     return Atlas(side_px, texel_mm, chart, corners_px, _pad(triangle_of_texel), is_inside)
 
 
+def _pack_charts(
+    corners_mm: Floats, chart: Integers, texel_mm: float, most_side_px: int, may_be_coarser: bool
+) -> tuple[float, Floats, int]:
+    """Width of a texel, mm, places of the corners [n, 3, 2], px, and side of the texture, px."""
+    coarsest_mm = float(np.ptp(corners_mm.reshape(-1, 3), axis=0).max())
+    while True:
+        flat_px, sizes_px = _flatten(corners_mm, chart, texel_mm)
+        side_px, origins_px = _pack(sizes_px)
+        if side_px <= most_side_px:
+            return texel_mm, flat_px + origins_px[chart][:, None, :], side_px
+        if not may_be_coarser:
+            raise InputError(_too_large(texel_mm, side_px, most_side_px))
+        if texel_mm > coarsest_mm:
+            raise InputError(f"{len(sizes_px):,} charts need a map {side_px:,} px wide; give --map-px {side_px}")
+        texel_mm *= 1.02 * side_px / most_side_px
+
+
 def _too_large(texel_mm: float, side_px: int, most_side_px: int) -> str:
-    enough_mm = texel_mm * side_px / most_side_px * 1.01
+    enough_mm = texel_mm * side_px / most_side_px * 1.05
     return (
         f"texels of {texel_mm:.3g} mm need a texture {side_px:,} px wide, and {most_side_px:,} is the most; "
         f"give --texel-mm {enough_mm:.2g} or more"
@@ -162,16 +185,21 @@ def _rasterise(corners_px, triangle_of_texel, is_expelled):  # type: ignore[no-u
 
 def _pad(triangle_of_texel: Integers) -> Integers:
     """The same with the nearest triangle in the texels around charts."""
-    is_outside = (triangle_of_texel < 0).astype(np.uint8)
-    if is_outside.all() or not is_outside.any():
-        return triangle_of_texel
-    distance, label = cv2.distanceTransformWithLabels(
-        is_outside, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    nearest, distance_px = nearest_known(triangle_of_texel)
+    return np.where(distance_px <= PADDING_PX, nearest, -1).astype(np.int32)
+
+
+def nearest_known(numbers: Integers) -> tuple[Integers, NDArray[np.float32]]:
+    """[h, w] the number of the nearest place of a map that has one (others are -1), and how far it is, px."""
+    is_unknown = (numbers < 0).astype(np.uint8)
+    if is_unknown.all() or not is_unknown.any():
+        return numbers, np.zeros(numbers.shape, np.float32)
+    distance_px, label = cv2.distanceTransformWithLabels(
+        is_unknown, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     of_label = np.full(int(label.max()) + 1, -1, np.int32)
-    inside = is_outside == 0
-    of_label[label[inside]] = triangle_of_texel[inside]
-    return np.where(distance <= PADDING_PX, of_label[label], -1).astype(np.int32)
+    of_label[label[is_unknown == 0]] = numbers[is_unknown == 0]
+    return of_label[label], distance_px
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=False)

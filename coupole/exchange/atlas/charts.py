@@ -46,15 +46,20 @@ def neighbours_of(triangles: NDArray[np.integer]) -> Integers:
     return beyond.reshape(count, 3)
 
 
-def face_normals(corners_mm: Floats) -> Floats:
-    """[n, 3] unit normals of triangles [n, 3, 3]; 0 for those without an area."""
-    return _unit(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
+def double_areas(corners_mm: Floats) -> Floats:
+    """[n, 3] normals of triangles [n, 3, 3], twice as long as these have area."""
+    return np.asarray(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
+
+
+def unit(vectors: NDArray[np.floating]) -> Floats:
+    """[..., 3] the same of length 1; 0 of those without a length."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
 
 
 def cut_charts(corners_mm: Floats, neighbours: Integers) -> Integers:
     """[n] the chart of each triangle [n, 3, 3], from 0. Charts are round, as rectangles around them are to be
     full: they grow one by one, and then `_ROUNDINGS` times all together from their middles (Lloyd, 1982)."""
-    normals, means = face_normals(corners_mm), _mean_normals(corners_mm, neighbours)
+    normals, means = unit(double_areas(corners_mm)), _mean_normals(corners_mm, neighbours)
     most = max(int(_MOST_SHARE * len(normals)), _LEAST_TRIANGLES)
     no_seeds = np.empty(0, np.int64)
     chart, axes = _grow(normals, means, neighbours, no_seeds, most)
@@ -77,9 +82,8 @@ def _middles(corners_mm: Floats, chart: Integers) -> NDArray[np.int64]:
 
 def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
     """[charts, 3] unit directions: the mean of each chart's triangles, by area."""
-    areas = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    sums = [np.bincount(chart, column) for column in areas.T]
-    return _unit(np.stack(sums, axis=1))
+    sums = [np.bincount(chart, column) for column in double_areas(corners_mm).T]
+    return unit(np.stack(sums, axis=1))
 
 
 def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
@@ -89,17 +93,13 @@ def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.boo
     return parts
 
 
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
-
-
 def _mean_normals(corners_mm: Floats, neighbours: Integers) -> Floats:
-    sums = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    sums = double_areas(corners_mm)
     has_neighbour = (neighbours >= 0)[..., None]
     for _ in range(_ROUNDS):
         sums = sums + np.where(has_neighbour, sums[neighbours], 0.0).sum(axis=1)
         sums /= max(float(np.abs(sums).max(initial=0.0)), 1e-300)
-    return _unit(sums)
+    return unit(sums)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -12,12 +12,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.atlas_layout import Atlas, lay_out
+from coupole.exchange.atlas.atlas_layout import Atlas, lay_out, nearest_known
+from coupole.exchange.atlas.charts import double_areas, unit
 from coupole.exchange.atlas.open_sky import open_sky
 from coupole.exchange.material_values import UNCERTAIN, red_green_blue
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
@@ -104,15 +104,15 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
     corners_mm = surface.vertices_mm[surface.triangles[rows]]
     options = surface.options
     options.say("charts", 0, 1)
-    atlas = _lay_out(
+    atlas = lay_out(
         corners_mm,
         surface.triangles[rows],
-        options.texel_mm,
+        options.texel_mm or _finest_mm(views, corners_mm),
         options.map_px or MOST_SIDE_PX,
-        _finest_mm(views, corners_mm),
+        may_be_coarser=options.texel_mm is None,
     )
     options.say("charts", 1, 1)
-    return _fill(surface, rows, atlas, views)
+    return _fill(surface, rows, atlas, _Known(surface, views, rows, corners_mm))
 
 
 def _rows_to_show(surface: MeasuredSurface, views: list[TexelView]) -> NDArray[np.int64]:
@@ -159,30 +159,12 @@ def _finest_mm(views: list[TexelView], corners_mm: Floats) -> float:
     return float(np.median(np.linalg.norm(corners_mm[:, 1] - corners_mm[:, 0], axis=1))) / 2.0
 
 
-def _lay_out(
-    corners_mm: Floats, triangles: NDArray[np.int64], asked_mm: float | None, most_px: int, finest_mm: float
-) -> Atlas:
-    if asked_mm is not None:
-        return lay_out(corners_mm, triangles, asked_mm, most_px)
-    area_mm2 = float(np.linalg.norm(_areas(corners_mm), axis=1).sum()) / 2.0
-    texel_mm = max(finest_mm, np.sqrt(area_mm2) / most_px)
-    while True:
-        atlas = lay_out(corners_mm, triangles, texel_mm, MOST_SIDE_PX)
-        if atlas.side_px <= most_px:
-            return atlas
-        texel_mm *= 1.02 * atlas.side_px / most_px
-
-
-def _areas(corners_mm: Floats) -> Floats:
-    return np.asarray(np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]))
-
-
-def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, views: list[TexelView]) -> FlatSurface:
+def _fill(surface: MeasuredSurface, rows: NDArray[np.int64], atlas: Atlas, known: _Known) -> FlatSurface:
     texels = np.flatnonzero(atlas.triangle_of_texel.reshape(-1) >= 0)
     values = _Values.empty(len(texels))
     for first in range(0, len(texels), _BLOCK):
         part = slice(first, min(first + _BLOCK, len(texels)))
-        _look_up(surface, rows, atlas, views, texels[part], values.rows(part))
+        known.look_up(atlas, texels[part], values.rows(part))
         surface.options.say("texels", part.stop, len(texels))
     is_known = values.alpha > 0.0
     if not is_known.any():
@@ -220,41 +202,42 @@ class _Values:
         return _Values(*(values[part] for values in vars(self).values()))
 
 
-def _look_up(
-    surface: MeasuredSurface,
-    rows: NDArray[np.int64],
-    atlas: Atlas,
-    views: list[TexelView],
-    texels: NDArray[np.int64],
-    values: _Values,
-) -> None:
-    """Fill what is known of texels: from the views' pixels, or else from their triangles."""
-    triangle = rows[atlas.triangle_of_texel.reshape(-1)[texels]]
-    has_material = _has_certain_material(surface)[triangle] if views else surface.has_material[triangle]
-    of_triangles = triangle[has_material]
-    values.normals[has_material] = surface.normals[of_triangles]
-    values.kd[has_material], values.ks[has_material] = surface.kd[of_triangles], surface.ks[of_triangles]
-    values.alpha[has_material] = surface.alpha[of_triangles]
-    for column, name in enumerate(UNCERTAIN):
-        values.uncertain[has_material, column] = surface.uncertain[name][of_triangles]
-    if views:
-        corners_mm = surface.vertices_mm[surface.triangles[rows]]
-        _look_up_views(surface, views, atlas.places_mm(corners_mm, texels), values)
+class _Known:
+    """What is known of places on a surface's triangles `rows` [n], whose corners are `corners_mm` [n, 3, 3]."""
 
+    def __init__(
+        self, surface: MeasuredSurface, views: list[TexelView], rows: NDArray[np.int64], corners_mm: Floats
+    ) -> None:
+        self._surface, self._views, self._rows, self._corners_mm = surface, views, rows, corners_mm
+        self._has_material = _has_certain_material(surface) if views else surface.has_material
 
-def _look_up_views(surface: MeasuredSurface, views: list[TexelView], places_mm: Floats, values: _Values) -> None:
-    """Fill what views are certain of at places [k, 3]."""
-    gathered_there, is_certain = _seen_there(surface, views, places_mm)
-    materials = gathered_there.materials
-    values.is_measured[:] = is_certain
-    values.normals[is_certain] = materials.normals[is_certain] @ surface.result.base_from_support[:3, :3]
-    values.kd[is_certain] = red_green_blue(materials.kd)[is_certain]
-    values.ks[is_certain] = red_green_blue(materials.ks)[is_certain]
-    values.alpha[is_certain] = materials.alpha[is_certain]
-    first, second, kd, ks, alpha = gathered_there.covariance[is_certain][:, VARIANCES].T
-    common = np.mean([view.u_common**2 for view in views])
-    columns = (np.sqrt(kd + common), np.sqrt(ks + common), np.sqrt(first + second), np.sqrt(alpha))
-    values.uncertain[is_certain] = np.stack(columns, axis=1)
+    def look_up(self, atlas: Atlas, texels: NDArray[np.int64], values: _Values) -> None:
+        """Fill the values of texels: from the views' pixels, or else from their triangles."""
+        surface, triangle = self._surface, self._rows[atlas.triangle_of_texel.reshape(-1)[texels]]
+        has_material = self._has_material[triangle]
+        of_triangles = triangle[has_material]
+        values.normals[has_material] = surface.normals[of_triangles]
+        values.kd[has_material], values.ks[has_material] = surface.kd[of_triangles], surface.ks[of_triangles]
+        values.alpha[has_material] = surface.alpha[of_triangles]
+        for column, name in enumerate(UNCERTAIN):
+            values.uncertain[has_material, column] = surface.uncertain[name][of_triangles]
+        if self._views:
+            self._look_up_views(atlas.places_mm(self._corners_mm, texels), values)
+
+    def _look_up_views(self, places_mm: Floats, values: _Values) -> None:
+        """Fill what views are certain of at places [k, 3]."""
+        gathered_there, is_certain = _seen_there(self._surface, self._views, places_mm)
+        materials = gathered_there.materials
+        values.is_measured[:] = is_certain
+        support_from_base = self._surface.result.base_from_support[:3, :3].T
+        values.normals[is_certain] = materials.normals[is_certain] @ support_from_base.T
+        values.kd[is_certain] = red_green_blue(materials.kd)[is_certain]
+        values.ks[is_certain] = red_green_blue(materials.ks)[is_certain]
+        values.alpha[is_certain] = materials.alpha[is_certain]
+        first, second, kd, ks, alpha = gathered_there.covariance[is_certain][:, VARIANCES].T
+        common = np.mean([view.u_common**2 for view in self._views])
+        columns = (np.sqrt(kd + common), np.sqrt(ks + common), np.sqrt(first + second), np.sqrt(alpha))
+        values.uncertain[is_certain] = np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
@@ -288,10 +271,10 @@ def _mesh(
 
 def _vertex_normals(surface: MeasuredSurface) -> Floats:
     """[vertices, 3] means of the triangles around, by area."""
-    areas = _areas(surface.vertices_mm[surface.triangles])
+    areas = double_areas(surface.vertices_mm[surface.triangles])
     count = len(surface.vertices_mm)
     sums = [np.bincount(surface.triangles.reshape(-1), np.repeat(column, 3), count) for column in areas.T]
-    return _unit(np.stack(sums, axis=1))
+    return unit(np.stack(sums, axis=1))
 
 
 def _tangents(corners_mm: Floats, corners_px: Floats, corners: NDArray[np.int64], normals: Floats) -> Floats:
@@ -300,14 +283,14 @@ def _tangents(corners_mm: Floats, corners_px: Floats, corners: NDArray[np.int64]
     ab_mm, ac_mm = corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0]
     ab_px, ac_px = corners_px[:, 1] - corners_px[:, 0], corners_px[:, 2] - corners_px[:, 0]
     turn = np.sign(ab_px[:, 0] * ac_px[:, 1] - ab_px[:, 1] * ac_px[:, 0])
-    ways = _unit(turn[:, None] * (ab_mm * ac_px[:, 1:] - ac_mm * ab_px[:, 1:]))
+    ways = unit(turn[:, None] * (ab_mm * ac_px[:, 1:] - ac_mm * ab_px[:, 1:]))
     sums = [np.bincount(corners.reshape(-1), np.repeat(column, 3), len(normals)) for column in ways.T]
     means = np.stack(sums, axis=1)
     across = means - np.einsum("vk,vk->v", means, normals)[:, None] * normals
     is_lost = np.linalg.norm(across, axis=1) < 1e-6
     helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     across[is_lost] = np.cross(normals, helper)[is_lost]
-    return _unit(across)
+    return unit(across)
 
 
 def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Singles) -> tuple[Singles, Singles]:
@@ -319,12 +302,12 @@ def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Si
         weights = np.clip(atlas.barycentric(texels[part]), 0.0, 1.0)
         weights /= weights.sum(axis=1, keepdims=True)
         corners = mesh.corners[atlas.triangle_of_texel.reshape(-1)[texels[part]]]
-        outward = _unit(np.einsum("kc,kcx->kx", weights, mesh.flat.normals[corners]))
-        along = _unit(np.einsum("kc,kcx->kx", weights, mesh.flat.tangents[corners]))
+        outward = unit(np.einsum("kc,kcx->kx", weights, mesh.flat.normals[corners]))
+        along = unit(np.einsum("kc,kcx->kx", weights, mesh.flat.tangents[corners]))
         frames = np.stack([along, np.cross(outward, along), outward], axis=2)
         components = np.linalg.solve(frames, normals[part].astype(np.float64)[..., None])[..., 0]
         components[:, 2] = np.maximum(components[:, 2], 0.0)
-        local[part] = _unit(components)
+        local[part] = unit(components)
         sky[part] = np.einsum("kc,kc->k", weights, mesh.flat.open_sky[corners])
     return local, sky
 
@@ -334,14 +317,5 @@ def _nearest(atlas: Atlas, known_texels: NDArray[np.int64]) -> NDArray[np.int32]
     number = np.full(atlas.side_px**2, -1, np.int32)
     number[known_texels] = np.arange(len(known_texels), dtype=np.int32)
     picture = number.reshape(atlas.side_px, atlas.side_px)
-    is_unknown = (picture < 0).astype(np.uint8)
-    _, label = cv2.distanceTransformWithLabels(
-        is_unknown, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.full(int(label.max()) + 1, -1, np.int32)
-    of_label[label[is_unknown == 0]] = picture[is_unknown == 0]
-    return np.where(atlas.triangle_of_texel >= 0, of_label[label], -1).astype(np.int32)
-
-
-def _unit(vectors: NDArray[np.floating]) -> Floats:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
+    nearest, _ = nearest_known(picture)
+    return np.where(atlas.triangle_of_texel >= 0, nearest, -1).astype(np.int32)

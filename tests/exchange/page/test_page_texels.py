@@ -65,6 +65,7 @@ def test_texels_look_as_the_command_relight_shows_them(page: Page, detailed: Pat
     page.run(f"coupole.setLight({', '.join(map(str, LIGHT))})")
     mine = page.picture(1)[..., :3]
     assert "(texels)" in page.browser.text("#banner")
+    assert not page.driver.find_elements("css selector", "#mode option[value=residual]")  # it is of triangles
     light = [DistantLight(towards=LIGHT)]
     theirs = scene_from(RunResult(detailed / "result"), camera, TEXELS).picture(light)
     plain = scene_from(RunResult(detailed / "result"), camera, "ggx").picture(light)

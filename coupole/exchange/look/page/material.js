@@ -27,7 +27,7 @@ function materialOf(arrays, triangle) {
   const codes = [0, 1, 2, 3].map((k) => uncertaintyOf(arrays.uncertainty[4 * triangle + k]));
   return {
     normal: normalOf(arrays, triangle), kd: three(arrays.kd), ks: three(arrays.ks), alpha,
-    residual: half(arrays.gloss[2 * triangle + 1]),
+    residual: ABOUT.texels ? null : half(arrays.gloss[2 * triangle + 1]),
     uncertainty: { kd: codes[0], ks: codes[1], normal: codes[2], roughness: codes[3] },
   };
 }

@@ -60,6 +60,7 @@ function toldOf(triangle, place, material, view) {
     ${row("Highlight ks", three(material.ks), percent(ks))}
     ${row("Roughness α", material.alpha.toPrecision(3), percent(roughness))}
     ${row("Normal", material.normal.map((value) => value.toFixed(3)).join(", "), angle)}
-    <tr><th scope="row">Fit misses</th><td colspan="2">${percent(material.residual)} of √kd</td></tr>
+    ${material.residual === null ? "" : `<tr><th scope="row">Fit misses</th><td colspan="2">${
+      percent(material.residual)} of √kd</td></tr>`}
     </tbody></table>`;
 }

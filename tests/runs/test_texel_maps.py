@@ -1,0 +1,139 @@
+"""Maps of texels in other formats: for their own checkers, and for a renderer with tangents of its own."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cells
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import trimesh
+from checkers import gltf_messages, needs_checkers
+from lazily import lazily
+from maps_in_mitsuba import ExportedMaps
+from relief_cells import Made
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from coupole.exchange.srgb import srgb
+from coupole.reflectance.fits import TEXELS
+from coupole.reflectance.new_light.light_kinds import DistantLight
+from coupole.reflectance.new_light.pictured_surface import FreeCamera
+from coupole.reflectance.run_relighting import scene_from
+from coupole.reflectance.run_result import RunResult
+
+MaterialX: Any = lazily("MaterialX")
+Usd: Any = lazily("pxr.Usd")
+UsdGeom: Any = lazily("pxr.UsdGeom")
+UsdValidation: Any = lazily("pxr.UsdValidation")
+
+
+def exported(made: Made, to: str, folder: Path, *options: str) -> Path:
+    ended = cells.here("export", made[1], "--to", to, "--out", folder, *options, "--json")
+    assert ended.code == 0, ended.err
+    return folder
+
+
+def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(detailed: Made, tmp_path: Path) -> None:
+    """Under five lights, in CIEDE2000, where both show something lit, which they do nearly everywhere; with the
+    map's green turned round, they do not."""
+    maps = ExportedMaps.read(exported(detailed, "obj", tmp_path / "obj"))
+    camera = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
+    scene = scene_from(RunResult(detailed[1]), replace(camera, size_px=(480, 360)), TEXELS)
+
+    def difference(theirs: np.ndarray, ours: np.ndarray) -> float:
+        known, shared = (ours > 0.0).any(axis=2), (theirs > 0.0).any(axis=2)
+        assert (known & ~shared).sum() < 0.05 * known.sum()
+        known &= shared
+        white = np.percentile(ours[known], 99)
+        colours = [rgb2lab(srgb(np.clip(picture / white, 0.0, 1.0))) for picture in (ours, theirs)]
+        return float(np.mean(deltaE_ciede2000(*colours)[known]))
+
+    found = []
+    for towards in ((-1.0, 0.0, 0.5), (1.0, 0.3, 0.7), (0.0, 1.0, 0.6), (0.2, -1.0, 1.0), (0.0, 0.1, 1.0)):
+        way = np.array(towards) / np.linalg.norm(towards)
+        ours = scene.picture([DistantLight(towards=towards)]).reshape(180, 2, 240, 2, 3).mean(axis=(1, 3))
+        found.append(difference(maps.render(camera, way, 16), ours))
+    assert np.mean(found) < 1.5, found
+    turned = replace(maps, normal=maps.normal * [1.0, -1.0, 1.0] + [0.0, 1.0, 0.0])
+    assert difference(turned.render(camera, way, 16), ours) > 1.5 * found[-1]
+
+
+@needs_checkers
+def test_gltf_with_maps_is_valid_and_has_them(detailed: Made, tmp_path: Path) -> None:
+    path = exported(detailed, "gltf", tmp_path / "gltf") / "surface.glb"
+    assert gltf_messages(path) == []
+    (mesh,) = trimesh.load(path).geometry.values()
+    material = mesh.visual.material
+    size = material.baseColorTexture.size
+    assert size == material.normalTexture.size == material.metallicRoughnessTexture.size
+    assert min(size) > 300
+    normals = np.asarray(material.normalTexture, float)[..., :3] / 127.5 - 1.0
+    tilt_deg = np.degrees(np.arccos(np.clip(normals[..., 2], -1.0, 1.0)))
+    assert 2.0 < np.percentile(tilt_deg[tilt_deg > 0.7], 50) < 12.0  # bumps of 6 degrees, and triangles of 1 mm
+
+
+def test_usd_with_maps_is_valid_to_its_own_validators(detailed: Made, tmp_path: Path) -> None:
+    path = exported(detailed, "usd", tmp_path / "usd") / "surface.usdz"
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    stage = Usd.Stage.Open(str(path))
+    assert [found.GetMessage() for found in context.Validate(stage)] == []
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/measured/surface"))
+    with zipfile.ZipFile(path) as archive:
+        assert {Path(name).name for name in archive.namelist()} == {
+            "surface.usdc", "base_color.png", "specular.png", "roughness.png", "occlusion.png", "normal.png",
+        }  # fmt: skip
+    width_mm = 1e3 * np.ptp(np.asarray(mesh.GetPointsAttr().Get()), axis=0)
+    assert 20.0 < width_mm[0] < 120.0
+    assert "simulated" in stage.GetRootLayer().comment
+    broken = Usd.Stage.CreateInMemory()
+    UsdGeom.Mesh.Define(broken, "/surface")
+    assert context.Validate(broken)
+
+
+def test_materialx_with_maps_is_valid(detailed: Made, tmp_path: Path) -> None:
+    folder = exported(detailed, "materialx", tmp_path / "materialx")
+    library, document = MaterialX.createDocument(), MaterialX.createDocument()
+    MaterialX.loadLibraries(
+        MaterialX.getDefaultDataLibraryFolders(), MaterialX.getDefaultDataSearchPath(), library
+    )
+    document.setDataLibrary(library)
+    MaterialX.readFromXmlFile(document, str(folder / "surface.mtlx"))
+    assert document.validate() == (True, "")
+    pixels = OpenEXR.File(str(folder / "normal.exr")).channels()["RGB"].pixels
+    lengths = np.linalg.norm(2.0 * pixels[pixels.any(axis=2)] - 1.0, axis=1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-5)
+
+
+def width_px(folder: Path) -> int:
+    return len(np.asarray(cv2.imread(str(folder / "normal.png"))))
+
+
+def test_maps_are_as_large_as_asked(detailed: Made, tmp_path: Path) -> None:
+    exported(detailed, "obj", tmp_path / "small", "--map-px", "256")
+    assert width_px(tmp_path / "small") <= 256
+    exported(detailed, "obj", tmp_path / "coarse", "--texel-mm", "0.4")
+    exported(detailed, "obj", tmp_path / "fine", "--texel-mm", "0.2")
+    coarse, fine = (width_px(tmp_path / name) for name in ("coarse", "fine"))
+    assert 1.6 < fine / coarse < 2.1
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--to", "ply", "--fit", "texels"), "texels: is for formats with maps"),
+        (("--to", "ply", "--map-px", "512"), "--map-px: is for --to gltf, obj, usd, materialx"),
+        (("--to", "obj", "--texel-mm", "0.001"), "give --texel-mm"),
+    ],
+)
+def test_maps_that_cannot_be_are_refused(
+    detailed: Made, tmp_path: Path, options: tuple[str, ...], told: str
+) -> None:
+    ended = cells.here("export", detailed[1], "--out", tmp_path / "out", *options)
+    assert ended.code == 2
+    assert told in " ".join(ended.err.split())
+    assert not list((tmp_path / "out").glob("*"))

@@ -199,7 +199,7 @@ def nearest_known(numbers: Integers) -> tuple[Integers, NDArray[np.float32]]:
     )
     of_label = np.full(int(label.max()) + 1, -1, np.int32)
     of_label[label[is_unknown == 0]] = numbers[is_unknown == 0]
-    return of_label[label], distance_px
+    return of_label[np.asarray(label)], np.asarray(distance_px, np.float32)
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=False)

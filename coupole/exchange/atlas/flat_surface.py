@@ -203,7 +203,7 @@ class _Values:
 
 
 class _Known:
-    """What is known of places on a surface's triangles `rows` [n], whose corners are `corners_mm` [n, 3, 3]."""
+    """Materials that are known of a surface's triangles `rows` [n], whose corners are `corners_mm` [n, 3, 3]."""
 
     def __init__(
         self, surface: MeasuredSurface, views: list[TexelView], rows: NDArray[np.int64], corners_mm: Floats

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import inspect
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, cast
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
@@ -98,10 +99,22 @@ class _OnDemand(Mapping[str, Any]):
         return _command(name)
 
 
+def _entry(name: str) -> Any:
+    """A command's function, or the Typer of a group of commands."""
+    module, function = COMMANDS[name].split(".")
+    return getattr(importlib.import_module(f"coupole.commands.{module}"), function)
+
+
+def _summary(name: str) -> TyperCommand:
+    """A command as the list of all needs it: its text, without its options, whose signatures take longest."""
+    entry = _entry(name)
+    text = entry.info.help if isinstance(entry, typer.Typer) else inspect.getdoc(entry)
+    return TyperCommand(name, help=text)
+
+
 @functools.cache
 def _command(name: str) -> Any:
-    module, function = COMMANDS[name].split(".")
-    entry = getattr(importlib.import_module(f"coupole.commands.{module}"), function)
+    entry = _entry(name)
     alone = typer.Typer(callback=lambda: None)
     if isinstance(entry, typer.Typer):
         alone.add_typer(entry, name=name)
@@ -116,6 +129,13 @@ class _Commands(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands = cast("Any", _OnDemand())
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(COMMANDS)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        self.commands = {name: _summary(name) for name in COMMANDS}
+        super().format_help(ctx, formatter)
 
 
 app = typer.Typer(

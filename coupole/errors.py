@@ -67,6 +67,12 @@ class InputError(CoupoleError):
         super().__init__(problems if isinstance(problems, str) else "\n".join(map(str, problems)))
 
 
+class ExtraMissing(CoupoleError):
+    """A library that not everybody needs is not installed; the message names the extra that adds it."""
+
+    exit_code = 2
+
+
 class PreflightRefused(CoupoleError):
     """Preflight found reasons not to run; `refusals` holds all of them."""
 

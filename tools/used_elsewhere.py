@@ -7,6 +7,7 @@ the exception: what tests do to stand-ins, and what they see of them.
 # mypy: disable-error-code="name-defined"
 
 # ---- by name ----
+_.list_commands  # typer, of coupole/commands/cli.py
 _.doctor, _.archive, _.sim, _.demo  # COMMANDS of coupole/commands/cli.py
 _.TextLineBox  # named in rigs, as drivers are
 _.MemoryCamera  # named in rigs

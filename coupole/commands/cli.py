@@ -17,6 +17,8 @@ from typer.core import TyperCommand, TyperGroup
 import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
 from coupole.bounded import leave
+from coupole.commands.common import fail
+from coupole.commands.extras import missing_extra
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
@@ -100,13 +102,13 @@ class _OnDemand(Mapping[str, Any]):
 
 
 def _entry(name: str) -> Any:
-    """A command's function, or the Typer of a group of commands."""
+    """Return a command's function, or the Typer of a group of commands."""
     module, function = COMMANDS[name].split(".")
     return getattr(importlib.import_module(f"coupole.commands.{module}"), function)
 
 
 def _summary(name: str) -> TyperCommand:
-    """A command as the list of all needs it: its text, without its options, whose signatures take longest."""
+    """Return a command as the list of all needs it: with its text, without its options, which take longest."""
     entry = _entry(name)
     text = entry.info.help if isinstance(entry, typer.Typer) else inspect.getdoc(entry)
     return TyperCommand(name, help=text)
@@ -186,6 +188,8 @@ def _exit_code_of_command() -> int:
         code = interruption.exit_code
     except typer.Abort:
         code = Interrupted.exit_code
+    except ImportError as error:
+        code = _code_of_missing(error)
     except Exception as error:  # noqa: BLE001  click's usage errors, which know their own exit code, and defects
         if hasattr(error, "exit_code") and hasattr(error, "show"):
             error.show()
@@ -193,15 +197,29 @@ def _exit_code_of_command() -> int:
         elif isinstance(error, OSError) and (why := text_outlet.full_stdout()):
             code = _not_taken(why)
         else:
-            with contextlib.suppress(OSError):
-                traceback.print_exception(error)
-                print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
-            code = 1
+            code = _code_of_defect(error)
     if why := text_outlet.full_stdout():
         code = _not_taken(why)
     with contextlib.suppress(SignalReceived):  # a signal more: nothing is waited for
         text_outlet.finish()
     return int(code or 0)
+
+
+def _code_of_missing(error: ImportError) -> int:
+    """Tell which extra has the library; return the exit code."""
+    missing = missing_extra(error)
+    if missing is None:
+        return _code_of_defect(error)
+    fail(missing, as_json="--json" in sys.argv)
+    _say(missing)
+    return missing.exit_code
+
+
+def _code_of_defect(error: Exception) -> int:
+    with contextlib.suppress(OSError):
+        traceback.print_exception(error)
+        print("This is a defect of Coupole: please report it, with the lines above.", file=sys.stderr)
+    return 1
 
 
 def _not_taken(why: str) -> int:

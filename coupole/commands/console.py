@@ -48,10 +48,7 @@ def serve(
 
     At the first start a token is printed with which the engineer signs in, once, to make accounts.
     """
-    try:
-        from coupole.console.service import serve as serve_cell
-    except ModuleNotFoundError as error:
-        raise InputError(f"the console wants {error.name}: install coupole[console]") from error
+    from coupole.console.service import serve as serve_cell
     from coupole.plan.cell import read_cell
     from coupole.viewing.terminal import make_console
 

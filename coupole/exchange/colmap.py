@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -18,9 +17,9 @@ from scipy.spatial.transform import Rotation
 import coupole
 from coupole.calibration.optics import Intrinsics, project
 from coupole.calibration.rotations import Floats
+from coupole.exchange.demosaiced import demosaiced
 from coupole.exchange.srgb import srgb
 from coupole.exchange.target_folder import refuse_standing, writing_into
-from coupole.exchange.tiff_for_the_eye import DEMOSAIC
 from coupole.geometry import Transform, apply, inverse
 from coupole.motion.packet_rays import PacketMesh
 from coupole.reflectance.alignment.refined_geometry import read_refined
@@ -82,6 +81,8 @@ def export_colmap(
     with writing_into(model), writing_into(out / PICTURES):
         for number, (view, path) in enumerate(zip(measured_run.views, pictures, strict=True)):
             views.append(_posed_picture(measured_run, view, mesh))
+            import cv2
+
             write_synced(path, cv2.imencode(".png", views[-1].codes)[1].tobytes())
             say("views", number + 1, len(pictures))
         centres_mm = apply(inverse(measured_run.base_from_support), measured_run.corners_mm.mean(axis=1))
@@ -176,8 +177,7 @@ def _picture(measured_run: MeasuredRun, view: MeasuredView) -> NDArray[np.uint8]
         total += np.maximum(frame.read().astype(np.float64) - measured_run.frames.black_dn, 0.0)
     white = float(np.quantile(total, _WHITE_QUANTILE)) or 1.0
     mosaic = np.rint(65535.0 * np.clip(total / white, 0.0, 1.0)).astype(np.uint16)
-    pattern = measured_run.frames.pattern
-    colour = cv2.merge([mosaic] * 3) if pattern == "MONO" else cv2.cvtColor(mosaic, DEMOSAIC[pattern])[..., ::-1]
+    colour = demosaiced(mosaic, measured_run.frames.pattern)[..., ::-1]
     codes: NDArray[np.uint8] = np.rint(255.0 * srgb(colour / 65535.0)).astype(np.uint8)
     return codes
 

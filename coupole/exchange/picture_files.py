@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
@@ -38,6 +37,8 @@ def write_picture(path: Path, picture: NDArray[np.float32]) -> None:
                 header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
                 OpenEXR.File(header, {"RGB": np.ascontiguousarray(picture)}).write(str(part))
             case _:
+                import cv2
+
                 codes = np.rint(np.clip(picture, 0.0, 1.0) * _PNG_WHITE).astype(np.uint16)
                 part.write_bytes(cv2.imencode(".png", codes[..., ::-1])[1].tobytes())
         part.replace(path)

@@ -7,23 +7,16 @@ import io
 import json
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 import coupole
 from coupole.errors import InputError
 from coupole.exchange.camera_colour import CameraColour
+from coupole.exchange.demosaiced import PATTERNS, demosaiced
 from coupole.exchange.exported_frame import Picture
 from coupole.exchange.srgb import srgb
 
-DEMOSAIC = {
-    "RGGB": cv2.COLOR_BayerRGGB2RGB,
-    "GRBG": cv2.COLOR_BayerGRBG2RGB,
-    "BGGR": cv2.COLOR_BayerBGGR2RGB,
-    "GBRG": cv2.COLOR_BayerGBRG2RGB,
-}
-"""OpenCV's codes, red first."""
 _PARAMETRIC = b"para\0\0\0\0\0\x03\0\0"
 _SRGB_NAME, _LINEAR_NAME = ("sRGB built-in".encode("utf-16-be"), "sRGB, linear ".encode("utf-16-be"))
 
@@ -34,13 +27,13 @@ def encode(picture: Picture, colour: CameraColour, *, linear: bool) -> bytes:
     a camera without colours."""
     from coupole.appearance.spectra.light import linear_srgb
 
-    if picture.pattern not in DEMOSAIC:
+    if picture.pattern not in PATTERNS:
         raise InputError(f"--for-the-eye: the camera's pattern is {picture.pattern}; it has no colours")
     assert colour.xyz_from_balanced is not None
     signal = picture.pixels.astype(np.float64) - picture.black_dn
     top = float(picture.white_dn - picture.black_dn)
     mosaic = np.rint(np.clip(signal / top, 0.0, 1.0) * 65535).astype(np.uint16)
-    channels = cv2.cvtColor(mosaic, DEMOSAIC[picture.pattern]).astype(np.float64) / 65535.0
+    channels = demosaiced(mosaic, picture.pattern).astype(np.float64) / 65535.0
     white_balance = np.minimum(channels / colour.neutral(picture.about.get("led")), 1.0)
     rgb = np.clip(linear_srgb(white_balance @ colour.xyz_from_balanced.T), 0.0, 1.0)
     codes = np.rint(65535.0 * (rgb if linear else srgb(rgb))).astype(np.uint16)

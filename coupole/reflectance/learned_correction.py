@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,6 +109,8 @@ def look(
 
 def mean_around(mask: NDArray[np.bool_], values: Floats, width_px: int) -> Floats:
     """[pixels, 3] means over squares, of what the mask holds."""
+    import cv2
+
     picture = np.zeros((*mask.shape, values.shape[-1]), np.float32)
     picture[mask] = values
     share = cv2.blur(mask.astype(np.float32), (width_px, width_px))[mask]

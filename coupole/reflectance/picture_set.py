@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -136,6 +135,8 @@ def _names_in(folder: Path, other_files: set[Path]) -> tuple[str, ...]:
 
 def read_picture(path: Path) -> NDArray[Any]:
     """[h, w, 3] red, green, blue, uint8 or uint16; a grey picture three times. Raises InputError."""
+    import cv2
+
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
         refuse(path, "is no picture that can be read; expected PNG, TIFF or JPEG")

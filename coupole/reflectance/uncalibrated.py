@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,6 +54,8 @@ def write_pictures(folder: Path, view: str | None, out: Path, say: Said) -> Pict
 
     Raises InputError: no such view, too few LEDs, a folder with other pictures; StorageError for damaged frames.
     """
+    import cv2
+
     run = Run(folder)
     files = read_plan(run.plan_path, run.rig_path)
     frames = open_light_frames([folder])
@@ -171,6 +172,8 @@ def _picture(
 
 
 def _write_png(picture: NDArray[np.integer], path: Path) -> None:
+    import cv2
+
     path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 

@@ -13,9 +13,22 @@ from pathlib import Path
 import pytest
 from places import REPO
 
+from coupole.commands.extras import EXTRA_OF
+
 DEPENDENCIES = next(path for path in map(Path, sys.path) if path.name == "site-packages")
 PACKAGES = ("coupole", "drivers", "sim")
-MOST_BYTES = 15_000_000
+MOST_BYTES, MOST_INSTALLED_BYTES = 15_000_000, 700_000_000
+WITHOUT_EXTRAS = f"""
+import importlib.abc, sys
+
+class Missing(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {sorted(library for library in EXTRA_OF if EXTRA_OF[library] != "xarray")}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+"""
+"""As if of the extras `xarray` alone were installed, though the dependencies lie beside."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +89,7 @@ def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     (site_packages,) = environment.glob("lib/python*/site-packages")
     if shared:
         (site_packages / "dependencies.pth").write_text(f"{DEPENDENCIES}\n")
+        (site_packages / "sitecustomize.py").write_text(WITHOUT_EXTRAS)
         share_kernels(site_packages)
     (folder / "Kuppel ä").mkdir()
     return Installed(wheel, environment, folder / "Kuppel ä")
@@ -147,3 +161,25 @@ def test_runs_of_a_shipped_cell_go_to_the_working_folder(installed: Installed) -
 
 def test_the_wheel_is_small(installed: Installed) -> None:
     assert installed.wheel.stat().st_size < MOST_BYTES
+
+
+def test_what_a_command_lacks_is_named_with_its_extra(installed: Installed) -> None:
+    ended = installed.run("coupole", "view", "demo-short", "--out", "plan.png", "--json")
+    assert ended.returncode == 2, ended.stdout
+    assert "pip install 'coupole[pictures]'" in json.loads(ended.stdout)["error"]
+    assert "pip install 'coupole[pictures]'" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.full
+def test_the_base_is_light(tmp_path: Path) -> None:
+    environment = tmp_path / "venv"
+    for words in (
+        ("build", "--wheel", "--out-dir", str(tmp_path), str(REPO)),
+        ("venv", "--python", sys.executable, str(environment)),
+    ):
+        subprocess.run([uv(), *words], cwd=REPO, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    subprocess.run([uv(), "pip", "install", "--python", environment, wheel], check=True, capture_output=True)
+    size_bytes = sum(path.stat().st_size for path in environment.rglob("*") if path.is_file())
+    assert size_bytes < MOST_INSTALLED_BYTES

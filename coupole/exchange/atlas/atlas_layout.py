@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import ConvexHull, QhullError
 
 from coupole.errors import InputError
 from coupole.exchange.atlas.charts import Floats, Integers, chart_axes, cut_charts, neighbours_of, split_off
@@ -119,13 +120,28 @@ def _flatten(corners_mm: Floats, chart: Integers, texel_mm: float) -> tuple[Floa
 
 def _turn_to_fit(corners_px: Floats) -> tuple[Floats, tuple[int, int]]:
     """Turn a chart [n, 3, 2] so that its rectangle is small and lies; its size, with padding around."""
-    (_, _), (width, height), angle_deg = cv2.minAreaRect(corners_px.reshape(-1, 2).astype(np.float32))
-    angle = math.radians(angle_deg if width >= height else angle_deg + 90.0)
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    fitted_px = corners_px @ turn
+    fitted_px = corners_px @ _lying(corners_px.reshape(-1, 2))
     fitted_px += PADDING_PX - fitted_px.reshape(-1, 2).min(axis=0)
     width, height = np.ceil(fitted_px.reshape(-1, 2).max(axis=0)).astype(int) + PADDING_PX
     return fitted_px, (int(width), int(height))
+
+
+def _lying(points_px: Floats) -> Floats:
+    """[2, 2] turn `t` so that `points_px @ t`, of points [n, 2], fill the smallest rectangle, longer than high.
+
+    One of its sides lies along an edge of the convex hull (Freeman and Shapira 1975).
+    """
+    try:
+        hull = points_px[ConvexHull(points_px).vertices]
+    except QhullError:  # all on a line
+        hull = points_px[np.lexsort(points_px.T)[[0, -1]]]
+    edges = np.roll(hull, -1, axis=0) - hull
+    angles = np.arctan2(edges[:, 1], edges[:, 0])
+    across, along = np.stack([np.cos(angles), np.sin(angles)]), np.stack([-np.sin(angles), np.cos(angles)])
+    widths, heights = np.ptp(hull @ across, axis=0), np.ptp(hull @ along, axis=0)
+    best = int(np.argmin(widths * heights))
+    angle = angles[best] + (0.0 if widths[best] >= heights[best] else 0.5 * math.pi)
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
 def _pack(sizes_px: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
@@ -191,15 +207,15 @@ def _pad(triangle_of_texel: Integers) -> Integers:
 
 def nearest_known(numbers: Integers) -> tuple[Integers, NDArray[np.float32]]:
     """[h, w] the number of the nearest place of a map that has one (others are -1), and how far it is, px."""
-    is_unknown = (numbers < 0).astype(np.uint8)
+    is_unknown = numbers < 0
     if is_unknown.all() or not is_unknown.any():
         return numbers, np.zeros(numbers.shape, np.float32)
-    distance_px, label = cv2.distanceTransformWithLabels(
-        is_unknown, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.full(int(label.max()) + 1, -1, np.int32)
-    of_label[label[is_unknown == 0]] = numbers[is_unknown == 0]
-    return of_label[np.asarray(label)], np.asarray(distance_px, np.float32)
+    rows, columns = distance_transform_edt(is_unknown, return_distances=False, return_indices=True)
+    nearest, distance_px = np.empty_like(numbers), np.empty(numbers.shape, np.float32)
+    for row in range(len(numbers)):
+        nearest[row] = numbers[rows[row], columns[row]]
+        distance_px[row] = np.hypot(rows[row] - row, columns[row] - np.arange(numbers.shape[1]))
+    return nearest, distance_px
 
 
 @numba.njit(cache=True, error_model="numpy", parallel=False)

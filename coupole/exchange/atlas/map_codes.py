@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from coupole.errors import CoupoleError
 from coupole.exchange.atlas.flat_surface import FlatSurface
@@ -53,7 +54,15 @@ def normal_map(flat: FlatSurface, bits: int) -> NDArray[np.uint8 | np.uint16]:
 
 
 def png(picture: NDArray[np.integer]) -> bytes:
-    """A picture [h, w, 1 or 3], red first, as PNG."""
+    """A picture [h, w, 1 or 3], red first, as PNG of 8 or 16 bits."""
+    if picture.dtype == np.uint8:
+        buffer = io.BytesIO()
+        Image.fromarray(picture if picture.shape[2] == 3 else picture[..., 0]).save(
+            buffer, "PNG", compress_level=1
+        )
+        return buffer.getvalue()
+    import cv2  # Pillow has no colours of 16 bits
+
     pixels = np.ascontiguousarray(picture[..., ::-1])
     is_encoded, content = cv2.imencode(".png", pixels)
     if not is_encoded:

@@ -7,21 +7,23 @@ numbers share their higher bytes; then zlib, then base64.
 from __future__ import annotations
 
 import base64
+import io
 import json
 import zlib
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 TYPES = ("uint8", "uint16", "uint32", "float16", "float32")
 LOG_LEAST, LOG_STEPS = 1e-4, 254
 """Codes of `log_coded`: the value of code 1, and steps from there to its `LOG_RATIO`-fold."""
 LOG_RATIO = 1e5
 _LARGEST_HALF = 65504.0
-_SAME_SIZE = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+_SAME_SIZE = 0
+"""Pillow's word for colours that are as fine as the brightness."""
 SCRIPT_BEGINS = "coupoleBlock("
 """Beginning of each block's script."""
 
@@ -75,10 +77,9 @@ def block_of(name: str, values: NDArray[Any]) -> Block:
 
 def jpeg_of(name: str, picture: NDArray[np.uint8], quality: int) -> Block:
     """A picture [h, w] or [h, w, 3] (red first), as JPEG without coarser colours; its numbers change a little."""
-    pixels = picture if picture.ndim == 2 else picture[..., ::-1]
-    options = (cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, _SAME_SIZE)
-    content = cv2.imencode(".jpg", pixels, options)[1].tobytes()
-    return Block(name, base64.b64encode(content).decode("ascii"), "jpeg", picture.shape)
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=quality, subsampling=_SAME_SIZE)
+    return Block(name, base64.b64encode(buffer.getvalue()).decode("ascii"), "jpeg", picture.shape)
 
 
 def log_coded(values: NDArray[np.float64]) -> NDArray[np.uint8]:

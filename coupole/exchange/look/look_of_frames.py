@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import base64
 import fnmatch
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from coupole.calibration.light.frames import LightFrame, LightFrames, open_light_frames
 from coupole.calibration.light.records import dark_signal
 from coupole.errors import InputError
+from coupole.exchange.demosaiced import demosaiced
 from coupole.exchange.look.light_planes import LightPlanes, error_figures, light_planes
 from coupole.exchange.look.look_blocks import Block, Look, block_of, jpeg_of
 from coupole.exchange.look.look_frames import MOST_PX, block_means
@@ -54,11 +56,8 @@ class Frames:
         steps = 65535.0 / (run.white_dn - run.black_dn)
         linear = np.clip((frame.read() - self.dark(frame)) * np.float32(steps), 0, 65535)
         codes = np.rint(linear).astype(np.uint16)
-        if run.pattern == "MONO":
-            colours = np.repeat(codes[..., None], 3, axis=2)
-        else:
-            colours = cv2.demosaicing(codes, getattr(cv2, f"COLOR_Bayer{run.pattern}2RGB"))
-        return colours.astype(np.float32) * np.float32(self.shortest_us / frame.exposure_us / 65535.0)
+        colours = demosaiced(codes, run.pattern).astype(np.float32)
+        return colours * np.float32(self.shortest_us / frame.exposure_us / 65535.0)
 
 
 def look_of_run(folder: Path, patterns: Sequence[str], say: Said) -> Look:
@@ -234,10 +233,8 @@ def _missed_as_written(
     step: NDArray[np.float32],
 ) -> tuple[float, float]:
     """Median and rms of the shares that the page's first tile misses under some LEDs."""
-    jpeg = np.frombuffer(base64.b64decode(tiles[0].text), np.uint8)
-    picture = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
-    assert picture is not None
-    codes = picture.reshape(-1, TILE_PX, TILE_PX).astype(np.float64)
+    picture = Image.open(io.BytesIO(base64.b64decode(tiles[0].text)))
+    codes = np.asarray(picture.convert("L")).reshape(-1, TILE_PX, TILE_PX).astype(np.float64)
     planes = codes * step[:, None, None] + low[:, None, None]
     models, shares = [], []
     for number in range(0, len(leds), -(-len(leds) // _CHECKED)):

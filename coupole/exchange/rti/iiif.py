@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -63,6 +62,8 @@ def write(views: Iterable[LitView], out: Path, base_url: str, say: Said) -> list
 
 def write_tiles(codes: NDArray[np.uint8], folder: Path, url: str) -> list[Path]:
     """Write a picture [h, w, 3] as tiles, scaled pictures and `info.json`, under their canonical addresses."""
+    import cv2
+
     height, width = codes.shape[:2]
     factors = [1]
     while max(width, height) / factors[-1] > _TILE_PX:

@@ -7,7 +7,6 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,7 @@ from coupole.storage.run import Run
 
 LINEAR = "linear"
 """Folder of the pictures of 16 bit, with lights, intensities and mask, from which `--pictures` makes a result."""
-_JPEG = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
+_JPEG_QUALITY = 95
 
 
 def export_rti(
@@ -44,6 +43,12 @@ def export_rti(
 
 
 def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], None]) -> list[Path]:
+    import cv2
+
+    as_jpeg = (
+        *(cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY),
+        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+    )
     pictures = write_pictures(
         run.folder, view, out / LINEAR, lambda step, done, of: say(f"{view}: {step}", done, of)
     )
@@ -54,7 +59,7 @@ def _export_view(run: Run, view: str, out: Path, say: Callable[[str, int, int], 
     paths = []
     for number, source in enumerate(pictures.files):
         paths.append(out / f"{source.stem}.jpg")
-        write_synced(paths[-1], cv2.imencode(".jpg", codes[_read_picture(source)], _JPEG)[1].tobytes())
+        write_synced(paths[-1], cv2.imencode(".jpg", codes[_read_picture(source)], as_jpeg)[1].tobytes())
         say(f"{view}: jpeg", number + 1, len(pictures.files))
     directions = pictures.lights_mm / np.linalg.norm(pictures.lights_mm, axis=1, keepdims=True)
     lines = [f"{path.name} {x:.6f} {y:.6f} {z:.6f}" for path, (x, y, z) in zip(paths, directions, strict=True)]
@@ -94,6 +99,8 @@ def _points(places: NDArray[np.float64]) -> list[dict[str, float]]:
 
 def _read_picture(path: Path) -> NDArray[np.uint16]:
     """[h, w, 3] or [h, w, 1], blue first."""
+    import cv2
+
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     return np.atleast_3d(picture).astype(np.uint16)

@@ -12,11 +12,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
+from coupole.errors import ExtraMissing, InputError
 from coupole.exchange.material_values import red_green_blue
 from coupole.exchange.of_results.measured_surface import read_surface
 from coupole.heritage.comparison.state_files import Colours, Floats, State
-from coupole.scan.registration.extra import ExtraMissing
 from coupole.scan.registration.prepared_scan import spacing
 
 _STEP = 1e-4

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.errors import InputError
-from coupole.scan.registration.extra import ExtraMissing
+from coupole.errors import ExtraMissing, InputError
 from coupole.scan.registration.prepared_scan import spacing, vertex_normals
 from coupole.scan.registration.scan_files import read_scan, sources_of
 

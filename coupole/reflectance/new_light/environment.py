@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
@@ -105,6 +104,8 @@ def _read_radiance(path: Path) -> NDArray[np.float32]:
     if path.suffix.lower() not in {".exr", ".hdr"}:
         raise InputError(f"{path}: expected an environment in a file .exr or .hdr")
     if path.suffix.lower() == ".hdr":
+        import cv2
+
         try:
             picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         except cv2.error:  # more pixels than OpenCV takes

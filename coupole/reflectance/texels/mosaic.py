@@ -7,9 +7,9 @@ difference of the channels around it. Its own channel stays as it was fitted.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 Singles = NDArray[np.float32]
 
@@ -28,12 +28,12 @@ def all_channels(deviation: Singles, certainty: Singles, channel: NDArray[np.int
     is_fitted = certainty > 0.0
     if channels == 1:
         return np.where(is_fitted, deviation, np.float32(0.0))[..., None]
-    around = cv2.GaussianBlur(certainty, (0, 0), _SPREAD_PX)
+    around = _spread(certainty)
     means = []
     for number in range(channels):
         here = np.where(channel == number, certainty, np.float32(0.0))
-        weight = cv2.GaussianBlur(here, (0, 0), _SPREAD_PX)
-        total = cv2.GaussianBlur(np.where(here > 0.0, here * deviation, np.float32(0.0)), (0, 0), _SPREAD_PX)
+        weight = _spread(here)
+        total = _spread(np.where(here > 0.0, here * deviation, np.float32(0.0)))
         is_enough = weight > _LEAST_SHARE * around
         means.append(np.where(is_enough, total / np.where(is_enough, weight, np.float32(1.0)), np.nan))
     colour = np.stack(means, axis=-1)
@@ -46,3 +46,8 @@ def all_channels(deviation: Singles, certainty: Singles, channel: NDArray[np.int
         np.float32
     )
     return result
+
+
+def _spread(picture: Singles) -> Singles:
+    """[h, w] weighted sums around each pixel; mirrored at the edges."""
+    return np.asarray(gaussian_filter(picture, _SPREAD_PX, mode="mirror"), np.float32)

@@ -10,10 +10,10 @@ normal follow by their covariance with them.
 
 from __future__ import annotations
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from coupole.reflectance.ggx import UNKNOWNS, tangents
 from coupole.reflectance.kernel_arrays import assign_rows
@@ -112,13 +112,18 @@ def _draw_rows(
 def mean_around(values: Singles, is_used: NDArray[np.bool_], side_px: int, *, default: float = 0.0) -> Singles:
     """[h, w, k] mean over the pixels of a window that are used [h, w], whatever the others are; `default` where
     there are none."""
-    weight = cv2.boxFilter(is_used.astype(np.float32), -1, (side_px, side_px), normalize=False)
+    weight = _window_sum(is_used.astype(np.float32), side_px)
     means = np.empty_like(values)
     for k in range(values.shape[-1]):
         plane = np.where(is_used, values[..., k], np.float32(0.0))
-        total = cv2.boxFilter(plane, -1, (side_px, side_px), normalize=False)
+        total = _window_sum(plane, side_px)
         means[..., k] = np.where(weight > 0.5, total / np.maximum(weight, 1.0), default)
     return means
+
+
+def _window_sum(plane: Singles, side_px: int) -> Singles:
+    """[h, w] sums over a window around each pixel; mirrored at the edges."""
+    return np.asarray(uniform_filter(plane, side_px, mode="mirror"), np.float32) * np.float32(side_px**2)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

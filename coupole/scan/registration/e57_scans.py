@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from coupole.errors import InputError
+from coupole.errors import ExtraMissing, InputError
 from coupole.scan.mesh import Mesh, expect_finite
-from coupole.scan.registration.extra import ExtraMissing
 from coupole.scan.registration.scan_content import ScanContent, ScanSource
 
 UNIT = "m"

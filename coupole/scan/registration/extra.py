@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from coupole.errors import CoupoleError
-
-
-class ExtraMissing(CoupoleError):
-    """A library that only registration needs is not installed."""
-
-    exit_code = 2
+from coupole.errors import ExtraMissing
 
 
 def registration_libraries() -> tuple[Any, Any]:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from coupole.errors import InputError
-from coupole.scan.registration.extra import ExtraMissing, registration_libraries
+from coupole.errors import ExtraMissing, InputError
+from coupole.scan.registration.extra import registration_libraries
 from coupole.scan.registration.merged_colours import around, encode_srgb, linear_light
 from coupole.scan.registration.prepared_scan import NEIGHBOURS, PreparedScan, vertex_normals
 from coupole.scan.registration.scan_files import read_scan

@@ -118,6 +118,13 @@ class RawFiles:
                 happened=str(error),
                 remedy="Check the file; if it is truncated, increase `still_s` in the rig.",
             ) from error
+        except ModuleNotFoundError as error:
+            raise DeviceRefused(
+                self._name,
+                expected="the package rawpy, which decodes RAW files",
+                happened=str(error),
+                remedy="Install it: pip install 'coupole[pictures]'.",
+            ) from error
 
     # -- who it is ----------------------------------------------------------------------------------------
 

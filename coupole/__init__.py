@@ -30,6 +30,15 @@ _NAMES = {
     "acquire": "scripting.acquisition",
     "Acquisition": "scripting.acquisition",
     "open_cell": "scripting.cell_devices",
+    "fit_reflectance": "scripting.analyses",
+    "calibrate_camera": "scripting.analyses",
+    "CalibrationRecord": "scripting.analyses",
+    "identify": "scripting.analyses",
+    "PigmentFinding": "heritage.analysis.identification",
+    "register": "scripting.analyses",
+    "Registration": "scan.registration.registering",
+    "compare": "scripting.analyses",
+    "Comparison": "heritage.comparison.state_comparison",
 }
 """Module of this package by public name."""
 _MODULES = {

@@ -220,7 +220,7 @@ def bench_mesh(options: Asked) -> None:
 
 
 def bench_calibration(options: Asked) -> None:
-    """Finding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
+    """PigmentFinding a board, and the adjustments of hand-eye and LEDs, against plain use of OpenCV and scipy."""
     from bench_calibration import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):

@@ -27,7 +27,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from ray_scanner import RayScanner, tower  # noqa: E402
 
 from coupole.scan.registration.merging import merge  # noqa: E402
-from coupole.scan.registration.registering import Registered, register  # noqa: E402
+from coupole.scan.registration.registering import Registration, register  # noqa: E402
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of, step_between  # noqa: E402
 from smallest import add_smallest  # noqa: E402
 
@@ -101,7 +101,7 @@ def make_scans(folder: Path, count: int, across: int) -> dict[str, np.ndarray]:
     return truth
 
 
-def compare_with_truth(registration: Registered, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
+def compare_with_truth(registration: Registration, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, float]:
     """Displacement of each placed scan's points from the truth, in the first one's frame; and the share of poses
     in their 95 % regions, on average over the frames of all scans, as the error of one frame is in all poses."""
     world_from = [truth[registration.names[number]] for number in registration.placed_numbers]
@@ -117,7 +117,7 @@ def compare_with_truth(registration: Registered, truth: dict[str, np.ndarray]) -
     )
 
 
-def _coverage(registration: Registered, world_from: list[np.ndarray], reference: int) -> float:
+def _coverage(registration: Registration, world_from: list[np.ndarray], reference: int) -> float:
     """Share of the poses, seen from one scan, that lie in their 95 % regions."""
     fit, inside = registration.fit, []
     true_from_world = fit.common_from_scan[reference] @ inverse_of(world_from[reference])

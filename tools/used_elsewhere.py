@@ -17,7 +17,7 @@ _._write_command, _._write_enumeration, _._write_string, _._write_boolean  # Fea
 _._write_integer, _._write_float  # the same
 _.relight_uncertainty, _.PicturesResult, _.Acquisition, _.__dir__  # users of the Python face
 _.__getattr__  # drivers/kuka/rsi, drivers/ur: Python, for names that are imported on first use
-_.open_run, _.open_result, _.open_cell  # coupole/__init__.py, by its table
+_.open_run, _.open_result, _.open_cell, _.fit_reflectance  # coupole/__init__.py, by its table
 _.residual_rms_us, _.residual_max_us  # the report, coupole/viewing/report_facts.py
 _.white_at_us  # coupole/preflight/simulated_world.py, in the rig's settings
 _.adaptive, _.author, _.refined  # ExportOptions.given_options, which lists all fields

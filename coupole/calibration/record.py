@@ -183,10 +183,12 @@ class Record(Model):
 
     @property
     def is_accepted(self) -> bool:
+        """True if all limits are met."""
         return all(limit.is_met for limit in self.limits)
 
     @property
     def covariance_matrix(self) -> NDArray[np.float64]:
+        """[parameters, parameters], in the units of their names."""
         return np.array(self.covariance)
 
     def value(self, name: str) -> float:
@@ -247,6 +249,18 @@ def read_record(path: Path, files: InputFiles | None = None) -> Record:
     if problems:
         raise InputError(problems)
     return record
+
+
+def records_named(paths: list[Path]) -> tuple[Path, ...]:
+    """Records, and those in folders that are named."""
+    records: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files = sorted(path.glob("*.yaml"))
+            records += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
+        else:
+            records.append(path)
+    return tuple(records)
 
 
 def rows_of(matrix: NDArray[np.float64]) -> tuple[tuple[float, ...], ...]:

@@ -44,8 +44,6 @@ SquareOption = Annotated[
         "--square", help="Side of a plain chessboard's squares, mm.", min=0.01, max=1000.0, show_default=False
     ),
 ]
-_PRINTED_U_PPM = 5000.0
-"""Standard uncertainty of the scale of a board of which nothing but a nominal side is known."""
 PosesOption = Annotated[
     Path | None, typer.Option("--poses", help="Robot poses of pictures (YAML); FOLDER/poses.yaml if not given.")
 ]
@@ -166,42 +164,24 @@ def _refuse_unknown_model(model: str) -> None:
 def _plain_board(text: str | None, square_mm: float | None) -> Board | None:
     """The plain chessboard COLUMNSxROWS of squares of a stated side; None if `text` names a file, or nothing.
     Raises InputError if only one of the two is given, or for a board that none can be."""
-    from coupole.calibration.lens.board import Board
+    from coupole.scripting.analyses import plain_chessboard
 
     match = re.fullmatch(r"([0-9]{1,3})x([0-9]{1,3})", text or "")
     if match is None:
         if square_mm is not None:
             raise InputError(f"--square: belongs to a plain board, --board COLUMNSxROWS; got --board {text}")
         return None
-    corners = int(match[1]), int(match[2])
-    if square_mm is None:
-        raise InputError(f"--board {text}: expected the side of its squares too, --square MM")
-    if not all(3 <= count <= 200 for count in corners):
-        raise InputError(f"--board {text}: expected 3 to 200 inner corners each way")
-    return Board(kind="chessboard", corners=corners, square_mm=square_mm, scale_u_ppm=_PRINTED_U_PPM)
+    return plain_chessboard((int(match[1]), int(match[2])), square_mm)
 
 
 def _look(
     paths: list[Path], board: Path | None, poses: Path | None, console: Console, plain_board: Board | None = None
 ) -> tuple[Sources, Board, Found]:
     """Open the images and find the board in them."""
-    from coupole.calibration.lens.board import read_board
-    from coupole.calibration.lens.images import find_board
-    from coupole.calibration.sources import BOARD_NAME, open_sources
+    from coupole.scripting.analyses import sight_board
 
-    beside = paths[0] / BOARD_NAME
-    named_file = board or (beside if beside.is_file() else None)
-    if plain_board is None and named_file is None:
-        raise InputError(f"expected the board's description: give --board, or put it at {beside}")
-    description = None if plain_board is not None else named_file
-    target = plain_board if description is None else read_board(description)
-    assert target is not None  # as was refused above
-    sources = open_sources(paths, poses).with_file(description)
-    if description is None:
-        across, down = target.corners
-        sources = sources.with_words(f"--board {across}x{down} --square {target.square_mm:g}")
     with bar(console, "looking for the board") as progress:
-        sightings = find_board(target, sources, progress)
+        sources, target, sightings = sight_board(paths, board, poses, plain_board, progress)
     for line in sightings.left_out:
         console.print(f"[yellow]left out:[/] {line}")
     corners = sum(len(sighting.ids) for sighting in sightings.sightings)

@@ -105,17 +105,3 @@ def fail(error: CoupoleError, *, as_json: bool, figures: dict[str, Any] | None =
             "exit_code": error.exit_code,
         }
         print(json.dumps(document))
-
-
-def records_named(paths: list[Path]) -> tuple[Path, ...]:
-    """Records, and those in folders that are named."""
-    from coupole.calibration.record import SEAL
-
-    records: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            files = sorted(path.glob("*.yaml"))
-            records += [file for file in files if file.read_text(encoding="utf-8").startswith(SEAL)]
-        else:
-            records.append(path)
-    return tuple(records)

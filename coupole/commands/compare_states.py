@@ -40,21 +40,19 @@ def compare(
 ) -> None:
     """Compare two states: align them by what did not change, then mark significant changes of shape and colour."""
     from coupole.heritage.comparison.state_comparison import about
-    from coupole.heritage.comparison.state_comparison import compare as compare_states
-    from coupole.scan.scan import UNITS, new_scan_folder
+    from coupole.scan.scan import new_scan_folder
+    from coupole.scripting import analyses
     from coupole.viewing import comparison_page
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
     try:
-        if unit not in UNITS:
-            raise InputError(f"--unit {unit}: expected one of {', '.join(UNITS)}")
-        if noise_mm is not None and not 0 < noise_mm < 1e3:
-            raise InputError(f"--noise-mm {noise_mm:g}: expected a standard deviation above 0 mm")
         if out is not None and out.exists():
             raise InputError(f"--out {out}: exists already; name a new folder")
         with step_bars(console) as say:
-            changes = compare_states(before, after, unit, noise_mm, is_aligned=is_aligned, say=say)
+            changes = analyses.compare(
+                before, after, unit=unit, noise_mm=noise_mm, is_aligned=is_aligned, progress=say
+            )
             facts = about(changes)
             if out is not None:
                 say("drawing", 0, 1)

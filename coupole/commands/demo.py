@@ -101,16 +101,14 @@ def _acquire(parent: Path, plan_name: str, console: Console) -> Path:
 
 def _find_reflectance(run: Path, out: Path, console: Console) -> Path:
     """The result of the run, which goes on where it was; one that is whole stays."""
-    from coupole.reflectance.run_job import RunRequest, reflectance_of
     from coupole.reflectance.run_result import REPORT
-    from coupole.viewing import run_reflectance_page
+    from coupole.scripting.analyses import fit_reflectance
     from coupole.viewing.terminal import step_bars
 
     if (out / REPORT).exists():
         return out
     with step_bars(console) as say:
-        reflectance_of(RunRequest((run,)), out, say=say)
-    run_reflectance_page.write(out)
+        fit_reflectance(run, out, progress=say)
     return out
 
 

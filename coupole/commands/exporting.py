@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, fail, records_named
+from coupole.commands.common import JsonOption, fail
 from coupole.commands.export_options import ExportOptions, ToOption
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError, InputError
@@ -61,6 +61,8 @@ class Asked:
 
     @property
     def records(self) -> tuple[Path, ...]:
+        from coupole.calibration.record import records_named
+
         return records_named([Path(text) for text in self.texts("calibrations")])
 
 

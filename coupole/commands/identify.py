@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from coupole.appearance.spectra.spectra_library import LibrarySpectrum
-    from coupole.heritage.analysis.identification import Finding
-    from coupole.heritage.analysis.references import Rate, References
+    from coupole.heritage.analysis.identification import PigmentFinding
+    from coupole.heritage.analysis.references import Rate
 
 _SHOWN = 3
 _COLOURS = {"match": "green", "mixture": "green", "ambiguous": "yellow", "unknown": "yellow"}
@@ -95,6 +95,7 @@ def identify(
     A verdict is match, mixture, ambiguous or unknown. The class and its probability stand beside the verdict,
     whatever it is; how often the library misleads about its own spectra is printed below.
     """
+    from coupole.scripting.analyses import references_of
     from coupole.viewing.terminal import make_console
 
     console = make_console(quiet=as_json)
@@ -103,7 +104,7 @@ def identify(
         if (spot_of_result is None) == (not spectra):
             raise InputError("expected spectra, or a spot of a result (--result, --at); found both or neither")
         if spot_of_result is not None:
-            document = identify_spot(spot_of_result, _references(library, classes))
+            document = identify_spot(spot_of_result, references_of(library, classes))
             console.print(f"{document['name']}: {document['verdict']}; {document['reason']}", markup=False)
             if as_json:
                 print(json.dumps(document))
@@ -128,41 +129,21 @@ def identify(
 
 def _findings(
     console: Console, paths: list[Path], library: Path, classes: Path | None, unit: Any
-) -> list[tuple[LibrarySpectrum, Finding]]:
+) -> list[tuple[LibrarySpectrum, PigmentFinding]]:
     from coupole.appearance.spectra.spectra_library import read_library
-    from coupole.heritage.analysis import identification
-    from coupole.heritage.analysis.references import trimmed_spectrum
+    from coupole.scripting.analyses import identify_spectra, references_of
     from coupole.viewing.terminal import step_bars
 
     spectra = [spectrum for path in paths for spectrum in read_library(path, unit=unit)]
-    references = _references(library, classes)
+    references = references_of(library, classes)
     for remark in references.remarks:
         console.print(remark, markup=False)
-    findings = []
     with step_bars(console) as say:
-        for count, spectrum in enumerate(spectra):
-            say("identify", count, len(spectra))
-            findings.append((spectrum, identification.identify(trimmed_spectrum(spectrum), references)))
-        say("identify", len(spectra), len(spectra))
-    return findings
+        findings = identify_spectra(spectra, references, say)
+    return list(zip(spectra, findings, strict=True))
 
 
-def _references(library: Path, classes: Path | None) -> References:
-    from coupole.appearance.spectra.spectra_library import read_library
-    from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
-    from coupole.heritage.analysis.references import make_references
-
-    spectra = read_library(library)
-    table = read_classes(classes) if classes is not None else shipped_classes(spectra)
-    if not table:
-        raise InputError(
-            f"{library}: no table of classes comes with Coupole for this library; name one with --classes: "
-            "lines of name and class"
-        )
-    return make_references(spectra, table)
-
-
-def _show(console: Console, findings: list[Finding]) -> None:
+def _show(console: Console, findings: list[PigmentFinding]) -> None:
     from rich.table import Table
 
     table = Table("spectrum", "verdict", "class", "probability", "not in library", box=None)
@@ -191,7 +172,7 @@ def _show(console: Console, findings: list[Finding]) -> None:
     )
 
 
-def _document_of(spectrum: LibrarySpectrum, finding: Finding, page: Path | None) -> dict[str, Any]:
+def _document_of(spectrum: LibrarySpectrum, finding: PigmentFinding, page: Path | None) -> dict[str, Any]:
     evidence, rates = finding.evidence, finding.rates
     return {
         "name": finding.name,

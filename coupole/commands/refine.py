@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from coupole.commands.common import JsonOption, MeshOption, RecordsOption, fail, records_named
+from coupole.commands.common import JsonOption, MeshOption, RecordsOption, fail
 from coupole.commands.option_groups import flatten_options
 from coupole.errors import CoupoleError
 
@@ -63,6 +63,7 @@ def refine(
 
     The last options are standard uncertainties that no record states.
     """
+    from coupole.calibration.record import records_named
     from coupole.reflectance.alignment.refine_job import RefineRequest, refine_runs
     from coupole.reflectance.extraction.pointing import Doubts
     from coupole.viewing import refinement_page

@@ -159,14 +159,10 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
 
 
 def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, *, with_texels: bool) -> Made:
-    from coupole.reflectance.run_job import reflectance_of
+    from coupole.scripting.analyses import fit_runs
     from coupole.viewing import run_reflectance_page
 
-    about = reflectance_of(request, out, scheduler=scheduler, say=say)
-    if with_texels:
-        from coupole.reflectance.texels.texel_job import add_texels
-
-        about |= {"texels": add_texels(request, out, scheduler=scheduler, say=say)}
+    about = fit_runs(request, out, scheduler, say, with_texels=with_texels)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from coupole.commands.common import MeshOption, RecordsOption, records_named
+from coupole.commands.common import MeshOption, RecordsOption
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
@@ -134,6 +134,7 @@ class SamplesOfRuns:
 
     def request(self, runs: Sequence[Path], left_out: Sequence[int]) -> RunRequest:
         """Request to these runs; LEDs that are left out are kept for the check."""
+        from coupole.calibration.record import records_named
         from coupole.reflectance.run_job import RunRequest
 
         return RunRequest(

@@ -13,8 +13,7 @@ from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
     from coupole.scan.registration.merging import Merged
-    from coupole.scan.registration.registering import Registered, Say
-    from coupole.scan.registration.viewpoint import Stand
+    from coupole.scan.registration.registering import Registration, Say
 
 
 def _option(name: str, help_text: str) -> typer.models.OptionInfo:
@@ -72,22 +71,26 @@ def register(
     as_json: JsonOption = False,
 ) -> None:
     """Find the poses of scans from what they overlap, prove them by loops, and merge the scans."""
-    from coupole.scan.registration.registering import register as register_scans
     from coupole.scan.registration.summary import about, remarks
     from coupole.scan.scan import new_scan_folder
+    from coupole.scripting import analyses
     from coupole.viewing import registration_page
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)
     try:
         unit = _unit(unit, scans)
-        stand = _stand(seen_from)
-        if mesh_mm is not None and not mesh_mm > 0:
-            raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
+        _refuse_cells(mesh_mm)
         levels_mm = _levels(levels)
         with new_scan_folder(out) as folder, step_bars(console) as say:
-            registration = register_scans(
-                scans, unit, stand=stand, targets=targets, control=control, trust_poses=trust_poses, say=say
+            registration = analyses.register(
+                scans,
+                unit=unit,
+                targets=targets,
+                control=control,
+                seen_from=seen_from,
+                trust_poses=trust_poses,
+                progress=say,
             )
             mesh = None if no_mesh else _merge_scans(registration, unit, mesh_mm, levels_mm, folder, say)
             document = about(registration, mesh)
@@ -119,17 +122,13 @@ def _unit(stated_unit: str | None, scans: list[Path]) -> str:
     return stated_unit
 
 
-def _stand(seen_from: str | None) -> Stand | None:
-    from coupole.scan.registration.viewpoint import STANDS
-
-    stand = next((candidate for candidate in STANDS if candidate == seen_from), None)
-    if seen_from is not None and stand is None:
-        raise InputError(f"--seen-from {seen_from}: expected one of {', '.join(STANDS)}")
-    return stand
+def _refuse_cells(mesh_mm: float | None) -> None:
+    if mesh_mm is not None and not mesh_mm > 0:
+        raise InputError(f"--mesh-mm {mesh_mm:g}: expected cells of more than 0 mm")
 
 
 def _merge_scans(
-    registration: Registered, unit: str, mesh_mm: float | None, levels_mm: list[float], folder: Path, say: Say
+    registration: Registration, unit: str, mesh_mm: float | None, levels_mm: list[float], folder: Path, say: Say
 ) -> Merged:
     from coupole.scan.registration.merging import default_cell_mm, merge
 

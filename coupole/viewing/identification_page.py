@@ -8,7 +8,7 @@ import numpy as np
 
 from coupole.appearance.spectra.grid import Array
 from coupole.errors import StorageError, reason
-from coupole.heritage.analysis.identification import Evidence, Finding
+from coupole.heritage.analysis.identification import Evidence, PigmentFinding
 from coupole.heritage.analysis.references import HeldOutRates
 from coupole.storage.durable import write_synced
 from coupole.viewing.page_parts import facts, page, section, table, text
@@ -20,7 +20,7 @@ _HEIGHT = _CURVES + _BARS + 60.0
 _SIGNS = {"match": "ok", "mixture": "ok", "ambiguous": "stopped", "unknown": "stopped"}
 
 
-def write(folder: Path, findings: list[Finding], library: str) -> Path:
+def write(folder: Path, findings: list[PigmentFinding], library: str) -> Path:
     """Write the page of findings that share a library. Raises StorageError."""
     path = folder / PAGE
     parts = [
@@ -51,7 +51,7 @@ def write(folder: Path, findings: list[Finding], library: str) -> Path:
     return path
 
 
-def _of_one(finding: Finding) -> str:
+def _of_one(finding: PigmentFinding) -> str:
     nm = finding.evidence.wavelengths_nm
     second = finding.candidates[1].class_name
     best = finding.candidates[0]
@@ -85,11 +85,11 @@ def _of_one(finding: Finding) -> str:
     )
 
 
-def _verdict(finding: Finding) -> str:
+def _verdict(finding: PigmentFinding) -> str:
     return f'<span class="{_SIGNS[finding.verdict]}">{finding.verdict}</span>'
 
 
-def _percent(finding: Finding) -> str:
+def _percent(finding: PigmentFinding) -> str:
     return f"{finding.candidates[0].probability:.0%}"
 
 

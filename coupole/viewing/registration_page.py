@@ -14,7 +14,7 @@ from coupole.geometry import look_at
 from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration.merging import Merged
-from coupole.scan.registration.registering import Registered
+from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import moved_points
 from coupole.scan.registration.summary import point_uncertainty_mm, remarks, worst_loop_mm
 from coupole.viewing.page_parts import facts, link, page, picture, section, table, text
@@ -29,7 +29,7 @@ _STONE = (0.75, 0.72, 0.66)
 _LOOPS_SHOWN, _TARGETS_SHOWN = 12, 60
 
 
-def write(registration: Registered, merged_mesh: Merged | None, folder: Path) -> None:
+def write(registration: Registration, merged_mesh: Merged | None, folder: Path) -> None:
     """Write the report beside what was merged. Raises OSError."""
     body = f"<h1>{len(registration.names)} scans registered</h1><ul>"
     body += "".join(f"<li>{text(remark[0].upper() + remark[1:])}." for remark in remarks(registration)) + "</ul>"
@@ -41,7 +41,7 @@ def write(registration: Registered, merged_mesh: Merged | None, folder: Path) ->
     (folder / REPORT).write_text(page("Scans registered", body), encoding="utf-8")
 
 
-def _pictures(registration: Registered, merged_mesh: Merged | None, folder: Path) -> str:
+def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> str:
     figures = _image(scans_drawn(registration), "Each scan in its place in a colour of its own, from three sides")
     if merged_mesh is not None:
         mesh = read_ply(MeshFile(folder / "mesh.ply"))
@@ -58,7 +58,7 @@ def _image(sheet: Any, alternative: str) -> str:
     return f"<figure>{image}<figcaption>{text(alternative)}.</figcaption></figure>"
 
 
-def scans_drawn(registration: Registered) -> Any:
+def scans_drawn(registration: Registration) -> Any:
     """The scans' coarse points, each scan in a colour of its own, as a PIL image."""
     clouds = [
         moved_points(registration.first_from_scan[k], registration.scans[k].coarse.points_mm)
@@ -116,7 +116,7 @@ def _files(merged_mesh: Merged | None) -> str:
     return facts(rows)
 
 
-def _scans(registration: Registered) -> str:
+def _scans(registration: Registration) -> str:
     rows = []
     for number, scan in enumerate(registration.scans):
         is_placed = number in registration.placed_numbers
@@ -137,7 +137,7 @@ def _scans(registration: Registered) -> str:
     return table("Scans", head, rows) + note
 
 
-def _loops(registration: Registered) -> str:
+def _loops(registration: Registration) -> str:
     rows: Sequence[Sequence[str]] = [
         (
             text(" - ".join(registration.names[k] for k in loop.scans)),
@@ -156,7 +156,7 @@ def _loops(registration: Registered) -> str:
     return summary + table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
 
 
-def _targets(registration: Registered) -> str:
+def _targets(registration: Registration) -> str:
     rows = [
         (
             text(sighting.name),

@@ -35,6 +35,10 @@ u_picture = result.relight_uncertainty([lamp], direction=(0.3, 0.2, 1.0), view="
 print(picture.shape, picture.max(), u_picture.max())
 result.to("ply", "coupole-demo-export")
 
+# ---- fit, calibrate, identify, register, compare ----
+result = coupole.fit_reflectance(folder, "coupole-demo/reflectance")
+print(result.fits, "in", result.folder.name)
+
 # ---- build and check a plan ----
 plan = coupole.Plan.read("demo-short")
 few_lights = {"kind": "every", "every": 180}

@@ -15,6 +15,7 @@ from photographed import BOARD_YAML, FLANGE_FROM_CAMERA, LENS, SIZE_PX, shoot, w
 from synthesis import Array
 from typer.testing import CliRunner, Result
 
+import coupole
 from coupole.calibration.arm_errors import axis_sensitivity
 from coupole.calibration.lens.board import Board
 from coupole.calibration.lens.images import find_board
@@ -93,6 +94,10 @@ def test_pictures_of_a_plain_board_need_no_description(tmp_path: Path) -> None:
         calibrate("camera", folder, "--board", "9x6", "--square", 16, "--model", "brown4", "--out", tmp_path)
     )
     record = read_record(Path(document["record"]))
+    from_python = coupole.calibrate_camera(folder, board=(9, 6), square_mm=16.0, model="brown4")
+    for here, there in zip(from_python.parameters, record.parameters, strict=True):
+        assert (here.name, here.value) == (there.name, pytest.approx(there.value, rel=1e-6))
+    assert (from_python.inputs, from_python.is_accepted) == (record.inputs, record.is_accepted)
     values = {parameter.name: parameter for parameter in record.parameters}
     for name, true in zip(("fx_px", "fy_px"), boards.LENS.focal_px, strict=True):
         assert abs(values[name].value - true) < 3 * values[name].u + 0.5

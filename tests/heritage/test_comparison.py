@@ -12,6 +12,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+import coupole
 from coupole.commands.cli import app
 from coupole.errors import InputError
 from coupole.heritage.comparison.significance import discoveries
@@ -120,7 +121,7 @@ def test_nothing_is_marked_where_nothing_changed(head: Head, before: Path, tmp_p
 
 def test_uncertainties_hold_by_a_stated_noise(head: Head, before: Path, tmp_path: Path) -> None:
     again = head.write(tmp_path / "again.ply", 9)
-    stated = compare(before, again, "mm", NOISE_MM, is_aligned=True, say=silent)
+    stated = coupole.compare(before, again, noise_mm=NOISE_MM, is_aligned=True)
     spread = stated.distance_mm[np.isfinite(stated.distance_mm)].std()
     assert np.nanmedian(stated.u_mm) == pytest.approx(spread, rel=0.25)
 

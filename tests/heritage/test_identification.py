@@ -12,7 +12,7 @@ from coupole.appearance.spectra.grid import WAVELENGTHS_NM, Array
 from coupole.appearance.spectra.measured import Measured
 from coupole.appearance.spectra.spectra_library import LibrarySpectrum, read_library
 from coupole.errors import InputError
-from coupole.heritage.analysis.identification import Finding, identify
+from coupole.heritage.analysis.identification import PigmentFinding, identify
 from coupole.heritage.analysis.pigment_classes import PigmentClass, shipped_classes
 from coupole.heritage.analysis.references import Rate, References, make_references, trimmed_spectrum
 from tests.places import SHARED_DATA
@@ -48,7 +48,7 @@ def kremer() -> References:
     return make_references(spectra, shipped_classes(spectra))
 
 
-def identified(reflectance: Array, references: References) -> Finding:
+def identified(reflectance: Array, references: References) -> PigmentFinding:
     return identify(Measured("spot", WAVELENGTHS_NM, reflectance, ()), references)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from relight_cases import BASE_FROM_SUPPORT, Coat, moved, waves, write_result
 
+import coupole
 from coupole.appearance.matter import kubelka_munk, typical
 from coupole.appearance.spectra.channels import channel_values, channel_weights
 from coupole.appearance.spectra.grid import WAVELENGTHS_NM
@@ -58,6 +59,9 @@ def test_one_spectrum_is_an_object_and_several_are_a_list(
     several = json.loads(capsys.readouterr().out)
 
     assert (one["name"], one["verdict"], one["class"]) == ("azurite", "match", "copper blue")
+    from_python = coupole.identify([blue, red], library=library, classes=classes)
+    told = [(finding.name, finding.verdict, finding.not_in_library) for finding in from_python]
+    assert told == [(each["name"], each["verdict"], each["not_in_library"]) for each in several]
     assert [found["class"] for found in several] == ["copper blue", "cinnabar"]
     probabilities = [candidate["probability"] for candidate in one["candidates"]]
     assert probabilities == sorted(probabilities, reverse=True)

@@ -16,7 +16,7 @@ from lazily import lazily
 from relief_cells import DETAIL, DIFFUSE, RECORDS, Made, glossy_result
 from scipy.ndimage import gaussian_filter
 
-from coupole.commands.common import records_named
+from coupole.calibration.record import records_named
 from coupole.reflectance.fits import TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight, LedLight
 from coupole.reflectance.new_light.pictured_surface import FreeCamera, pixels_of_places, surface_of_view

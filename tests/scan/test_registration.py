@@ -21,7 +21,7 @@ from coupole.scan.mesh_files import read_mesh
 from coupole.scan.registration.joining import join
 from coupole.scan.registration.merging import Merged, merge
 from coupole.scan.registration.pair_matching import PairMotion
-from coupole.scan.registration.registering import Registered, register
+from coupole.scan.registration.registering import Registration, register
 from coupole.scan.registration.summary import about
 from coupole.scan.registration.viewpoint import DepthPicture, Viewpoint, choose_viewpoints, folds
 
@@ -39,7 +39,7 @@ class Surveyed:
 
     scans: dict[str, RayScan]
     paths: list[Path]
-    found: Registered
+    found: Registration
     merged: Merged
     folder: Path
 

@@ -63,14 +63,17 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Finding:
+class PigmentFinding:
     """Result of an identification."""
 
     name: str
+    """Name of the spectrum."""
     verdict: Verdict
+    """`match`, `mixture`, `ambiguous` or `unknown`."""
     class_name: str
     """The first candidate's (of a mixture, the larger share's), whether or not the verdict trusts it."""
     reason: str
+    """Reason of the verdict, as a sentence."""
     candidates: tuple[Candidate, ...]
     """One of each class, best first."""
     not_in_library: float
@@ -78,13 +81,16 @@ class Finding:
     parts: tuple[Part, ...]
     """Two pigments, if it is a mixture."""
     evidence: Evidence
+    """Evidence of each band, with the two nearest references."""
     near_infrared: bool
     """True if bands beyond 780 nm were compared."""
     remarks: tuple[str, ...]
+    """Remarks about the spectrum, such as bands that were left out."""
     rates: HeldOutRates
+    """How often the library is right about its own spectra when they are left out."""
 
 
-def identify(spectrum: Measured, references: References) -> Finding:
+def identify(spectrum: Measured, references: References) -> PigmentFinding:
     """Compare a reflectance spectrum with the library, in the bands that both have.
 
     Raises InputError if these are fewer than 16 bands of 10 nm.
@@ -112,7 +118,7 @@ def identify(spectrum: Measured, references: References) -> Finding:
     mixture = unmix(reflectance, of_bands.reflectance, of_bands.classes)
     verdict, reason = _judge(of_bands, probabilities, candidates, mixture, reflectance)
     parts = _parts(references, of_bands, mixture) if verdict == "mixture" and mixture is not None else ()
-    return Finding(
+    return PigmentFinding(
         spectrum.name,
         verdict,
         parts[0].class_name if parts else candidates[0].class_name,

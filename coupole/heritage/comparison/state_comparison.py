@@ -50,9 +50,13 @@ class Comparison:
     """Changes from one state to another, at the points of the first."""
 
     before: State
+    """First state: points, triangles and colours as they were read."""
     after: State
+    """Second state."""
     alignment: Alignment
+    """Motion [4, 4] from the second state's frame to the first's, mm, with its covariance."""
     normals: Floats
+    """[n, 3] outward unit normals of the first state."""
     distance_mm: Floats
     """[n] along the normals, outwards positive; NaN where the other state has no surface."""
     u_mm: Floats
@@ -60,12 +64,17 @@ class Comparison:
     moved_points: NDArray[np.bool_]
     """[n] significantly."""
     noise_factor: float
+    """Factor by which the scatter enlarged all uncertainties of distances."""
     de00: Floats | None
     """[n] CIEDE2000 under D65."""
     recoloured_points: NDArray[np.bool_] | None
+    """[n] True where the colour differs significantly; None without colours."""
     colour_factor: float
+    """Factor by which the scatter enlarged all uncertainties of colours."""
     shape_regions: tuple[Region, ...]
+    """Regions of `moved_points`, the largest first."""
     colour_regions: tuple[Region, ...]
+    """Regions of `recoloured_points`, the largest first."""
 
 
 def compare(

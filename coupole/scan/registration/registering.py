@@ -37,11 +37,13 @@ _LEAST_JOINT_OVERLAP = 0.04
 
 
 @dataclass(frozen=True)
-class Registered:
+class Registration:
     """Scans with their poses; numbers count them in the order in which they were named."""
 
     names: tuple[str, ...]
+    """Names of the scans."""
     scans: tuple[PreparedScan, ...]
+    """Points and normals of each scan in its own frame, mm."""
     placed_numbers: tuple[int, ...]
     """Numbers of the scans that hang together; the first is the one whose frame is the common one."""
     first_from_scan: dict[int, Floats]
@@ -52,14 +54,19 @@ class Registered:
     site_from_first: Floats | None
     """Transform of the first placed scan's frame into the control points' frame."""
     unplaced_numbers: tuple[int, ...]
+    """Numbers of the scans that no other overlaps enough."""
     motions: tuple[PairMotion, ...]
+    """Motions between pairs that the poses rest on."""
     rejected_motions: tuple[PairMotion, ...]
+    """Motions between pairs that contradict the others."""
     pairs: int
     """Number of pairs that overlap."""
     loops: tuple[Loop, ...]
+    """Closed chains of pairs, with the error of each."""
     loop_factor: float
     """Factor by which the loops enlarged all uncertainties."""
     fit: JointFit
+    """The joint adjustment of all poses."""
 
 
 def register(
@@ -72,7 +79,7 @@ def register(
     trust_poses: bool = False,
     processes: int | None = None,
     say: Say,
-) -> Registered:
+) -> Registration:
     """Poses of scans in files; with `trust_poses` those that PTX and E57 state are first guesses.
 
     Raises InputError for invalid files, and if no two scans overlap; ExtraMissing.
@@ -246,7 +253,7 @@ def _adjusted_registration(
     placed_numbers: Sequence[int],
     sightings: Sightings,
     say: Say,
-) -> Registered:
+) -> Registration:
     placed_scans = [scans[k] for k in placed_numbers]
     into_first = inverse_of(groups.group_from_scan[placed_numbers[0]])
     poses = [into_first @ groups.group_from_scan[k] for k in placed_numbers]
@@ -261,7 +268,7 @@ def _adjusted_registration(
         for loop in find_loops(placed_scans, alone)
     ]
     to_first = inverse_of(fit.common_from_scan[0])
-    return Registered(
+    return Registration(
         tuple(names),
         tuple(scans),
         tuple(placed_numbers),

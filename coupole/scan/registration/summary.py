@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from coupole.scan.registration.merging import Merged
-from coupole.scan.registration.registering import Registered
+from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import displacement_mm, inverse_of
 
 _CONSPICUOUS = 3.0
 """Times their uncertainty that targets may be off before a sentence says so."""
 
 
-def about(registration: Registered, merged_mesh: Merged | None) -> dict[str, Any]:
+def about(registration: Registration, merged_mesh: Merged | None) -> dict[str, Any]:
     """The content of `registration.json`; lengths in mm, angles in degrees."""
     summary: dict[str, Any] = {
         "frame": registration.names[registration.placed_numbers[0]],
@@ -72,7 +72,7 @@ def about(registration: Registered, merged_mesh: Merged | None) -> dict[str, Any
     return summary
 
 
-def _uncertainty(registration: Registered, number: int) -> dict[str, Any]:
+def _uncertainty(registration: Registration, number: int) -> dict[str, Any]:
     covariance = registration.covariance[number]
     return {
         "position_mm": np.sqrt(np.diag(covariance)[:3]).tolist(),
@@ -83,7 +83,7 @@ def _uncertainty(registration: Registered, number: int) -> dict[str, Any]:
     }
 
 
-def point_uncertainty_mm(registration: Registered, number: int) -> float:
+def point_uncertainty_mm(registration: Registration, number: int) -> float:
     """Root mean square displacement of a scan's points by the uncertainty of its pose (68 %)."""
     covariance, points = registration.covariance[number], registration.scans[number].coarse.points_mm
     arms = points - points.mean(axis=0)
@@ -93,7 +93,7 @@ def point_uncertainty_mm(registration: Registered, number: int) -> float:
     return float(np.sqrt(np.trace(covariance[:3, :3]) + np.sum(turning * covariance[3:, 3:])))
 
 
-def stated_poses_off_mm(registration: Registered) -> dict[str, float]:
+def stated_poses_off_mm(registration: Registration) -> dict[str, float]:
     """Root mean square displacement of each scan's points from where the pose that its file states puts them, seen
     from the first placed scan that states one."""
     stated_poses = {
@@ -110,12 +110,12 @@ def stated_poses_off_mm(registration: Registered) -> dict[str, float]:
     return off
 
 
-def worst_loop_mm(registration: Registered) -> float:
+def worst_loop_mm(registration: Registration) -> float:
     """0 where there is no loop."""
     return registration.loops[0].error_mm if registration.loops else 0.0
 
 
-def remarks(registration: Registered) -> Iterator[str]:
+def remarks(registration: Registration) -> Iterator[str]:
     """Yield remarks that the reader must know, one sentence each."""
     names = registration.names
     yield (

@@ -1,0 +1,287 @@
+"""Work on what was acquired, called from Python: as the commands of these names do it, with values in return."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from coupole.calibration.record import Record
+from coupole.errors import InputError
+from coupole.heritage.analysis.identification import PigmentFinding
+from coupole.heritage.comparison.state_comparison import Comparison
+from coupole.scan.registration.registering import Registration
+from coupole.scripting.opened_result import Result
+
+if TYPE_CHECKING:
+    from coupole.appearance.spectra.spectra_library import LibrarySpectrum
+    from coupole.calibration.lens.board import Board
+    from coupole.calibration.lens.images import Found
+    from coupole.calibration.sources import Sources
+    from coupole.heritage.analysis.references import References
+    from coupole.reflectance.run_job import RunRequest
+
+CalibrationRecord = Record
+AnyPath = str | os.PathLike[str]
+Progress = Callable[[str, int, int], None]
+"""Called with the name of a step, and how many of how many parts of it are done."""
+PRINTED_U_PPM = 5000.0
+"""Standard uncertainty of the scale of a board of which nothing but a nominal side is known."""
+
+
+def fit_reflectance(
+    runs: AnyPath | Sequence[AnyPath],
+    out: AnyPath,
+    *,
+    mesh: AnyPath | None = None,
+    calibrations: Sequence[AnyPath] = (),
+    left_out: Sequence[int] = (),
+    texels: bool = False,
+    memory_bytes: int = 2_000_000_000,
+    progress: Progress | None = None,
+) -> Result:
+    """Materials of an object from proven frames of its runs, as `coupole reflectance RUN --out OUT` finds them.
+
+    `mesh` and `calibrations` (records, or folders of them) replace those of the runs' plans. `left_out` are LEDs
+    that are kept for the check (by default every twelfth). `texels` adds materials of single pixels. A job that
+    was stopped goes on where it was when it is called again.
+
+    Raises InputError: no runs, or records that do not belong to them; StorageError, ChecksumMismatch.
+    """
+    from coupole.calibration.record import records_named
+    from coupole.reflectance.run_job import RunRequest
+    from coupole.scripting.opened_result import open_result
+    from coupole.viewing import run_reflectance_page
+
+    request = RunRequest(
+        tuple(_paths(runs)),
+        None if mesh is None else Path(mesh),
+        records_named(_paths(calibrations)),
+        tuple(left_out),
+        memory_bytes=memory_bytes,
+    )
+    fit_runs(request, Path(out), None, progress or _silent, with_texels=texels)
+    run_reflectance_page.write(Path(out))
+    result = open_result(out)
+    assert isinstance(result, Result)
+    return result
+
+
+def calibrate_camera(
+    images: AnyPath | Sequence[AnyPath],
+    *,
+    board: AnyPath | tuple[int, int] | None = None,
+    square_mm: float | None = None,
+    model: Literal["pinhole", "radial", "brown4", "brown5"] = "brown5",
+    progress: Progress | None = None,
+) -> CalibrationRecord:
+    """Lens and distortion from 8 to 60 pictures of a board, as `coupole calibrate camera` finds them.
+
+    `images` is a folder of pictures, or runs. `board` is a description (YAML; by default `board.yaml` of the
+    folder), or the numbers of inner corners of a plain chessboard, columns and rows, with the side of its squares
+    `square_mm`. The record has parameters with standard uncertainties, their covariance and remarks; look at
+    `is_accepted` before you use it.
+
+    Raises InputError: no board, too few pictures of it; CalibrationRefused.
+    """
+    from coupole.calibration.lens.workflow import camera_from
+    from coupole.calibration.request import Request
+
+    plain_board = plain_chessboard(board, square_mm) if isinstance(board, tuple) else None
+    if plain_board is None and square_mm is not None:
+        raise InputError("square_mm: belongs to a plain board of columns and rows")
+    path = Path(board) if board is not None and not isinstance(board, tuple) else None
+    sources, _, sightings = sight_board(
+        _paths(images),
+        path,
+        None,
+        plain_board,
+        partial(progress or _silent, "looking for the board"),
+    )
+    now = datetime.now(UTC)
+    return camera_from(sightings, sources, model, Request(f"camera-{now:%Y%m%d}", now))[1].record
+
+
+def identify(
+    spectra: AnyPath | Sequence[AnyPath],
+    *,
+    library: AnyPath,
+    classes: AnyPath | None = None,
+    unit: Literal["auto", "percent", "fraction"] = "auto",
+    progress: Progress | None = None,
+) -> tuple[PigmentFinding, ...]:
+    """Class of pigments that each reflectance spectrum shows, as `coupole identify` finds it.
+
+    `spectra` are files of an instrument or tables, or folders of them; `library` has the spectra of known
+    pigments, `classes` the class of each (by default the table that comes with Coupole). Raises InputError.
+    """
+    from coupole.appearance.spectra.spectra_library import read_library
+
+    measured_spectra = [spectrum for path in _paths(spectra) for spectrum in read_library(path, unit=unit)]
+    return identify_spectra(
+        measured_spectra,
+        references_of(Path(library), None if classes is None else Path(classes)),
+        progress or _silent,
+    )
+
+
+def register(
+    scans: Sequence[AnyPath],
+    *,
+    unit: str = "mm",
+    targets: AnyPath | None = None,
+    control: AnyPath | None = None,
+    seen_from: str | None = None,
+    trust_poses: bool = False,
+    progress: Progress | None = None,
+) -> Registration:
+    """Poses of two or more scans from what they overlap, as `coupole register` finds them.
+
+    `scans` are PLY, STL, OBJ, PTX, PTS, E57, or text with x y z, in `unit` (mm, cm, m, um or in; E57 is always in
+    m). `targets` is a table of targets in the scans, `control` one of targets whose places are known;
+    `seen_from` is the scanner's place in each scan's frame: origin, +x, -x, +y, -y, +z, -z or none (by default it
+    is found); `trust_poses` starts from the poses that PTX and E57 state.
+
+    Raises InputError: no two scans overlap; ExtraMissing.
+    """
+    from coupole.scan.registration import registering
+    from coupole.scan.registration.viewpoint import STANDS
+
+    stand = next((candidate for candidate in STANDS if candidate == seen_from), None)
+    if seen_from is not None and stand is None:
+        raise InputError(f"--seen-from {seen_from}: expected one of {', '.join(STANDS)}")
+    return registering.register(
+        _paths(scans),
+        unit,
+        stand=stand,
+        targets=None if targets is None else Path(targets),
+        control=None if control is None else Path(control),
+        trust_poses=trust_poses,
+        say=progress or _silent,
+    )
+
+
+def compare(
+    before: AnyPath,
+    after: AnyPath,
+    *,
+    unit: str = "mm",
+    noise_mm: float | None = None,
+    is_aligned: bool = False,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Significant changes of shape and colour between two states of an object, as `coupole compare` finds them.
+
+    Both are meshes or clouds (PLY, STL, OBJ) in `unit`, or folders of a result of reflectance. `noise_mm` is the
+    standard deviation of a point (by default estimated from the scatter); with `is_aligned` they are in one frame
+    already. Raises InputError, ExtraMissing.
+    """
+    from coupole.heritage.comparison import state_comparison
+    from coupole.scan.scan import UNITS
+
+    if unit not in UNITS:
+        raise InputError(f"--unit {unit}: expected one of {', '.join(UNITS)}")
+    if noise_mm is not None and not 0 < noise_mm < 1e3:
+        raise InputError(f"--noise-mm {noise_mm:g}: expected a standard deviation above 0 mm")
+    return state_comparison.compare(
+        Path(before), Path(after), unit, noise_mm, is_aligned=is_aligned, say=progress or _silent
+    )
+
+
+# -- parts that the commands share ------------------------------------------------------------------------------
+
+
+def fit_runs(
+    request: RunRequest, out: Path, scheduler: str | None, progress: Progress, *, with_texels: bool
+) -> dict[str, Any]:
+    """Make a result, or what of it is missing; return what `result.json` says. Raises as `fit_reflectance`."""
+    from coupole.reflectance.run_job import reflectance_of
+
+    about = reflectance_of(request, out, scheduler=scheduler, say=progress)
+    if with_texels:
+        from coupole.reflectance.texels.texel_job import add_texels
+
+        about |= {"texels": add_texels(request, out, scheduler=scheduler, say=progress)}
+    return about
+
+
+def references_of(library: Path, classes: Path | None) -> References:
+    """Return the library's spectra with their classes. Raises InputError, also if no table of classes is known."""
+    from coupole.appearance.spectra.spectra_library import read_library
+    from coupole.heritage.analysis.pigment_classes import read_classes, shipped_classes
+    from coupole.heritage.analysis.references import make_references
+
+    spectra = read_library(library)
+    table = read_classes(classes) if classes is not None else shipped_classes(spectra)
+    if not table:
+        raise InputError(
+            f"{library}: no table of classes comes with Coupole for this library; name one with --classes: "
+            "lines of name and class"
+        )
+    return make_references(spectra, table)
+
+
+def identify_spectra(
+    spectra: Sequence[LibrarySpectrum], references: References, progress: Progress
+) -> tuple[PigmentFinding, ...]:
+    """Return a finding for each spectrum. Raises InputError, with file and line."""
+    from coupole.heritage.analysis import identification
+    from coupole.heritage.analysis.references import trimmed_spectrum
+
+    findings = []
+    for count, spectrum in enumerate(spectra):
+        progress("identify", count, len(spectra))
+        findings.append(identification.identify(trimmed_spectrum(spectrum), references))
+    progress("identify", len(spectra), len(spectra))
+    return tuple(findings)
+
+
+def plain_chessboard(corners: tuple[int, int], square_mm: float | None) -> Board:
+    """Return a chessboard of so many inner corners, columns and rows. Raises InputError if there can be none."""
+    from coupole.calibration.lens.board import Board
+
+    columns, rows = corners
+    if square_mm is None:
+        raise InputError(f"--board {columns}x{rows}: expected the side of its squares too, --square MM")
+    if not all(3 <= count <= 200 for count in corners):
+        raise InputError(f"--board {columns}x{rows}: expected 3 to 200 inner corners each way")
+    return Board(kind="chessboard", corners=corners, square_mm=square_mm, scale_u_ppm=PRINTED_U_PPM)
+
+
+def sight_board(
+    paths: list[Path],
+    board: Path | None,
+    poses: Path | None,
+    plain_board: Board | None,
+    progress: Callable[[int, int], None],
+) -> tuple[Sources, Board, Found]:
+    """Open the images, and find the board in them: a plain one, that of a file, or of `board.yaml` beside them."""
+    from coupole.calibration.lens.board import read_board
+    from coupole.calibration.lens.images import find_board
+    from coupole.calibration.sources import BOARD_NAME, open_sources
+
+    usual_file = paths[0] / BOARD_NAME
+    named_file = board or (usual_file if usual_file.is_file() else None)
+    if plain_board is None and named_file is None:
+        raise InputError(f"expected the board's description: give --board, or put it at {usual_file}")
+    description = None if plain_board is not None else named_file
+    target = plain_board if description is None else read_board(description)
+    assert target is not None  # as was refused above
+    sources = open_sources(paths, poses).with_file(description)
+    if description is None:
+        across, down = target.corners
+        sources = sources.with_words(f"--board {across}x{down} --square {target.square_mm:g}")
+    return sources, target, find_board(target, sources, progress)
+
+
+def _silent(step: str, count: int, total: int) -> None:
+    """Tell nobody."""
+
+
+def _paths(paths: AnyPath | Sequence[AnyPath]) -> list[Path]:
+    if isinstance(paths, str | os.PathLike):
+        return [Path(paths)]
+    return [Path(path) for path in paths]

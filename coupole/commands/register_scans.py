@@ -84,14 +84,9 @@ def register(
         levels_mm = _levels(levels)
         with new_scan_folder(out) as folder, step_bars(console) as say:
             registration = analyses.register(
-                scans,
-                unit=unit,
-                targets=targets,
-                control=control,
-                seen_from=seen_from,
-                trust_poses=trust_poses,
-                progress=say,
-            )
+                scans, unit=unit, targets=targets, control=control, seen_from=seen_from,
+                trust_poses=trust_poses, progress=say,
+            )  # fmt: skip
             mesh = None if no_mesh else _merge_scans(registration, unit, mesh_mm, levels_mm, folder, say)
             document = about(registration, mesh)
             (folder / "registration.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

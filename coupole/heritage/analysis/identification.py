@@ -87,7 +87,7 @@ class PigmentFinding:
     remarks: tuple[str, ...]
     """Remarks about the spectrum, such as bands that were left out."""
     rates: HeldOutRates
-    """How often the library is right about its own spectra when they are left out."""
+    """Shares of the library's own spectra, each left out, about which it is right."""
 
 
 def identify(spectrum: Measured, references: References) -> PigmentFinding:

@@ -93,6 +93,22 @@ class Identity:
     """Settings as read back from the device once its driver has set them; a run records them."""
 
 
+@dataclass(frozen=True)
+class HostNeed:
+    """A need of a driver of the machine that it runs on. A `Settings` model may have a method `host_needs`, which
+    returns a list of them without touching the device; `coupole doctor` shows them."""
+
+    name: str
+    """Right, library, file or setting of the system."""
+    is_met: bool
+    state: str
+    """State that was seen, in words."""
+    remedy: str
+    """Action of a person that meets it, as a sentence."""
+    is_vital: bool = True
+    """False: it works without, but slower or with losses."""
+
+
 class LedBox(Protocol):
     """An LED control box with the functions that every box has: it lights one LED at a time on command.
 

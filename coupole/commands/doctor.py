@@ -1,19 +1,28 @@
-"""`coupole doctor`: what this machine can promise a cell, measured. No device is opened and nothing moves."""
+"""`coupole doctor`: what this machine lacks for a cell, and what it can promise. No device is opened."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from coupole.commands.common import JsonOption
-from coupole.errors import InputError, PreflightRefused
+from coupole.errors import PreflightRefused
 from coupole.plan.shipped_files import SIMULATED_CELL
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.devices import HostNeed
+    from coupole.plan.cell import Cell
 
 SLOWER_MS = 12
 """RSI's other cycle (#IPO)."""
+NOT_TIMED = "the arm's driver does not answer its controller in cycles: there was nothing to measure"
 
 
 def doctor(
@@ -26,27 +35,55 @@ def doctor(
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure whether this machine answers the arm's controller in time, in each cycle of the rig.
+    """Look what this machine lacks for a rig, and measure whether it answers the arm's controller in time.
 
-    The process that answers runs as in a session, with a controller that this command plays; have the machine do
-    meanwhile what it does in a run. Exit code 3: it cannot hold the rig's cycle.
+    Libraries, rights, ports, folders: each with its remedy. No device is opened. Where the arm's driver answers
+    its controller in every cycle, the process that answers runs as in a session, with a controller that this
+    command plays; have the machine do meanwhile what it does in a run. Exit code 3: something is missing, or the
+    machine cannot hold the rig's cycle.
     """
-    from rich.progress import Progress, TimeRemainingColumn
-
+    from coupole.commands.extras import lacking_extras
     from coupole.plan.cell import read_cell
-    from coupole.plan.registry import ANSWER_JITTER, load_class
-    from coupole.plan.rig_devices import robot_settings_here
+    from coupole.preflight.machine import machine_needs
     from coupole.viewing.terminal import make_console
 
     cell = read_cell(rig or SIMULATED_CELL)
+    console = make_console(quiet=as_json)
+    needs, lacking = machine_needs(cell), lacking_extras()
+    for part, need in needs:
+        console.print(line_of(part, need), highlight=False)
+    for extra, libraries in lacking.items():
+        console.print(f"  extra {extra} is not installed: {', '.join(libraries)}", highlight=False)
+    jitters = _measure(cell, seconds, console)
+    for jitter in jitters:
+        console.print(words_of(jitter))
+    advice = advice_of(jitters, cell.document.path) if jitters else NOT_TIMED
+    if as_json:
+        documents = [{**jitter._asdict(), "holds": jitter.holds} for jitter in jitters]
+        about_answers = {"holds": jitters[0].holds if jitters else None, "measured": documents, "advice": advice}
+        told_needs = [{"part": part, **asdict(need)} for part, need in needs]
+        print(json.dumps({**about_answers, "needs": told_needs, "lacking_extras": lacking}))
+    unmet = [need for _, need in needs if need.is_vital and not need.is_met]
+    refusals = [f"{need.name}: {need.state}. {need.remedy}" for need in unmet]
+    if jitters and not jitters[0].holds:
+        refusals.append(advice)
+    if refusals:
+        raise PreflightRefused(refusals)
+    console.print(advice)
+
+
+def _measure(cell: Cell, seconds: float, console: Console) -> list[Any]:
+    """Measure the answers in the rig's cycle, and in the longer one if that does not hold; nothing for a driver
+    that does not answer in cycles."""
+    from rich.progress import Progress, TimeRemainingColumn
+
+    from coupole.plan.registry import ANSWER_JITTER, load_class
+    from coupole.plan.rig_devices import robot_settings_here
+
     driver = cell.rig.robot.driver
     if driver not in ANSWER_JITTER:
-        raise InputError(
-            f"{cell.document.path}: `{driver}` does not answer its controller in every cycle: there is nothing to "
-            "measure"
-        )
+        return []
     measure, settings = load_class(ANSWER_JITTER[driver]), robot_settings_here(cell.rig)
-    console = make_console(quiet=as_json)
     jitters: list[Any] = []
     with Progress(*Progress.get_default_columns()[:3], TimeRemainingColumn(), console=console) as bars:
         for cycle_ms in (settings.cycle_ms, SLOWER_MS):
@@ -54,15 +91,14 @@ def doctor(
                 bar = bars.add_task(f"answers in a cycle of {cycle_ms} ms", total=seconds)
                 cycle_settings = settings.model_copy(update={"cycle_ms": cycle_ms})
                 jitters.append(measure(cycle_settings, seconds, lambda s, bar=bar: bars.update(bar, completed=s)))
-    for jitter in jitters:
-        console.print(words_of(jitter))
-    advice = advice_of(jitters, cell.document.path)
-    if as_json:
-        documents = [{**jitter._asdict(), "holds": jitter.holds} for jitter in jitters]
-        print(json.dumps({"holds": jitters[0].holds, "measured": documents, "advice": advice}))
-    if not jitters[0].holds:
-        raise PreflightRefused([advice])
-    console.print(advice)
+    return jitters
+
+
+def line_of(part: str, need: HostNeed) -> str:
+    """Return a need as a line for people, with the remedy if it is not met."""
+    mark = "[green]ok  [/]" if need.is_met else "[red]lack[/]" if need.is_vital else "[yellow]weak[/]"
+    remedy = "" if need.is_met else f". {escape(need.remedy)}"
+    return f"{mark} {part}: {escape(need.name)}: {escape(need.state)}{remedy}"
 
 
 def words_of(jitter: Any) -> str:

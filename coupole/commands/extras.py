@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 from coupole.errors import ExtraMissing
 
 EXTRA_OF = {
@@ -39,3 +41,16 @@ def missing_extra(error: ImportError) -> ExtraMissing | None:
     if library not in EXTRA_OF:
         return None
     return ExtraMissing(f"this needs {library}; install it: pip install 'coupole[{EXTRA_OF[library]}]'")
+
+
+def lacking_extras() -> dict[str, list[str]]:
+    """Return the libraries that are not installed, by extra."""
+    lacking: dict[str, list[str]] = {}
+    for library, extra in EXTRA_OF.items():
+        try:
+            is_missing = find_spec(library) is None
+        except ImportError:
+            is_missing = True
+        if is_missing:
+            lacking.setdefault(extra, []).append(library)
+    return lacking

@@ -6,12 +6,13 @@ addresses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
 from pydantic import BaseModel
 
+from coupole.devices import HostNeed
 from coupole.errors import Problem
 from coupole.kinematics import Arm, slowed_arm
 from coupole.plan.arm_description import ArmDescription, arm_of_driver, read_arm, shipped_arm
@@ -84,6 +85,17 @@ def robot_settings_here(rig: Rig) -> Any:
     driver, settings = device_for(rig, "robot", dry_run=False)
     model = settings_class(driver)
     return model(**settings | _known_settings(NOWHERE["robot"], model))
+
+
+def host_needs(rig: Rig) -> Iterator[tuple[str, HostNeed]]:
+    """Yield each need of a driver with its kind of device, where the driver tells what it needs of this machine.
+    An address that a world gives is none of them."""
+    for kind in DEVICES:
+        driver, settings = device_for(rig, kind, dry_run=False)
+        model = settings_class(driver)
+        whole: Any = model(**_known_settings(NOWHERE[kind], model) | settings)
+        if hasattr(whole, "host_needs"):
+            yield from ((kind, need) for need in whole.host_needs())
 
 
 def runs_tables(rig: Rig) -> bool:

@@ -1,5 +1,6 @@
 """The LED control box that speaks SCPI."""
 
-from drivers.ledbox.driver import LedBox, Settings
+from drivers.ledbox.driver import LedBox
+from drivers.ledbox.settings import Settings
 
 __all__ = ["LedBox", "Settings"]

@@ -11,11 +11,10 @@ import contextlib
 import zlib
 from collections.abc import Mapping
 from dataclasses import astuple
-from typing import Literal, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.clock import Clock, Deadline
 from coupole.devices import STEP_DTYPE, Identity, Step, StepRecord
@@ -23,51 +22,21 @@ from coupole.errors import DeviceError, DeviceFault, DeviceRefused, DeviceTimeou
 from drivers.ledbox.link import CallEnded, Link
 from drivers.ledbox.scpi import REPLY_MARGIN_S, ScpiSession
 from drivers.ledbox.serial_link import no_port, open_serial
+from drivers.ledbox.settings import BLOCK_BYTES, Settings
 from drivers.ledbox.usbtmc import UsbtmcLink
-from drivers.ledbox.wire import RECORD_BYTES, STEP_BYTES, pack, unpack_log
+from drivers.ledbox.wire import RECORD_BYTES, pack, unpack_log
 
 _BLOCK_TIMEOUT_S = 2.2
 """Silence after which the box has discarded an incomplete block (its own limit is 2 s)."""
 _POLL_S, _POLL_OVERHEAD_BYTES = 0.055, 130
 """Duration of a poll during a burst, and its bytes on the line apart from records."""
 _MAX_RECORDS_PER_POLL = 512
-_BLOCK_BYTES = 512
-"""Largest part of a table in one message: what a box that lacks the device clear lets another command wait for."""
-_BLOCK_OVERHEAD_BYTES, _BLOCK_OVERHEAD_S = 70, 0.003
-_UPLOAD_OVERHEAD_S, _BITS_PER_BYTE = 0.1, 10
 _UNDEFINED_HEADER, _HARDWARE_MISSING, _FIRST_PROTOCOL = "-113", "-241", "1.0"
 _CLEARS_AT_ONCE = 5
 """Threads that may switch the lights off at the same time; each clears the box, and ends the others' messages."""
 _SHORTEST_PERIOD_US = 100
 _FLASH_MARGIN_S = 5.0
 """A flash that lasts this much longer than requested counts as not ended."""
-
-
-class Settings(BaseModel):
-    """Settings of the LED box in a rig."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    port: str
-    """A pyserial URL (`/dev/ttyACM0`, `COM3`, `socket://host:port`, `rfc2217://host:port`) or
-    `usbtmc:VID:PID[:SERIAL]`, VID and PID in hexadecimal."""
-    baud: int = Field(default=115200, ge=1200)
-    led_count: int = Field(default=1080, ge=1, le=65535)
-    """Number of LEDs that the box must report."""
-    watchdog_s: float = Field(default=2.0, ge=0, le=60)
-    """The box switches all light off after this time without a command; 0: never."""
-    edge_width_us: int = Field(default=50, ge=10, le=10_000)
-    edge_polarity: Literal["normal", "inverted"] = "normal"
-    wait_for_ready: bool = False
-    """Delay each step until the camera's exposure-ready line is high; needs that cable."""
-    name: str = "led box"
-
-    def upload_s(self, steps: int) -> float:
-        """Time to upload a table of `steps` steps over a serial line."""
-        table_bytes = STEP_BYTES * steps
-        blocks = -(-table_bytes // _BLOCK_BYTES)
-        line_s = (table_bytes + blocks * _BLOCK_OVERHEAD_BYTES) * _BITS_PER_BYTE / self.baud
-        return line_s + blocks * _BLOCK_OVERHEAD_S + _UPLOAD_OVERHEAD_S
 
 
 class LedBox:
@@ -332,7 +301,7 @@ class LedBox:
 
     def _upload(self, bank: int, payload: bytes) -> None:
         self._banks[bank] = None
-        size = _BLOCK_BYTES if self._clears else max(1, len(payload))
+        size = BLOCK_BYTES if self._clears else max(1, len(payload))
         for first in range(0, max(1, len(payload)), size):
             header = f"SEQ:BANK {bank};DATA{':APP' if first else ''} ".encode("ascii")
             self._scpi.ask(header + _block(payload[first : first + size]), 0)

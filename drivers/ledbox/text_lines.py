@@ -19,8 +19,9 @@ from typing import Literal, NoReturn, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coupole.clock import Clock, Deadline
-from coupole.devices import NO_LED, UNKNOWN_NS, Identity, StepRecord
+from coupole.devices import NO_LED, UNKNOWN_NS, HostNeed, Identity, StepRecord
 from coupole.errors import DeviceError, DeviceLost, DeviceRefused, DeviceTimeout
+from drivers.host_checks import serial_port
 from drivers.ledbox.link import CallEnded, Cleared
 from drivers.ledbox.serial_link import SerialLink, open_serial
 
@@ -77,6 +78,10 @@ class Settings(BaseModel):
         """Longest time that the box leaves a light of `on_us` on if the host dies: its own bound. (If `on` has no
         `{on_ms}`, the box has none: it then leaves the light on until it is told otherwise.)"""
         return _box_bound_ms(on_us) * 1e-3
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return serial_port(self.port)
 
     @model_validator(mode="after")
     def _templates_are_right(self) -> Self:

@@ -23,12 +23,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole import geometry
 from coupole.clock import Clock, Deadline
-from coupole.devices import ArmCondition, ArmState, Identity
+from coupole.devices import ArmCondition, ArmState, HostNeed, Identity
 from coupole.errors import ArmUnattended, DeviceLost, DeviceRefused
 from coupole.kinematics import Arm
 from coupole.supervision import ATTENTION_S, LOOK_S, Attention
 from drivers.arm_motion import MessageTime, checked_speed, checked_target, overtaken, refusal, wait_for
 from drivers.fair_lock import FairLock
+from drivers.host_checks import package
 from drivers.ur.messages import (
     BACKDRIVE,
     EMERGENCY_STOP_BITS,
@@ -85,6 +86,10 @@ class Settings(BaseModel):
     follow_samples: int = Field(default=10, ge=1)
     """The arm does not follow: farther than `follow_deg` from the controller's target joints for this many
     samples."""
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return [package("rtde_control", "ur")]
 
     def arm(self) -> Arm | None:
         """The arm with the limits and speeds that this driver uses; preflight computes durations with it.

@@ -15,7 +15,7 @@ from test_ledbox import TcpLink, usb_world
 
 from coupole.clock import Deadline, SystemClock
 from coupole.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.ledbox.driver import LedBox, Settings
+from drivers.ledbox import LedBox, Settings
 from drivers.ledbox.link import Cleared
 from drivers.ledbox.serial_link import SerialLink
 from drivers.ledbox.wire import pack

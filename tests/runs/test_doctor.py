@@ -27,9 +27,23 @@ def test_it_measures_real_answers_and_says_whether_they_hold() -> None:
 
 
 def test_an_arm_that_is_not_answered_in_cycles_has_nothing_to_measure() -> None:
-    ended = cells.here("doctor", "--rig", REPO / "configs/rigs/sim-eki.yaml")
-    assert ended.code == 2
-    assert "drivers.kuka.eki:KukaEki" in ended.err
+    ended = cells.here("doctor", "--rig", REPO / "configs/rigs/sim-eki.yaml", "--json")
+    told = json.loads(ended.out)
+    assert (ended.code, told["holds"], told["measured"]) == (0, None, [])
+    assert "nothing to measure" in told["advice"]
+    assert {need["part"] for need in told["needs"]} == {"storage"}
+
+
+def test_what_a_real_cell_lacks_is_told_with_its_remedy_and_refused() -> None:
+    rig = REPO / "configs/rigs/la-coupole.yaml"
+    ended = cells.here("doctor", "--rig", rig, "--json")
+    lacking = {need["name"]: need for need in json.loads(ended.out)["needs"] if not need["is_met"]}
+    assert "port: /dev/ttyACM0" in rig.read_text()
+    assert ended.code == 3
+    assert "by-id" in lacking["serial port /dev/ttyACM0"]["remedy"]
+    assert "XIMEA's software package" in lacking["library libm3api.so.2"]["remedy"]
+    for need in lacking.values():
+        assert need["remedy"] in ended.err or not need["is_vital"]
 
 
 def test_one_late_answer_of_fifteen_thousand_is_a_cycle_that_does_not_hold() -> None:

@@ -113,6 +113,9 @@ _NOT_CONNECTED, _TRANSFER_ERROR, _TIMEOUT, _NOT_FOUND, _NOT_CONTROLLER = 2, 4, 5
 """Codes of ArvDeviceError (arvdevice.h)."""
 
 
+HOW_TO_INSTALL = "Install it (Debian: apt install libaravis-0.8-0; else pip install aravis-python)."
+
+
 @functools.cache
 def load() -> Any:
     """The library, which also exports GObject's functions; None if it is not installed.
@@ -143,7 +146,7 @@ def require(device: str) -> Any:
             device,
             expected="libaravis-0.8, which implements GigE Vision and USB3 Vision",
             happened="it is not installed",
-            remedy="Install it (Debian: apt install libaravis-0.8-0; else pip install aravis-python).",
+            remedy=HOW_TO_INSTALL,
         )
     return library
 

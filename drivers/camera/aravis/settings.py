@@ -6,7 +6,10 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coupole.devices import HostNeed
+from drivers.camera.aravis.library import HOW_TO_INSTALL, load
 from drivers.camera.genicam_settings import Counter, Region, Value
+from drivers.host_checks import receive_buffer
 
 
 class Settings(BaseModel):
@@ -49,3 +52,11 @@ class Settings(BaseModel):
     """Longest time for the last packets of a frame, before it counts as incomplete."""
     buffers: Annotated[int, Field(ge=2)] = 16
     """Least number of buffers queued."""
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        is_installed = load() is not None
+        return [
+            HostNeed("libaravis-0.8", is_installed, "installed" if is_installed else "missing", HOW_TO_INSTALL),
+            receive_buffer(),
+        ]

@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coupole.devices import HostNeed
 from drivers.camera.genicam_settings import Counter, Region, Value
+from drivers.host_checks import library_file, package
 
 
 class Settings(BaseModel):
@@ -52,3 +54,7 @@ class Settings(BaseModel):
     """Largest deviation of the timestamps from the edges; from the camera's data sheet, or measured."""
     buffers: Annotated[int, Field(ge=2)] = 16
     """Least number of buffers queued."""
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return [package("harvesters", "gentl"), package("genicam", "gentl"), library_file(self.producer)]

@@ -26,13 +26,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.clock import Clock
-from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, Identity
+from coupole.devices import CameraStatistics, Exposure, Frame, FrameFormat, HostNeed, Identity
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
 from drivers.camera.frame_pool import FramePool
 from drivers.camera.misuse import misuse_error
 from drivers.camera.raw.exif import Exif
 from drivers.camera.raw.order import Order, file_number
 from drivers.camera.raw.picture import RawPicture, read_picture
+from drivers.host_checks import folder_of_pictures, package
 
 _LOOK_S = 0.05
 """Interval between two looks into the folder."""
@@ -71,6 +72,10 @@ class Settings(BaseModel):
     """Longest wait for a picture after a later one has arrived, before it counts as lost."""
     black_dn: Annotated[int, Field(ge=0)] | None = None
     """Black level, DN; None: the value that LibRaw finds in the file."""
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return [package("rawpy", "pictures"), folder_of_pictures(self.folder)]
 
 
 class RawFiles:

@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coupole.devices import HostNeed
 from drivers.camera.xiapi.library import LIBRARY
+from drivers.host_checks import huge_pages, library
 
 
 class Region(BaseModel):
@@ -60,3 +62,7 @@ class Settings(BaseModel):
     """Further xiAPI parameters, set at opening in this order. The driver's own table (`state`) leaves them out."""
     leave: tuple[str, ...] = ()
     """Parameters of the driver's own table that stay as they are in the camera."""
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return [library(self.library, "Install XIMEA's software package for Linux."), huge_pages()]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 from ipaddress import IPv4Address
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from coupole.devices import HostNeed
 from coupole.kinematics import Arm, slowed_arm
+from drivers.host_checks import own_address
 from drivers.senders import refuse_anybody
 
 
@@ -68,6 +71,10 @@ class Settings(BaseModel):
                 f"of the controller's own highest values: both must be from 1 to 100 %"
             )
         return self
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        return own_address(self.address, kind=socket.SOCK_STREAM) if self.controller_is == "client" else []
 
     def velocity_percent(self) -> int:
         return int(round(100.0 * self.speed_fraction, 6))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from ipaddress import IPv4Address
 from typing import Literal, Self
 
@@ -9,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
+from coupole.devices import HostNeed
 from coupole.kinematics import Arm, SphericalWrist, slowed_arm, structure_of
 from coupole.supervision import ATTENTION_S
 from drivers.arm_motion import farthest_stop_deg
+from drivers.host_checks import own_address
 from drivers.kuka.rsi.corrections import TAGS
-from drivers.senders import refuse_anybody
+from drivers.kuka.rsi.realtime import how_to_give_the_right, may_be_realtime
+from drivers.senders import only_here, refuse_anybody
 
 _TAG = r"^[A-Za-z_]\w*$"
 
@@ -109,6 +113,22 @@ class Settings(BaseModel):
                 f"{self.arm_model.name}; set `corrects: axes`"
             )
         return self
+
+    def host_needs(self) -> list[HostNeed]:
+        """Needs of this machine, for `coupole doctor`."""
+        needs = own_address(self.listen, kind=socket.SOCK_DGRAM)
+        if not only_here(self.listen):
+            has_right = may_be_realtime()
+            needs.append(
+                HostNeed(
+                    "real-time priority",
+                    has_right,
+                    "this user has the right" if has_right else "this user lacks the right (SCHED_FIFO)",
+                    how_to_give_the_right(),
+                    is_vital=not self.without_realtime_by,
+                )
+            )
+        return needs
 
     @property
     def wrist(self) -> SphericalWrist:

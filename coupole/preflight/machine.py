@@ -1,0 +1,37 @@
+"""Needs of a cell of the machine that runs it, found without its devices (`coupole doctor`)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from coupole.devices import HostNeed
+from coupole.plan.cell import Cell
+from coupole.plan.rig_devices import host_needs
+
+ROOM_BYTES = 20_400_000_000
+"""One view under 1080 LEDs: frames of 12 megapixels, 12 bits packed."""
+
+
+def machine_needs(cell: Cell) -> list[tuple[str, HostNeed]]:
+    """Return the needs of the rig's drivers and of its storage, each with the part of the rig that has it."""
+    return [*host_needs(cell.rig), *(("storage", need) for need in storage_needs(cell.storage_folder))]
+
+
+def storage_needs(folder: Path) -> list[HostNeed]:
+    """Return the needs of a folder of runs: it can be written, and has room."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    need_name = f"folder of runs {folder}"
+    if not there.is_dir():
+        return [HostNeed(need_name, False, f"{there} is no folder", "Name another folder in the rig.")]
+    if not os.access(there, os.W_OK | os.X_OK):
+        return [
+            HostNeed(need_name, False, f"this user may not write into {there}", f"Say `sudo chown $USER {there}`.")
+        ]
+    free_bytes = shutil.disk_usage(there).free
+    remedy = "Archive or move older runs (`coupole archive`), or name another folder in the rig."
+    room = HostNeed(
+        "room for runs", free_bytes >= ROOM_BYTES, f"{free_bytes / 1e9:.0f} GB free", remedy, is_vital=False
+    )
+    return [HostNeed(need_name, True, "can be written", ""), room]

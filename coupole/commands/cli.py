@@ -6,6 +6,8 @@ import contextlib
 import functools
 import importlib
 import inspect
+import json
+import platform
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
@@ -18,7 +20,7 @@ import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
 from coupole.bounded import leave
 from coupole.commands.common import fail
-from coupole.commands.extras import missing_extra
+from coupole.commands.extras import lacking_extras, missing_extra
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
 
@@ -145,25 +147,36 @@ app = typer.Typer(
     cls=_Commands,
     help="Acquisition controller of La Coupole: a plan in, proven frames out.",
     no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
 )
-
-
-def _print_version(asked: bool) -> None:
-    if asked:
-        print(f"coupole {coupole.__version__}")
-        raise typer.Exit
 
 
 @app.callback()
 def _options(
     context: typer.Context,
-    _: Annotated[
-        bool, typer.Option("--version", help="Print the version and end.", callback=_print_version, is_eager=True)
+    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="With --version: one JSON line, with Python, system and missing extras.")
     ] = False,
 ) -> None:
+    if version:
+        print(json.dumps(_about_version()) if as_json else f"coupole {coupole.__version__}")
+        raise typer.Exit
+    if as_json or context.invoked_subcommand is None:
+        context.fail("--json goes with --version here, or behind a command's name")
     if context.invoked_subcommand in AT_A_CELL:
         text_outlet.install()
+
+
+def _about_version() -> dict[str, Any]:
+    """Return what a report of a defect should say of an installation."""
+    return {
+        "coupole": coupole.__version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "lacking_extras": lacking_extras(),
+    }
 
 
 def main() -> None:

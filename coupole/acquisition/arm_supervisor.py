@@ -121,6 +121,7 @@ class ArmSupervisor:
 
     def _follow(self, here_deg: Joints, there_deg: Joints, meanwhile: Callable[[], None], speed: float) -> None:
         """One straight motion, watched until the arm is at rest. Raises ArmUnattended if it was braked."""
+        self._control.await_word()
         self._control.go_on()
         self._robot.move_to(there_deg, speed)
         self.hurry(move_duration_s(self._arm, here_deg, there_deg) / speed + self._motion.settle_dwell_s)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from coupole.acquisition.operator import (
     refuse_uncommissioned,
 )
 from coupole.acquisition.sequencer import Sequencer
-from coupole.acquisition.signals import obeyed_by
+from coupole.acquisition.signals import Act, obeyed_by
 from coupole.acquisition.single_shots import SingleShots
 from coupole.bounded import NOW, refuse_overdue, run_bounded
 from coupole.errors import CoupoleError, InputError, PreflightRefused
@@ -45,6 +44,8 @@ from coupole.viewing.live_page import serve
 from coupole.viewing.terminal import LiveFigures, RunObserver, alarm
 
 _FIGURES_EVERY_S = 0.2
+LOOKS_ON = "this process only looks on: the run goes on"
+"""Word of a live view of a run, which has nothing to make safe."""
 
 
 def meter(
@@ -142,7 +143,7 @@ def _ask_the_ledger(job: Job, console: Console) -> None:
 
 def watch_run(folder: Path, console: Console, *, port: int) -> None:
     """Show the newest proven frame of a run until the operator stops it."""
-    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0, halt=lambda: None)
+    _show_live(RunSource(folder), Studio(Choice(None, 0)), console, port, longest_us=0, halt=lambda: [LOOKS_ON])
 
 
 def _show_live(
@@ -152,7 +153,7 @@ def _show_live(
     port: int,
     *,
     longest_us: int,
-    halt: Callable[[], object],
+    halt: Act,
 ) -> None:
     """Show the live view until the operator stops it; `halt` is called as soon as he does."""
     try:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from coupole.viewing.progress import Progress
 
 
+_WORD_EVERY_S = 0.01
+
+
 class Observer(Protocol):
     """Observes a run. Called in the sequencer's thread, so methods must return quickly."""
 
@@ -58,6 +61,8 @@ class Control:
     (`halting`), and only a person lets it go on.
     """
 
+    session: Control | None = None
+    """The session that this is a part of, whose stop and holds count here too; None: it is the session."""
     stop: threading.Event = field(default_factory=threading.Event)
     pause: threading.Event = field(default_factory=threading.Event)
     standing: threading.Event = field(default_factory=threading.Event)
@@ -133,13 +138,26 @@ class Control:
         """True while the session is to stand, and does not yet: devices fail then because they were stopped, or
         because this process was. If it did not run for a while, this waits for the word of the thread that hears
         of SIGCONT: whether it was frozen, or the machine only busy."""
-        if self.awaits_word:
-            self.hold_pending.wait(HEARD_WITHIN_S)
+        if self.session is not None:
+            return self.session.stands
+        self.await_word()
         return self.hold_pending.is_set()
+
+    def await_word(self) -> None:
+        """Wait, if this process did not run for a while, until it is known why: before an arm that stands is moved
+        again."""
+        if self.session is not None:
+            self.session.await_word()
+            return
+        end_s = time.monotonic() + HEARD_WITHIN_S
+        while self.awaits_word and not self.stop.is_set() and time.monotonic() < end_s:
+            self.hold_pending.wait(_WORD_EVERY_S)
 
     @property
     def awaits_word(self) -> bool:
         """True if `stands` would wait: this process did not run for a while, and it is not known yet why."""
+        if self.session is not None:
+            return self.session.awaits_word
         now_s = time.monotonic()
         late = now_s - self.pulse_s > ASKS_FROM_S or now_s - self.stood_at_s < HEARD_WITHIN_S
         return late and not self.hold_pending.is_set()
@@ -147,6 +165,8 @@ class Control:
     def go_on(self) -> None:
         """Raise Interrupted if the session is to stop, Held if it is to stand: to be called before each command
         that lights or moves."""
+        if self.session is not None:
+            self.session.go_on()
         if self.stop.is_set():
             raise self.interruption()
         if self.hold_pending.is_set():

@@ -35,6 +35,10 @@ _WORLD_STARTS_S, _OPENS_S = 900.0, 30.0
 _SLOW_START_S = 15.0
 
 
+ARM_STOPPED = "arm stopped"
+"""Name of the safeguard of the arm."""
+
+
 @dataclass
 class OpenedCell:
     """Devices in use. `make_safe` and `close` never raise; their errors are in `trouble`."""
@@ -65,7 +69,7 @@ class OpenedCell:
         """Begin to switch the lights off and to stop the arm, side by side; returns at once. From any thread."""
         return [
             Safeguard("lights off", self.switch_off),
-            Safeguard("arm stopped", self.robot.stop),
+            Safeguard(ARM_STOPPED, self.robot.stop),
         ]
 
     def switch_off(self) -> None:

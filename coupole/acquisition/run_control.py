@@ -37,6 +37,7 @@ State = dict[str, Any]
 """`run`, `rig`, `pid`, `light_after_lux_h`, `state` (running, pausing, paused, stopping); from the first burst on
 `Progress` too."""
 _SAFE_WITHIN_S = 4.0
+_UNHEARD = "it did not run for a while and is being made safe; it has then to be asked anew"
 _LOOK_PATIENCE_S = 0.5
 
 
@@ -99,7 +100,9 @@ class RunControl:
             case "pause":
                 self._control.pause.set()
             case "go-on":
-                if not self._control.stands and not is_gone():  # which waits for the word of what was frozen
+                if self._control.stands:  # which waits for the word of what was frozen
+                    return {**self.state(), "unheard": _UNHEARD}
+                if not is_gone():
                     self._control.let_go_on()
             case "stop":
                 self._control.stop_by(signal.SIGINT, "`coupole stop`, or the console")
@@ -107,6 +110,12 @@ class RunControl:
             case _:
                 return {"version": VERSION, "error": "expected the command pause, go-on, stop or state"}
         return self.state()
+
+
+class NoAnswer(InputError):
+    """The process that acquires does not answer."""
+
+    exit_code = 4
 
 
 # -- the side of whoever asks ---------------------------------------------------------------------------------
@@ -123,7 +132,7 @@ def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: No
     """Send a command to the process that acquires into `run`; its state after it. `say` is told within 2 s why it
     does not answer, and of a command that is given up without an answer what becomes of it.
 
-    Raises InputError: none does, on this machine and by this user, or it does not answer.
+    Raises InputError: none does, on this machine and by this user; NoAnswer.
     """
     path = named_after(run, "sock")
     try:
@@ -132,7 +141,7 @@ def ask(run: Path, command: Command, say: Callable[[str], object] = lambda _: No
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise InputError(f"{run}: no process of this user acquires into this run on this machine") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
+        raise NoAnswer(f"{run}: the process that acquires into it does not answer: {reason(error)}") from error
 
 
 def running() -> list[State]:

@@ -18,8 +18,9 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from coupole import bounded
@@ -28,6 +29,7 @@ from coupole.acquisition.safeguard import Safeguard, unsure
 from coupole.supervision import ASKS_FROM_S
 from coupole.viewing.text_outlet import say_now
 
+Act = Callable[[], Sequence["Safeguard | str"]]
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _heard_s = deque([-math.inf], maxlen=1)
 """Time when the main thread last heard of a signal, outside sessions."""
@@ -113,10 +115,13 @@ def drop_signals() -> Iterator[None]:
 
 
 @contextmanager
-def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
+def obeyed_by(control: Control, act: Act, *, is_watched: bool = True) -> Iterator[None]:
     """A signal that ends the session sets `control.stop` and calls `act` at once, in another thread; SIGUSR1
     pauses the session or continues it; Ctrl-Z calls `act`, stops the process, and holds the session. `act` begins
-    to make the cell safe; it may return its `Safeguard`s.
+    to make the cell safe; it returns its `Safeguard`s, and in words what is not sure already.
+
+    Without `is_watched` another process watches the arm and the lamps: that this one did not run for a while holds
+    nothing.
 
     Signals are delivered to Python's main thread only between two of its steps, and a disk or a device may hold it
     for seconds within one. The interpreter writes each signal's number to a pipe without delay; a thread reads it.
@@ -127,7 +132,8 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
     read_fd, write_fd = os.pipe()
     os.set_blocking(write_fd, False)
 
-    thread = threading.Thread(target=_obey, args=(read_fd, control, act), name="signals", daemon=True)
+    obey = partial(_obey, read_fd, control, act, is_watched=is_watched)
+    thread = threading.Thread(target=obey, name="signals", daemon=True)
     before = signal.set_wakeup_fd(write_fd, warn_on_full_buffer=False)
     thread.start()
     try:
@@ -145,7 +151,7 @@ def obeyed_by(control: Control, act: Callable[[], object]) -> Iterator[None]:
         control.pulse_s = math.inf
 
 
-def _obey(read_fd: int, control: Control, act: Callable[[], object]) -> None:
+def _obey(read_fd: int, control: Control, act: Act, *, is_watched: bool) -> None:
     """Obey the signals whose numbers come through a pipe, until it is closed; and prove that the process runs."""
     has_acted, stood_s, noticed_s = False, 0.0, 0.0
     slept_s = _slept_s()
@@ -159,7 +165,8 @@ def _obey(read_fd: int, control: Control, act: Callable[[], object]) -> None:
             control.stood_at_s = noticed_s = now_s
         if (asleep_s := _slept_s() - slept_s) > ASKS_FROM_S:
             slept_s += asleep_s
-            _hold(control, act, frozen(asleep_s))
+            if is_watched:
+                _hold(control, act, frozen(asleep_s))
         if not ready:
             continue
         if not (numbers := os.read(read_fd, 64)):
@@ -172,7 +179,8 @@ def _obey(read_fd: int, control: Control, act: Callable[[], object]) -> None:
             elif number == signal.SIGTSTP:
                 _suspend(control, act)
             elif number == signal.SIGCONT and stood_s and now_s - noticed_s < ASKS_FROM_S:
-                _hold(control, act, frozen(stood_s))
+                if is_watched:
+                    _hold(control, act, frozen(stood_s))
                 stood_s = 0.0
 
 
@@ -181,23 +189,20 @@ def _slept_s() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME) - time.clock_gettime(time.CLOCK_MONOTONIC)
 
 
-def _hold(control: Control, act: Callable[[], object], why: str) -> None:
+def _hold(control: Control, act: Act, why: str) -> None:
     """Hold the session, and have lights off and the arm at rest."""
     control.halting.set()
     try:
         control.hold(why)
         answer = act()
-        safeguards = (
-            [safeguard for safeguard in answer if isinstance(safeguard, Safeguard)]
-            if isinstance(answer, list)
-            else []
-        )
-        control.unsure = unsure(safeguards, _SAFE_WITHIN_S)
+        words = [told for told in answer if isinstance(told, str)]
+        safeguards = [told for told in answer if isinstance(told, Safeguard)]
+        control.unsure = [*words, *unsure(safeguards, _SAFE_WITHIN_S)]
     finally:
         control.halting.clear()
 
 
-def _suspend(control: Control, act: Callable[[], object]) -> None:
+def _suspend(control: Control, act: Act) -> None:
     """Ctrl-Z: first the cell is safe, then the process stops; when it goes on, a person is asked."""
     _hold(control, act, "suspended by Ctrl-Z: the lights were switched off and the arm was stopped first")
     state = "; ".join(control.unsure) or "lights are off, the arm is at rest"

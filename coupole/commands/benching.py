@@ -119,6 +119,8 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
     print(f"{path['to']}: {path['duration_s']:.1f} s, {steps} straight motion(s)", file=sys.stderr)
     if not yes and not ask("Drive the arm along this path?"):
         raise Interrupted("not driven: answer the question, or say `--yes`")
+    control.await_word()  # the answer may have been given while nobody ran
+    control.go_on()
     try:
         work = checked_answer(send_request("drive", path=path["path"]))
         while work["state"] == "running":
@@ -132,6 +134,7 @@ def _drive(send_request: Asked, goal: Any, control: Control, *, yes: bool) -> di
             _say(str(silent))
         raise
     if work["state"] != "done":
+        control.go_on()  # whose stop ends the work too
         raise DeviceError(
             "robot", expected=f"the arm to arrive at {work['to']}", happened=work["why"], remedy="See its state."
         )

@@ -42,7 +42,12 @@ def pause(run: RunningRun = None, as_json: JsonOption = False) -> None:
 
 def go_on(run: RunningRun = None, as_json: JsonOption = False) -> None:
     """Go on with a paused acquisition. (One that has ended goes on by `coupole acquire --resume RUN`.)"""
-    _say(_state_after(run, "go-on"), as_json=as_json)
+    state = _state_after(run, "go-on")
+    if why := state.get("unheard"):
+        raise DeviceError(
+            "run", expected="it to go on", happened=why, remedy="Say `coupole go-on` again when it is paused."
+        )
+    _say(state, as_json=as_json)
 
 
 def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:

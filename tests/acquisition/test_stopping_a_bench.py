@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ from coupole.acquisition.cell_bench.bench_frames import BenchFrames
 from coupole.acquisition.cell_bench.bench_requests import FrameAsked
 from coupole.acquisition.cell_bench.bench_service import BenchService
 from coupole.acquisition.cell_bench.bench_work import Work, Works
+from coupole.acquisition.observer import Control
 from coupole.errors import InputError
 
 
@@ -41,6 +43,7 @@ def test_a_metering_that_is_still_prepared_when_a_stop_comes_never_begins(
     plan, service = SlowPlan(), BenchService.__new__(BenchService)
     parts = {
         "works": Works(),
+        "_control": Control(),
         "closing": threading.Event(),
         "_ending": False,
         "_arm": plan,
@@ -74,7 +77,28 @@ def test_who_lights_again_and_again_is_refused_after_a_stop(monkeypatch: pytest.
 
 def test_a_stop_ends_what_is_under_way() -> None:
     works, ended = Works(), threading.Event()
-    work = Work("drive", {}, lambda control: {"stopped": control.stop.wait(10.0) and not ended.set()})
+    work = Work(Control(), "drive", {}, lambda control: {"stopped": control.stop.wait(10.0) and not ended.set()})
     works.begin(work, works.stops)
     works.stop()
     assert ended.wait(10.0)
+
+
+def test_no_work_of_a_bench_goes_on_before_it_is_known_why_its_process_stood_still() -> None:
+    """The work's own thread runs again before the one that hears of SIGCONT: it waits for that one's word."""
+    session, went_on = Control(), threading.Event()
+    session.pulse_s = time.monotonic() - 2.0
+
+    def move(control: Control) -> dict[str, Any]:
+        control.await_word()
+        control.go_on()
+        went_on.set()
+        return {}
+
+    works = Works()
+    work = Work(session, "drive", {}, move)
+    works.begin(work, works.stops)
+    time.sleep(0.05)
+    session.hold("the program did not run for 2.0 s")
+    work.join(10.0)
+    assert (work.figures()["state"], went_on.is_set()) == ("stopped", False)
+    assert "did not run" in work.figures()["why"]

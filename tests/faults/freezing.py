@@ -100,15 +100,22 @@ def cell_in(folder: Path, arm: str) -> CellFolder:
 
 
 @contextmanager
-def running(cell: CellFolder, arm: str) -> Iterator[tuple[World, subprocess.Popen[str]]]:
-    """A world and a run in it, ended with the context at the latest."""
+def world_of(cell: CellFolder, arm: str) -> Iterator[World]:
+    """A world at the pace of life, whose arm waits for nobody."""
     robots: dict[str, dict[str, Any]] = {
         "rsi": {"kind": "rsi", "sends_to": "127.0.0.1:0", "cycle_ms": 12, "lock_step": False},
         "eki": {"kind": "eki", "write_limit_s": 0.01},
     }
     real_time = {"robot": robots[arm]} if arm in robots else {}
+    with cell.world(**real_time) as world:
+        yield world
+
+
+@contextmanager
+def running(cell: CellFolder, arm: str) -> Iterator[tuple[World, subprocess.Popen[str]]]:
+    """A world and a run in it, ended with the context at the latest."""
     with ExitStack() as stack:
-        world = stack.enter_context(cell.world(**real_time))
+        world = stack.enter_context(world_of(cell, arm))
         process = stack.enter_context(cell.start_acquire())
         stack.callback(_end, process)
         yield world, process

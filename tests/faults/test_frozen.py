@@ -12,6 +12,7 @@ import cells
 import freezing
 import numpy as np
 import pytest
+from cells import SIDE, TOP
 from freezing import Freeze
 from ur import needs_ur_rtde
 
@@ -21,6 +22,8 @@ ARMS = [
     pytest.param("ur", marks=(needs_ur_rtde, pytest.mark.full)),
 ]
 TODAY = date.today().toordinal()
+SLACK_DEG = 0.3
+"""Four turns of an answering process that lag behind: some 0.08 s at this speed."""
 
 
 @pytest.mark.parametrize("arm", ARMS)
@@ -58,6 +61,23 @@ def test_a_frozen_process_of_the_arm_ends_the_run_with_a_fault_and_the_arm_at_re
     assert f"first   coupole confirm {cell.rig} --name NAME" in ended.err
     assert cells.events(cell.run_folder, "fault")[0]["device"] == "robot"
     assert not cells.alive(pid)
+
+
+def test_an_arm_that_is_driven_by_hand_does_not_move_again_after_a_freeze(tmp_path: Path) -> None:
+    """Not even before the process has heard of SIGCONT: the motion is ended, not asked anew."""
+    cell = freezing.cell_in(tmp_path, "rsi")
+    plan = str(cell.plan)
+    with freezing.world_of(cell, "rsi") as world:
+        for view in (TOP["name"], SIDE["name"], TOP["name"]):
+            process = cells.start("arm", cell.rig, "view", plan, view, "--yes")
+            assert freezing.moment(world, process, random.Random(TODAY), moving=True)
+            freezing.freeze(world, process.pid, Freeze("rsi", "controller", while_moving=True))
+            at_once = world.ask("state")["joints_deg"]
+            ended = cells.finish(process)
+            assert ended.code == 130, ended.err
+            assert "the program did not run for" in ended.err
+            turned_deg = np.abs(np.subtract(world.ask("state")["joints_deg"], at_once)).max()
+            assert turned_deg < SLACK_DEG
 
 
 def test_ctrl_z_makes_the_cell_safe_before_the_process_stops_and_the_run_asks_when_it_goes_on(

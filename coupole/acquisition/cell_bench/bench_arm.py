@@ -39,8 +39,11 @@ class HoldLostError(Exception):
 class BenchArm:
     """One arm at a time does one thing: a path, or a motion by hand."""
 
-    def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None, works: Works) -> None:
-        self._cell, self._opened, self._works = cell, opened_cell, works
+    def __init__(
+        self, cell: Cell, opened_cell: OpenedCell, job: Job | None, works: Works, control: Control
+    ) -> None:
+        """`control` is that of the bench's session."""
+        self._cell, self._opened, self._works, self._control = cell, opened_cell, works, control
         self._faults = faults_of(cell, opened_cell.identities["robot"])
         self._paths = ArmPaths(cell, job)
         self._switch = EnablingSwitch(opened_cell.ledbox, must_exist=cell.rig.console.enabling_switch)
@@ -97,7 +100,8 @@ class BenchArm:
             raise InputError(
                 f"path {number} begins {off_deg:.2f} deg from where the arm stands: plan it anew and look at it"
             )
-        work = Work("drive", {"path": path.id, "to": path.to}, lambda control: self._follow(path, control))
+        about = {"path": path.id, "to": path.to}
+        work = Work(self._control, "drive", about, lambda control: self._follow(path, control))
         self._works.begin(work, stops)
         return work.figures()
 
@@ -116,7 +120,7 @@ class BenchArm:
         self._switch.refuse_released()
         hold = _Hold(next(self._numbers), request)
         about = {"hold": hold.number, "axis": request.axis, "direction": request.direction}
-        work = Work("jog", about, lambda control: self._go_on(hold, control))
+        work = Work(self._control, "jog", about, lambda control: self._go_on(hold, control))
         self._works.begin(work, stops)
         self._hold, hold.work = hold, work
         return work.figures()

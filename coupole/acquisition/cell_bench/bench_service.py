@@ -42,7 +42,7 @@ from coupole.acquisition.cell_bench.bench_work import Work, Works
 from coupole.acquisition.cell_marks import is_in_use
 from coupole.acquisition.looking import metered, metering_job
 from coupole.acquisition.observer import Control
-from coupole.acquisition.opened_cell import OpenedCell, open_cell
+from coupole.acquisition.opened_cell import ARM_STOPPED, OpenedCell, open_cell
 from coupole.acquisition.operator import ask_to_begin, identity_printer
 from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
@@ -64,12 +64,15 @@ _BEGIN = (SelfTestAsked, DriveAsked, JogAsked, FrameAsked, MeterAsked)
 class BenchService:
     """Answers requests; each is called in a thread of its own."""
 
-    def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None) -> None:
-        self._cell, self._opened, self._job = cell, opened_cell, job
+    def __init__(self, cell: Cell, opened_cell: OpenedCell, job: Job | None, control: Control) -> None:
+        """`control` is that of the bench's session."""
+        self._cell, self._opened, self._job, self._control = cell, opened_cell, job, control
         self.works = Works()
         self.closing = threading.Event()
+        self.trouble: list[str] = []
+        """Sentences on what was not sure when the bench was closed."""
         self._devices = BenchDevices(cell, opened_cell)
-        self._arm = BenchArm(cell, opened_cell, job, self.works)
+        self._arm = BenchArm(cell, opened_cell, job, self.works, control)
         self._frames = BenchFrames(cell, opened_cell, job, self._devices, self.works)
         self._ending = False
         self._asked_s = time.monotonic()
@@ -93,9 +96,12 @@ class BenchService:
         try:
             request = read_request(line)
             self._asked_s = time.monotonic()
-            if self._ending or self.closing.is_set():
+            begins = isinstance(request, _BEGIN)
+            if begins:
+                self._control.await_word()
+            if self._ending or self.closing.is_set() or (begins and self._control.stop.is_set()):
                 raise InputError("the bench is closing")
-            if isinstance(request, _BEGIN) and is_gone():
+            if begins and is_gone():
                 raise InputError("whoever asked has gone: not begun")
             return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
@@ -144,9 +150,9 @@ class BenchService:
                 return {"trouble": self._stop(), **self._state()}
             case CloseAsked():
                 self._ending = True
-                trouble = self._stop()
+                self.trouble = self._stop()
                 self.closing.set()
-                return {"trouble": trouble}
+                return {"trouble": self.trouble}
 
     def _refuse_while_metering(self) -> None:
         if (work := self.works.running) is not None and work.kind == "meter":
@@ -166,7 +172,7 @@ class BenchService:
                     self._frames.begin_counting()
             return advice.figures()
 
-        work = Work("meter", {"plan": asked.plan}, meter)
+        work = Work(self._control, "meter", {"plan": asked.plan}, meter)
         self.works.begin(work, stops)
         return work.figures()
 
@@ -229,7 +235,7 @@ def bench_of(
         )
     ask_to_begin(cell, confirm=confirm)
     with open_cell(cell, job=job, on_opened=identity_printer(console)) as opened_cell:
-        service = BenchService(cell, opened_cell, job)
+        service = BenchService(cell, opened_cell, job, control)
         with obeyed_by(control, opened_cell.halt):
             try:
                 yield service
@@ -237,8 +243,9 @@ def bench_of(
                 service.end()
                 for trouble in opened_cell.trouble:
                     alarm(trouble)
-                if not opened_cell.arm_confirmed:
-                    faults_of(cell, opened_cell.identities["robot"]).note("; ".join(opened_cell.trouble), "bench")
+                if not opened_cell.arm_confirmed or any(ARM_STOPPED in trouble for trouble in service.trouble):
+                    reasons = "; ".join([*service.trouble, *opened_cell.trouble])
+                    faults_of(cell, opened_cell.identities["robot"]).note(reasons, "bench")
 
 
 def serve_bench(
@@ -272,5 +279,12 @@ def serve_bench(
                 console.print(f"nobody has asked for {leave_after_s:g} s: closed")
                 break
         service.closing.set()
+    if service.trouble:
+        raise DeviceError(
+            "cell",
+            expected="lights off, the arm at rest and the camera disarmed",
+            happened="; ".join(service.trouble),
+            remedy="Look at the cell.",
+        )
     if control.stop.is_set() and not control.stopped_by_hand:
         raise control.interruption()

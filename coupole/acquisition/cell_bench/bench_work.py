@@ -15,10 +15,12 @@ from coupole.errors import CoupoleError, InputError, Interrupted
 class Work:
     """One piece of work, and what has become of it."""
 
-    def __init__(self, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]) -> None:
-        """`act` returns what was found; it raises Interrupted after `Control.stop`."""
+    def __init__(
+        self, session: Control, kind: str, about: dict[str, Any], act: Callable[[Control], dict[str, Any]]
+    ) -> None:
+        """`act` returns what was found; it raises Interrupted after the `stop` of its Control or the session's."""
         self.kind, self._about, self._act = kind, about, act
-        self.control = Control()
+        self.control = Control(session=session)
         self._state, self._found, self._why = "running", {}, ""  # type: tuple[str, dict[str, Any], str]
         self._thread = threading.Thread(target=self._run, name=kind, daemon=True)
 

@@ -68,9 +68,13 @@ def call(
     *,
     patience_s: float = _PATIENCE_S,
     given_up: Callable[[], bool] = _never,
+    meanwhile: str = "",
 ) -> Any:
-    """Send a request and return the service's answer; a person is told on standard error if none comes within 2 s.
-    Raises NotServed; GivenUp; NoAnswer; InputError: the service refuses, with its words."""
+    """Send a request and return the service's answer; a person is told on standard error if none comes within 2 s,
+    and what happens `meanwhile`.
+
+    Raises NotServed; GivenUp; NoAnswer; InputError: the service refuses, with its words.
+    """
     rig, end_s = cell.document.path, time.monotonic() + patience_s
     place = _place(cell)
     connection = _Local(place, patience_s)
@@ -79,7 +83,7 @@ def call(
         _connect(cell, connection, end_s, given_up)
         connection.request(method, path, body, {"Content-Type": "application/json"} if body else {})
         with _told_if_given_up(rig, begins_nothing(method, path)):
-            _await(connection.sock, place, rig, end_s, given_up)
+            _await(connection.sock, place, rig, end_s, given_up, meanwhile)
         reply = connection.getresponse()
         answer = json_of(reply.read(), "its answer", allow_nan=True)
     except (NotServed, GivenUp):
@@ -131,7 +135,9 @@ def _connect(cell: Cell, connection: _Local, end_s: float, given_up: Callable[[]
         time.sleep(_LOOK_EVERY_S)
 
 
-def _await(sock: socket.socket, place: str, rig: Path, end_s: float, given_up: Callable[[], bool]) -> None:
+def _await(
+    sock: socket.socket, place: str, rig: Path, end_s: float, given_up: Callable[[], bool], meanwhile: str
+) -> None:
     """Wait for an answer. Raises TimeoutError, GivenUp."""
     pid, begun_s, probed_s, has_spoken = peer_pid(sock), time.monotonic(), 0.0, False
     while not select.select([sock], [], [], _LOOK_EVERY_S)[0]:
@@ -147,7 +153,7 @@ def _await(sock: socket.socket, place: str, rig: Path, end_s: float, given_up: C
             probed_s, silent = now_s, not _answers(place)
         if silent:
             has_spoken = True
-            alarm(f"{rig}: its console does not answer: {_state_of(pid)}; waiting for it")
+            alarm(f"{rig}: its console does not answer: {_state_of(pid)}; waiting for it{meanwhile}")
 
 
 def _answers(place: str) -> bool:

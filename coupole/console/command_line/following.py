@@ -17,7 +17,7 @@ from rich.console import Console
 
 from coupole.acquisition.observer import Control
 from coupole.acquisition.operator import ask_to_begin, refuse
-from coupole.acquisition.run_control import State, ask
+from coupole.acquisition.run_control import State, ask, running
 from coupole.acquisition.signals import obeyed_by
 from coupole.console.command_line.client import GivenUp, NoAnswer, NotServed, call
 from coupole.errors import DeviceError, DeviceLost, InputError, Interrupted, error_as_told, reason
@@ -31,7 +31,7 @@ from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Progress
 from coupole.viewing.terminal import RunObserver, alarm
 
-_LOOK_EVERY_S, _TRIALS = 0.3, 50
+_LOOK_EVERY_S, _TRIALS, _STOP_PATIENCE_S = 0.3, 50, 2.0
 _PROGRESS_LINE = re.compile(r"view \S+ \(\d+/\d+\) .* frames proven, ")
 _FIELDS = tuple(Progress.__dataclass_fields__)
 
@@ -53,7 +53,7 @@ def acquire_by_console(
         _confirm(cell, console, request)
     control = Control()
     follower = _Followed(cell, console, control)
-    with obeyed_by(control, follower.stop):
+    with obeyed_by(control, follower.stop, is_watched=False):
         follower.enter(request)
         follower.to_its_end(summary)
 
@@ -98,25 +98,37 @@ class _Followed:
         if self._control.stop.is_set():
             self.stop()
 
-    def stop(self) -> None:
-        """Stop what was entered, whether or not it has begun; from any thread."""
+    def stop(self) -> list[str]:
+        """Stop what was entered, whether or not it has begun; from any thread. Return what is not sure then.
+
+        A run is asked itself, which obeys whatever its console does, and answers when lights are off and the arm
+        was stopped."""
         number = self._entry.get("id")
         for _ in range(_TRIALS if number else 0):
+            if (trouble := self._stop_run()) is not None:
+                return trouble
             for method, path in (("POST", f"/api/v1/queue/{number}/stop"), ("DELETE", f"/api/v1/queue/{number}")):
-                try:
-                    call(self._cell, method, path)
-                except (NotServed, NoAnswer):
-                    if self._run is not None:  # which goes on without the console
-                        with contextlib.suppress(InputError):
-                            ask(self._run, "stop")
-                            return
-                except InputError:
-                    continue
-                else:
-                    return
+                with contextlib.suppress(InputError):
+                    call(self._cell, method, path, patience_s=_STOP_PATIENCE_S)
+                    if method == "DELETE":  # it had not begun
+                        return []
             if self._has_ended:
-                return
+                return []
             time.sleep(_LOOK_EVERY_S)
+        return ["not sure: the run gives no answer"] if number else []
+
+    def _stop_run(self) -> list[str] | None:
+        """Stop the run that is at work in the cell; what is not sure then. None if there is none, or no answer."""
+        with contextlib.suppress(InputError):
+            run = self._run or self._run_at_work()
+            if run is not None:
+                return list(ask(run, "stop").get("trouble", ()))
+        return None
+
+    def _run_at_work(self) -> Path | None:
+        """The run of this cell that is at work, while the console has not told of it."""
+        rig = str(self._cell.document.path.resolve())
+        return next((Path(state["run"]) for state in running() if state["run"] and state.get("rig") == rig), None)
 
     @property
     def _run(self) -> Path | None:
@@ -146,7 +158,10 @@ class _Followed:
         is_announced = False
         while not self._has_ended:
             try:
-                yield call(self._cell, "GET", f"/api/v1/queue/{self._entry['id']}/output")
+                path = f"/api/v1/queue/{self._entry['id']}/output"
+                yield call(self._cell, "GET", path, given_up=self._was_stopped, meanwhile=self._meanwhile())
+            except GivenUp:
+                raise self._control.interruption() from None
             except (NotServed, NoAnswer) as error:
                 run = self._run or "RUN"
                 if self._state() is None and self._control.stop.is_set():
@@ -170,6 +185,14 @@ class _Followed:
                     raise self._control.interruption() from None
                 raise
             time.sleep(_LOOK_EVERY_S)
+
+    def _was_stopped(self) -> bool:
+        """Tell whether this terminal has stopped the run, and it has ended."""
+        return self._control.stop.is_set() and self._state() is None
+
+    def _meanwhile(self) -> str:
+        run = self._run or "RUN"
+        return f"; the run GOES ON, with its arm and lamps. Ctrl-C and q stop it, as does `coupole stop {run}`"
 
     def _state(self) -> State | None:
         try:

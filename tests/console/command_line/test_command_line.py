@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import cells
+import numpy as np
 import pytest
 from cells import CellFolder
 from served import BORROWER, Browser, Served, served
@@ -133,6 +134,54 @@ def test_a_run_whose_console_is_killed_goes_on_which_is_said_and_ctrl_c_stops_it
         cells.wait_until(lambda: cells.events(run, "stop"), "the run's end")
         assert cells.safe(world)
     assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
+
+
+def test_a_run_whose_console_is_frozen_is_stopped_by_ctrl_c_all_the_same(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=2.0)
+    cell.join()
+    cell.write(lights=cells.SOME_LIGHTS, repeats=200)
+    with cell.world() as world, served(cell) as service:
+        follower = cells.start("acquire", cell.plan, "--yes")
+        run = cell.run_folder
+        cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+        service.process.send_signal(signal.SIGSTOP)
+        try:
+            time.sleep(2.5)  # until it is told
+            follower.send_signal(signal.SIGINT)
+            ended = cells.finish(follower)
+            cells.wait_until(lambda: cells.events(run, "stop"), "the run's end")
+            assert cells.safe(world)
+        finally:
+            service.process.send_signal(signal.SIGCONT)
+    assert (ended.code, "the run GOES ON" in ended.err) == (130, True), ended.err
+    assert cells.events(run, "stop")[-1]["outcome"] == "interrupted"
+
+
+def test_a_terminal_that_stands_still_stops_no_run_but_ctrl_z_does_and_says_so_when_it_has(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=1.0)
+    cell.rig_data["motion"] |= {"speed_fraction": 0.1}
+    cell.join()
+    cell.write(views=[cells.TOP, cells.SIDE], lights=cells.SOME_LIGHTS)
+    with cell.world() as world, served(cell):
+        follower = cells.start("acquire", cell.plan, "--yes", anew=True)
+        cells.wait_until(lambda: world.ask("state")["arm_moving"], "a motion")
+        follower.send_signal(signal.SIGSTOP)
+        time.sleep(1.5)
+        follower.send_signal(signal.SIGCONT)
+        time.sleep(1.0)
+        assert not cells.events(cell.run_folder, "stop"), "the run has a process of its own"
+        cells.wait_until(lambda: world.ask("state")["arm_moving"], "a motion")
+        follower.send_signal(signal.SIGTSTP)
+        assert follower.stderr is not None
+        line = next(line for line in follower.stderr if "suspended" in line)
+        joints_deg = world.ask("state")["joints_deg"]
+        time.sleep(0.5)
+        state = world.ask("state")
+        assert np.allclose(state["joints_deg"], joints_deg, atol=0.01), line
+        assert not state["shining"]
+        assert "lights are off, the arm is at rest" in line
+        follower.send_signal(signal.SIGCONT)
+        assert cells.finish(follower).code == 130
 
 
 def test_the_cell_is_lent_to_a_process_until_that_ends(standing: Standing) -> None:

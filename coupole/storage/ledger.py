@@ -85,18 +85,28 @@ class Ledger:
         """Light that is about to be given, at most; returns the id for `correct`.
 
         The budget is asked for what is `budget_request`; a plan's budget becomes the object's if that has none.
-        Raises DoseBudgetReached: nothing is entered then.
+        Raises DoseBudgetReached, and StorageError if earlier lines are missing: nothing is entered then.
         """
         line = LightPlanned(id=uuid.uuid4().hex, run=run, dose_lux_h=dose_lux_h, damage_wh_m2=damage_wh_m2)
         lines: list[Line] = [line]
         with self._open_locked() as file:
+            history = self.newest()
+            self._refuse_lacking(history)
             if budget_request is not None:
-                history = self.newest()
                 budget_request.refuse_beyond(self.object_id, history)
                 if budget_request.budget_lux_h is not None and history.budget_lux_h is None:
                     lines.insert(0, budget_request.as_the_objects())
             file.append([new_line.model_dump_json() + "\n" for new_line in lines])
         return line.id
+
+    def _refuse_lacking(self, history: History) -> None:
+        if history.lacks_lines:
+            raise StorageError(
+                f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was moved "
+                "away or replaced while light was given, and nobody knows what the object may still receive. Put "
+                f"the whole ledger back; if it is lost, say `coupole dose {self.object_id} --add LUX_H --note WHY` "
+                "with what it had, or with 0"
+            )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:
         """Ask the budget once more for light whose plan has this id. Raises DoseBudgetReached."""

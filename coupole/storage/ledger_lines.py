@@ -102,8 +102,15 @@ class History:
     warn_above_lux_h: float | None = None
     budgets: list[BudgetSet] = field(default_factory=list)
     """Budgets in the order in which they were set; the last one holds."""
+    without_plan: int = 0
+    """Lines of light that was given of a plan which is not here, since light was last entered by hand."""
     unreadable: int = 0
     """Lines that are no entries: torn by a crash before their light was given, or damaged later."""
+
+    @property
+    def lacks_lines(self) -> bool:
+        """True if earlier lines are missing: more plans than damaged lines explain."""
+        return self.without_plan > self.unreadable
 
     @property
     def total_lux_h(self) -> float:
@@ -291,9 +298,11 @@ def _add(history: History, line: Line) -> None:
             entry.dose_lux_h, entry.damage_wh_m2, entry.is_settled = line.dose_lux_h, line.damage_wh_m2, True
             return
         entry = Entry(line.t, "unknown", line.dose_lux_h, line.damage_wh_m2)
+        history.without_plan += 1
     elif isinstance(line, LightPlanned):
         entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, is_settled=False)
         history.of_plan[line.id] = entry
     else:
         entry = Entry(line.t, line.run, line.dose_lux_h, line.damage_wh_m2, line.note)
+        history.without_plan = 0
     history.entries.append(entry)

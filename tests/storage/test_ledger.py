@@ -241,3 +241,26 @@ def test_check_tells_of_the_threshold_and_of_objects_with_nearly_the_same_id(cel
     assert "its ledger warns above 0.001 lux.h" in warnings
     assert "there is also a ledger of `RELIEF`" in warnings
     assert "there is also a ledger of `RELIEF`" in dose(cell, "relief").err
+
+
+def test_a_ledger_that_was_moved_away_while_light_was_given_is_missed(tmp_path: Path) -> None:
+    """What was given is entered where the ledger was; whoever lights next is told that the rest is missing."""
+    ledger = Ledger(tmp_path, "shroud")
+    ledger.correct(ledger.plan("one", 40.0, None), 40.0, None)
+    under_way = ledger.plan("two", 3.0, None)
+    whole = ledger.path.rename(tmp_path / "elsewhere.jsonl")
+    ledger.correct(under_way, 2.5, None)
+    with pytest.raises(StorageError, match="earlier lines are missing") as refused:
+        Ledger(tmp_path, "shroud").plan("three", 1.0, None)
+    assert "coupole dose shroud --add LUX_H --note WHY" in str(refused.value)
+    left = ledger.path.read_bytes()
+    ledger.path.write_bytes(whole.read_bytes() + left)
+    ledger = Ledger(tmp_path, "shroud")
+    ledger.plan("three", 1.0, None)
+    assert ledger.read_history().total_lux_h == 43.5
+
+    lost = Ledger(tmp_path, "statue")
+    lost.path.write_bytes(left)
+    lost.enter(40.0, "of a ledger that was lost")
+    lost.plan("three", 1.0, None)
+    assert lost.read_history().total_lux_h == 43.5

@@ -7,8 +7,8 @@ the exception: what tests do to stand-ins, and what they see of them.
 # mypy: disable-error-code="name-defined"
 
 # ---- by name ----
-_.list_commands  # typer, of coupole/commands/cli.py
-_.doctor, _.archive, _.sim, _.demo  # COMMANDS of coupole/commands/cli.py
+_.list_commands, _.epilog  # typer, for its help
+_.doctor, _.archive, _.sim, _.demo  # GROUPS of coupole/commands/cli.py
 _.TextLineBox  # named in rigs, as drivers are
 _.MemoryCamera  # named in rigs
 _.export_scan, _.Stills, _.measure_jitter  # named in coupole/plan/registry.py

@@ -20,6 +20,7 @@ import coupole
 from coupole.acquisition.signals import SignalReceived, raise_outside_sessions, unheard_end
 from coupole.bounded import leave
 from coupole.commands.common import fail
+from coupole.commands.examples import add_examples
 from coupole.commands.extras import lacking_extras, missing_extra
 from coupole.errors import CoupoleError, Interrupted, StorageError
 from coupole.viewing import text_outlet
@@ -40,51 +41,69 @@ AT_A_CELL = {
 AT_A_CELL |= {"serve", "pause", "go-on", "stop"}
 """Commands that hold a cell, or speak to what does: none of them waits for a reader of its text."""
 
-COMMANDS = {
-    "check": "planning.check",
-    "view": "planning.view",
-    "simulate": "planning.simulate",
-    "demo": "demo.demo",
-    "acquire": "running.acquire",
-    "pause": "run_controls.pause",
-    "stop": "run_controls.stop",
-    "serve": "console.serve",
-    "queue": "console.queue",
-    "meter": "running.meter",
-    "live": "running.live",
-    "devices": "running.devices",
-    "doctor": "doctor.doctor",
-    "bench": "benching.bench",
-    "arm": "benching.arm",
-    "confirm": "running.confirm",
-    "commission": "commissioning.commission",
-    "sim": "running.sim",
-    "status": "keeping.status",
-    "report": "keeping.report",
-    "verify": "keeping.verify",
-    "archive": "keeping.archive",
-    "export": "exporting.export",
-    "scan": "keeping.scan",
-    "identify": "identify.identify",
-    "register": "register_scans.register",
-    "compare": "compare_states.compare",
-    "dose": "dose_ledger.dose",
-    "render": "render_scene.render",
-    "layer": "layer.layer",
-    "bracket": "bracketing.bracket",
-    "sphere-brdf": "bracketing.sphere_brdf",
-    "makie": "makie_photograph.makie",
-    "recipe": "recipe.recipe",
-    "show": "show.show",
-    "budget": "uncertainty.budget",
-    "schema": "planning.schema",
-    "go-on": "run_controls.go_on",
-    "plan": "planning.plan_app",
-    "calibrate": "calibrate.calibrate_app",
-    "reflectance": "reflectance.reflectance_app",
-    "restore": "restore.restore_app",
+GROUPS = {
+    "Plan and acquire": {
+        "plan": "planning.plan_app",
+        "schema": "planning.schema",
+        "check": "planning.check",
+        "view": "planning.view",
+        "simulate": "planning.simulate",
+        "meter": "running.meter",
+        "acquire": "running.acquire",
+        "demo": "demo.demo",
+    },
+    "Cell": {
+        "devices": "running.devices",
+        "doctor": "doctor.doctor",
+        "live": "running.live",
+        "arm": "benching.arm",
+        "bench": "benching.bench",
+        "commission": "commissioning.commission",
+        "confirm": "running.confirm",
+        "sim": "running.sim",
+        "serve": "console.serve",
+        "queue": "console.queue",
+        "dose": "dose_ledger.dose",
+    },
+    "Calibrate": {
+        "calibrate": "calibrate.calibrate_app",
+        "budget": "uncertainty.budget",
+    },
+    "Results": {
+        "reflectance": "reflectance.reflectance_app",
+        "compare": "compare_states.compare",
+        "register": "register_scans.register",
+        "scan": "keeping.scan",
+    },
+    "Look and share": {
+        "show": "show.show",
+        "export": "exporting.export",
+        "render": "render_scene.render",
+        "restore": "restore.restore_app",
+    },
+    "Bench: spectra and photographs": {
+        "identify": "identify.identify",
+        "layer": "layer.layer",
+        "recipe": "recipe.recipe",
+        "bracket": "bracketing.bracket",
+        "sphere-brdf": "bracketing.sphere_brdf",
+        "makie": "makie_photograph.makie",
+    },
+    "Runs": {
+        "status": "keeping.status",
+        "pause": "run_controls.pause",
+        "go-on": "run_controls.go_on",
+        "stop": "run_controls.stop",
+        "report": "keeping.report",
+        "verify": "keeping.verify",
+        "archive": "keeping.archive",
+    },
 }
-"""Module of `coupole.commands` and function, or group of commands, by command; in the order of `--help`."""
+"""Module of `coupole.commands` and function, or group of steps, by command; under the headings of `--help`, in its
+order."""
+
+COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
+_HEADINGS = {name: heading for heading, group in GROUPS.items() for name in group}
 
 
 class _OnDemand(Mapping[str, Any]):
@@ -113,7 +132,7 @@ def _summary(name: str) -> TyperCommand:
     """Return a command as the list of all needs it: with its text, without its options, which take longest."""
     entry = _entry(name)
     text = entry.info.help if isinstance(entry, typer.Typer) else inspect.getdoc(entry)
-    return TyperCommand(name, help=text)
+    return TyperCommand(name, help=text, rich_help_panel=_HEADINGS[name])
 
 
 @functools.cache
@@ -124,7 +143,9 @@ def _command(name: str) -> Any:
         alone.add_typer(entry, name=name)
     else:
         alone.command(name)(entry)
-    return typer.main.get_group(alone).commands[name]
+    command = typer.main.get_group(alone).commands[name]
+    add_examples(command, name)
+    return command
 
 
 class _Commands(TyperGroup):

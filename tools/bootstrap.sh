@@ -28,6 +28,21 @@ prepare() {
     ((status == 0)) || fail "the set-up failed; see the messages above"
 }
 
+# prepare_group NAME: adds a dependency group of pyproject.toml that `prepare` leaves out to `$root/.venv`.
+prepare_group() {
+    local uv made="$root/.tools/group-$1"
+    [[ -f "$made" && "$(<"$made")" == "$(stamp_now)" ]] && return 0
+    say "installing the packages of the group $1 into $root/.venv (once; needs the network)"
+    (
+        if command -v flock >/dev/null; then flock 9; fi
+        find_uv
+        cd "$root"
+        unset VIRTUAL_ENV
+        UV_PROJECT_ENVIRONMENT="$root/.venv" UV_PYTHON_DOWNLOADS=never "$uv" sync --quiet --inexact --group "$1" \
+            --python "$root/.venv/bin/python" && stamp_now >"$made"
+    ) 9>"$root/.tools/lock" >&2 </dev/null || fail "the set-up failed; see the messages above"
+}
+
 # What some tests want of the system, installed by root where there is apt-get, tried once; without it they are
 # skipped. libaravis and its command line for the GigE Vision camera (the wheel `aravis-python` may serve in its
 # place), Chromium for the pages that operators look at, ExifTool for the frames as DNG. And checkers of others' formats,

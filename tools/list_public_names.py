@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import inspect
+import re
 import textwrap
 from collections.abc import Iterator
 from itertools import pairwise
@@ -75,7 +76,7 @@ def _section(name: str, entry: Any) -> str:
     text = f"\n## `coupole.{name}`\n\n"
     if signature := _signature(entry):
         text += f"```python\n{name}{signature}\n```\n\n"
-    text += f"{inspect.getdoc(entry)}\n"
+    text += f"{_as_markdown(inspect.getdoc(entry) or '')}\n"
     rows: list[tuple[str, str, str]] = []
     if isinstance(entry, ModuleType):
         rows = [(member, "", inspect.getdoc(value) or "") for member, value in _classes(entry)]
@@ -85,6 +86,17 @@ def _section(name: str, entry: Any) -> str:
         text += "\n| name | is |\n|---|---|\n"
     cells = ((f"`{member}{signature}`", " ".join(docstring.split())) for member, signature, docstring in rows)
     return text + "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |\n" for row in cells)
+
+
+def _as_markdown(docstring: str) -> str:
+    """The docstring with its blocks after `::` and its tables as fenced blocks."""
+    blocks = re.sub(
+        r"^::\n\n((?:(?: {4}.*)?\n)+)",
+        lambda block: f"```text\n{textwrap.dedent(block[1]).strip()}\n```\n\n",
+        docstring + "\n",
+        flags=re.MULTILINE,
+    )
+    return re.sub(r"^=+  =+\n(?:.+\n)+?=+  =+$", r"```text\n\g<0>\n```", blocks, flags=re.MULTILINE).rstrip()
 
 
 def _classes(module: ModuleType) -> list[tuple[str, type]]:

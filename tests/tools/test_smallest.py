@@ -94,6 +94,7 @@ TESTED_ELSEWHERE = {
     "make_kuka_files.py": "tests/tools/test_kuka_files.py",
     "make_plaque_scan.py": "tests/tools/test_make_plaque_scan.py",
     "make_relief.py": "tests/tools/test_make_assets.py",
+    "make_site.py": "tests/docs/test_site.py",
 }
 """Tools that another test runs, and that test; the last of `bench_console.py` is a bench's own process."""
 

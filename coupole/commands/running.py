@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,7 +19,11 @@ from coupole.commands.common import (
 )
 from coupole.commands.completion import plans, runs
 from coupole.errors import CoupoleError
-from coupole.plan.shipped_files import SIMULATED_CELL
+from coupole.plan.shipped_files import SIMULATED_CELL, file_of
+
+if TYPE_CHECKING:
+    from coupole.plan.cell import Cell
+    from coupole.preflight.job import Job
 
 
 def acquire(
@@ -157,7 +161,10 @@ def meter(
 
 
 def live(
-    what: Annotated[Path, typer.Argument(help="A run's folder, a plan, or a rig.", show_default=False)],
+    what: Annotated[
+        Path,
+        typer.Argument(help="A run's folder, a plan, or a rig; or a name such as sim.", show_default=False),
+    ],
     led: Annotated[
         int | None, typer.Option("--led", help="Id of the LED to begin with; dark if not given.")
     ] = None,
@@ -177,9 +184,7 @@ def live(
     """
     from coupole.acquisition.looking import watch_cell, watch_run
     from coupole.console.command_line.client import borrowed_cell
-    from coupole.plan.cell import Cell, read_cell
-    from coupole.plan.yamlfile import read_document
-    from coupole.preflight.job import read_job
+    from coupole.plan.cell import Cell
     from coupole.viewing.live import Choice
     from coupole.viewing.terminal import make_console
 
@@ -187,10 +192,20 @@ def live(
     if what.is_dir():
         watch_run(what, console, port=port)
         return
-    source = read_job(what) if "views" in read_document(what).data else read_cell(what)
+    source = cell_or_job(what)
     choice = Choice(led, exposure_us)
     with borrowed_cell(source if isinstance(source, Cell) else source.cell, "live"):
         watch_cell(source, console, choice, frames_per_s=frames_per_s, port=port, confirm=not yes)
+
+
+def cell_or_job(what: Path) -> Cell | Job:
+    """The cell of a rig, or the job of a plan: a file, or the name of a shipped rig (first) or plan."""
+    from coupole.plan.cell import read_cell
+    from coupole.plan.yamlfile import read_document
+    from coupole.preflight.job import read_job
+
+    path = file_of(file_of(what, "rigs"), "plans")
+    return read_job(path) if "views" in read_document(path).data else read_cell(path)
 
 
 def confirm(

@@ -62,6 +62,29 @@ def test_the_parser_takes_the_examples_of_a_command(
         assert (parsed(example) + " ").startswith(f"{of_its_own} "), example
 
 
+QUICK = ("plan new", "schema", "check", "view", "simulate", "devices", "dose")
+"""Commands whose examples are run: they need no file but that of `plan new first`."""
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        one
+        for name in QUICK
+        for one in EXAMPLES[name]
+        if not {"my-cell.yaml", "leds", "12", "--show", "--add"} & set(shlex.split(one))
+    ],
+)
+def test_an_example_that_needs_no_device_of_ones_own_runs(
+    example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if "first.yaml" in example:
+        assert cells.here(*shlex.split(EXAMPLES["plan new"][0])).code == 0
+    ended = cells.here(*shlex.split(example))
+    assert ended.code == 0, ended.err
+
+
 @pytest.mark.parametrize("line", ["check first.yaml --no-path", "verify", "arm sim home x y z", "plan neu first"])
 def test_the_parser_refuses_what_is_no_command(line: str) -> None:
     with pytest.raises(Exception, match=r"No such|Missing|unexpected") as refused:

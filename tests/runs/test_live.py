@@ -23,6 +23,10 @@ from cells import CellFolder
 from PIL import Image
 from text_cells import text_cell
 
+from coupole.commands.running import cell_or_job
+from coupole.plan.cell import Cell
+from coupole.preflight.job import Job
+
 
 class Viewer:
     """A browser's part, without the browser."""
@@ -237,6 +241,13 @@ def test_a_live_view_that_was_suspended_by_ctrl_z_does_not_light_again_and_says_
         assert "suspended by Ctrl-Z" in ended.err
         assert "cannot stand and go on, so it was ended" in ended.err
         assert not world.ask("state")["shining"]
+
+
+def test_a_shipped_rig_or_plan_is_named_by_one_word() -> None:
+    rig, plan = cell_or_job(Path("sim")), cell_or_job(Path("demo"))
+    assert isinstance(rig, Cell)
+    assert isinstance(plan, Job)
+    assert (rig.rig.name, plan.plan.name) == (plan.cell.rig.name, "demo")
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,14 @@ def code_cells(path: Path) -> list[str]:
     return [text for kind, text in zip(parts[1::2], parts[2::2], strict=True) if "[markdown]" not in kind]
 
 
+def line_count(code: str) -> int:
+    """Lines that are not blank."""
+    return len([line for line in code.splitlines() if line.strip()])
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_no_cell_of_code_is_long(path: Path) -> None:
-    lines = [len([line for line in text.splitlines() if line.strip()]) for text in code_cells(path)]
+    lines = [line_count(text) for text in code_cells(path)]
     assert lines
     assert max(lines) <= MOST_LINES
 
@@ -64,6 +69,13 @@ def acquired(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_the_first_notebook_acquires_all_frames(acquired: tuple[Path, str]) -> None:
     assert "36 of 36 shots" in acquired[1]
+
+
+def test_the_comparison_with_other_programs_has_their_numbers_of_lines() -> None:
+    page = (REPO / "docs/neighbours.md").read_text(encoding="utf-8")
+    for path in NOTEBOOKS:
+        count = sum(line_count(text) for text in code_cells(path))
+        assert path.stem == "your_own_led_box" or f"| {count} lines" in page, (path.stem, count)
 
 
 PRINTS = {

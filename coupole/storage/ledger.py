@@ -104,8 +104,8 @@ class Ledger:
             raise StorageError(
                 f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was moved "
                 "away or replaced while light was given, and nobody knows what the object may still receive. Put "
-                f"the whole ledger back; if it is lost, say `coupole dose {self.object_id} --add LUX_H --note WHY` "
-                "with what it had, or with 0"
+                "the whole ledger back; if it is lost, say "
+                f"`coupole dose {self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
             )
 
     def ask_again(self, budget_request: Asked, plan_id: str) -> None:

@@ -45,6 +45,7 @@ _MODULES = {
     "errors": "errors",
     "events": "storage.journal_events",
     "lights": "reflectance.new_light.light_kinds",
+    "testing": "testing",
 }
 """Modules by their public names."""
 

@@ -1,4 +1,5 @@
 from coupole import errors as errors
+from coupole import testing as testing
 from coupole.heritage.analysis.identification import PigmentFinding as PigmentFinding
 from coupole.heritage.comparison.state_comparison import Comparison as Comparison
 from coupole.preflight.preflight import Report as Report
@@ -30,7 +31,7 @@ __all__ = [
     "Acquisition", "CalibrationRecord", "Comparison", "Frame", "FreeCamera", "Materials", "PicturesResult",
     "PigmentFinding", "Plan", "Registration", "Report", "Result", "Rig", "Run", "RunView", "acquire",
     "calibrate_camera", "compare", "errors", "events", "fit_reflectance", "identify", "lights", "open_cell",
-    "open_result", "open_run", "register",
+    "open_result", "open_run", "register", "testing",
 ]  # fmt: skip
 
 __version__: str

@@ -24,6 +24,7 @@ from xdist.scheduler.loadscope import LoadScopeScheduling
 
 from sim.world import client
 
+pytest_plugins = ["coupole.testing"]
 compile_each_kernel_once()
 client._launch = NURSERY.start  # type: ignore[assignment] # for what runs in the tests' own process
 
@@ -44,7 +45,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "full: at full scale only; left out without --full")
     if config.getoption("--full"):
+        from coupole.testing import RobotConformance
+
         settings.load_profile("coupole at full scale")
+        RobotConformance.poses, RobotConformance.stops = 200, 40
     if folder := config.getoption("--account"):
         from time_account import Account
 

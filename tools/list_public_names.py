@@ -100,6 +100,10 @@ def _as_markdown(docstring: str) -> str:
 
 
 def _classes(module: ModuleType) -> list[tuple[str, type]]:
+    """Classes of a module: those that it lists, or that are written in it."""
+    if listed_names := getattr(module, "__all__", None):
+        values = [(name, getattr(module, name)) for name in sorted(listed_names)]
+        return [(name, value) for name, value in values if inspect.isclass(value)]
     members = inspect.getmembers(module, inspect.isclass)
     return [(name, value) for name, value in members if value.__module__ == module.__name__]
 

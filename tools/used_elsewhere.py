@@ -55,6 +55,8 @@ _.u_seen  # prove_layers.py
 _.BEAT_MS, _.COMMAND_ELEMENTS, _.STATUS_ELEMENTS  # make_kuka_files.py, for the controller's files
 
 # ---- by tests alone ----
+_.LEFT_BY_SFNC, _.is_safe, _.light_given_s  # coupole/testing, for the tests of others
+_.switch_panel, _.ledbox_alone, _.RobotAlone  # sim/world, for them and for ours
 _.safeguard_stop, _.safety_fault, _.stop_program, _.drop_link  # faults of the simulated UR controller
 _.ended_programs  # the simulated RSI controller: how often a client has ended its program
 _.ambiguous  # Match: whether frames were left open, whose reason people are told

@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 from arms import KR10_R1100_SIXX
 from numpy.typing import NDArray
-from robot_cells import UNHURRIED_S, RobotCell
 
 from coupole.devices import Robot
+from coupole.testing.robot_conformance import UNHURRIED_S
 from drivers.kuka.eki.driver import KukaEki, Settings
 from sim.devices.kuka_eki_controller import KukaEkiController
 from sim.devices.kuka_eki_controller import Settings as ControllerSettings
 from sim.world.clock import ClockWriter
 from sim.world.reactor import Reactor
+from sim.world.robot_alone import RobotAlone
 
 SAMPLE_MS = 4
 
 
-class EkiCell(RobotCell):
+class EkiCell(RobotAlone):
     """A KUKA controller with EthernetKRL, and its driver."""
 
     def __init__(self, folder: Path, *, speed: float = 10.0, **controller: Any) -> None:
@@ -42,7 +43,7 @@ class EkiCell(RobotCell):
         super().__init__(folder / "clock", reactor, arm, SAMPLE_MS)
 
     def open(self, **settings: object) -> KukaEki:
-        opened: KukaEki = self.kept(KukaEki(self.settings.model_copy(update=settings), self.clock))
+        opened: KukaEki = self.keep(KukaEki(self.settings.model_copy(update=settings), self.clock))
         return opened
 
     def hold_until_commanded(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from camera_conformance import fire, flat, in_world, ramp, sensor
+from camera_world import fire, flat, in_world, ramp, sensor
 from numpy.typing import NDArray
 
 from sim.devices import camera_body

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from camera_conformance import begun_ns
-from foreign_state import Left
+from camera_world import begun_ns
 from gentl_camera import serve
 from harvesters.core import Harvester
 
 from coupole.devices import Camera, Frame
+from coupole.testing.camera_state_conformance import Left
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings
 from sim.world.clock import SharedClock

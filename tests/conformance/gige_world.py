@@ -9,11 +9,11 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from camera_conformance import begun_ns, fire, flat, in_world, sensor
-from foreign_state import Left
+from camera_world import begun_ns, fire, flat, in_world, sensor
 from gige import gige_port
 
 from coupole.devices import Frame
+from coupole.testing.camera_state_conformance import Left
 from drivers.camera.aravis.driver import AravisCamera, Settings
 from sim.devices import gige_camera
 from sim.devices.camera_body import Render

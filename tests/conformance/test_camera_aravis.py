@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_conformance import A_MOMENT_S, EXPOSURE, CameraConformance, in_world, ramp, take
-from foreign_state import LEFT_BY_SFNC, ForeignStateConformance, Left
+from camera_world import in_world, ramp
 from gige import needs_aravis
 from gige_world import SETTINGS, GigeWorld, arv_tool, gige_world
 
 from coupole.errors import DeviceLost, DeviceRefused
+from coupole.testing.camera_conformance import A_MOMENT_S, EXPOSURE, CameraConformance, take
+from coupole.testing.camera_state_conformance import LEFT_BY_SFNC, ForeignStateConformance, Left
 from drivers.camera.aravis.discovery import discover
 from drivers.camera.aravis.driver import AravisCamera
 

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_conformance import EXPOSURE, PATIENCE_S, CameraConformance, take, take_numbers
-from foreign_state import LEFT_BY_SFNC, ForeignStateConformance, Left
 from gentl_camera import EXPOSURE_AUTO, OFFSET_X, OFFSET_Y, TRIGGER_MODE, TRIGGER_SOURCE
 from gentl_world import SERIAL, GenTLWorld, camera_process, compile_producer, needs_compiler
 from hypothesis import given, settings
@@ -23,6 +21,8 @@ from hypothesis import strategies as st
 
 from coupole.devices import Exposure
 from coupole.errors import DeviceLost, DeviceRefused
+from coupole.testing.camera_conformance import EXPOSURE, PATIENCE_S, CameraConformance, take, take_numbers
+from coupole.testing.camera_state_conformance import LEFT_BY_SFNC, ForeignStateConformance, Left
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.producer import Gaps
 

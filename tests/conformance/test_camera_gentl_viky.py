@@ -16,10 +16,10 @@ from typing import Any, Protocol
 import genicam
 import numpy as np
 import pytest
-from camera_conformance import A_MOMENT_S, BY_SOFTWARE, EXPOSURE, take
 
 from coupole.clock import SystemClock
 from coupole.errors import DeviceLost, DeviceRefused
+from coupole.testing.camera_conformance import A_MOMENT_S, BY_SOFTWARE, EXPOSURE, take
 from drivers.camera.gentl.driver import GenTLCamera
 from drivers.camera.gentl.settings import Settings
 

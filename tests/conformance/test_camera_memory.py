@@ -8,9 +8,10 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
-from camera_conformance import CameraConformance, fire, in_world, sensor
+from camera_world import fire, in_world, sensor
 
 from coupole.devices import Camera
+from coupole.testing.camera_conformance import CameraConformance
 from sim.devices.camera_server import CameraServer
 from sim.devices.camera_server import Settings as ServerSettings
 from sim.devices.memory_camera import MemoryCamera, Settings

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_conformance import EXPOSURE, HEIGHT_PX, WIDTH_PX, CameraConformance, take, take_numbers
-from foreign_state import ForeignStateConformance, Left
 from xiapi_world import XiWorld, compile_stub, needs_compiler
 
 from coupole.devices import Exposure
 from coupole.errors import DeviceLost, DeviceRefused
+from coupole.testing.camera_conformance import EXPOSURE, HEIGHT_PX, WIDTH_PX, CameraConformance, take, take_numbers
+from coupole.testing.camera_state_conformance import ForeignStateConformance, Left
 from drivers.camera.xiapi.library import Image, code_name
 
 pytestmark = needs_compiler

@@ -23,10 +23,10 @@ from arms import KR10_R1100_SIXX
 from beside import beside
 from eki_cell import EkiCell
 from pydantic import ValidationError
-from robot_cells import AWAY_DEG
 
 from coupole import supervision
 from coupole.errors import DeviceFault, DeviceLost, DeviceTimeout
+from coupole.testing.robot_conformance import AWAY_DEG
 from drivers.kuka.eki import link
 from drivers.kuka.eki.driver import KukaEki, Settings
 

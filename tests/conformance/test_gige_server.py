@@ -16,13 +16,14 @@ from xml.etree import ElementTree
 
 import cells
 import pytest
-from camera_conformance import EXPOSURE, in_world, take
+from camera_world import in_world
 from garbage import garbage
 from gige import needs_aravis
 from gige_world import GigeWorld, gige_world
 from places import REPO
 
 from coupole.errors import DeviceLost
+from coupole.testing.camera_conformance import EXPOSURE, take
 
 PORT = 3956
 TRIES = 10

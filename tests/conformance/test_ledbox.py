@@ -11,17 +11,19 @@ from typing import Any
 import pytest
 import usb.backend.libusb1
 from fake_usb import Backend, UsbLink
-from ledbox_conformance import LedBoxConformance, TableLedBoxConformance
-from ledbox_world import SPEED, LedBoxWorld, ledbox_world, opened, run_to_end, table
+from ledbox_world import SPEED, ledbox_world, opened
 
 from coupole.errors import DeviceLost, DeviceRefused
+from coupole.testing import LedBoxConformance, TableLedBoxConformance
+from coupole.testing.table_box_conformance import run_to_end, table
 from drivers.ledbox.driver import LedBox
+from sim.world.ledbox_alone import LedBoxAlone
 from sim.world.reactor import Reactor
 
 
 def usb_world(
     folder: Path, monkeypatch: pytest.MonkeyPatch, speed: float = SPEED
-) -> AbstractContextManager[LedBoxWorld]:
+) -> AbstractContextManager[LedBoxAlone]:
     """A world whose box hangs on a USB cable that pyusb finds by itself."""
 
     def plug_in(reactor: Any) -> UsbLink:
@@ -92,7 +94,7 @@ class TcpLink:
 @pytest.fixture(params=["serial", "socket", "usbtmc"])
 def world(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[LedBoxWorld]:
+) -> Iterator[LedBoxAlone]:
     made = {
         "serial": lambda: ledbox_world(tmp_path),
         "socket": lambda: ledbox_world(tmp_path, link=TcpLink),
@@ -103,7 +105,7 @@ def world(
 
 
 @pytest.fixture
-def box(world: LedBoxWorld) -> Iterator[LedBox]:
+def box(world: LedBoxAlone) -> Iterator[LedBox]:
     with opened(world) as driver:
         yield driver
 
@@ -111,15 +113,39 @@ def box(world: LedBoxWorld) -> Iterator[LedBox]:
 class TestLedBoxOverScpi(LedBoxConformance, TableLedBoxConformance):
     """The contract of boxes that run tables, over each wire; and what this box has beside it."""
 
+    limits = (
+        ("led", 1080, "led must be below 1080"),
+        ("on_us", 999, "on_us must be 1000 to 2000000"),
+        ("trigger_delay_us", 8001, "trigger_delay_us must not exceed on_us"),
+        ("period_us", 7999, "period_us must cover"),
+    )
+    words_of_rest = "record 7: led 6 rests 2000 us after record 6, 16000 us"
+    words_of_no_table = "neither bank"
+    words_of_silence = "led box: expected an answer to"
+    words_of_lost_state = "led box: expected an answer to SEQ:STAT"
+    words_of_a_lost_link = "Check the cable"
+
     def test_it_says_who_it_is(self, box: LedBox) -> None:
         identity = box.identify()
         assert (identity.vendor, identity.serial, identity.simulated) == ("Coupole", "SIM-0001", True)
+
+    def test_it_measures_the_current_of_each_led(self, box: LedBox, world: LedBoxAlone) -> None:
+        steps = table(3)
+        box.load(steps)
+        box.start(steps)
+        assert (run_to_end(box, world)["led_current_ma"] == 700).all()
+
+    def test_a_table_out_of_limits_is_refused_by_its_own_number(self, box: LedBox) -> None:
+        steps = table()
+        steps["led"][5] = 1080
+        with pytest.raises(DeviceRefused, match=r"-222.*record 5: led"):
+            box.load(steps)
 
     def test_its_self_test_tells_state_and_temperature(self, box: LedBox) -> None:
         assert box.self_test()["state"] == "IDLE"
         assert box.self_test()["hottest board"] == "22.0 C"
 
-    def test_a_box_with_another_number_of_leds_is_refused(self, world: LedBoxWorld) -> None:
+    def test_a_box_with_another_number_of_leds_is_refused(self, world: LedBoxAlone) -> None:
         with pytest.raises(DeviceRefused, match="7 LEDs"), opened(world, led_count=7):
             pass
 
@@ -127,7 +153,7 @@ class TestLedBoxOverScpi(LedBoxConformance, TableLedBoxConformance):
         with pytest.raises(DeviceRefused, match="-114"):
             box.panel(5, on=True)
 
-    def test_light_heats_its_board(self, box: LedBox, world: LedBoxWorld) -> None:
+    def test_light_heats_its_board(self, box: LedBox, world: LedBoxAlone) -> None:
         steps = table(1, on_us=2_000_000, period_us=2_000_000)
         box.load(steps)
         box.start(steps)
@@ -135,7 +161,7 @@ class TestLedBoxOverScpi(LedBoxConformance, TableLedBoxConformance):
         assert box.board_temperature_c(0) == pytest.approx(22.6, abs=0.06)
         assert box.board_temperature_c(1) == 22.0
 
-    def test_steps_wait_for_the_camera_to_be_ready(self, world: LedBoxWorld) -> None:
+    def test_steps_wait_for_the_camera_to_be_ready(self, world: LedBoxAlone) -> None:
         with opened(world, wait_for_ready=True) as box:
             world.ready = False
             steps = table(2)
@@ -146,13 +172,13 @@ class TestLedBoxOverScpi(LedBoxConformance, TableLedBoxConformance):
             world.ready = True
             assert run_to_end(box, world)["waited"].tolist() == [True, False]
 
-    def test_lights_off_is_obeyed_after_an_upload_was_cut_off(self, box: LedBox, world: LedBoxWorld) -> None:
+    def test_lights_off_is_obeyed_after_an_upload_was_cut_off(self, box: LedBox, world: LedBoxAlone) -> None:
         box.panel(1, on=True)
         box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
         box.lights_off()
         assert world.panels[-1] == (1, False)
 
-    def test_after_a_crash_in_an_upload_the_box_can_be_opened_again(self, world: LedBoxWorld) -> None:
+    def test_after_a_crash_in_an_upload_the_box_can_be_opened_again(self, world: LedBoxAlone) -> None:
         with opened(world) as box:
             box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
         with opened(world) as box:

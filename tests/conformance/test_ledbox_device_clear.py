@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ledbox_world import Call, LedBoxWorld, ledbox_world, opened, run_to_end, table, wait_until
+from ledbox_world import ledbox_world, opened
 from test_ledbox import TcpLink, usb_world
 
 from coupole.clock import Deadline, SystemClock
 from coupole.errors import DeviceError, DeviceRefused, DeviceTimeout
+from coupole.testing.table_box_conformance import run_to_end, table
+from coupole.testing.waiting import Call, wait_until
 from drivers.ledbox import LedBox, Settings
 from drivers.ledbox.link import Cleared
 from drivers.ledbox.serial_link import SerialLink
 from drivers.ledbox.wire import pack
+from sim.world.ledbox_alone import LedBoxAlone
 
 PROMISED_S = 0.1
 SLOW = 0.25
@@ -26,7 +29,7 @@ SLOW = 0.25
 LONG_FLASH = table(1, led=900, on_us=2_000_000, period_us=2_000_000)
 
 
-def dark_after_s(world: LedBoxWorld, lights_off: Callable[[], None]) -> float:
+def dark_after_s(world: LedBoxAlone, lights_off: Callable[[], None]) -> float:
     """World time from the call to the moment at which the light and the panel are off."""
     dark_ns: list[int] = []
     world.box._on_panel = lambda panel, on, t_ns: dark_ns.append(t_ns)
@@ -36,14 +39,14 @@ def dark_after_s(world: LedBoxWorld, lights_off: Callable[[], None]) -> float:
     return (max(dark_ns[0], world.darkened_ns[0]) - called_ns) / 1e9
 
 
-def light_up(box: LedBox, world: LedBoxWorld) -> None:
+def light_up(box: LedBox, world: LedBoxAlone) -> None:
     box.load(LONG_FLASH)
     box.start(LONG_FLASH)
     box.panel(2, on=True)
     wait_until(lambda: bool(world.lights), "light")
 
 
-def upload_in_the_middle(box: LedBox, world: LedBoxWorld) -> Call:
+def upload_in_the_middle(box: LedBox, world: LedBoxAlone) -> Call:
     """An upload in another thread, a part of which has reached the box."""
     call = Call(lambda: box.load(table(1080, on_us=1000)))
     wait_until(lambda: any(32 <= len(bank) < 1080 for bank in world.box._tables), "an upload in its middle")
@@ -60,7 +63,7 @@ def test_lights_off_overtakes_an_upload_on_a_serial_line(tmp_path: Path, baud: i
         light_up(box, world)
         upload = upload_in_the_middle(box, world)
         assert dark_after_s(world, box.lights_off) < PROMISED_S
-        error = upload.ended()
+        error = upload.wait()
     assert isinstance(error, DeviceError)
     assert "meanwhile the lights were switched off" in str(error)
 
@@ -68,7 +71,7 @@ def test_lights_off_overtakes_an_upload_on_a_serial_line(tmp_path: Path, baud: i
 @pytest.fixture(params=["serial", "socket", "usbtmc"])
 def world(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[LedBoxWorld]:
+) -> Iterator[LedBoxAlone]:
     made = {
         "serial": lambda: ledbox_world(tmp_path, speed=SLOW),
         "socket": lambda: ledbox_world(tmp_path, link=TcpLink, speed=SLOW),
@@ -79,21 +82,21 @@ def world(
 
 
 @pytest.fixture
-def box(world: LedBoxWorld) -> Iterator[LedBox]:
+def box(world: LedBoxAlone) -> Iterator[LedBox]:
     with opened(world, watchdog_s=0) as driver:
         yield driver
 
 
-def test_lights_off_does_not_wait_for_an_upload_that_hangs(box: LedBox, world: LedBoxWorld) -> None:
+def test_lights_off_does_not_wait_for_an_upload_that_hangs(box: LedBox, world: LedBoxAlone) -> None:
     light_up(box, world)
     lost = world.lose_answers(1)
     upload = Call(lambda: box.load(table(1080, on_us=1000)))
     wait_until(lambda: bool(lost), "a block that is not confirmed")
     assert dark_after_s(world, box.lights_off) < PROMISED_S
-    assert not isinstance(upload.ended(), DeviceTimeout)
+    assert not isinstance(upload.wait(), DeviceTimeout)
 
 
-def test_a_device_clear_reaches_a_box_that_waits_for_the_rest_of_a_block(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_device_clear_reaches_a_box_that_waits_for_the_rest_of_a_block(box: LedBox, world: LedBoxAlone) -> None:
     light_up(box, world)
     box._scpi._link.write(b"SEQ:DATA #532000abc", _NoDeadline(), box._scpi._link.clears)
     if not world.box.port.startswith("usbtmc"):  # whose messages arrive whole
@@ -102,26 +105,26 @@ def test_a_device_clear_reaches_a_box_that_waits_for_the_rest_of_a_block(box: Le
     assert not world.do(lambda: world.box._scpi.inside_block)
 
 
-def test_after_a_device_clear_the_next_upload_and_burst_are_whole(box: LedBox, world: LedBoxWorld) -> None:
+def test_after_a_device_clear_the_next_upload_and_burst_are_whole(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(200, on_us=1000, period_us=1000)
     lost = world.lose_answers(1)
     upload = Call(lambda: box.load(steps))
     wait_until(lambda: bool(lost), "a block that is not confirmed")
     box.lights_off()
-    assert upload.ended() is not None
+    assert upload.wait() is not None
     box.load(steps)
     box.start(steps)
     assert run_to_end(box, world)["led"].tolist() == list(range(200))
 
 
 def test_a_flash_whose_table_is_up_does_not_begin_after_lights_off(
-    box: LedBox, world: LedBoxWorld, monkeypatch: pytest.MonkeyPatch
+    box: LedBox, world: LedBoxAlone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load = box.load
 
     def load_and_be_overtaken(table: Any) -> None:
         load(table)
-        assert Call(box.lights_off).ended() is None
+        assert Call(box.lights_off).wait() is None
 
     monkeypatch.setattr(box, "load", load_and_be_overtaken)
     with pytest.raises(DeviceError, match="meanwhile the lights were switched off"):
@@ -137,7 +140,7 @@ def test_a_write_to_a_line_that_takes_nothing_more_ends_when_exchanges_are_ended
     write = Call(lambda: link.write(bytes(1_000_000), Deadline(SystemClock(), 15.0), link.clears))
     wait_until(lambda: bool(select.select([master], [], [], 0)[0]), "the first bytes")
     link.end_exchanges()
-    assert isinstance(write.ended(), Cleared)
+    assert isinstance(write.wait(), Cleared)
     link.close()
     os.close(master)
     os.close(slave)
@@ -174,10 +177,10 @@ def test_initiate_clear_does_not_wait_for_a_box_that_takes_no_bytes(
         upload = Call(lambda: box.load(table(1080, on_us=1000)))
         wait_until(lambda: bool(world.box._link.refused), "a transfer that is not taken")
         assert dark_after_s(world, box.lights_off) < PROMISED_S
-        assert isinstance(upload.ended(), DeviceError)
+        assert isinstance(upload.wait(), DeviceError)
 
 
-def test_a_device_clear_keeps_tables_settings_and_the_error_queue(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_device_clear_keeps_tables_settings_and_the_error_queue(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(7)
     box.load(steps)
     world.do(lambda: world.box._scpi.receive(b"FOO\n"))
@@ -214,7 +217,7 @@ def test_other_messages_pass_between_the_blocks_of_an_upload(tmp_path: Path) -> 
         upload = upload_in_the_middle(box, world)
         assert box.board_temperature_c(0) == 22.0
         seen = len(world.box._tables[0])
-        assert upload.ended() is None
+        assert upload.wait() is None
     assert seen < 1080
 
 
@@ -278,7 +281,7 @@ def test_lights_off_of_a_box_without_device_clear_comes_behind_the_upload(tmp_pa
         sent = Call(lambda: box.load(table(600, on_us=1000)))
         wait_until(lambda: world.box._scpi.inside_block, "an upload in its middle")
         assert 0.2 < dark_after_s(world, box.lights_off) < 2.0
-        assert sent.ended() is None
+        assert sent.wait() is None
 
 
 def test_a_box_with_device_clear_says_so(tmp_path: Path) -> None:

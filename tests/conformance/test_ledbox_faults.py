@@ -11,31 +11,33 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ledbox_world import LedBoxWorld, ledbox_world, opened, run_to_end, table
+from ledbox_world import ledbox_world, opened
 
 from coupole.devices import NO_LED
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
+from coupole.testing.table_box_conformance import run_to_end, table
 from drivers.ledbox import wire
 from drivers.ledbox.driver import LedBox
 from sim.devices import ledbox_firmware
+from sim.world.ledbox_alone import LedBoxAlone
 
 OVER_TEMPERATURE = 2
 """In the status of a log record, as on the wire."""
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[LedBoxWorld]:
+def world(tmp_path: Path) -> Iterator[LedBoxAlone]:
     with ledbox_world(tmp_path) as running:
         yield running
 
 
 @pytest.fixture
-def box(world: LedBoxWorld) -> Iterator[LedBox]:
+def box(world: LedBoxAlone) -> Iterator[LedBox]:
     with opened(world) as driver:
         yield driver
 
 
-def send_behind_its_back(world: LedBoxWorld, message: bytes) -> None:
+def send_behind_its_back(world: LedBoxAlone, message: bytes) -> None:
     """Another program writes to the box on the driver's port."""
     port = os.open(world.box.port, os.O_WRONLY | os.O_NOCTTY)
     os.write(port, message)
@@ -43,7 +45,7 @@ def send_behind_its_back(world: LedBoxWorld, message: bytes) -> None:
     world.clock.sleep(0.3)
 
 
-def test_a_dead_led_draws_no_current_and_gives_no_light(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_dead_led_draws_no_current_and_gives_no_light(box: LedBox, world: LedBoxAlone) -> None:
     world.do(lambda: world.box.dead_leds.add(4))
     steps = table(8)
     box.load(steps)
@@ -54,7 +56,7 @@ def test_a_dead_led_draws_no_current_and_gives_no_light(box: LedBox, world: LedB
     assert 4 not in [led for led, _, _ in world.lights]
 
 
-def test_a_dropped_edge_is_logged_and_counted_but_not_sent(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_dropped_edge_is_logged_and_counted_but_not_sent(box: LedBox, world: LedBoxAlone) -> None:
     world.do(lambda: world.box.drop_edge(2))
     steps = table(5)
     box.load(steps)
@@ -64,7 +66,7 @@ def test_a_dropped_edge_is_logged_and_counted_but_not_sent(box: LedBox, world: L
     assert (box.edges(), world.box.edge_count, len(world.edges_ns)) == (5, 5, 4)
 
 
-def test_a_doubled_edge_is_sent_twice_but_counted_once(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_doubled_edge_is_sent_twice_but_counted_once(box: LedBox, world: LedBoxAlone) -> None:
     world.do(lambda: world.box.double_edge(2, delay_us=4000))
     steps = table(5)
     box.load(steps)
@@ -74,7 +76,7 @@ def test_a_doubled_edge_is_sent_twice_but_counted_once(box: LedBox, world: LedBo
     assert world.edges_ns[3] - world.edges_ns[2] == 4_000_000
 
 
-def test_a_fault_can_wait_for_an_edge(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_fault_can_wait_for_an_edge(box: LedBox, world: LedBoxAlone) -> None:
     counted: list[int] = []
     world.box.on_edge_counted = counted.append
     steps = table(3)
@@ -84,7 +86,7 @@ def test_a_fault_can_wait_for_an_edge(box: LedBox, world: LedBoxWorld) -> None:
     assert counted == [0, 1, 2]
 
 
-def test_a_board_over_temperature_ends_the_burst_in_a_fault(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_board_over_temperature_ends_the_burst_in_a_fault(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(100)
     box.load(steps)
     box.start(steps)
@@ -107,7 +109,7 @@ def test_the_last_record_before_a_fault_says_over_temperature(tmp_path: Path) ->
         assert int.from_bytes(log[4 + 6 : 4 + 8], "little") == OVER_TEMPERATURE
 
 
-def test_a_hot_board_keeps_the_box_from_starting(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_hot_board_keeps_the_box_from_starting(box: LedBox, world: LedBoxAlone) -> None:
     world.do(lambda: world.box.over_temperature(179))
     steps = table()
     box.load(steps)
@@ -115,7 +117,7 @@ def test_a_hot_board_keeps_the_box_from_starting(box: LedBox, world: LedBoxWorld
         box.start(steps)
 
 
-def test_the_watchdog_darkens_a_burst_when_the_host_is_silent(world: LedBoxWorld) -> None:
+def test_the_watchdog_darkens_a_burst_when_the_host_is_silent(world: LedBoxAlone) -> None:
     with opened(world, watchdog_s=1.0) as box:
         steps = table(300)
         box.load(steps)
@@ -126,14 +128,14 @@ def test_the_watchdog_darkens_a_burst_when_the_host_is_silent(world: LedBoxWorld
             box.poll_log()
 
 
-def test_the_watchdog_darkens_panels_when_the_host_is_silent(world: LedBoxWorld) -> None:
+def test_the_watchdog_darkens_panels_when_the_host_is_silent(world: LedBoxAlone) -> None:
     with opened(world, watchdog_s=1.0) as box:
         box.panel(1, on=True)
         world.clock.sleep(1.5)
         assert world.panels == [(1, True), (1, False)]
 
 
-def test_the_watchdog_is_fed_by_polls(world: LedBoxWorld) -> None:
+def test_the_watchdog_is_fed_by_polls(world: LedBoxAlone) -> None:
     with opened(world, watchdog_s=3.0) as box:
         steps = table(500)
         box.load(steps)
@@ -141,13 +143,13 @@ def test_the_watchdog_is_fed_by_polls(world: LedBoxWorld) -> None:
         assert len(run_to_end(box, world)) == 500
 
 
-def test_the_watchdog_sleeps_while_all_is_dark(world: LedBoxWorld) -> None:
+def test_the_watchdog_sleeps_while_all_is_dark(world: LedBoxAlone) -> None:
     with opened(world, watchdog_s=1.0) as box:
         world.clock.sleep(3.0)
         assert not box.running()
 
 
-def test_a_watchdog_fault_lasts_until_the_box_is_opened_anew(world: LedBoxWorld) -> None:
+def test_a_watchdog_fault_lasts_until_the_box_is_opened_anew(world: LedBoxAlone) -> None:
     steps = table(300)
     with opened(world, watchdog_s=1.0) as box:
         box.load(steps)
@@ -162,7 +164,7 @@ def test_a_watchdog_fault_lasts_until_the_box_is_opened_anew(world: LedBoxWorld)
         assert box.running()
 
 
-def test_a_muted_box_darkens_by_its_watchdog(world: LedBoxWorld) -> None:
+def test_a_muted_box_darkens_by_its_watchdog(world: LedBoxAlone) -> None:
     with opened(world, watchdog_s=1.0) as box:
         steps = table(300)
         box.load(steps)
@@ -172,7 +174,7 @@ def test_a_muted_box_darkens_by_its_watchdog(world: LedBoxWorld) -> None:
         assert len(world.lights) < 110
 
 
-def test_a_light_cut_short_is_reported_dark(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_light_cut_short_is_reported_dark(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(1, on_us=2_000_000, period_us=2_000_000)
     box.load(steps)
     box.start(steps)
@@ -182,7 +184,7 @@ def test_a_light_cut_short_is_reported_dark(box: LedBox, world: LedBoxWorld) -> 
     assert world.darkened_ns[0] < world.lights[0][2]
 
 
-def test_a_cable_pulled_in_a_burst_is_a_device_lost(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_cable_pulled_in_a_burst_is_a_device_lost(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(50)
     box.load(steps)
     box.start(steps)
@@ -192,7 +194,7 @@ def test_a_cable_pulled_in_a_burst_is_a_device_lost(box: LedBox, world: LedBoxWo
 
 
 def test_a_burst_that_another_program_aborts_is_not_taken_for_one_that_is_over(
-    box: LedBox, world: LedBoxWorld
+    box: LedBox, world: LedBoxAlone
 ) -> None:
     steps = table(400, on_us=2000)
     box.load(steps)
@@ -202,7 +204,7 @@ def test_a_burst_that_another_program_aborts_is_not_taken_for_one_that_is_over(
         run_to_end(box, world)
 
 
-def test_a_bank_that_changed_is_uploaded_once_more(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_bank_that_changed_is_uploaded_once_more(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(7)
     box.load(steps)
     send_behind_its_back(world, b"SEQ:BANK 0;DATA #10\n")
@@ -211,7 +213,7 @@ def test_a_bank_that_changed_is_uploaded_once_more(box: LedBox, world: LedBoxWor
 
 
 def test_a_bank_that_stays_wrong_is_refused(
-    box: LedBox, world: LedBoxWorld, monkeypatch: pytest.MonkeyPatch
+    box: LedBox, world: LedBoxAlone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_memory = SimpleNamespace(crc32=lambda data: zlib.crc32(data) ^ 1)
     monkeypatch.setattr(ledbox_firmware, "zlib", broken_memory)
@@ -221,7 +223,7 @@ def test_a_bank_that_stays_wrong_is_refused(
         box.start(steps)
 
 
-def test_the_running_bank_cannot_be_replaced(box: LedBox, world: LedBoxWorld) -> None:
+def test_the_running_bank_cannot_be_replaced(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(100)
     box.load(steps)
     box.start(steps)
@@ -230,7 +232,7 @@ def test_the_running_bank_cannot_be_replaced(box: LedBox, world: LedBoxWorld) ->
         box.poll_log()
 
 
-def test_a_log_of_another_burst_is_not_taken_for_ours(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_log_of_another_burst_is_not_taken_for_ours(box: LedBox, world: LedBoxAlone) -> None:
     steps, other = table(30), table(30, led=300)
     box.load(steps)
     box.start(steps)
@@ -240,18 +242,18 @@ def test_a_log_of_another_burst_is_not_taken_for_ours(box: LedBox, world: LedBox
         run_to_end(box, world)
 
 
-def test_an_open_port_cannot_be_opened_twice(box: LedBox, world: LedBoxWorld) -> None:
+def test_an_open_port_cannot_be_opened_twice(box: LedBox, world: LedBoxAlone) -> None:
     with pytest.raises(DeviceLost, match="no other program has it open"), opened(world):
         pass
 
 
-def test_garbage_on_the_line_does_not_keep_the_driver_out(world: LedBoxWorld) -> None:
+def test_garbage_on_the_line_does_not_keep_the_driver_out(world: LedBoxAlone) -> None:
     send_behind_its_back(world, b"\x00\xff*IDN?\n#9\nSEQ:DATA #14zz\n*IDN?\n" * 20)
     with opened(world) as box:
         assert box.identify().vendor == "Coupole"
 
 
-def test_a_late_answer_to_the_first_message_does_not_keep_the_driver_out(world: LedBoxWorld) -> None:
+def test_a_late_answer_to_the_first_message_does_not_keep_the_driver_out(world: LedBoxAlone) -> None:
     """It comes in place of the answer to the second."""
     link, held = world.box._link, []
     send = link.send
@@ -268,7 +270,7 @@ def test_a_late_answer_to_the_first_message_does_not_keep_the_driver_out(world: 
     assert len(held) > 2
 
 
-def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxAlone) -> None:
     steps = table(3)
     steps["led"][1] = NO_LED
     box.load(steps)
@@ -277,7 +279,7 @@ def test_a_dark_step_is_no_step_of_an_led(box: LedBox, world: LedBoxWorld) -> No
 
 
 def test_all_errors_of_the_queue_are_told_and_none_is_left_for_the_next_call(
-    box: LedBox, world: LedBoxWorld
+    box: LedBox, world: LedBoxAlone
 ) -> None:
     send_behind_its_back(world, b"FOO\nOUTP:PAN7 1\nBAR\n")
     with pytest.raises(DeviceRefused, match=r"-113 .*FOO; -114 .*panel 7.*; -113 .*BAR"):
@@ -285,7 +287,7 @@ def test_all_errors_of_the_queue_are_told_and_none_is_left_for_the_next_call(
     assert not box.running()
 
 
-def test_a_queue_that_never_ends_is_given_up(box: LedBox, world: LedBoxWorld) -> None:
+def test_a_queue_that_never_ends_is_given_up(box: LedBox, world: LedBoxAlone) -> None:
     """Else no lights_off would ever come to its end."""
 
     class Endless(deque[str]):

@@ -11,13 +11,16 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ledbox_conformance import FLASH_US, LedBoxConformance
-from ledbox_world import LedBoxWorld, text_world, wait_until
+from ledbox_world import text_world
 from pydantic import ValidationError
 
 from coupole.devices import table_box
 from coupole.errors import DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.testing import LedBoxConformance
+from coupole.testing.ledbox_conformance import FLASH_US
+from coupole.testing.waiting import wait_until
 from drivers.ledbox.text_lines import Settings, TextLineBox, read_reply
+from sim.world.ledbox_alone import LedBoxAlone
 
 LONG_US = 20_000_000
 DIALECTS: dict[str, dict[str, Any]] = {
@@ -29,25 +32,25 @@ DIALECTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(params=sorted(DIALECTS))
-def world(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[LedBoxWorld]:
+def world(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[LedBoxAlone]:
     with text_world(tmp_path, **DIALECTS[request.param]) as running:
         yield running
 
 
 @pytest.fixture
-def box(world: LedBoxWorld) -> Iterator[TextLineBox]:
+def box(world: LedBoxAlone) -> Iterator[TextLineBox]:
     with world.opener() as driver:
         yield driver
 
 
 @pytest.fixture
-def plain(tmp_path: Path) -> Iterator[LedBoxWorld]:
+def plain(tmp_path: Path) -> Iterator[LedBoxAlone]:
     """A world with the plain dialect alone."""
     with text_world(tmp_path) as running:
         yield running
 
 
-def say(world: LedBoxWorld, words: bytes) -> None:
+def say(world: LedBoxAlone, words: bytes) -> None:
     """The box says something that nobody asked for."""
     world.do(lambda: world.box._link.send(words))
     world.clock.sleep(0.2)
@@ -57,12 +60,18 @@ class TestTextLineBox(LedBoxConformance):
     """The contract, in each dialect."""
 
     long_us = LONG_US
+    words_of_silence = "led box: expected an answer to"
+    words_of_a_lost_link = "Check the cable"
+
+    def test_it_tells_vendor_and_serial_number(self, box: TextLineBox) -> None:
+        identity = box.identify()
+        assert (identity.vendor, identity.serial) == ("Coupole", "SIM-0002")
 
     def test_it_runs_no_tables_and_says_what_to_do(self, box: TextLineBox) -> None:
         with pytest.raises(DeviceRefused, match="Set `trigger: software` in the plan"):
             table_box(box)
 
-    def test_opening_ends_what_a_host_left_alight_that_was_killed(self, world: LedBoxWorld) -> None:
+    def test_opening_ends_what_a_host_left_alight_that_was_killed(self, world: LedBoxAlone) -> None:
         port = os.open(world.box.port, os.O_WRONLY | os.O_NOCTTY)
         number = b"6" if world.box._settings.first_led else b"5"
         os.write(port, b"LED " + number + b" ON\n")
@@ -72,7 +81,7 @@ class TestTextLineBox(LedBoxConformance):
         with world.opener():
             assert world.shining() == []
 
-    def test_half_a_line_of_a_host_that_was_killed_does_no_harm(self, world: LedBoxWorld) -> None:
+    def test_half_a_line_of_a_host_that_was_killed_does_no_harm(self, world: LedBoxAlone) -> None:
         port = os.open(world.box.port, os.O_WRONLY | os.O_NOCTTY)
         os.write(port, b"LED 5 O")
         os.close(port)
@@ -80,7 +89,7 @@ class TestTextLineBox(LedBoxConformance):
             box.flash(7, LONG_US)
             assert world.shining() == [7]
 
-    def test_a_box_with_fewer_leds_than_the_rig_says_is_quoted(self, world: LedBoxWorld) -> None:
+    def test_a_box_with_fewer_leds_than_the_rig_says_is_quoted(self, world: LedBoxAlone) -> None:
         with (
             world.opener(led_count=1000) as box,
             pytest.raises(DeviceRefused, match=r"it said `ERR no LED 0?90[01]`"),
@@ -89,7 +98,7 @@ class TestTextLineBox(LedBoxConformance):
         assert world.lights == []
 
 
-def test_a_flash_refused_by_the_box_ends_what_shone_before(plain: LedBoxWorld) -> None:
+def test_a_flash_refused_by_the_box_ends_what_shone_before(plain: LedBoxAlone) -> None:
     with plain.opener(led_count=1000) as box:
         box.flash(5, LONG_US)
         with pytest.raises(DeviceRefused, match="ERR no LED 900"):
@@ -97,7 +106,7 @@ def test_a_flash_refused_by_the_box_ends_what_shone_before(plain: LedBoxWorld) -
         assert plain.shining() == []
 
 
-def test_an_led_beyond_the_rigs_count_is_refused_though_the_box_has_it(plain: LedBoxWorld) -> None:
+def test_an_led_beyond_the_rigs_count_is_refused_though_the_box_has_it(plain: LedBoxAlone) -> None:
     with (
         plain.opener(led_count=8) as box,
         pytest.raises(DeviceRefused, match="an LED from 0 to 7; 8 was asked for"),
@@ -106,14 +115,14 @@ def test_an_led_beyond_the_rigs_count_is_refused_though_the_box_has_it(plain: Le
     assert plain.lights == []
 
 
-def test_a_second_flash_ends_the_first(plain: LedBoxWorld) -> None:
+def test_a_second_flash_ends_the_first(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         box.flash(5, LONG_US)
         box.flash(7, LONG_US)
         assert plain.shining() == [7]
 
 
-def test_a_light_that_was_not_confirmed_is_ended(plain: LedBoxWorld) -> None:
+def test_a_light_that_was_not_confirmed_is_ended(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         silent = plain.box._settings.model_copy(update={"answers": False})
         plain.do(lambda: setattr(plain.box, "_settings", silent))  # it obeys, but its answers are lost
@@ -123,7 +132,7 @@ def test_a_light_that_was_not_confirmed_is_ended(plain: LedBoxWorld) -> None:
         plain.wait_until_dark()
 
 
-def test_a_box_that_refuses_to_end_a_light_is_quoted_and_all_is_switched_off(plain: LedBoxWorld) -> None:
+def test_a_box_that_refuses_to_end_a_light_is_quoted_and_all_is_switched_off(plain: LedBoxAlone) -> None:
     with plain.opener(off="DARK {led}") as box:
         box.flash(5, LONG_US)
         with pytest.raises(DeviceRefused, match=r"it said `ERR what\? DARK 5`"):
@@ -131,7 +140,7 @@ def test_a_box_that_refuses_to_end_a_light_is_quoted_and_all_is_switched_off(pla
         assert plain.shining() == []
 
 
-def test_the_same_is_said_where_the_drivers_own_thread_ended_it(plain: LedBoxWorld) -> None:
+def test_the_same_is_said_where_the_drivers_own_thread_ended_it(plain: LedBoxAlone) -> None:
     with plain.opener(off="DARK {led}") as box:
         box.flash(5, FLASH_US)
         plain.wait_until_dark()
@@ -139,7 +148,7 @@ def test_the_same_is_said_where_the_drivers_own_thread_ended_it(plain: LedBoxWor
             box.end_flash()
 
 
-def test_a_box_that_confirms_with_other_words_is_refused_and_dark(plain: LedBoxWorld) -> None:
+def test_a_box_that_confirms_with_other_words_is_refused_and_dark(plain: LedBoxAlone) -> None:
     with (
         pytest.raises(DeviceRefused, match="expected `ready` in answer to `ALL OFF`; it said `OK`"),
         plain.opener(expected_reply="ready"),
@@ -148,7 +157,7 @@ def test_a_box_that_confirms_with_other_words_is_refused_and_dark(plain: LedBoxW
     assert plain.shining() == []
 
 
-def test_the_light_goes_out_though_the_caller_hangs_and_the_box_knows_no_time(plain: LedBoxWorld) -> None:
+def test_the_light_goes_out_though_the_caller_hangs_and_the_box_knows_no_time(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         box.flash(5, FLASH_US)
         plain.wait_until_dark()  # the caller does nothing at all
@@ -156,7 +165,7 @@ def test_the_light_goes_out_though_the_caller_hangs_and_the_box_knows_no_time(pl
         assert box.end_flash().on_us >= FLASH_US
 
 
-def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain: LedBoxWorld) -> None:
+def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         box.flash(5, FLASH_US)
         with box._lock:  # the thread that is to end it is held up
@@ -165,7 +174,7 @@ def test_past_its_time_a_light_is_not_believed_though_nothing_has_ended_it(plain
             assert not box.lit()
 
 
-def test_a_light_that_could_not_be_ended_in_time_is_not_hidden(plain: LedBoxWorld) -> None:
+def test_a_light_that_could_not_be_ended_in_time_is_not_hidden(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         box.flash(5, FLASH_US)
         plain.do(plain.box.mute)
@@ -183,7 +192,7 @@ def test_a_box_that_ends_lights_itself_goes_dark_when_its_host_is_gone(tmp_path:
         assert world.lit_us(0) > FLASH_US
 
 
-def test_words_that_nobody_asked_for_are_not_taken_for_an_answer(plain: LedBoxWorld) -> None:
+def test_words_that_nobody_asked_for_are_not_taken_for_an_answer(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         say(plain, b"boot: brown-out\r\n")
         with pytest.raises(DeviceRefused, match="said `boot: brown-out` unasked"):
@@ -192,14 +201,14 @@ def test_words_that_nobody_asked_for_are_not_taken_for_an_answer(plain: LedBoxWo
         assert plain.shining() == [5]
 
 
-def test_an_empty_line_that_nobody_asked_for_does_no_harm(plain: LedBoxWorld) -> None:
+def test_an_empty_line_that_nobody_asked_for_does_no_harm(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         say(plain, b"\r\n")
         box.flash(5, LONG_US)
         assert plain.shining() == [5]
 
 
-def test_a_late_answer_is_not_taken_for_the_next_ones(plain: LedBoxWorld) -> None:
+def test_a_late_answer_is_not_taken_for_the_next_ones(plain: LedBoxAlone) -> None:
     with plain.opener() as box:
         plain.do(plain.box._link._stop_waiting)  # it hears nothing for a while
         with pytest.raises(DeviceTimeout):
@@ -212,7 +221,7 @@ def test_a_late_answer_is_not_taken_for_the_next_ones(plain: LedBoxWorld) -> Non
         assert plain.shining() == [7]
 
 
-def test_a_stuck_led_shines_on_though_the_box_confirms_that_it_is_off(plain: LedBoxWorld) -> None:
+def test_a_stuck_led_shines_on_though_the_box_confirms_that_it_is_off(plain: LedBoxAlone) -> None:
     plain.do(lambda: plain.box.stick_led(5))
     with plain.opener() as box:
         box.flash(5, FLASH_US)
@@ -220,17 +229,17 @@ def test_a_stuck_led_shines_on_though_the_box_confirms_that_it_is_off(plain: Led
         assert plain.shining() == [5]
 
 
-def test_a_port_that_does_not_exist_is_a_device_lost(plain: LedBoxWorld) -> None:
+def test_a_port_that_does_not_exist_is_a_device_lost(plain: LedBoxAlone) -> None:
     with pytest.raises(DeviceLost, match="nowhere"), plain.opener(port="/dev/nowhere"):
         pass
 
 
-def test_an_open_port_cannot_be_opened_twice(plain: LedBoxWorld) -> None:
+def test_an_open_port_cannot_be_opened_twice(plain: LedBoxAlone) -> None:
     with plain.opener(), pytest.raises(DeviceLost, match="no other program has it open"), plain.opener():
         pass
 
 
-def test_a_port_where_nobody_answers_times_out(plain: LedBoxWorld) -> None:
+def test_a_port_where_nobody_answers_times_out(plain: LedBoxAlone) -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     with pytest.raises(DeviceTimeout, match="`ALL OFF` within"), plain.opener(port=os.ttyname(slave)):

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from arms import KR10_R1100_SIXX
 from eki_cell import SAMPLE_MS, EkiCell
+from our_robot_conformance import OurRobotConformance
 from pydantic import ValidationError
-from robot_cells import AWAY_DEG, HOME_DEG
-from robot_conformance import RobotConformance
 
 from coupole.devices import ArmCondition
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused
 from coupole.kinematics import move_duration_s
+from coupole.testing.robot_conformance import AWAY_DEG, HOME_DEG
 from drivers.kuka.eki.driver import KukaEki, Settings
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -49,7 +49,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("kind", [kind for kind in KINDS if full or name in ALSO_ON.get(kind, (name,))])
 
 
-class TestKukaEki(RobotConformance):
+class TestKukaEki(OurRobotConformance):
     @pytest.fixture
     def cell(self, kind: str, tmp_path: Path) -> Iterator[EkiCell]:
         with closing(EkiCell(tmp_path, **KINDS[kind])) as cell:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_cells import AWAY_DEG, HOME_DEG, KukaCell
-from robot_conformance import RobotConformance
+from our_robot_conformance import OurRobotConformance
+from robot_cells import KukaCell
 
 from coupole.errors import DeviceError, DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout
+from coupole.testing.robot_conformance import AWAY_DEG, HOME_DEG
 from drivers.kuka.rsi.driver import KukaRsi
 
 KINDS: dict[str, dict[str, Any]] = {
@@ -51,7 +52,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("kind", [kind for kind in KINDS if full or name in ALSO_ON.get(kind, (name,))])
 
 
-class TestKukaRsi(RobotConformance):
+class TestKukaRsi(OurRobotConformance):
     @pytest.fixture
     def cell(self, kind: str, tmp_path: Path) -> Iterator[KukaCell]:
         with closing(KukaCell(tmp_path, **KINDS[kind])) as cell:

@@ -17,25 +17,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from robot_cells import AWAY_DEG, HOME_DEG, UNHURRIED_S, RobotCell
-from robot_conformance import RobotConformance
+from our_robot_conformance import OurRobotConformance
 from ur import needs_ur_rtde
 
 from coupole.devices import ArmCondition
 from coupole.errors import DeviceFault, DeviceLost, DeviceRefused, DeviceTimeout, InputError
+from coupole.testing.robot_conformance import AWAY_DEG, HOME_DEG, UNHURRIED_S
 from drivers.ur.driver import Settings, UrRobot
 from sim.devices.ur_arm import flange_pose, rotation_vector
 from sim.devices.ur_controller import Settings as ControllerSettings
 from sim.devices.ur_controller import UrController
 from sim.world.clock import ClockWriter
 from sim.world.reactor import Reactor
+from sim.world.robot_alone import RobotAlone
 
 pytestmark = needs_ur_rtde
 
 _CYCLE_S = 0.002
 
 
-class UrCell(RobotCell):
+class UrCell(RobotAlone):
     """A UR controller and its driver."""
 
     def __init__(self, folder: Path) -> None:
@@ -56,7 +57,7 @@ class UrCell(RobotCell):
         super().__init__(folder / "clock", reactor, arm, 1e3 * _CYCLE_S)
 
     def open(self) -> UrRobot:
-        opened: UrRobot = self.kept(UrRobot(self.settings, self.clock))
+        opened: UrRobot = self.keep(UrRobot(self.settings, self.clock))
         return opened
 
     @property
@@ -89,14 +90,15 @@ def robot(cell: UrCell) -> UrRobot:
     return cell.open()
 
 
-class TestUrRobot(RobotConformance):
+class TestUrRobot(OurRobotConformance):
+    model = "UR10"
+
     @pytest.fixture
     def cell(self, tmp_path: Path) -> Iterator[UrCell]:
         with closing(UrCell(tmp_path)) as cell:
             yield cell
 
-    def test_it_says_who_it_is_and_that_it_is_simulated(self, cell: UrCell, robot: UrRobot) -> None:
-        assert robot.identify().model == "UR10"
+    def test_it_says_who_it_is_and_whether_it_is_simulated(self, cell: UrCell, robot: UrRobot) -> None:
         assert robot.identify().simulated
         assert robot.self_test()["tool offset"] == "0.00, 0.00, 100.00 mm"
         assert robot.measured().condition == ArmCondition("running", False, False, True)

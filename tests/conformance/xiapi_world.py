@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foreign_state import Left
 
 from coupole.clock import SystemClock
 from coupole.devices import Camera, Frame
+from coupole.testing.camera_state_conformance import Left
 from drivers.camera.xiapi.driver import Settings, XiCamera
 
 SOURCE = Path(__file__).with_name("xiapi_stub.c")

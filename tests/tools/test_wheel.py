@@ -85,7 +85,13 @@ def installed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
     call("venv", "--python", sys.executable, environment)
     (wheel,) = (folder / "dist").glob("*.whl")
     shared = request.param == "dependencies shared"
-    call("pip", "install", "--python", environment, *(["--no-deps", wheel] if shared else [f"{wheel}[xarray]"]))
+    call(
+        "pip",
+        "install",
+        "--python",
+        environment,
+        *(["--no-deps", wheel] if shared else [f"{wheel}[testing,xarray]"]),
+    )
     (site_packages,) = environment.glob("lib/python*/site-packages")
     if shared:
         (site_packages / "dependencies.pth").write_text(f"{DEPENDENCIES}\n")
@@ -143,6 +149,16 @@ def test_mypy_is_content_with_a_users_file(installed: Installed) -> None:
         check=False,
     )
     assert ended.returncode == 0, ended.stdout
+
+
+def test_the_driver_of_another_passes_the_class_of_the_wheel(installed: Installed) -> None:
+    example = REPO / "docs/how-to/your_driver"
+    shutil.copytree(example, installed.folder / "mein Treiber", ignore=shutil.ignore_patterns("__pycache__"))
+    plugins = [word for name in ("npe2", "schemathesis", "anyio") for word in ("-p", f"no:{name}")]
+    few_tests = ["-k", "flash and not mute"]
+    ended = installed.run("python", "-m", "pytest", "-q", "-W", "error", *plugins, *few_tests, "mein Treiber")
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert " passed" in ended.stdout
 
 
 def test_a_new_plan_names_the_shipped_cell_and_can_be_run(installed: Installed) -> None:

@@ -1,7 +1,7 @@
-"""What a camera delivers that another program left in a state of its own: one class for all cameras with features.
+"""Frames of a camera that another program left in a state of its own: one class for all cameras with features.
 
-The expected frames are written down here (`camera_conformance.expected_ramp`), and so is what each state would do
-to them; the stand-ins do what a camera in that state does.
+The expected frames are written down (`expected_ramp` of `camera_conformance`), and so is here what each state does
+to frames; the stand-ins do what a camera in that state does.
 """
 
 from __future__ import annotations
@@ -11,9 +11,16 @@ from typing import Any, Protocol
 
 import numpy as np
 import pytest
-from camera_conformance import EXPOSURE, HEIGHT_PX, WIDTH_PX, CameraWorld, expected_ramp, take
 
 from coupole.devices import Camera, Frame
+from coupole.testing.camera_conformance import (
+    EXPOSURE,
+    HEIGHT_PX,
+    WIDTH_PX,
+    CameraWorld,
+    expected_ramp,
+    take,
+)
 
 Left = tuple[tuple[str, Any], ...]
 LEFT_BY_SFNC: Mapping[str, Left] = {
@@ -44,13 +51,13 @@ LEFT_BY_SFNC: Mapping[str, Left] = {
     "blue is amplified": (("BalanceRatioSelector", "Blue"), ("BalanceRatio", 2.0)),
     "another pixel format": (("PixelFormat", "Mono8"),),
 }
-"""By what each does: features and values, in the order in which a program sets them."""
+"""Features and values, in the order in which a program sets them, by what they do to frames."""
 
 
 class ForeignStateWorld(CameraWorld, Protocol):
-    """A camera whose frames show `camera_conformance.ramp`."""
+    """A camera whose frames show the ramp of `camera_conformance.expected_ramp`."""
 
-    def leave(self, left: Left) -> None:
+    def leave(self, features: Left) -> None:
         """Have another program set these features, and go."""
         ...
 
@@ -61,8 +68,8 @@ class ForeignStateWorld(CameraWorld, Protocol):
 
 def assert_right_frames(world: ForeignStateWorld, camera: Camera) -> None:
     """Three edges expose three frames, each at its edge; a fourth, which comes too early, is counted."""
-    found = camera.configure(EXPOSURE)
-    assert (found.height_px, found.width_px) == (HEIGHT_PX, WIDTH_PX)
+    frame_format = camera.configure(EXPOSURE)
+    assert (frame_format.height_px, frame_format.width_px) == (HEIGHT_PX, WIDTH_PX)
     camera.arm(8)
     edges_ns = world.fire(12_000, 3_000, 12_000)
     frames = take(camera, 3)
@@ -75,7 +82,11 @@ def assert_right_frames(world: ForeignStateWorld, camera: Camera) -> None:
 
 
 class ForeignStateConformance:
-    """Any driver passes that decides the camera's state itself; `left` is what its `world`'s was left in."""
+    """Any driver passes that decides the camera's state itself.
+
+    A subclass gives the fixtures `world`, a `ForeignStateWorld`; `left`, features that another program has set;
+    and `all_left`, all of these.
+    """
 
     def test_frames_are_right_whatever_the_camera_was_left_in(self, world: ForeignStateWorld, left: Left) -> None:
         world.leave(left)

@@ -9,10 +9,16 @@ from __future__ import annotations
 import shutil
 
 from checkers import CHECKERS_FAILED
+from neighbour_programs import NEIGHBOURS_FAILED
 from places import SHARED_DATA
 from ur import NO_WHEEL
 
-ALLOWED = ("punx, the NeXus validator, is not installed: it wants Qt", NO_WHEEL, CHECKERS_FAILED)
+ALLOWED = (
+    "punx, the NeXus validator, is not installed: it wants Qt",
+    NO_WHEEL,
+    CHECKERS_FAILED,
+    NEIGHBOURS_FAILED,
+)
 """Reasons that stand for a thing that the machine cannot have."""
 
 

@@ -54,6 +54,9 @@ _.burst_times_s  # bench.py sequencing
 _.u_seen  # prove_layers.py
 _.BEAT_MS, _.COMMAND_ELEMENTS, _.STATUS_ELEMENTS  # make_kuka_files.py, for the controller's files
 
+_.describe_collect, _.collect_asset_docs, _.get_index, _.success  # bluesky: DomeCell, ProvenFrames
+_.run_folder, _.take_view  # users of coupole/neighbours/bluesky.py
+
 # ---- by tests alone ----
 _.LEFT_BY_SFNC, _.is_safe, _.light_given_s  # coupole/testing, for the tests of others
 _.switch_panel, _.ledbox_alone, _.RobotAlone  # sim/world, for them and for ours

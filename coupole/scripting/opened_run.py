@@ -76,6 +76,15 @@ class RunView(Mapping[str, Frame]):
         """Greatest value of a pixel, DN."""
         return self._file.white_dn
 
+    @property
+    def pixel_mm(self) -> float | None:
+        """Nominal size of a pixel on the plane in focus, mm, by the rig's lens; None if the file has no lens."""
+        names = ("pixel_pitch_um", "focal_length_mm", "focus_distance_mm")
+        pitch_um, focal_mm, focus_mm = (self._file.number(name) for name in names)
+        if not pitch_um or not focal_mm or not focus_mm or focus_mm <= focal_mm:
+            return None
+        return pitch_um * 1e-3 * (focus_mm - focal_mm) / focal_mm
+
     @cached_property
     def _file(self) -> ViewFile:
         paths = {self._run.folder / event.file for event in self._events.values()}

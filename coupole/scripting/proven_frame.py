@@ -57,6 +57,16 @@ class Frame:
         """Height and width, px; reads no pixels."""
         return self._file.layout.height_px, self._file.layout.width_px
 
+    @property
+    def file(self) -> str:
+        """NeXus HDF5 file of its view, in the run's folder: `views/top.h5`."""
+        return self._event.file
+
+    @property
+    def slot(self) -> int:
+        """Row of that file's data where its pixels are, from 0."""
+        return self._event.index
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """The pixels as numpy wants them; always a new array."""
         if copy is False:

@@ -23,7 +23,7 @@ def dataset_of(frames: Sequence[Frame], facts: Mapping[str, Any]) -> xr.Dataset:
     try:
         import xarray as xr
 
-        pixels = _stack(frames)
+        pixels = stack_frames(frames)
     except ModuleNotFoundError as error:
         message = f"a dataset needs {error.name}; install it: pip install 'coupole[xarray]'"
         raise ModuleNotFoundError(message, name=error.name) from error
@@ -35,7 +35,7 @@ def dataset_of(frames: Sequence[Frame], facts: Mapping[str, Any]) -> xr.Dataset:
     )
 
 
-def _stack(frames: Sequence[Frame]) -> Any:
+def stack_frames(frames: Sequence[Frame]) -> Any:
     """Dask array [frames, height, width]; a frame is read when a part of it is computed."""
     import dask.array
 

@@ -42,7 +42,7 @@ from coupole.testing.table_box_conformance import TableLedBoxConformance, TableL
 __all__ = [
     "CameraConformance", "CameraWorld", "ForeignStateConformance", "ForeignStateWorld", "LedBoxConformance",
     "LedBoxWorld", "RobotCell", "RobotConformance", "SeenFromOutside", "SimulatedCell", "TableLedBoxConformance",
-    "TableLedBoxWorld", "simulated_cell", "simulated_rig", "simulated_speed",
+    "TableLedBoxWorld", "simulated_cell", "simulated_rig", "simulated_speed", "started_cell",
 ]  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Cells, runs and results of Coupole in other programs: bluesky with Tiled, and napari."""

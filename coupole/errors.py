@@ -47,10 +47,15 @@ class Problem:
     """
 
     file: str
+    """Path of the file."""
     line: int
+    """Line, from 1; 0: the file as a whole."""
     column: int
+    """Column, from 1."""
     key: str
+    """Key of the file that it concerns, with those above it; empty for the file as a whole."""
     message: str
+    """Sentence of what was expected, and what was found."""
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file

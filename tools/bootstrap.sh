@@ -55,7 +55,7 @@ prepare_tests() {
     prepare_neighbours
 }
 
-# The dependency group `neighbours` (bluesky, ophyd-async, Tiled, napari), tried once; it is too large for whoever runs no
+# The dependency group `neighbours` (bluesky, ophyd-async, Tiled, napari, pyright), tried once; it is too large for whoever runs no
 # tests.
 prepare_neighbours() {
     local tried="$root/.tools/tried-neighbours"
@@ -136,7 +136,7 @@ has_exiftool() {
 has_neighbours() {
     "$root/.venv/bin/python" -c '
 from importlib.util import find_spec
-raise SystemExit(not all(map(find_spec, ("bluesky", "napari", "npe2", "ophyd_async", "tiled"))))'
+raise SystemExit(not all(map(find_spec, ("basedpyright", "bluesky", "napari", "npe2", "ophyd_async", "tiled"))))'
 }
 
 install_neighbours() {

@@ -47,6 +47,7 @@ class JournalBegun(JournalEvent):
 
     event: Literal["journal"] = "journal"
     version: int = JOURNAL_VERSION
+    """Version of the journal's format."""
 
 
 class SessionStarted(JournalEvent):
@@ -54,12 +55,14 @@ class SessionStarted(JournalEvent):
 
     event: Literal["start"] = "start"
     simulated: bool = False
+    """True if the devices are those of a simulated cell."""
     room_c: float | None = None
-    """Temperature of the coolest LED board."""
+    """Temperature of the coolest LED board, C; None if the box knows none."""
     acknowledged: str = ""
     """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
-    """Light that the object may receive in its life, by its ledger and the plan, as the session begins."""
+    """Light that the object may receive in its life, by its ledger and the plan, as the session begins; None: no
+    budget."""
     trusted: tuple[str, ...] = ()
     """Permissions that a person gives by name in the rig (`any_controller_by`, `without_realtime_by`), in
     words."""
@@ -70,10 +73,16 @@ class SessionResumed(JournalEvent):
 
     event: Literal["resume"] = "resume"
     simulated: bool = False
+    """True if the devices are those of a simulated cell."""
     room_c: float | None = None
+    """Temperature of the coolest LED board, C; None if the box knows none."""
     acknowledged: str = ""
+    """The fault of the arm that the operator confirmed to be repaired."""
     dose_budget_lux_h: float | None = None
+    """Light that the object may receive in its life, by its ledger and the plan, as the session begins; None: no
+    budget."""
     trusted: tuple[str, ...] = ()
+    """Permissions that a person gives by name in the rig, in words."""
 
 
 class ViewBegun(JournalEvent):
@@ -81,6 +90,7 @@ class ViewBegun(JournalEvent):
 
     event: Literal["view"] = "view"
     view: str
+    """Name of the view."""
     hidden_leds: tuple[int, ...] = ()
     """LEDs that are occluded from everything that this view sees."""
 
@@ -90,8 +100,9 @@ class MoveBegun(JournalEvent):
 
     event: Literal["move"] = "move"
     view: str
+    """Name of the view."""
     joints_deg: tuple[Joints, ...]
-    """Joint angles of each waypoint, the view's last."""
+    """[waypoints, 6] angles of the axes, degrees; the last are the view's."""
 
 
 class ArmSettled(JournalEvent):
@@ -99,8 +110,11 @@ class ArmSettled(JournalEvent):
 
     event: Literal["settled"] = "settled"
     view: str
+    """Name of the view."""
     joints_deg: Joints
+    """[6] measured angles of the axes, degrees."""
     base_from_camera: tuple[tuple[float, ...], ...]
+    """[4, 4] pose of the camera by these angles, mm: from camera to base coordinates."""
 
 
 class FrameProven(JournalEvent):
@@ -108,11 +122,13 @@ class FrameProven(JournalEvent):
 
     event: Literal["frame"] = "frame"
     shot: Shot
+    """Id of the shot, such as `top/led0417/e0`."""
     file: InnerPath
     """The view's file, relative to the run's folder."""
     index: int
     """Its slot in that file."""
     frame_id: int
+    """Number that the camera gave the frame."""
     xxh3: str
     """Checksum of the frame's bytes, 16 hexadecimal digits."""
 
@@ -122,8 +138,9 @@ class BurstBegun(JournalEvent):
 
     event: Literal["begin"] = "begin"
     view: str
+    """Name of the view."""
     planned_lux_h: tuple[float, ...]
-    """Largest light at each of the object's dose points."""
+    """Largest light at each of the object's dose points, lux h."""
 
 
 class BurstEnded(JournalEvent):
@@ -131,21 +148,27 @@ class BurstEnded(JournalEvent):
 
     event: Literal["burst"] = "burst"
     view: str
+    """Name of the view."""
     steps: int
+    """Number of steps that the box has run."""
     on_s: float
-    """Sum of the on-times of its LEDs."""
+    """Sum of the on-times of its LEDs, s."""
     joints_before_deg: Joints | None = None
+    """[6] measured angles before the burst, degrees."""
     joints_after_deg: Joints | None = None
-    """None if the arm was not at rest."""
+    """[6] the same after it; None if the arm was not at rest."""
     frames: int
+    """Number of frames that came from the camera."""
     table_s: float | None = None
+    """Planned duration of the burst's table, s."""
     clocks: dict[str, float] | None = None
     """Fit of the camera's clock against the box's."""
     camera: dict[str, int] | None = None
     """The camera's counters."""
     hottest_board_c: float | None = None
+    """Highest temperature of a board in the burst, C; None if the box knows none."""
     given_lux_h: tuple[float, ...] | None = None
-    """Light at each of the object's dose points, in place of what was planned; None in version 0.1."""
+    """Light at each of the object's dose points, lux h, in place of what was planned; None in version 0.1."""
 
 
 class GapFound(JournalEvent):
@@ -153,13 +176,19 @@ class GapFound(JournalEvent):
 
     event: Literal["gap"] = "gap"
     view: str
+    """Name of the view."""
     shots: tuple[Shot, ...]
+    """Shots that are not proven."""
     missing: int
+    """Number of steps that sent an edge and have no frame."""
     lost_in_transfer: int
+    """Number of those whose frames the camera exposed, and which did not arrive."""
     surplus: int
+    """Number of frames that no step has triggered."""
     dead_leds: tuple[Shot, ...] = ()
     """Shots whose LED drew no current."""
     reason: str = ""
+    """Reason why nothing, or not everything, could be proven; empty if everything that came was."""
 
 
 class ReshootBegun(JournalEvent):
@@ -167,8 +196,11 @@ class ReshootBegun(JournalEvent):
 
     event: Literal["reshoot"] = "reshoot"
     view: str
+    """Name of the view."""
     attempt: int
+    """Number of this attempt, from 1."""
     shots: tuple[Shot, ...]
+    """Shots that are taken again."""
 
 
 class FaultNoted(JournalEvent):
@@ -176,7 +208,9 @@ class FaultNoted(JournalEvent):
 
     event: Literal["fault"] = "fault"
     kind: str
+    """Name of the error, such as `DeviceTimeout`, or `unsafe`: a device could not be made safe."""
     message: str
+    """Message of the error."""
     device: str = ""
     """The device that failed, by its kind in the rig; empty if none did."""
 
@@ -206,9 +240,11 @@ class TextUnread(JournalEvent):
 
     event: Literal["unread"] = "unread"
     lost_lines: int
+    """Number of lines that were dropped."""
     lost_bytes: int
+    """Bytes of these lines."""
     waiting_bytes: int
-    """Kept for the reader when this was written."""
+    """Bytes that were kept for the reader when this was written."""
     stalled_s: float
     """Time for which nothing had been taken, s."""
 
@@ -218,6 +254,7 @@ class ViewSealed(JournalEvent):
 
     event: Literal["seal"] = "seal"
     view: str
+    """Name of the view."""
 
 
 class SessionStopped(JournalEvent):
@@ -225,6 +262,7 @@ class SessionStopped(JournalEvent):
 
     event: Literal["stop"] = "stop"
     outcome: Literal["done", "interrupted", "failed"]
+    """End of the session, in one word."""
     reason: str = ""
     """Why, if not all was done: who stopped it, or what failed."""
     robot: dict[str, Any] = Field(default_factory=dict)

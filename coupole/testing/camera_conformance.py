@@ -25,7 +25,9 @@ A_MOMENT_S = 0.2
 class CameraWorld(Protocol):
     """A camera, its trigger cable and its clock; every frame is filled with the number of its exposure."""
 
-    def open(self) -> Camera: ...
+    def open(self) -> Camera:
+        """A driver on the camera, closed with the world."""
+        ...
 
     def open_nothing(self) -> Camera:
         """Open a camera that is not there."""
@@ -40,7 +42,9 @@ class CameraWorld(Protocol):
         ...
 
     @property
-    def is_armed(self) -> bool: ...
+    def is_armed(self) -> bool:
+        """True if edges make the camera expose frames."""
+        ...
 
 
 def expected_ramp(number: int) -> NDArray[np.uint16]:

@@ -138,6 +138,7 @@ class RobotConformance:
 
     @pytest.fixture
     def robot(self, cell: RobotCell) -> Robot:
+        """An opened driver."""
         return cell.open()
 
     def test_opening_moves_nothing(self, cell: RobotCell, robot: Robot) -> None:

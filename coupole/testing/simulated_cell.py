@@ -30,9 +30,11 @@ class SeenFromOutside:
     panels: tuple[int, ...]
     """Numbers of the panels that shine, from 1."""
     arm_moves: bool
+    """True while an axis turns."""
     joints_deg: tuple[float, ...]
     """[6] where the axes truly are."""
     camera_is_armed: bool
+    """True if edges make frames."""
 
     @property
     def is_safe(self) -> bool:

@@ -47,27 +47,36 @@ class Light(Model):
     """Properties that all lights have."""
 
     strength: Factor | tuple[Factor, Factor, Factor] = 1.0
+    """Strength, one for all channels or for red, green and blue; what 1 is stands at the head of this module."""
 
     @property
     def rgb(self) -> Floats:
-        """[3]"""
+        """[3] strength for red, green and blue."""
         return np.broadcast_to(np.asarray(self.strength, np.float64), 3).copy()
 
 
 class DistantLight(Light):
+    """A light so far away that it comes from one direction."""
+
     kind: Literal["direction"] = "direction"
     towards: Way
-    """The light."""
+    """Vector towards the light; its length does not count."""
 
 
 class LedLight(Light):
+    """An LED of the run, as it was measured."""
+
     kind: Literal["led"] = "led"
     number: Annotated[int, Field(ge=0)]
+    """Number of the LED."""
 
 
 class PointLight(Light):
+    """A light at a point, which shines alike to all sides."""
+
     kind: Literal["point"] = "point"
     at_mm: Vector
+    """Place of the point, mm."""
 
 
 _LEVEL = (1.0, 0.0, 0.0)
@@ -79,13 +88,15 @@ class AreaLight(Light):
 
     kind: Literal["area"] = "area"
     at_mm: Vector
-    """Place of its centre."""
+    """Place of its centre, mm."""
     normal: Way
+    """Direction to the side to which it radiates."""
     across: Way | None = None
     """Direction of the width; only its part across the normal counts."""
     width_mm: Length
+    """Width, mm."""
     height_mm: Length | None = None
-    """Height; equal to the width if it is not given."""
+    """Height, mm; equal to the width if it is not given."""
 
 
 class EnvironmentLight(Light):
@@ -93,8 +104,9 @@ class EnvironmentLight(Light):
 
     kind: Literal["environment"] = "environment"
     file: FilePath
+    """Picture of all directions."""
     turn_deg: float = 0.0
-    """Angle by which it is turned about up, from the middle of the picture to its left."""
+    """Angle, degrees, by which it is turned about up, from the middle of the picture to its left."""
 
 
 AnyLight = Annotated[
@@ -103,7 +115,10 @@ AnyLight = Annotated[
 
 
 class LightsFile(Model):
+    """A file of lights that are summed."""
+
     lights: Annotated[tuple[AnyLight, ...], Field(min_length=1, max_length=1000)]
+    """The lights."""
 
 
 def read_lights(path: Path) -> list[AnyLight]:

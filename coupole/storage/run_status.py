@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,7 +10,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, assert_never
 
+from coupole.errors import CoupoleError
+from coupole.plan.cell import read_cell
 from coupole.storage import journal, run_dose
+from coupole.storage.arm_faults import faults_of
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
     ArmSettled,
@@ -93,6 +97,8 @@ class Status:
     """The process that has the run, where that is stopped (Ctrl-Z, SIGSTOP)."""
     go_on: str = ""
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
+    before_that: str = ""
+    """The command line by which a person first confirms a fault of the arm; empty if none stands."""
 
     @property
     def missing(self) -> int:
@@ -135,7 +141,18 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     status.stopped_pid = holder if holder and is_stopped(holder) else None
     if status.frames_left and not in_use:
         status.go_on = run.go_on_command
+        status.before_that = _confirmation(run)
     return status
+
+
+def _confirmation(run: Run) -> str:
+    """Return the command that confirms the standing faults of the arm of the run's rig; empty without any, and if
+    the rig is not where the run was begun."""
+    with contextlib.suppress(CoupoleError):
+        cell = read_cell(Path(run.about["rig"]["path"]))
+        if faults_of(cell).standing():
+            return f"coupole confirm {cell.document.path} --name NAME"
+    return ""
 
 
 def _note_event(found: Status, event: Event) -> None:

@@ -119,6 +119,14 @@ def test_what_is_no_request_changes_nothing_and_is_told_what_was_expected(
     assert ask(served.run, "state")["state"] == "running"
 
 
+def test_a_word_to_go_on_is_not_heard_while_it_is_not_known_why_the_process_stood_still(served: Served) -> None:
+    served.control.can_stand = True
+    served.control.hold("the program did not run for 6.0 s")
+    answer = ask(served.run, "go-on")
+    assert "asked anew" in answer["unheard"]
+    assert served.control.pause.is_set()
+
+
 def test_a_client_that_says_nothing_holds_up_no_other(served: Served) -> None:
     (path,) = runtime_folder.runtime_folder().glob("*.sock")
     with socket.socket(socket.AF_UNIX) as silent:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import time
@@ -15,6 +16,9 @@ import pytest
 from cells import SIDE, TOP
 from freezing import Freeze
 from ur import needs_ur_rtde
+
+from coupole.acquisition.cell_bench.bench_client import ask_bench
+from coupole.plan.cell import read_cell
 
 ARMS = [
     "rsi",
@@ -59,6 +63,9 @@ def test_a_frozen_process_of_the_arm_ends_the_run_with_a_fault_and_the_arm_at_re
         assert not world.ask("state")["arm_moving"]
     assert ended.code == 4
     assert f"first   coupole confirm {cell.rig} --name NAME" in ended.err
+    told = cells.here("status", cell.run_folder, "--json").document
+    assert told["go_on"]
+    assert told["before_that"] == f"coupole confirm {cell.rig} --name NAME"
     assert cells.events(cell.run_folder, "fault")[0]["device"] == "robot"
     assert not cells.alive(pid)
 
@@ -78,6 +85,26 @@ def test_an_arm_that_is_driven_by_hand_does_not_move_again_after_a_freeze(tmp_pa
             assert "the program did not run for" in ended.err
             turned_deg = np.abs(np.subtract(world.ask("state")["joints_deg"], at_once)).max()
             assert turned_deg < SLACK_DEG
+
+
+def test_a_bench_that_is_closed_and_not_sure_of_its_arm_ends_with_4_and_the_fault_stands(tmp_path: Path) -> None:
+    """The process that answers the arm is frozen, at rest: the stop that a close asks for is not confirmed."""
+    cell = freezing.cell_in(tmp_path, "rsi")
+    with freezing.world_of(cell, "rsi"):
+        bench = cells.start("bench", cell.rig, "--yes", "--json")
+        assert bench.stdout is not None
+        assert bench.stdout.readline()
+        pid = freezing.frozen_pid(bench, "arm's process")
+        assert pid != bench.pid
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(2.0)
+        trouble = ask_bench(read_cell(cell.rig), "close")["trouble"]
+        ended = cells.finish(bench)
+        assert any("arm stopped" in words for words in trouble), trouble
+        assert ended.code == 4
+        refused = cells.here("arm", cell.rig, "home", "--yes")
+    assert refused.code == 4, refused.err
+    assert f"coupole confirm {cell.rig}" in refused.err
 
 
 def test_ctrl_z_makes_the_cell_safe_before_the_process_stops_and_the_run_asks_when_it_goes_on(

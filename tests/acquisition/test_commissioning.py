@@ -16,12 +16,12 @@ from cells import Ended, here
 from commissioned_cells import ABOVE_THE_BALL_DEG, Eye, Wrapped, ball_cell, board_cell, opened_bench, with_devices
 from places import REPO
 
-from coupole.acquisition.commissioning import arm_steps, lamp_step, light_timing
+from coupole.acquisition.commissioning import arm_steps, lamp_step, light_timing, session
 from coupole.acquisition.commissioning.bench import Bench, Findings, StepFailedError
 from coupole.acquisition.commissioning.light_directions import deviations_deg
 from coupole.acquisition.commissioning.reduced_speed import REDUCED_MM_S, at_reduced_speed, greatest_speeds_deg_s
 from coupole.acquisition.observer import Control
-from coupole.errors import Interrupted
+from coupole.errors import DeviceTimeout, Interrupted
 from coupole.kinematics import link_frames
 from coupole.motion.itinerary import bodies_of
 from coupole.plan.cell import read_cell
@@ -282,3 +282,16 @@ def _world(wrong: tuple[Bench, Any]) -> World:
 def _eye(wrong: tuple[Bench, Any]) -> Eye:
     world = _world(wrong)
     return Eye(wrong[1], lambda: list(world.ask("state")["joints_deg"]))
+
+
+def test_a_device_that_failed_because_the_program_stood_still_is_not_blamed(
+    wrong: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def act(bench: Bench) -> None:
+        bench.control.hold("the program did not run for 3.0 s")
+        raise DeviceTimeout("led box", expected="time for INIT", happened="lights off", remedy="See why.")
+
+    monkeypatch.setitem(session.ACTS, "watchdog", act)
+    bench = replace(wrong, control=Control())
+    with pytest.raises(Interrupted, match="the program did not run for 3"):
+        session._run_step("watchdog", bench, bench.cell, "A. Person")

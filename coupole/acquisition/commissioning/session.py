@@ -170,7 +170,8 @@ def _due(cell: Cell, record: CommissioningRecord, opened_cell: OpenedCell) -> li
 
 
 def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResult, DeviceError | None]:
-    """Do one step; returns its result, and the error of a device that ended it."""
+    """Do one step; returns its result, and the error of a device that ended it. Raises Interrupted if this process
+    did not run for a while, or was suspended."""
     findings = bench.findings = Findings()
     failure, error = "", None
     try:
@@ -178,6 +179,9 @@ def _run_step(step: Step, bench: Bench, cell: Cell, name: str) -> tuple[StepResu
     except StepFailedError as shortcoming:
         failure = str(shortcoming)
     except DeviceError as raised:
+        bench.control.await_word()
+        if bench.control.held_because:  # the device did what a hold asked of it
+            raise bench.control.interruption() from raised
         failure, error = str(raised), raised
     result = StepResult(
         step=step,

@@ -99,14 +99,17 @@ while True:
     if "error" in work:
         break
     if work.get("state") != "running":
-        break
+        if not work.get("ended", "").startswith("it was not renewed"):
+            break
+        hold = None  # a busy machine was late: pressed anew
     time.sleep(0.1)
 """
 
 
 @contextmanager
 def holding(bench: Bench, axis: str, direction: int, **fields: Any) -> Iterator[subprocess.Popen[str]]:
-    """A console, as a process, whose user holds a button; it ends when its hold has."""
+    """A console, as a process, whose user holds a button, and presses it anew where a busy machine was too late to
+    renew it; it ends when its hold has for another reason."""
     told = json.dumps({"axis": axis, "direction": direction, "from": HERE, **fields})
     command = [sys.executable, "-c", _HOLDING, str(bench.path), told]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as console:

@@ -143,13 +143,21 @@ def test_by_hand_only_from_a_console_at_the_cell_and_slowly(asked: Bench, world:
     assert np.allclose(joints_deg(world), HOME_DEG, atol=0.01)
     with holding(asked, "A1", 1):
         cells.wait_until(lambda: joints_deg(world)[0] > 1.0, "the arm under way")
-        before = world.ask("state")
-        time.sleep(0.5)
-        after = world.ask("state")
+        before, after = cells.wait_until(
+            lambda: _half_a_second_of_one_hold(asked, world), "half a second of a hold"
+        )
     turned = np.radians(after["joints_deg"][0] - before["joints_deg"][0])
     reach_mm = 25 + 560 + 515 + 80 + TIP_MM + TIP_RADIUS_MM
     speed_mm_s = turned * reach_mm / (after["t_s"] - before["t_s"])
     assert 50.0 < speed_mm_s < 105.0, "0.4 of 250 mm/s, were the arm stretched out"
+
+
+def _half_a_second_of_one_hold(asked: Bench, world: World) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """The world before and after; None if the button was pressed anew in between."""
+    hold, before = asked.done("state")["work"]["hold"], world.ask("state")
+    time.sleep(0.5)
+    after, work = world.ask("state"), asked.done("state")["work"]
+    return (before, after) if (work["hold"], work["state"]) == (hold, "running") else None
 
 
 def test_an_arm_whose_console_is_killed_stops_at_once(asked: Bench, world: World) -> None:

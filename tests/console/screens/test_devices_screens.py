@@ -254,7 +254,8 @@ def test_a_picture_under_two_leds_and_its_light(room: Room) -> None:
     assert given > 0
     said = ada.sees("[data-name=exposed]", "this picture gave")
     assert f"{given:.5f} lux h" in said
-    assert ada.browser.run("document.querySelector('.look-picture').naturalWidth") > 0
+    shown = "document.querySelector('.look-picture').naturalWidth"
+    cells.wait_until(lambda: (ada.browser.run(shown) or 0) > 0, "the picture")
     lit = ada.browser.run("[...document.querySelectorAll('.led-chooser circle')].map(one => one.dataset.led)")
     assert sorted(lit) == ["500", "700"]
     assert words.startswith("Picture ")

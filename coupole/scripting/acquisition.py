@@ -8,6 +8,7 @@ kernel if the thread that began it dies (docs/decisions/0058-python-face.md).
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -28,8 +29,10 @@ from coupole.scripting.plans import Plan
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import Event
 from coupole.storage.run import Run
+from coupole.storage.stopped_process import is_stopped
 
 AnyPath = str | os.PathLike[str]
+_LOG = logging.getLogger("coupole")
 _LOOK_EVERY_S = 0.1
 _SIGNALLED = 128
 """Exit codes above this are of a signal."""
@@ -50,7 +53,7 @@ class Acquisition(Iterator[Event]):
         self.run, self.figures = None, {}
         self._events: deque[Event] = deque()
         self._follower: Follower | None = None
-        self._words = ""
+        self._words, self._stands_still = "", False
         self._folder = tempfile.TemporaryDirectory(prefix="coupole-")
         if plan is not None:
             arguments = [str(plan.write(Path(self._folder.name) / "plan.yaml")), *arguments]
@@ -91,6 +94,7 @@ class Acquisition(Iterator[Event]):
                 if is_over:
                     self._conclude()
                     raise StopIteration
+                self._tell_if_it_stands_still()
                 time.sleep(_LOOK_EVERY_S)
         return self._events.popleft()
 
@@ -100,9 +104,23 @@ class Acquisition(Iterator[Event]):
         was_over = self._process.poll() is not None
         if not was_over:
             self._process.send_signal(signal.SIGINT)
+            self._process.send_signal(signal.SIGCONT)  # it may have been stopped, and is to end now
         self._take_in_the_end()
         if not was_over and (trouble := self.figures.get("unsafe")):
             raise unsafe_end("; ".join(trouble))
+
+    def _tell_if_it_stands_still(self) -> None:
+        """Log once that the run's process is stopped (SIGSTOP): no event comes until it runs again."""
+        stands_still = is_stopped(self._process.pid)
+        if stands_still and not self._stands_still:
+            _LOG.warning(
+                "process %d, which acquires, is stopped (SIGSTOP): `kill -CONT %d` lets it run again; it then asks "
+                "a person (`coupole go-on %s`)",
+                self._process.pid,
+                self._process.pid,
+                self.run or "RUN",
+            )
+        self._stands_still = stands_still
 
     def _look(self) -> None:
         """Take in what the journal has gained."""

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from cells import CellFolder
 
 import coupole
+from coupole.acquisition.run_control import ask
 from sim.world.client import World
 
 LIGHTING = """
@@ -86,6 +88,25 @@ def test_a_run_that_an_exception_stopped_is_resumed_to_its_end(
     assert isinstance(events[0], coupole.events.SessionResumed)
     assert isinstance(events[-1], coupole.events.SessionStopped)
     assert events[-1].outcome == "done"
+
+
+def test_a_run_that_stands_still_is_told_and_ends_with_its_context_all_the_same(
+    standing: tuple[CellFolder, World], caplog: pytest.LogCaptureFixture
+) -> None:
+    cell, world = standing
+    with coupole.acquire(cell.plan) as events:
+        next(event for event in events if isinstance(event, coupole.events.FrameProven))
+        assert events.run is not None
+        pid = ask(events.run, "state")["pid"]
+        os.kill(pid, signal.SIGSTOP)
+        threading.Timer(2.5, os.kill, (pid, signal.SIGCONT)).start()
+        held = next(event for event in events if isinstance(event, coupole.events.FaultNoted))
+        assert "did not run for" in held.message
+        assert "is stopped (SIGSTOP)" in caplog.text
+        assert f"coupole go-on {events.run}" in caplog.text
+        os.kill(pid, signal.SIGSTOP)
+    assert cells.safe(world)
+    assert cells.events(events.run)[-1]["outcome"] == "interrupted"
 
 
 def test_frames_are_those_on_the_disk(acquired: tuple[list[coupole.events.Event], Path, World]) -> None:

@@ -114,8 +114,8 @@ class Acquisition(Iterator[Event]):
         stands_still = is_stopped(self._process.pid)
         if stands_still and not self._stands_still:
             _LOG.warning(
-                "process %d, which acquires, is stopped (SIGSTOP): `kill -CONT %d` lets it run again; it then asks "
-                "a person (`coupole go-on %s`)",
+                "process %d, which acquires, is stopped (SIGSTOP): `kill -CONT %d` lets it run again; it then "
+                "asks a person (`coupole go-on %s`)",
                 self._process.pid,
                 self._process.pid,
                 self.run or "RUN",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor
-from coupole.acquisition.dose import DoseMeter
+from coupole.acquisition.dose import DoseMeter, led_time_s
 from coupole.acquisition.frame_grabber import FrameGrabber, buffers_for, memory_for_buffers
 from coupole.acquisition.frame_matching import UNLABELLED, FaultModel, Match, match
 from coupole.acquisition.host_burst import HostBurst
@@ -308,7 +308,7 @@ class BurstRunner:
             BurstEnded(
                 view=burst.view,
                 steps=len(log),
-                on_s=round(float(log["on_us"][log["led"] != NO_LED].sum()) * 1e-6, 6),
+                on_s=round(led_time_s(burst, log, table_ran_s), 6),
                 given_lux_h=given_lux_h,
                 joints_before_deg=_rounded_joints_deg(arm_before),
                 joints_after_deg=_rounded_joints_deg(arm_after) if arm_after else None,

@@ -310,15 +310,11 @@ class DoseMeter:
         """
         if not self._cell.lights_confirmed:
             return tuple(np.round(self._light.planned_lux_h, _DIGITS).tolist())
-        given_lux_h = self._of_leds(log["led"], log["on_us"])
-        begins_us = np.cumsum(burst.table["period_us"]) - burst.table["period_us"]
-        allowed_us = table_ran_s * (1e6 + _CLOCKS_PPM) + _START_US
-        has_begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
-        unlogged_steps = burst.table[has_begun & ~np.isin(np.arange(len(has_begun)), log["step"])]
-        given_lux_h = (
-            given_lux_h + self._of_leds(unlogged_steps["led"], unlogged_steps["on_us"]) + self._of_panel(panel_s)
+        unlogged_steps = steps_without_log(burst, log, table_ran_s)
+        of_leds_lux_h = self._of_leds(log["led"], log["on_us"]) + self._of_leds(
+            unlogged_steps["led"], unlogged_steps["on_us"]
         )
-        return tuple(np.round(given_lux_h, _DIGITS).tolist())
+        return tuple(np.round(of_leds_lux_h + self._of_panel(panel_s), _DIGITS).tolist())
 
     def end(self, given_lux_h: tuple[float, ...]) -> None:
         """Enter what `count` has found, once the journal has it. Until then all that was planned counts: so
@@ -345,3 +341,19 @@ class DoseMeter:
 
     def _of_panel(self, seconds: float) -> LuxHours:
         return np.full(len(self._lux), self._job.cell.rig.dome.panel_lux * seconds / 3600.0)
+
+
+def steps_without_log(burst: Burst, log: NDArray[np.void], table_ran_s: float) -> NDArray[np.void]:
+    """Return the steps of a burst's table that its `log` (STEP_RECORD_DTYPE [n]) lacks, and that may have begun
+    while the box ran the table for `table_ran_s`."""
+    begins_us = np.cumsum(burst.table["period_us"]) - burst.table["period_us"]
+    allowed_us = table_ran_s * (1e6 + _CLOCKS_PPM) + _START_US
+    has_begun = (begins_us <= allowed_us) if table_ran_s > 0 else np.zeros(len(begins_us), bool)
+    return burst.table[has_begun & ~np.isin(np.arange(len(has_begun)), log["step"])]
+
+
+def led_time_s(burst: Burst, log: NDArray[np.void], table_ran_s: float) -> float:
+    """Return how long LEDs were on in a burst, each by itself: by its log; steps that the log lacks and that may
+    have begun count whole."""
+    parts = (log, steps_without_log(burst, log, table_ran_s))
+    return float(sum(part["on_us"][part["led"] != NO_LED].sum() for part in parts)) * 1e-6

@@ -13,7 +13,7 @@ import pytest
 from cells import CellFolder
 from places import REPO
 
-from coupole.acquisition.dose import DoseMeter, FlashMeter
+from coupole.acquisition.dose import DoseMeter, FlashMeter, led_time_s
 from coupole.devices import NO_LED, STEP_RECORD_DTYPE, StepRecord
 from coupole.errors import DoseBudgetReached
 from coupole.plan.bursts import Burst
@@ -132,6 +132,17 @@ def test_steps_that_may_have_begun_count_though_the_log_lacks_them(job: Job, bur
         end(found, burst, log_of(burst, logged), table_ran_s=ran_s, panel_s=0.0)
         doses.append(total(job) - before)
     assert doses[1] == pytest.approx(doses[0], rel=1e-6)
+
+
+def test_leds_were_on_in_the_steps_that_the_log_lacks_too(burst: Burst) -> None:
+    """A program that was frozen in a burst has a log that ends with the freeze; the box went on until its
+    watchdog."""
+    leds = lit(burst)
+    on_s = burst.table["on_us"][leds[0]] * 1e-6
+    log, ran_s = log_of(burst, int(leds[3]) + 1), float(burst.table["period_us"][: leds[9]].sum()) * 1e-6
+    assert led_time_s(burst, log, 0.0) == pytest.approx(4 * on_s)
+    assert led_time_s(burst, log, ran_s) == pytest.approx(10 * on_s)
+    assert led_time_s(burst, log_of(burst, 0), ran_s) == pytest.approx(10 * on_s)
 
 
 def test_a_burst_that_never_started_gave_nothing(job: Job, burst: Burst) -> None:

@@ -10,6 +10,7 @@ from boards import CHARUCO, CHESS, LENS, as_dn, magnified, picture_of
 from synthesis import Array
 
 from coupole.calibration.grey_image import Picture
+from coupole.calibration.lens import board as board_module
 from coupole.calibration.lens.board import Board, Sighting, detect, in_channel, read_board
 from coupole.errors import InputError
 
@@ -99,6 +100,25 @@ def test_a_board_that_is_partly_hidden_gives_the_corners_that_are_left() -> None
     seen = found(CHARUCO, Picture.of_grey(image))
     assert 10 < len(seen.ids) < 60
     assert rms(seen.pixels - picture.corners[seen.ids]) < 0.03
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+@pytest.mark.parametrize("board", [CHARUCO, CHESS])
+def test_a_search_at_half_size_ends_at_the_same_corners(
+    board: Board, hidden: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fiftieth of a corner's noise; of a board that is partly hidden none is lost."""
+    picture = picture_of(board, 3).pixels.copy()
+    if hidden and board is CHARUCO:
+        picture[:, : picture.shape[1] // 2] = 0.5
+    seen = []
+    for least_px in (10_000, 100):
+        monkeypatch.setattr(board_module, "_HALVED_FROM_PX", least_px)
+        seen.append(found(board, Picture.of_grey(as_dn(picture, 4095, 8.0), white=4095.0)))
+    whole, half = seen
+    assert len(half.ids) >= len(whole.ids) > 8
+    there = np.isin(half.ids, whole.ids)
+    assert rms(half.pixels[there] - whole.pixels) < 0.003
 
 
 def test_a_description_is_read_and_its_mistakes_are_named_with_their_lines(tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ Count = Annotated[int, Field(ge=3, le=200)]
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 
 LEAST_CORNERS = 8
+_HALVED_FROM_PX = 1500
+"""Least side of an image whose board is searched at half its size."""
 CLIPPED_SHARE = 0.02
 """An image with a larger share of white pixels about the corners is left out: clipping shifts edges."""
 
@@ -100,13 +102,12 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     import cv2
 
     image = picture.plane()
-    eight_bits = _eight_bits(image)
-    ids, rough = _chess(board, eight_bits) if board.kind == "chessboard" else _charuco(board, eight_bits)
+    ids, rough = _search(board, image)
     if len(ids) < LEAST_CORNERS:
         return f"{len(ids)} of {len(board.points_mm)} corners seen, {LEAST_CORNERS} needed"
     outline = cv2.boundingRect(rough.astype(np.float32))
     part = image[max(outline[1], 0) : outline[1] + outline[3], max(outline[0], 0) : outline[0] + outline[2]]
-    if (share := float(np.mean(part >= picture.white))) > CLIPPED_SHARE:
+    if (share := np.count_nonzero(part >= picture.white) / part.size) > CLIPPED_SHARE:
         return f"clipped: {share:.0%} of the pixels on the board are saturated. Expose shorter"
     sighting = _refined_corners(Sighting(picture.name, ids, board.points_mm[ids], rough), board, picture, "green")
     if len(sighting.ids) < LEAST_CORNERS:
@@ -114,6 +115,25 @@ def detect(board: Board, picture: Picture) -> Sighting | str:
     if np.linalg.matrix_rank(sighting.board_mm[:, :2] - sighting.board_mm[0, :2]) < 2:
         return "all corners seen lie on one line"
     return sighting
+
+
+def _search(board: Board, image: NDArray[Any]) -> tuple[NDArray[np.intp], Floats]:
+    """Return numbers and places of corners, to a pixel or so. A large image is searched at half its size first:
+    that takes a quarter of the time, and corners there are as good to begin the fit from, if all are found."""
+    import cv2
+
+    search = _chess if board.kind == "chessboard" else _charuco
+    if min(image.shape) < _HALVED_FROM_PX:
+        return search(board, _eight_bits(image))
+    height, width = image.shape
+    half = cv2.resize(
+        image[: height // 2 * 2, : width // 2 * 2], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
+    )
+    ids, corners = search(board, _eight_bits(half))
+    if len(ids) == len(board.points_mm):
+        return ids, 2.0 * corners + 0.5
+    whole_ids, whole_corners = search(board, _eight_bits(image))
+    return (whole_ids, whole_corners) if len(whole_ids) >= len(ids) else (ids, 2.0 * corners + 0.5)
 
 
 def in_channel(board: Board, picture: Picture, channel: Channel, green: Sighting) -> Sighting:

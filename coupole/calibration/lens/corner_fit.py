@@ -31,7 +31,10 @@ _UNKNOWNS = 9
 _LEAST_PIXELS = 24
 _X, _Y, _FIRST, _SECOND, _SIGMA, _LEVEL, _CONTRAST, _ALONG_X, _ALONG_Y = range(_UNKNOWNS)
 _MOST_STEPS = 40
-_CLOSE_PX = 1e-5
+_ABOUT_PX, _CLOSE_PX = 2e-3, 1e-4
+"""Last steps of the fits about the start, and about the corner found: a hundredth of the noise of a corner."""
+_FIRST_RADIUS_PX = 6.5
+"""Largest radius of the window of the first fit, which only centres the second one's."""
 _WORST = 0.2
 """Largest rms residual, as a share of the contrast: with a larger one the image is not that of a corner."""
 _LEAST_SIGMA_PX = 0.05
@@ -65,26 +68,34 @@ def fit_corners(image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats
     `image` [H, W] are RAW values; `mask_tile` [h, w] is the mask of the pixels to use, a tile that repeats over
     the image.
     """
+    first_radius_px = radius_px
+    if radius_px > _FIRST_RADIUS_PX and enough_pixels(mask_tile, _FIRST_RADIUS_PX):
+        first_radius_px = _FIRST_RADIUS_PX
     values = np.ascontiguousarray(image, dtype=np.float32)
     unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
     mask, starts = np.ascontiguousarray(mask_tile), np.ascontiguousarray(rough, dtype=np.float64)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
-        list(pool.map(lambda part: _fit_all(values, mask, starts[part], radius_px, unknowns[part]), parts))
+        list(
+            pool.map(
+                lambda part: _fit_all(values, mask, starts[part], radius_px, first_radius_px, unknowns[part]),
+                parts,
+            )
+        )
     fits = np.isfinite(unknowns[:, _X])
     return Corners(np.where(fits[:, None], unknowns[:, :2], rough), fits, unknowns[:, _SIGMA].copy())
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit_all(image, mask_tile, rough, radius, solutions):  # type: ignore[no-untyped-def]
+def _fit_all(image, mask_tile, rough, radius, first_radius, solutions):  # type: ignore[no-untyped-def]
     for n in range(len(rough)):
         unknowns = np.zeros(_UNKNOWNS)
         unknowns[_X], unknowns[_Y] = rough[n]
         if not _start(image, mask_tile, radius, unknowns):
             continue
         # Again about the corner found: a window that is not centred on it would bias the result.
-        fits = _fit(image, mask_tile, rough[n, 0], rough[n, 1], radius, unknowns)
-        if fits and _fit(image, mask_tile, unknowns[_X], unknowns[_Y], radius, unknowns):
+        fits = _fit(image, mask_tile, rough[n, 0], rough[n, 1], first_radius, unknowns, _ABOUT_PX)
+        if fits and _fit(image, mask_tile, unknowns[_X], unknowns[_Y], radius, unknowns, _CLOSE_PX):
             # A gradient of light shifts blurred edges: p F, blurred, is p F + sigma^2 grad F.
             spread2 = unknowns[_SIGMA] ** 2 + 1.0 / 12.0
             unknowns[_X] += spread2 * unknowns[_ALONG_X]
@@ -142,8 +153,8 @@ def _start(image, mask_tile, radius, unknowns):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _fit(image, mask_tile, x, y, radius, unknowns):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt; False if it diverges or the residual is too large."""
+def _fit(image, mask_tile, x, y, radius, unknowns, close_px):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt until a step is below `close_px`; False if it diverges or the residual is too large."""
     squares, count, normal, right = _equations(image, mask_tile, x, y, radius, unknowns)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
@@ -162,7 +173,7 @@ def _fit(image, mask_tile, x, y, radius, unknowns):  # type: ignore[no-untyped-d
                 unknowns[k] = trial[k]
             squares, normal, right = tried_squares, tried_normal, tried_right
             damping *= 0.1
-            if change < _CLOSE_PX:
+            if change < close_px:
                 break
         else:
             damping *= 10.0

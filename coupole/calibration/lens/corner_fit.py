@@ -74,6 +74,8 @@ def fit_corners(image: NDArray[Any], mask_tile: NDArray[np.bool_], rough: Floats
     values = np.ascontiguousarray(image, dtype=np.float32)
     unknowns = np.full((len(rough), _UNKNOWNS), np.nan)
     mask, starts = np.ascontiguousarray(mask_tile), np.ascontiguousarray(rough, dtype=np.float64)
+    # Compiled before threads call it: numba's types, looked up by several at once, fail at times.
+    _fit_all(values, mask, starts[:0], radius_px, first_radius_px, unknowns[:0])
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         parts = (slice(first, first + _PART) for first in range(0, len(starts), _PART))
         list(

@@ -267,7 +267,10 @@ class World:
                 self._schedule(fault)
                 return {}
             case "exposures":
-                exposures = self._exposures.since(command["first"], command["count"])
+                first, count = command.get("first"), command.get("count")
+                if type(first) is not int or type(count) is not int or first < 0 or count < 0:
+                    return {"error": "exposures: expected `first` and `count`, whole numbers of 0 or more"}
+                exposures = self._exposures.since(first, count)
                 return {"next": self._exposures.next_number, "exposures": exposures}
             case "edges" if isinstance(self.box, LedBoxFirmware):
                 return {"next": self.box.edge_count}

@@ -318,6 +318,8 @@ def test_a_world_goes_on_after_garbage_on_all_its_sockets(cell: CellFolder) -> N
                     deaf.send(b'{"do": "state"}')
             assert world.ask("state")["t_s"] > 0
             assert "unknown command" in world.ask("no such thing")["error"]
+            for fields in ({}, {"first": 0}, {"first": "0", "count": 1}, {"first": -1, "count": 1}):
+                assert "expected `first` and `count`" in world.ask("exposures", **fields)["error"]
             assert "error" in world.ask("fault", fault={"kind": "over_temperature", "board": 10**6})
             assert json.dumps(world.ask("state"))
     assert world._process is not None

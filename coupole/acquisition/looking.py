@@ -91,7 +91,9 @@ def metered(
 ) -> exposure_advice.Advice:
     """Advice by the pictures of a metering job. When this raises the cell is safe and cannot be used any more."""
     recorder = MeterRecorder()
-    sequencer = run_bounded(partial(Sequencer, small, cell, recorder, observer=observer, control=control))
+    sequencer = run_bounded(
+        partial(Sequencer, small, cell, recorder, observer=observer, control=control, can_stand=False)
+    )
     run_bounded(sequencer.acquire, stop=control.stop, rescue=cell.make_safe)
     return exposure_advice.advise(recorder.views, request, longest_us=longest_exposure_us(small.cell.rig))
 

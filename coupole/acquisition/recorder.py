@@ -19,6 +19,7 @@ from coupole.storage.frame_file_creation import Collections, create
 from coupole.storage.journal import FRAME_LINE, Journal, append_lines
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
+from coupole.storage.view_reader import refuse_lost
 from coupole.storage.view_writer import ViewWriter
 
 COMMIT_EVERY_S = 0.5
@@ -196,9 +197,18 @@ class RunRecorder:
         return self._journal.take(), shots
 
     def _commit_in_place(self, writer: ViewWriter | None, lines: list[str], shots: list[ShotId]) -> None:
-        """Raises StorageError after that if the run's folder is no longer at its path."""
+        """Raises StorageError after that if the run's folder is no longer at its path, or the view's file is not
+        as it was."""
         self._commit(writer, lines, shots)
         self._refuse_moved()
+        if writer is not None:
+            path = self._run.folder / self._file
+            try:
+                with under_way(DISK, str(path)):
+                    writer.refuse_lost(path)
+            except StorageError:
+                self._refuse_moved()  # just now
+                raise
 
     def _refuse_moved(self) -> None:
         before = self._run.folder
@@ -230,6 +240,17 @@ class RunRecorder:
                 writer.sync()
             self._journal.append(lines)
         self.committed.update(shots)
+
+    def refuse_lost(self) -> None:
+        """Raise StorageError if the disk does not have what was proven in this session and before it: lines of the
+        journal, files of the views."""
+        proven_shots = self._run.proven()
+        if lost_shots := self.committed - set(proven_shots):
+            raise StorageError(
+                f"{self._run.journal_path}: has lost the lines of {len(lost_shots)} proven frames. Restore it if "
+                "there is a copy; or resume the run, which takes these frames again."
+            )
+        refuse_lost(self._run.folder, proven_shots.values())
 
     def end_view(self) -> None:
         if self._writer is not None:

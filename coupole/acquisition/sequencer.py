@@ -56,7 +56,9 @@ class Sequencer:
         *,
         observer: Observer | None = None,
         control: Control | None = None,
+        can_stand: bool = True,
     ) -> None:
+        """`can_stand`: a person can let the session go on after a hold; else a hold ends it."""
         self._job, self._cell, self._recorder = job, cell, recorder
         self._observer, self._control = observer or Unwatched(), control or Control()
         self._dose = DoseMeter(job, cell, recorder)
@@ -65,7 +67,7 @@ class Sequencer:
         self._view_number = 0
         self._view_name = ""
         self.outcome = Outcome(shots=job.schedule.shots, dose_lux_h=self._dose.lux_h_in_all)
-        self._control.can_stand = True
+        self._control.can_stand = can_stand
         self._arm = ArmSupervisor(
             job.cell.rig,
             job.motion,

@@ -56,6 +56,7 @@ from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import copied_s
+from coupole.storage.view_reader import refuse_lost
 from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
@@ -88,6 +89,7 @@ def acquire_plan(
             stack.callback(os.close, run.lock())
             run.refuse_old_journal()
             run.refuse_changes(job.inputs)
+            refuse_lost(run.folder, run.proven().values())
         job = without_hidden(job, run.hidden_leds if run else None)
         _acquire_into(
             run,
@@ -267,6 +269,7 @@ def _acquire(
                 finally:
                     cell.make_safe()
                 _refuse_unsafe_end(cell)
+                on_disk(str(run.folder), recorder.refuse_lost)
                 outcome = "done"
         except BaseException as error:
             failure = control.interruption() if control.stop.is_set() else error

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from coupole.errors import StorageError
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sync_folder
 
@@ -33,6 +34,7 @@ class LineFile:
             if self.was_empty:  # perhaps made just now
                 sync_folder(path.parent)
             self._end_torn_line()
+            self._end_bytes = os.fstat(self._fd).st_size
         except OSError as error:
             raise disk_error(path, error) from error
 
@@ -48,6 +50,11 @@ class LineFile:
             return
         data = "".join(lines).encode()
         start = os.fstat(self._fd).st_size
+        if start < self._end_bytes:
+            raise StorageError(
+                f"{self._path}: was cut to {start} bytes while lines were appended; it had {self._end_bytes}. "
+                "Find out which program did that, and restore what was there, if there is a copy."
+            )
         try:
             view = memoryview(data)
             while view:
@@ -57,6 +64,7 @@ class LineFile:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, start)
             raise disk_error(self._path, error) from error
+        self._end_bytes = start + len(data)
 
     @property
     def is_at_its_path(self) -> bool:

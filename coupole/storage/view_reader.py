@@ -64,6 +64,34 @@ class View:
         return number
 
 
+def refuse_lost(folder: Path, frames: Iterable[FrameProven]) -> None:
+    """Raise StorageError if the file of one of these frames is missing, is none of a view, or ends before it.
+    Checksums are not compared (`coupole verify` does)."""
+    last_slots: dict[str, int] = {}
+    for frame in frames:
+        last_slots[frame.file] = max(frame.index, last_slots.get(frame.file, -1))
+    for name, last_slot in last_slots.items():
+        path = folder / name
+        if not path.is_file():
+            raise StorageError(
+                f"{path}: is missing, and the journal has proven frames of it. Put it back, then resume the run; "
+                "if it is gone, these frames are lost: begin a new run."
+            )
+        try:
+            layout = frame_file.read_layout(path)
+        except StorageError as error:
+            raise StorageError(
+                f"{error}. Restore it, then resume the run; if that cannot be, its frames are lost: begin a new "
+                "run."
+            ) from error
+        end_bytes = layout.data_offset + (last_slot + 1) * layout.frame_bytes
+        if not layout.is_archived and path.stat().st_size < end_bytes:
+            raise StorageError(
+                f"{path}: ends within slot {last_slot}, of which the journal has a proven frame. Restore it, then "
+                "resume the run; if that cannot be, its frames are lost: begin a new run."
+            )
+
+
 def read_view(path: Path, frames: Iterable[FrameProven]) -> View:
     """The file that holds these frames. Raises StorageError if it is damaged, or does not hold one of them."""
     layout, records = frame_file.read_layout(path), frame_file.read_frames(path)

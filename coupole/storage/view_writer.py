@@ -74,6 +74,7 @@ class ViewWriter:
                 self._open_direct()
         except OSError as error:
             raise disk_error(path, error) from error
+        self._size_bytes = os.fstat(self._plain_fd).st_size
         self._poses = int(np.count_nonzero(self._read_poses()["t_ns"]))
         for slot in self._free:
             if self._table[slot]["state"] != FREE:
@@ -193,6 +194,20 @@ class ViewWriter:
             os.fdatasync(self._plain_fd)
         except OSError as error:
             raise disk_error(self.path, error) from error
+
+    def refuse_lost(self, path: Path) -> None:
+        """Raise StorageError if the file was removed, replaced or cut since it was opened; `path` is where it is
+        now, if its folder was moved."""
+        try:
+            is_there = os.path.samestat(os.fstat(self._plain_fd), path.stat())
+        except OSError:
+            is_there = False
+        if not is_there or os.fstat(self._plain_fd).st_size < self._size_bytes:
+            loss = "was cut" if is_there else "was removed or replaced"
+            raise StorageError(
+                f"{path}: {loss} while frames were written into it. Put it back as it was, then resume "
+                "the run; if it is gone, its frames are lost: begin a new run."
+            )
 
     def close(self) -> None:
         """Close the file; records that were not synced are written, but not durable."""

@@ -87,6 +87,18 @@ def test_an_arm_that_is_driven_by_hand_does_not_move_again_after_a_freeze(tmp_pa
             assert turned_deg < SLACK_DEG
 
 
+def test_a_metering_that_was_frozen_ends_as_nobody_can_let_it_go_on(tmp_path: Path) -> None:
+    cell = freezing.cell_in(tmp_path, "rsi")
+    with freezing.world_of(cell, "rsi") as world:
+        process = cells.start("meter", cell.plan, "--yes")
+        assert freezing.moment(world, process, random.Random(TODAY), moving=True)
+        freezing.freeze(world, process.pid, Freeze("rsi", "controller", while_moving=True))
+        ended = cells.finish(process)
+        assert cells.safe(world)
+    assert ended.code == 130, ended.err
+    assert "the program did not run for" in ended.err
+
+
 def test_a_bench_that_is_closed_and_not_sure_of_its_arm_ends_with_4_and_the_fault_stands(tmp_path: Path) -> None:
     """The process that answers the arm is frozen, at rest: the stop that a close asks for is not confirmed."""
     cell = freezing.cell_in(tmp_path, "rsi")

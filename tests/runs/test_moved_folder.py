@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -89,3 +90,71 @@ def test_a_run_whose_folder_is_removed_ends_and_does_not_make_another(standing: 
     assert "was removed or replaced while frames were taken" in ended.err
     assert "--resume" not in ended.err
     assert not run.exists()
+
+
+def cut(path: Path) -> None:
+    """What another program's mistake leaves of a file."""
+    os.truncate(path, 100)
+
+
+@pytest.mark.parametrize(
+    ("happens", "words"),
+    in_part(
+        [
+            (Path.unlink, "was removed or replaced while frames were"),
+            (cut, "was cut while frames were"),
+        ],
+        (Path.unlink, "was removed or replaced while frames were"),
+    ),
+)
+def test_a_views_file_that_is_lost_ends_the_run_which_is_not_called_done_later(
+    standing: tuple[CellFolder, World], happens: Callable[[Path], None], words: str
+) -> None:
+    cell, world = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    (view,) = (run / "views").iterdir()
+    happens(view)
+    ended = cells.finish(process)
+    assert ended.code == 6, ended.err
+    assert words in ended.err
+    assert cells.safe(world)
+    again = cell.acquire("--resume", run)
+    assert again.code == 6, again.err
+    assert "begin a new run" in again.err
+
+
+def test_a_view_that_is_lost_between_two_sessions_is_missed_and_its_run_not_done(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, _ = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    process.send_signal(signal.SIGTERM)
+    assert cells.finish(process).code == 143
+    (view,) = (run / "views").iterdir()
+    kept = view.rename(view.with_suffix(".kept"))
+    refused = cell.acquire("--resume", run)
+    assert refused.code == 6, refused.err
+    assert f"{view}: is missing, and the journal has proven frames of it" in refused.err
+    kept.rename(view)
+    assert cell.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)
+
+
+def test_a_journal_that_is_cut_while_frames_are_taken_ends_the_run_and_its_frames_are_taken_again(
+    standing: tuple[CellFolder, World],
+) -> None:
+    cell, world = standing
+    process = cells.start("acquire", cell.plan, "--yes")
+    run = cell.run_folder
+    cells.wait_until(lambda: cells.frame_lines(run) > 0, "proven frames")
+    os.truncate(run / "journal.jsonl", 200)
+    ended = cells.finish(process)
+    assert ended.code == 6, ended.err
+    assert "was cut to" in ended.err
+    assert cells.safe(world)
+    assert cell.acquire("--resume", run).code == 0
+    cells.assert_each_shot_proven_once(run)

@@ -22,7 +22,7 @@ from coupole.acquisition.operator import longest_exposure_us
 from coupole.acquisition.runtime_folder import named_after
 from coupole.acquisition.single_shots import Shot, SingleShots
 from coupole.devices import NO_LED
-from coupole.errors import DeviceError, InputError
+from coupole.errors import DeviceError, InputError, StorageError
 from coupole.plan.cell import Cell
 from coupole.preflight.job import Job
 from coupole.viewing.raw_preview import figures, look, loupe, white_point
@@ -94,14 +94,19 @@ class BenchFrames:
         return {"number": number, "region": [*at_px, width_px, height_px], "picture": str(picture)}
 
     def dose(self) -> dict[str, Any]:
-        """Return the dose of this bench, and of the object if it is known."""
-        meter = self._meter
-        left_lux_h = meter.left_lux_h if meter else math.inf
+        """Return the dose of this bench, and of the object if it is known. A ledger that cannot be read is the
+        `warning`: the rest is told all the same."""
+        meter, total_lux_h, left_lux_h, warning = self._meter, None, math.inf, ""
+        if meter:
+            try:
+                total_lux_h, left_lux_h, warning = meter.total_lux_h, meter.left_lux_h, meter.warning
+            except StorageError as error:
+                warning = str(error)
         return {
             "bench_lux_h": float(self._shots.given_lux_h.max()),
-            "total_lux_h": meter.total_lux_h if meter else None,
+            "total_lux_h": total_lux_h,
             "left_lux_h": left_lux_h if math.isfinite(left_lux_h) else None,
-            "warning": meter.warning if meter else "",
+            "warning": warning,
         }
 
     def begin_counting(self) -> None:

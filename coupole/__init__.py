@@ -6,11 +6,31 @@
 
 import importlib
 import os
+import tempfile
+from pathlib import Path
 from typing import Any
 
 # Matrices here are small and many: OpenBLAS's threads cost more than they bring (six times on a busy machine of
 # two cores, adjusting a mesh's pose), and simulator and stream want the cores. Set before numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def _is_writable(folder: Path) -> bool:
+    """Tell whether a folder can be written, or made."""
+    there = next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
+def _keep_kernels_somewhere() -> None:
+    """Numba wants a place for what it compiles: beside the package or in the user's cache. Where neither can be
+    written (another user's installation, no home), it gets a folder of this process alone. Set before numba is
+    imported."""
+    places = (Path(__file__).parent, Path("~/.cache").expanduser())
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_is_writable, places)):
+        os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="coupole-kernels-")
+
+
+_keep_kernels_somewhere()
 
 __version__ = "0.2.0"
 

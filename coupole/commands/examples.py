@@ -32,7 +32,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "sim": ("sim sim", "sim sim-gige --speed 4"),
     "serve": ("serve sim", "serve my-cell.yaml --port 8700 --plans plans"),
     "queue": ("queue my-cell.yaml first.yaml second.yaml", "queue my-cell.yaml --hold 'turn the object'"),
-    "dose": ("dose first-object", 'dose first-object --add 120 --note "a week in the window"'),
+    "dose": ("dose gilded-frame", 'dose gilded-frame --add 120 --note "a week in the window"'),
     # calibrate
     "calibrate": ("calibrate camera RUN", "calibrate all --rig sim"),
     "calibrate camera": ("calibrate camera RUN", "calibrate camera PICTURES --board 11x8 --square 20"),
@@ -68,7 +68,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "calibrate colour RUN --chart chart.yaml --white WHITE",
     ),
     "calibrate all": ("calibrate all --rig sim", "calibrate all --rig my-cell.yaml --only charuco --yes"),
-    "budget": ("budget camera.yaml hand-eye.yaml leds.yaml", "budget --plan first.yaml --out budget"),
+    "budget": ("budget camera.yaml hand-eye.yaml leds.yaml", "budget --plan first.yaml --out budget.png"),
     # results and bench
     "reflectance": (
         "reflectance RUN --out result",

@@ -57,10 +57,10 @@ def fit_reflectance(
     from coupole.viewing import run_reflectance_page
 
     request = RunRequest(
-        tuple(_paths(runs)),
+        tuple(_paths(runs, "runs")),
         None if mesh is None else Path(mesh),
         records_named(_paths(calibrations)),
-        tuple(left_out),
+        tuple(map(int, left_out)),
         memory_bytes=memory_bytes,
     )
     fit_runs(request, Path(out), None, progress or _silent, with_texels=texels)
@@ -95,7 +95,7 @@ def calibrate_camera(
         raise InputError("square_mm: belongs to a plain board of columns and rows")
     path = Path(board) if board is not None and not isinstance(board, tuple) else None
     sources, _, sightings = sight_board(
-        _paths(images),
+        _paths(images, "runs, or one folder of pictures"),
         path,
         None,
         plain_board,
@@ -120,7 +120,11 @@ def identify(
     """
     from coupole.appearance.spectra.spectra_library import read_library
 
-    measured_spectra = [spectrum for path in _paths(spectra) for spectrum in read_library(path, unit=unit)]
+    if unit not in ("auto", "percent", "fraction"):
+        raise InputError(f"unit {unit!r}: expected auto, percent or fraction")
+    measured_spectra = [
+        spectrum for path in _paths(spectra, "spectra") for spectrum in read_library(path, unit=unit)
+    ]
     return identify_spectra(
         measured_spectra,
         references_of(Path(library), None if classes is None else Path(classes)),
@@ -281,7 +285,10 @@ def _silent(step: str, count: int, total: int) -> None:
     """Tell nobody."""
 
 
-def _paths(paths: AnyPath | Sequence[AnyPath]) -> list[Path]:
+def _paths(paths: AnyPath | Sequence[AnyPath], what: str = "") -> list[Path]:
+    """Raises InputError if there is none and `what` is expected."""
     if isinstance(paths, str | os.PathLike):
         return [Path(paths)]
+    if what and not len(paths):
+        raise InputError(f"expected {what}, found none")
     return [Path(path) for path in paths]

@@ -76,6 +76,8 @@ class LedBoxConformance:
 
     long_us: ClassVar[int] = 2_000_000
     """Longest light that the box allows: no test may outlast it."""
+    most_on_us: ClassVar[float] = 1.7 * FLASH_US
+    """Most that a record may say of a light of `FLASH_US` that the box ended by itself, one such time ago."""
     is_simulated: ClassVar[bool] = True
     """The value that `Identity.simulated` must have: stand-ins are kept out of the ledger of real objects."""
     words_of_silence: ClassVar[str] = "expected"
@@ -125,7 +127,10 @@ class LedBoxConformance:
         box.flash(5, FLASH_US)
         world.wait_until_dark()
         assert world.lit_us(0) >= FLASH_US * 0.999
-        assert box.end_flash().on_us >= world.lit_us(0) * 0.999
+        world.clock.sleep(FLASH_US * 1e-6)
+        on_us = box.end_flash().on_us
+        assert on_us >= world.lit_us(0) * 0.999
+        assert on_us <= self.most_on_us, "a light that the box has ended does not go on"
 
     def test_a_flash_without_light_is_dark_all_through(self, box: LedBox, world: LedBoxWorld) -> None:
         box.flash(NO_LED, self.long_us)
@@ -167,6 +172,12 @@ class LedBoxConformance:
     def test_lights_off_ends_a_flash_at_once(self, box: LedBox, world: LedBoxWorld) -> None:
         box.flash(5, self.long_us)
         box.lights_off()
+        assert world.shining() == []
+        assert not box.lit()
+
+    def test_after_an_acknowledgement_all_is_dark(self, box: LedBox, world: LedBoxWorld) -> None:
+        box.flash(5, self.long_us)
+        box.acknowledge()
         assert world.shining() == []
         assert not box.lit()
 
@@ -243,6 +254,12 @@ class LedBoxConformance:
             box.lights_off()
         switchings = [(panel, on) for panel in range(1, box.panel_count + 1) for on in (True, False)]
         assert world.panels == switchings
+
+    def test_each_of_its_panels_can_be_switched_off_alone(self, box: LedBox, world: LedBoxWorld) -> None:
+        for panel in range(1, box.panel_count + 1):
+            box.panel(panel, on=True)
+            box.panel(panel, on=False)
+            assert world.panels[-2:] == [(panel, True), (panel, False)]
 
     def test_a_flash_of_a_mute_box_times_out(self, box: LedBox, world: LedBoxWorld) -> None:
         world.mute()

@@ -76,6 +76,18 @@ class TellsHalfTheLight(lumen_box.LumenBox):
         return replace(record, on_us=record.on_us / 2)
 
 
+class CountsOnForEver(lumen_box.LumenBox):
+    def end_flash(self) -> StepRecord:
+        record, flash = super().end_flash(), self._flash
+        assert flash is not None
+        return replace(record, on_us=(self._clock.now_ns() - flash.sent_ns) / 1e3)
+
+
+class AcknowledgesInTheLight(lumen_box.LumenBox):
+    def acknowledge(self) -> None:
+        self._ask(b"?")
+
+
 class PassesForReal(lumen_box.LumenBox):
     def identify(self) -> Identity:
         return replace(super().identify(), simulated=False)
@@ -91,6 +103,8 @@ CONTRACT = LedBoxConformance()
         (BelievesInItsFlashForEver, CONTRACT.test_a_flash_that_nobody_ends_goes_out_by_itself),
         (WaitsItsTurnToSwitchOff, CONTRACT.test_lights_off_from_another_thread_waits_for_no_call),
         (TellsHalfTheLight, CONTRACT.test_a_flash_lasts_as_long_as_was_asked_if_it_is_let),
+        (CountsOnForEver, CONTRACT.test_a_flash_lasts_as_long_as_was_asked_if_it_is_let),
+        (AcknowledgesInTheLight, CONTRACT.test_after_an_acknowledgement_all_is_dark),
     ],
 )
 def test_a_wrong_led_box_is_found_out(driver: type[Any], check: Callable[..., None], tmp_path: Path) -> None:
@@ -115,6 +129,20 @@ def lumen(driver: type[Any], folder: Path) -> Any:
         return closing(driver(lumen_box.Settings(host="127.0.0.1", tcp_port=world.box.tcp_port), world.clock))
 
     return ledbox_alone(folder, lumen_world.stand_in, opened)
+
+
+class LeavesThePanelOn(LedBox):
+    def panel(self, panel: int, on: bool) -> None:
+        if on:
+            super().panel(panel, on)
+
+
+def test_a_box_that_leaves_its_panel_on_is_found_out(tmp_path: Path) -> None:
+    with (
+        ledbox_world(tmp_path) as world,
+        closing(LeavesThePanelOn(Settings(port=world.box.port, watchdog_s=20.0), world.clock)) as box,
+    ):
+        find_out(CONTRACT.test_each_of_its_panels_can_be_switched_off_alone, box, world)
 
 
 class CountsAnEdgeTooMany(LedBox):

@@ -40,8 +40,8 @@ def test_the_example_passes_as_whoever_copies_it_runs_it() -> None:
         check=False,
     )
     assert ended.returncode == 0, ended.stdout
-    assert re.search(r"^33 passed", ended.stdout, re.MULTILINE), ended.stdout
-    assert "runs 33 tests" in PAGE.read_text()
+    assert re.search(r"^35 passed", ended.stdout, re.MULTILINE), ended.stdout
+    assert "runs 35 tests" in PAGE.read_text()
 
 
 def test_a_rig_names_the_example_and_its_settings_are_checked(

@@ -83,7 +83,7 @@ class CellFolder:
     plan_data: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        rig = YAML(typ="safe").load(REPO / "configs/rigs/sim.yaml")
+        rig = YAML(typ="safe", pure=True).load(REPO / "configs/rigs/sim.yaml")
         rig["sensor"] |= {"width_px": 128, "height_px": 96, "pixel_pitch_um": 176.0}
         rig["dome"]["leds"] = str(REPO / "configs/domes/coupole.csv")
         rig["robot"]["settings"] = {
@@ -112,7 +112,7 @@ class CellFolder:
 
     def moved_by_ur(self, model: str, *, patient: bool = True) -> None:
         """From now on the arm is a UR, where the rig that comes with it has it; `patient` with a busy machine."""
-        shipped = YAML(typ="safe").load(
+        shipped = YAML(typ="safe", pure=True).load(
             REPO / f"configs/rigs/{'sim-ur' if model == 'ur10e' else 'sim-' + model}.yaml"
         )
         self.rig_data |= {key: shipped[key] for key in ("robot", "motion", "support")}

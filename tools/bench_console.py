@@ -179,7 +179,7 @@ def _cell(root: Path, folder: Path, entries: dict[str, Any]) -> tuple[Path, Path
     """The demo's cell with a storage folder of its own; its plan with other entries."""
     from ruamel.yaml import YAML
 
-    rig = YAML(typ="safe").load(root / "configs/rigs/sim.yaml")
+    rig = YAML(typ="safe", pure=True).load(root / "configs/rigs/sim.yaml")
     rig["dome"]["leds"] = str(root / "configs/domes/coupole.csv")
     rig["storage"] |= {"folder": str(folder / "runs")}
     rig.pop("calibrations", None)

@@ -284,7 +284,7 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
     from coupole.storage.run import Run
     from coupole.viewing.progress import Progress
 
-    rig = YAML(typ="safe").load(root / "configs/rigs/sim.yaml")
+    rig = YAML(typ="safe", pure=True).load(root / "configs/rigs/sim.yaml")
     rig["sensor"] = {
         "width_px": size.width_px,
         "height_px": size.height_px,

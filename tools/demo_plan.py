@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 def write_demo_plan(root: Path, folder: Path, **entries: Any) -> Path:
     """Write `demo.yaml` with other entries to a folder; its path. Files are named by absolute paths."""
     plans = root / "configs/plans"
-    plan = YAML(typ="safe").load(plans / "demo.yaml")
+    plan = YAML(typ="safe", pure=True).load(plans / "demo.yaml")
 
     def absolute(name: str) -> str:
         return str((plans / name).resolve())

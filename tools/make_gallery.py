@@ -52,7 +52,7 @@ def make(piece: Piece) -> Path:
     kind = piece.thing["kind"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        rig = YAML(typ="safe").load(ROOT / "configs/rigs/sim.yaml")
+        rig = YAML(typ="safe", pure=True).load(ROOT / "configs/rigs/sim.yaml")
         rig["sensor"] = _SENSOR
         rig["dome"]["leds"] = str(ROOT / "configs/domes/coupole.csv")
         rig["world"] = {"serves": "always", "settings": {"seed": 1, "shading": "flat", "things": [piece.thing]}}

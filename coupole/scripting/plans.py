@@ -123,7 +123,7 @@ def _is_shipped_rig(path: Path) -> bool:
 
 def _text(model: BaseModel) -> str:
     """YAML of a model; the version of its format comes first."""
-    yaml: Any = YAML(typ="safe")
+    yaml: Any = YAML(typ="safe", pure=True)
     stream = io.StringIO()
     yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = None, 4096, False
     yaml.dump(model.model_dump(mode="json", exclude_defaults=True), stream)

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any, assert_never
 
 from coupole.errors import CoupoleError
-from coupole.plan.cell import read_cell
 from coupole.storage import journal, run_dose
-from coupole.storage.arm_faults import faults_of
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
     ArmSettled,
@@ -141,13 +139,17 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     status.stopped_pid = holder if holder and is_stopped(holder) else None
     if status.frames_left and not in_use:
         status.go_on = run.go_on_command
-        status.before_that = _confirmation(run)
+        if status.faults:
+            status.before_that = _confirmation(run)
     return status
 
 
 def _confirmation(run: Run) -> str:
     """Return the command that confirms the standing faults of the arm of the run's rig; empty without any, and if
     the rig is not where the run was begun."""
+    from coupole.plan.cell import read_cell
+    from coupole.storage.arm_faults import faults_of
+
     with contextlib.suppress(CoupoleError):
         cell = read_cell(Path(run.about["rig"]["path"]))
         if faults_of(cell).standing():

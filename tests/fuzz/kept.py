@@ -120,7 +120,7 @@ def read_record_of(path: Path) -> None:
     if "aliases" in told:
         return  # that stand for more than can be written out here
     try:
-        plain = YAML(typ="safe").load(path.read_bytes().decode())
+        plain = YAML(typ="safe", pure=True).load(path.read_bytes().decode())
         plain["sha256"] = content_sha256(json.loads(json.dumps(plain, default=str)))
         path.write_text(json.dumps(plain, default=str))
     except (YAMLError, ValueError, TypeError, AttributeError, RecursionError):

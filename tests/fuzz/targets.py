@@ -99,7 +99,7 @@ def check_part_of_rig(key: tuple[str, ...]) -> Callable[[Path], None]:
     def read(path: Path) -> None:
         from ruamel.yaml import YAML
 
-        rig = YAML(typ="safe").load(CONFIGS / "rigs/sim.yaml")
+        rig = YAML(typ="safe", pure=True).load(CONFIGS / "rigs/sim.yaml")
         part = rig
         for step in key[:-1]:
             part = part[step]

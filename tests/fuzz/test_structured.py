@@ -31,8 +31,8 @@ VALUES = st.recursive(
     max_leaves=6,
 )
 DOCUMENTS = [
-    (Plan, YAML(typ="safe").load(REPO / "configs/plans/demo.yaml")),
-    (Rig, YAML(typ="safe").load(REPO / "configs/rigs/sim.yaml")),
+    (Plan, YAML(typ="safe", pure=True).load(REPO / "configs/plans/demo.yaml")),
+    (Rig, YAML(typ="safe", pure=True).load(REPO / "configs/rigs/sim.yaml")),
 ]
 
 

@@ -41,7 +41,7 @@ class Checker:
 
     def __init__(self, model: UrModel) -> None:
         self._model = model
-        data: Any = YAML(typ="safe").load(REPO / f"configs/robots/{model}.yaml")
+        data: Any = YAML(typ="safe", pure=True).load(REPO / f"configs/robots/{model}.yaml")
         at_mm = np.vstack([np.zeros(3), np.cumsum([joint["origin_mm"] for joint in data["joints"]], axis=0)])
         flange = ur_arm.flange_pose(model, [0.0] * 6)
         self.bodies: dict[str, list[tuple[int, Floats, float, Any]]] = {}

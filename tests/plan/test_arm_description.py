@@ -25,7 +25,7 @@ SHIPPED = (REPO / "configs/rigs/sim.yaml").read_text().replace("../", f"{REPO}/c
 
 
 def described(change: Callable[[dict[str, Any]], None], name: str = "ur10e") -> dict[str, Any]:
-    data: dict[str, Any] = YAML(typ="safe").load(ROBOTS / f"{name}.yaml")
+    data: dict[str, Any] = YAML(typ="safe", pure=True).load(ROBOTS / f"{name}.yaml")
     change(data)
     return data
 

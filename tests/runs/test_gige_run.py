@@ -27,7 +27,7 @@ pytestmark = needs_aravis
 @pytest.fixture
 def gige(tmp_path: Path, scale: Callable[[int, int], int]) -> Iterator[CellFolder]:
     """A small cell in real time with the camera of `sim-gige.yaml`; at full scale all lights at 1024 x 768."""
-    shipped = YAML(typ="safe").load(cells.REPO / "configs/rigs/sim-gige.yaml")
+    shipped = YAML(typ="safe", pure=True).load(cells.REPO / "configs/rigs/sim-gige.yaml")
     cell = CellFolder(tmp_path, speed=1.0)
     cell.rig_data["camera"] = shipped["camera"]
     if scale(0, 1):
@@ -149,7 +149,7 @@ def test_a_rehearsal_of_the_shipped_rig_needs_no_network(tmp_path: Path) -> None
         "rig": str(cells.REPO / "configs/rigs/sim-gige.yaml"),
     }
     path = tmp_path / "rehearsal.yaml"
-    YAML(typ="safe").dump(plan, path)
+    YAML(typ="safe", pure=True).dump(plan, path)
     ended = cells.here("acquire", path, "--json", "--dry-run", "--speed", "20")
     assert ended.code == 0, ended.err
     assert ended.document["missing"] == 0

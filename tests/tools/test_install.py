@@ -37,7 +37,7 @@ def run(home: Path, *words: str | Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        (["st"], "stop status"),
+        (["st"], "status stop"),
         pytest.param(["export", "somewhere", "--to", "pt"], "ptm", marks=pytest.mark.full),
         pytest.param(["plan", "new", "ch"], "charuco", marks=pytest.mark.full),
         (["acquire", "configs/plans/demo."], "configs/plans/demo.yaml"),

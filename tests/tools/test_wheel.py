@@ -18,17 +18,18 @@ from coupole.commands.extras import EXTRA_OF
 DEPENDENCIES = next(path for path in map(Path, sys.path) if path.name == "site-packages")
 PACKAGES = ("coupole", "drivers", "sim")
 MOST_BYTES, MOST_INSTALLED_BYTES = 15_000_000, 700_000_000
+LACKING = sorted(library for library in EXTRA_OF if EXTRA_OF[library] not in ("testing", "xarray"))
 WITHOUT_EXTRAS = f"""
 import importlib.abc, sys
 
 class Missing(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {sorted(library for library in EXTRA_OF if EXTRA_OF[library] != "xarray")}:
+        if name.partition(".")[0] in {LACKING}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 sys.meta_path.insert(0, Missing())
 """
-"""As if of the extras `xarray` alone were installed, though the dependencies lie beside."""
+"""As if of the extras `testing` and `xarray` alone were installed, though the dependencies lie beside."""
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ FIELDS = st.builds(
 def test_what_is_filled_in_is_what_is_written(fields: PlanFields) -> None:
     text = text_with(PATH, TEXT, fields, (1.5, -2.0, 30.0))
     assert fields_of(PATH, text) == fields
-    plain = YAML(typ="safe").load(text)
+    plain = YAML(typ="safe", pure=True).load(text)
     assert plain["views"][0]["target_mm"] == [1.5, -2.0, 30.0]
     assert (plain["name"], plain["rig"], plain["gain_db"]) == ("vase", "rig.yaml", 3)
     assert "# Of the workshop's vase." in text
@@ -65,7 +65,7 @@ def test_what_the_form_does_not_know_stays_as_it_is() -> None:
     assert fields.own_views
     assert fields.own_lights
     text = text_with(PATH, TEXT, replace(fields, budget_lux_h=5.0))
-    plain, before = YAML(typ="safe").load(text), YAML(typ="safe").load(TEXT)
+    plain, before = YAML(typ="safe", pure=True).load(text), YAML(typ="safe", pure=True).load(TEXT)
     assert plain.pop("object") == {"id": "vase", "dose_budget_lux_h": 5.0}
     before.pop("object")
     assert plain == before

@@ -6,6 +6,7 @@
 
 import importlib
 import os
+import stat
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,19 @@ def _is_writable(folder: Path) -> bool:
 
 def _keep_kernels_somewhere() -> None:
     """Numba wants a place for what it compiles: beside the package or in the user's cache. Where neither can be
-    written (another user's installation, no home), it gets a folder of this process alone. Set before numba is
-    imported."""
+    written (another user's installation, no home), it gets this user's folder among the temporary files; one that
+    somebody else has made there is not used, since code is loaded from it. Set before numba is imported."""
     places = (Path(__file__).parent, Path("~/.cache").expanduser())
-    if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_is_writable, places)):
-        os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="coupole-kernels-")
+    if "NUMBA_CACHE_DIR" in os.environ or any(map(_is_writable, places)):
+        return
+    place = Path(tempfile.gettempdir()) / f"coupole-kernels-{os.getuid()}"
+    try:
+        place.mkdir(mode=0o700, exist_ok=True)
+        state = place.lstat()
+        is_own = stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077
+    except OSError:
+        is_own = False
+    os.environ["NUMBA_CACHE_DIR"] = str(place) if is_own else tempfile.mkdtemp(prefix="coupole-kernels-")
 
 
 _keep_kernels_somewhere()

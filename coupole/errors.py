@@ -195,6 +195,16 @@ class Interrupted(CoupoleError):
         self.exit_code = 128 + signal_number
 
 
+def unsafe_end(what_happened: str, remedy: str = "Look at the cell.") -> DeviceError:
+    """Return the error of a session after which the cell may not be safe."""
+    return DeviceError(
+        "cell",
+        expected="lights off, the arm at rest and the camera disarmed at the end",
+        happened=what_happened,
+        remedy=remedy,
+    )
+
+
 def reason(error: BaseException) -> str:
     """Say why something failed: of the system's errors without their numbers."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

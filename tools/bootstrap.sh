@@ -55,19 +55,15 @@ prepare_tests() {
     prepare_neighbours
 }
 
-# The dependency group `neighbours` (bluesky, ophyd-async, Tiled, napari, pyright), tried once; it is too large for whoever runs no
-# tests.
+# The dependency group `neighbours` (bluesky, ophyd-async, Tiled, napari, pyright), too large for whoever runs no tests;
+# tried once, without it its tests are skipped.
 prepare_neighbours() {
     local tried="$root/.tools/tried-neighbours"
-    if has_neighbours || [[ -e $tried ]]; then
-        return 0
+    [[ -e $tried ]] && return 0
+    if ! (prepare_group neighbours); then
+        : >"$tried"
+        say "bluesky, Tiled and napari could not be installed; remove $tried to try again"
     fi
-    say "installing bluesky, Tiled and napari into $root/.venv, for the tests (once; needs the network)"
-    (
-        if command -v flock >/dev/null; then flock 9; fi
-        has_neighbours || install_neighbours || : >"$tried"
-    ) 9>"$root/.tools/lock" >&2 </dev/null
-    has_neighbours || say "they could not be installed; remove $tried to try again"
 }
 
 # Checkers of exported files, in `.tools/checkers`, an environment of its own: their versions are not the project's.
@@ -131,19 +127,6 @@ has_chromium() {
 
 has_exiftool() {
     command -v exiftool >/dev/null
-}
-
-has_neighbours() {
-    "$root/.venv/bin/python" -c '
-from importlib.util import find_spec
-raise SystemExit(not all(map(find_spec, ("basedpyright", "bluesky", "napari", "npe2", "ophyd_async", "tiled"))))'
-}
-
-install_neighbours() {
-    local uv python
-    find_python
-    find_uv
-    "$uv" pip install --quiet --python "$root/.venv/bin/python" --group "$root/pyproject.toml:neighbours"
 }
 
 # What they were made from; virtual environments hold absolute paths.

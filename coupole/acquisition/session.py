@@ -41,10 +41,10 @@ from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.verdict import PROOF_BY
 from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
-    DeviceError,
     Interrupted,
     PreflightRefused,
     StorageError,
+    unsafe_end,
 )
 from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.schedule import Schedule
@@ -307,12 +307,7 @@ def _say_what_comes_first(job: Job, faults: ArmFaults) -> None:
 def _refuse_unsafe_end(cell: OpenedCell) -> None:
     """Raise DeviceError if it is not sure that all is off and at rest, though every frame is there."""
     if cell.trouble:
-        raise DeviceError(
-            "cell",
-            expected="lights off, the arm at rest and the camera disarmed at the end",
-            happened="; ".join(cell.trouble),
-            remedy="Look at the cell; all frames are stored.",
-        )
+        raise unsafe_end("; ".join(cell.trouble), "Look at the cell; all frames are stored.")
 
 
 def _figures(run: Run, job: Job, outcome: Outcome, proven: Collection[ShotId]) -> dict[str, Any]:

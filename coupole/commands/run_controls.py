@@ -13,7 +13,7 @@ import typer
 
 from coupole.commands.common import JsonOption
 from coupole.commands.completion import runs
-from coupole.errors import DeviceError, InputError
+from coupole.errors import DeviceError, InputError, unsafe_end
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -80,12 +80,7 @@ def stop(run: RunningRun = None, as_json: JsonOption = False) -> None:
         print(json.dumps(progress.figures()))
     show_status(make_console(quiet=as_json), progress)
     if unsafe := _unsafe(folder):
-        raise DeviceError(
-            "cell",
-            expected="lights off, the arm at rest and the camera disarmed",
-            happened="; ".join(unsafe),
-            remedy="Look at the cell.",
-        )
+        raise unsafe_end("; ".join(unsafe))
     make_console(quiet=as_json).print("lights are off, the arm is at rest, the camera is disarmed")
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from coupole.acquisition.run_control import running
 from coupole.console.processes import bound_process
-from coupole.errors import DeviceError, InputError, Interrupted, error_as_told
+from coupole.errors import InputError, Interrupted, error_as_told, unsafe_end
 from coupole.intake.plain_data import read_json
 from coupole.scripting.plans import Plan
 from coupole.storage.journal import Follower
@@ -207,13 +207,3 @@ def acquire(
         return Acquisition(arguments, plan, None)
     plan_words = [] if plan is None else [os.fspath(plan)]
     return Acquisition([*plan_words, *arguments], None, None if resume is None else Path(resume))
-
-
-def unsafe_end(what_happened: str) -> DeviceError:
-    """The error of a cell that may not be safe."""
-    return DeviceError(
-        "cell",
-        expected="lights off, the arm at rest and the camera disarmed at the end",
-        happened=what_happened,
-        remedy="Look at the cell; all proven frames are stored.",
-    )

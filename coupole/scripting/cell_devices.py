@@ -11,10 +11,9 @@ from coupole.acquisition import opened_cell
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.operator import refuse_uncommissioned
 from coupole.console.command_line.client import borrowed_cell
-from coupole.errors import InputError
+from coupole.errors import InputError, unsafe_end
 from coupole.plan.cell import read_cell
 from coupole.plan.rig_devices import in_world
-from coupole.scripting.acquisition import unsafe_end
 from coupole.storage.arm_faults import faults_of
 
 

@@ -48,7 +48,7 @@ from coupole.acquisition.safeguard import unsure
 from coupole.acquisition.signals import obeyed_by
 from coupole.acquisition.user_socket import Gone, UserSocket
 from coupole.bounded import NOW, on_disk, refuse_overdue
-from coupole.errors import CoupoleError, DeviceError, InputError, StorageError
+from coupole.errors import CoupoleError, DeviceError, InputError, StorageError, unsafe_end
 from coupole.plan.cell import Cell
 from coupole.preflight import exposure_advice
 from coupole.preflight.job import Job
@@ -280,11 +280,6 @@ def serve_bench(
                 break
         service.closing.set()
     if service.trouble:
-        raise DeviceError(
-            "cell",
-            expected="lights off, the arm at rest and the camera disarmed",
-            happened="; ".join(service.trouble),
-            remedy="Look at the cell.",
-        )
+        raise unsafe_end("; ".join(service.trouble))
     if control.stop.is_set() and not control.stopped_by_hand:
         raise control.interruption()

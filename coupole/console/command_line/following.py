@@ -103,26 +103,41 @@ class _Followed:
 
         A run is asked itself, which obeys whatever its console does, and answers when lights are off and the arm
         was stopped."""
-        number = self._entry.get("id")
-        for _ in range(_TRIALS if number else 0):
-            if (trouble := self._stop_run()) is not None:
+        if not self._entry:
+            return ["nothing has begun, as far as this terminal knows"]
+        for _ in range(_TRIALS):
+            if (trouble := self._stop_run(self._run)) is not None:
                 return trouble
-            for method, path in (("POST", f"/api/v1/queue/{number}/stop"), ("DELETE", f"/api/v1/queue/{number}")):
-                with contextlib.suppress(InputError):
-                    call(self._cell, method, path, patience_s=_STOP_PATIENCE_S)
-                    if method == "DELETE":  # it had not begun
-                        return []
+            try:
+                if self._take_out():
+                    return []
+            except (NotServed, NoAnswer):  # only then: else it might be somebody else's
+                if (trouble := self._stop_run(self._run_at_work())) is not None:
+                    return trouble
             if self._has_ended:
                 return []
             time.sleep(_LOOK_EVERY_S)
-        return ["not sure: the run gives no answer"] if number else []
+        return ["not sure: the run gives no answer"]
 
-    def _stop_run(self) -> list[str] | None:
-        """Stop the run that is at work in the cell; what is not sure then. None if there is none, or no answer."""
+    def _take_out(self) -> bool:
+        """Have the console stop the entry's process; True if it had not begun, and never will. Raises NotServed,
+        NoAnswer."""
+        place = f"/api/v1/queue/{self._entry['id']}"
+        for method, path in (("POST", f"{place}/stop"), ("DELETE", place)):
+            try:
+                call(self._cell, method, path, patience_s=_STOP_PATIENCE_S)
+            except (NotServed, NoAnswer):
+                raise
+            except InputError:
+                continue
+            if method == "DELETE":
+                return True
+        return False
+
+    def _stop_run(self, run: Path | None) -> list[str] | None:
+        """Return what is not sure when a run has stopped; None if it gives no answer, or there is none."""
         with contextlib.suppress(InputError):
-            run = self._run or self._run_at_work()
-            if run is not None:
-                return list(ask(run, "stop").get("trouble", ()))
+            return None if run is None else list(ask(run, "stop").get("trouble", ()))
         return None
 
     def _run_at_work(self) -> Path | None:

@@ -25,7 +25,7 @@ _.adaptive, _.author, _.refined  # ExportOptions.given_options, which lists all 
 # ---- by files that are written from all fields ----
 _.acknowledged, _.joints_before_deg, _.joints_after_deg, _.table_s  # lines of the journal
 _.entered  # entries of the console's queue
-_.stored  # files of run.json
+_.stored, _.chosen_in_the_run  # run.json
 
 # ---- by equality of the whole ----
 _.colour_index  # read_classes refuses a name with two of them

@@ -31,6 +31,7 @@ def complete_views(run: Run) -> list[str]:
     """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more."""
     proven = run.proven()
     incomplete_views = {shot.view for shot in run.expected_shots() if shot not in proven}
+    incomplete_views |= set(run.open_views())
     files = (run.view_path(view) for view in run.about["views"] if view not in incomplete_views)
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
 

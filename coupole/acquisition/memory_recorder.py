@@ -7,8 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from coupole.acquisition.frame_samples import FrameSamples
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.geometry import Transform
+from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.exposure_advice import Metered, sample_of
 from coupole.storage.frame_file_creation import Collections
@@ -27,6 +29,7 @@ class MemoryRecorder:
         self._proven: set[ShotId] = set()
         self._view = ""
         self._format: FrameFormat | None = None
+        self._samples = FrameSamples()
 
     def light_before_lux_h(self) -> tuple[float, ...]:
         return ()
@@ -44,15 +47,23 @@ class MemoryRecorder:
         collections: Collections,
     ) -> None:
         self._view, self._format = view, frame_format
+        self._samples.begin(frame_format)
 
     def store(self, frame: Frame, exposure_us: int) -> int:
         raise NotImplementedError
 
+    def sample_frames(self, *, is_wanted: bool) -> None:
+        self._samples.is_wanted = is_wanted
+
+    def sample(self, shot: ShotId) -> FrameSample:
+        return self._samples.of_shot(shot, _refuse_to_read)
+
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
+        self._samples.prove(slot, shot)
         self._proven.add(shot)
 
     def free(self, slot: int) -> None:
-        """Nobody asks for it again."""
+        self._samples.free(slot)
 
     def note(self, event: Event) -> None:
         self.events.append(event)
@@ -82,7 +93,9 @@ class DryRecorder(MemoryRecorder):
             black, white = self._format.black_dn, self._format.white_dn
             bright = (float(np.quantile(frame.pixels, 0.999)) - black) / (white - black)
             self._slots.append((bright, float(np.mean(frame.pixels >= white))))
-        return len(self._slots) - 1
+        slot = len(self._slots) - 1
+        self._samples.keep(slot, self._samples.of_frame(frame.pixels))
+        return slot
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         super().prove(slot, shot, fields)
@@ -92,6 +105,11 @@ class DryRecorder(MemoryRecorder):
 
     def end_view(self) -> None:
         self._slots.clear()
+        self._samples.end()
+
+
+def _refuse_to_read(shot: ShotId) -> FrameSample:
+    raise KeyError(f"{shot}: nothing of an earlier session is kept")
 
 
 class MeterRecorder(MemoryRecorder):

@@ -9,17 +9,19 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Protocol
 
+from coupole.acquisition.frame_samples import FrameSamples, frame_sample
 from coupole.bounded import DISK, NOW, Workers, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.devices import ArmState, Frame, FrameFormat
 from coupole.errors import StorageError
 from coupole.geometry import Transform
+from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.storage import journal, run_dose
 from coupole.storage.frame_file_creation import Collections, create
 from coupole.storage.journal import FRAME_LINE, Journal, append_lines
 from coupole.storage.journal_events import Event, FrameProven
 from coupole.storage.run import Run
-from coupole.storage.view_reader import refuse_lost
+from coupole.storage.view_reader import View, read_view, refuse_lost
 from coupole.storage.view_writer import ViewWriter
 
 COMMIT_EVERY_S = 0.5
@@ -62,6 +64,15 @@ class Recorder(Protocol):
         """Store an unproven frame; returns its slot."""
         ...
 
+    def sample_frames(self, *, is_wanted: bool) -> None:
+        """Sample the frames that come, for `sample`, or do not."""
+        ...
+
+    def sample(self, shot: ShotId) -> FrameSample:
+        """The sample of a proven frame of the current view; of a frame of an earlier session, from the disk.
+        Raises StorageError."""
+        ...
+
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None: ...
 
     def free(self, slot: int) -> None: ...
@@ -95,9 +106,12 @@ class RunRecorder:
         self._described = dict(collections or {})
         self._journal = Journal(run.journal_path)
         self._proven = {shot: frame.index for shot, frame in run.proven().items()}
+        self._samples = FrameSamples()
         self._writer: ViewWriter | None = None
         self._file = ""
         self._pose = 0
+        self._read_back: dict[str, tuple[View, dict[ShotId, FrameProven]]] = {}
+        """The view's file and its frames of an earlier session, once one of them is asked for."""
         self._committed_s = time.monotonic()
         self._committer = Workers(1, "commit")
         self._committing: Future[None] | None = None
@@ -122,6 +136,7 @@ class RunRecorder:
         collections: Collections,
     ) -> None:
         self._refuse_moved()
+        self._samples.begin(frame_format)
         path = self._run.view_path(view)
         allocated_bytes = (frames + SPARE_SLOTS) * frame_format.frame_bytes
         with under_way(DISK, str(path), allocated_bytes / _SLOWEST_ALLOCATION_BYTES_S):
@@ -156,9 +171,28 @@ class RunRecorder:
     def store(self, frame: Frame, exposure_us: int) -> int:
         self._unsynced_bytes += frame.pixels.nbytes
         with under_way(DISK, self._file):
-            return self._view.store(
+            slot = self._view.store(
                 frame.pixels, frame_id=frame.frame_id, camera_ns=frame.timestamp_ns, exposure_us=exposure_us
             )
+        self._samples.keep(slot, self._samples.of_frame(frame.pixels))
+        return slot
+
+    def sample_frames(self, *, is_wanted: bool) -> None:
+        self._samples.is_wanted = is_wanted
+
+    def sample(self, shot: ShotId) -> FrameSample:
+        return self._samples.of_shot(shot, self._read_sample)
+
+    def _read_sample(self, shot: ShotId) -> FrameSample:
+        """Read the frame from the file of an earlier session, checked against its journal."""
+        if shot.view not in self._read_back:
+            path = self._run.view_path(shot.view)
+            frames = {s: frame for s, frame in self._run.proven().items() if s.view == shot.view}
+            with under_way(DISK, str(path)):
+                self._read_back = {shot.view: (read_view(path, list(frames.values())), frames)}
+        view, frames = self._read_back[shot.view]
+        with under_way(DISK, str(view.path)):
+            return frame_sample(view.proven_pixels(frames[shot]), view.black_dn, view.white_dn)
 
     def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
         if shot in self._proven:
@@ -166,12 +200,14 @@ class RunRecorder:
         frame_id = self._view.frame_id(slot)
         digest = self._view.prove(slot, str(shot), pose=self._pose, **fields)
         self._proven[shot] = slot
+        self._samples.prove(slot, shot)
         self._journal.write(
             FrameProven(shot=shot, file=self._file, index=slot, frame_id=frame_id, xxh3=f"{digest:016x}")
         )
         self._uncommitted.append(shot)
 
     def free(self, slot: int) -> None:
+        self._samples.free(slot)
         self._view.free(slot)
 
     def note(self, event: Event) -> None:
@@ -253,6 +289,8 @@ class RunRecorder:
         refuse_lost(self._run.folder, proven_shots.values())
 
     def end_view(self) -> None:
+        self._samples.end()
+        self._read_back.clear()
         if self._writer is not None:
             try:
                 self.commit(now=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from coupole.acquisition.arm_supervisor import ArmMovedError, ArmSupervisor, SettledPose
 from coupole.acquisition.burst_runner import BurstRunner
+from coupole.acquisition.bursts_of_views import BurstsOfViews
 from coupole.acquisition.collector import collected_when_asked
 from coupole.acquisition.dose import DoseMeter
 from coupole.acquisition.frame_matching import compile_now
@@ -25,7 +26,7 @@ from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
 from coupole.motion.itinerary import Visit
 from coupole.plan.bursts import Burst
-from coupole.plan.schedule import ViewPose, bursts_left
+from coupole.plan.schedule import ViewPose
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.job import Job
 from coupole.preflight.preflight import BURST_OVERHEAD_S, SETTLE_CHECK_S
@@ -62,6 +63,7 @@ class Sequencer:
         self._job, self._cell, self._recorder = job, cell, recorder
         self._observer, self._control = observer or Unwatched(), control or Control()
         self._dose = DoseMeter(job, cell, recorder)
+        self._bursts = BurstsOfViews(job, recorder)
         self._ahead_s = 0.0
         """Expected duration of all that follows the burst under way."""
         self._view_number = 0
@@ -100,17 +102,11 @@ class Sequencer:
         """Take all frames that are not proven yet. Raises UnprovenError if some remain missing, or a
         CoupoleError."""
         schedule = self._job.schedule
-        proven = self._recorder.proven()
-        remaining_bursts = {
-            n: view_bursts
-            for n, bursts in enumerate(schedule.bursts)
-            if (view_bursts := bursts_left(bursts, proven))
-        }
-        numbers = list(remaining_bursts)
+        remaining_bursts = {n: self._remaining(n) for n in range(len(schedule.views))}
+        numbers = [n for n, bursts in remaining_bursts.items() if bursts or self._bursts.may_want_more(n)]
         itinerary = self._arm.itinerary([schedule.views[n] for n in numbers])
         self._ahead_s = sum(
-            self._motion_s(itinerary.visits[index]) + sum(map(_expected_s, remaining_bursts[numbers[index]]))
-            for index in itinerary.order
+            self._motion_s(itinerary.visits[index]) + self._expected_s(numbers[index]) for index in itinerary.order
         )
         start_ns = self._cell.clock.now_ns()
         try:
@@ -121,10 +117,10 @@ class Sequencer:
                     assert visit is not None
                     view = schedule.views[number]
                     self._view_number, self._view_name = (
-                        len(schedule.views) - len(remaining_bursts) + count,
+                        len(schedule.views) - len(numbers) + count,
                         view.name,
                     )
-                    self._acquire_view(view, visit, remaining_bursts[number], schedule.bursts[number])
+                    self._acquire_view(view, visit, number, remaining_bursts[number])
         except BaseException:
             self._cell.make_safe()
             raise
@@ -140,8 +136,9 @@ class Sequencer:
         """The outcome's figures, if these shots are proven."""
         self.outcome.dose_lux_h = self._dose.lux_h_in_all
         self.outcome.proven = sum(shot.is_shot for shot in proven_shots)
-        bursts = (burst for bursts in self._job.schedule.bursts for burst in bursts)
+        bursts = (burst for n in range(len(self._job.schedule.views)) for burst in self._bursts.bursts(n))
         expected_shots = [shot for burst in bursts for shot in burst.shots if shot]
+        self.outcome.shots = sum(shot.is_shot for shot in expected_shots)
         self.outcome.missing = [shot for shot in expected_shots if shot.is_shot and shot not in proven_shots]
         self.outcome.missing_darks = [
             shot for shot in expected_shots if not shot.is_shot and shot not in proven_shots
@@ -153,23 +150,32 @@ class Sequencer:
         self._dose.give_up()
         self.conclude(proven_shots)
 
-    def _acquire_view(self, view: ViewPose, visit: Visit, left: list[Burst], all_bursts: Sequence[Burst]) -> None:
+    def _remaining(self, number: int) -> list[Burst]:
+        """Bursts that are left of a view; those that are chosen now, if an earlier session has fired
+        all. A view that has not begun chooses when the arm is about to go there."""
+        bursts = self._bursts.bursts_left(number)
+        return bursts or (self._bursts.more(number) if self._bursts.bursts(number) else [])
+
+    def _acquire_view(self, view: ViewPose, visit: Visit, number: int, next_bursts: list[Burst]) -> None:
         occlusion = self._job.motion.occlusions.at(visit.joints_deg)
         hidden_leds = self._job.motion.occluded_leds(occlusion)
         self._recorder.note(ViewBegun(view=view.name, hidden_leds=tuple(hidden_leds)))
         patches = self._job.motion.occlusions.patches
         collections = {"shadow": {**occlusion.arrays(patches), "leds": self._job.cell.leds.ids}}
         dwell_s = self._job.cell.rig.motion.settle_dwell_s
-        self.outcome.ideal_s += visit.leg.duration_s + dwell_s + sum(burst.duration_s for burst in left)
+        self.outcome.ideal_s += visit.leg.duration_s + dwell_s
+        self._bursts.begin_view()
+        next_bursts = next_bursts or self._bursts.more(number)
+        allowed_s = self._expected_s(number)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))
         self._recorder.commit(now=True)  # what the arm is about to do is on the disk before it moves
-        self._burst_runner.prepare(left[0])
+        self._burst_runner.prepare(next_bursts[0])
         settled_pose = self._arm.go(visit, meanwhile=self._burst_runner.look_at_upload)
         self._ahead_s -= self._motion_s(visit)
-        frame_format = self._cell.camera.configure(self._burst_runner.exposure(left[0]))
+        frame_format = self._cell.camera.configure(self._burst_runner.exposure(next_bursts[0]))
         self._check_format(frame_format)
-        frames = sum(len(burst.labels) for burst in all_bursts)
+        frames = self._bursts.slots(number)
 
         def begin(settled_pose: SettledPose) -> None:
             self._recorder.note(
@@ -185,10 +191,17 @@ class Sequencer:
 
         begin(settled_pose)
         try:
-            for index, burst in enumerate(left):
-                following = left[index + 1] if index + 1 < len(left) else None
-                self._acquire_burst(burst, following, begin)
-                self._ahead_s -= _expected_s(burst)
+            while next_bursts:
+                for index, burst in enumerate(next_bursts):
+                    self.outcome.ideal_s += burst.duration_s
+                    following = next_bursts[index + 1] if index + 1 < len(next_bursts) else None
+                    self._acquire_burst(burst, following, begin)
+                    self._ahead_s -= _expected_s(burst)
+                    allowed_s -= _expected_s(burst)
+                next_bursts = self._bursts.more(number)
+                if next_bursts:
+                    self._burst_runner.prepare(next_bursts[0])
+            self._ahead_s -= allowed_s  # what was not chosen
             self._recorder.note(ViewSealed(view=view.name))
         except BaseException:
             self._cell.make_safe()  # before the disk, which may take its time
@@ -247,6 +260,12 @@ class Sequencer:
 
     # -- small things -------------------------------------------------------------------------------------
 
+    def _expected_s(self, number: int) -> float:
+        """Duration of what a view may still get, at most."""
+        is_open = self._bursts.may_want_more(number)
+        bursts = self._bursts.bound(number) if is_open else self._bursts.bursts_left(number)
+        return sum(map(_expected_s, bursts))
+
     def _motion_s(self, visit: Visit | None) -> float:
         """Expected duration of the motion to a view, until the arm has settled."""
         leg_s = visit.leg.duration_s if visit else 0.0
@@ -289,7 +308,8 @@ class Sequencer:
     def _tell_figures(self, light: str, dose_lux_h: float, left_s: float) -> None:
         schedule, proven = self._job.schedule, len(self._recorder.proven())
         place = (self._view_name, self._view_number, len(schedule.views))
-        self._observer.progress(Progress(*place, proven, schedule.frames, light, dose_lux_h, left_s))
+        frames = sum(self._bursts.expected_frames(number) for number in range(len(schedule.views)))
+        self._observer.progress(Progress(*place, proven, frames, light, dose_lux_h, left_s))
 
     def _wait_while_paused(self) -> None:
         control = self._control

@@ -50,7 +50,7 @@ from coupole.plan.rig_devices import trusted_by_name
 from coupole.plan.schedule import Schedule
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
-from coupole.preflight.job import Job, without_hidden
+from coupole.preflight.job import Job, with_choices, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults, faults_of
 from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
@@ -91,6 +91,7 @@ def acquire_plan(
             run.refuse_changes(job.inputs)
             refuse_lost(run.folder, run.proven().values())
         job = without_hidden(job, run.hidden_leds if run else None)
+        job = with_choices(job, run.choices() if run else {})
         _acquire_into(
             run,
             job,
@@ -124,7 +125,7 @@ def _acquire_into(
     )
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
-    if run is not None and not preflight.frames:
+    if run is not None and not preflight.frames and not run.open_views():
         dose_lux_h = close_complete(run, console)
         outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
         figures.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
@@ -194,7 +195,8 @@ def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
         "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
         "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
         "views": [view.name for view in job.schedule.views],
-        "labels": _labels(job.schedule),
+        "labels": [] if job.schedule.is_open else _labels(job.schedule),
+        "chosen_in_the_run": job.schedule.is_open,
         "hidden_leds": job.hidden_leds,
         "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
     }
@@ -211,7 +213,7 @@ def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
 
 def _proof(job: Job) -> str:
     """The kind of proof of the run's frames."""
-    return PROOF_BY[job.schedule.bursts[0][0].marks]
+    return PROOF_BY[job.schedule.planned_bursts()[0][0].marks]
 
 
 def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:

@@ -70,6 +70,26 @@ def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) 
             assert_never(lights)
 
 
+FEWEST_FIRST_LIGHTS, FIRST_SHARE = 6, 8
+
+
+def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[np.int64]:
+    """Ids of LEDs among `ids` [n] for a first pass, spread over the dome: `most`, but not more than an eighth of
+    them, nor fewer than six."""
+    count = min(len(ids), most, max(FEWEST_FIRST_LIGHTS, len(ids) // FIRST_SHARE))
+    return ids[spread_rows(leds.positions_mm[leds.rows(ids)], count)] if len(ids) else ids
+
+
+def spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """`count` of the positions [n, 3], each as far as possible from those before it."""
+    indices = [0]
+    apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
+    while len(indices) < min(count, len(positions_mm)):
+        indices.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[indices[-1]], axis=1))
+    return np.array(sorted(indices))
+
+
 def missing_lights(
     plan: Plan, leds: LedTable, base_from_support: Transform
 ) -> list[tuple[tuple[str | int, ...], str]]:

@@ -8,14 +8,17 @@ from typing import assert_never
 
 from coupole.geometry import Transform, look_at
 from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
+from coupole.plan.choices import Choice, OpenView, bound_of, has_enough
 from coupole.plan.led_table import LedTable
-from coupole.plan.light_selection import lit_in_bursts
+from coupole.plan.light_selection import first_lights, lit_in_bursts
 from coupole.plan.marks import MARKS, Marks
-from coupole.plan.plan import Grid, Joints, Lights, LookAt, Plan, View
+from coupole.plan.plan import AutoExposure, Grid, Joints, Lights, LookAt, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
 """Largest numbers of views and frames of one plan, as many as fit into memory."""
+TAKEN_TWICE = 4
+"""Each fourth light of a first pass is taken twice: noise is measured by pairs."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,11 @@ class Schedule:
 
     views: tuple[ViewPose, ...]
     bursts: tuple[tuple[Burst, ...], ...]
-    """Bursts of each view."""
+    """Bursts of each view; where they are chosen in the run, its bound (`coupole.plan.choices`)."""
     labels: tuple[tuple[ShotLabel, ...], ...]
     """Labels of all frames that each view can have, before any was left out, in the order of its bursts."""
+    choosable: tuple[tuple[Burst, ...], ...] = ()
+    """Bursts from which those of each view are chosen in the run; empty if the plan says them all."""
 
     @property
     def shots(self) -> int:
@@ -47,16 +52,42 @@ class Schedule:
     def frames(self) -> int:
         return sum(len(b.labels) for bursts in self.bursts for b in bursts)
 
+    @property
+    def is_open(self) -> bool:
+        """True if bursts are chosen in the run."""
+        return bool(self.choosable)
+
+    def open_view(self, number: int) -> OpenView:
+        """One of the views, where bursts are chosen."""
+        view = self.views[number]
+        return OpenView(view.name, view.target_mm, self.choosable[number], self.bursts[number])
+
+    def planned_bursts(self) -> tuple[tuple[Burst, ...], ...]:
+        """Bursts of each view with each frame that the plan allows."""
+        return self.choosable or self.bursts
+
     def without(self, hidden_leds: Mapping[str, Collection[int]]) -> Schedule:
         """The same without some LEDs in some views (LED ids by name of view)."""
-        return Schedule(
-            self.views,
-            tuple(
+
+        def without_hidden(bursts_of_views: tuple[tuple[Burst, ...], ...]) -> tuple[tuple[Burst, ...], ...]:
+            return tuple(
                 tuple(b.without(hidden_leds[view.name]) for b in bursts) if hidden_leds.get(view.name) else bursts
-                for view, bursts in zip(self.views, self.bursts, strict=True)
-            ),
-            self.labels,
-        )
+                for view, bursts in zip(self.views, bursts_of_views, strict=True)
+            )
+
+        choosable = without_hidden(self.choosable) if self.choosable else ()
+        return replace(self, bursts=without_hidden(self.bursts), choosable=choosable)
+
+    def with_choices(self, choices: Mapping[str, Sequence[Choice]]) -> Schedule:
+        """The same with the bursts that were chosen for views that have enough (by name of view), in place of
+        their bounds. Raises KeyError for a choice that the plan does not allow."""
+        bursts = []
+        for number, (view, bound) in enumerate(zip(self.views, self.bursts, strict=True)):
+            view_choices = choices.get(view.name, ())
+            bursts.append(
+                chosen_bursts(self.open_view(number), view_choices) if has_enough(view_choices) else bound
+            )
+        return replace(self, bursts=tuple(bursts))
 
     def without_proven(self, proven: Collection[ShotId]) -> Schedule:
         """Return the schedule of what is still to be taken: views with unproven frames, with their bursts reduced
@@ -67,7 +98,13 @@ class Schedule:
             tuple(self.views[n] for n in numbers),
             tuple(tuple(remaining_bursts[n]) for n in numbers),
             tuple(self.labels[n] for n in numbers),
+            tuple(self.choosable[n] for n in numbers if self.choosable),
         )
+
+
+def chosen_bursts(view: OpenView, choices: Sequence[Choice]) -> tuple[Burst, ...]:
+    """All bursts of these choices. Raises KeyError for one that the plan does not allow."""
+    return tuple(view.burst_of(burst) for choice in choices for burst in choice.bursts)
 
 
 def bursts_left(bursts: Sequence[Burst], proven: Collection[ShotId]) -> list[Burst]:
@@ -134,13 +171,14 @@ def build_schedule(
     bursts: list[list[Burst]] = []
     hardware = plan.trigger == "hardware"
     marks: Marks = "coded" if hardware else "none" if runs_tables else "plain"
+    is_auto = isinstance(plan.exposure, AutoExposure)
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
             lit = lit_in_bursts(lights, leds, base_from_support)
             bursts_of[lights] = [
                 burst
-                for repeat in range(plan.repeats)
+                for repeat in range(2 if is_auto else plan.repeats)
                 for index, exposure_us in enumerate(plan.exposure.exposures_us)
                 for burst in bursts_of_exposure(
                     lit,
@@ -164,7 +202,24 @@ def build_schedule(
     labels = tuple(
         tuple(label for burst in view_bursts for label in burst.labels if label) for view_bursts in bursts
     )
-    return Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+    schedule = Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
+    return _open_schedule(schedule, plan.exposure, leds) if isinstance(plan.exposure, AutoExposure) else schedule
+
+
+def _open_schedule(schedule: Schedule, exposure: AutoExposure, leds: LedTable) -> Schedule:
+    """The schedule of a plan whose exposures are chosen in the run: of all that may be chosen, and its bound."""
+    bounds: dict[int, tuple[Burst, ...]] = {}
+    for bursts in schedule.bursts:
+        first_table = id(bursts[0].table)  # views with the same lights share tables
+        if first_table not in bounds:
+            lit = OpenView("", None, bursts, ()).leds
+            taken_twice = first_lights(lit, leds, exposure.first_lights)[::TAKEN_TWICE]
+            bounds[first_table] = bound_of(bursts, exposure.most_exposures, taken_twice.tolist())
+    of_views = tuple(
+        tuple(replace(burst, view=view.name) for burst in bounds[id(bursts[0].table)])
+        for view, bursts in zip(schedule.views, schedule.bursts, strict=True)
+    )
+    return replace(schedule, bursts=of_views, choosable=schedule.bursts)
 
 
 def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], str]]:
@@ -174,7 +229,7 @@ def too_large(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ...], s
     ]
     if sum(sizes) > MOST_VIEWS:
         return [(("views",), f"expected at most {MOST_VIEWS} views in one plan, found {sum(sizes)}; split it")]
-    exposures = plan.repeats * len(plan.exposure.exposures_us)
+    exposures = plan.repeats * plan.exposure.frames_of_light
     frames = sum(sizes) * (exposures * len(leds.ids) + plan.darks_per_view)
     if frames > MOST_FRAMES:
         message = f"expected at most {MOST_FRAMES} frames in one plan, found up to {frames}; split it"

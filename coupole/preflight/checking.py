@@ -26,7 +26,7 @@ from coupole.storage.ledger_lines import History
 from coupole.storage.write_speed import measure_write_speed
 
 _DISK_GRAIN_US = 100
-_LED_DUTIES = tuple(0.9**k for k in range(1, 33))
+LED_DUTIES = tuple(0.9**k for k in range(1, 33))
 """Largest on-time shares, tried in turn if LEDs get too hot."""
 
 
@@ -224,6 +224,6 @@ def _at_cool_pace(job: Job, report: Report, check_at: Callable[[Pace], tuple[Job
     """The fastest pace at which LEDs do not get too hot; unchanged if none of the tried ones is sufficient."""
     if not report.too_hot:
         return job, report
-    paces = [replace(job.pace, led_duty=duty) for duty in _LED_DUTIES]
+    paces = [replace(job.pace, led_duty=duty) for duty in LED_DUTIES]
     first = bisect_left(paces, True, key=lambda pace: not check_at(pace)[1].too_hot)
     return check_at(paces[first]) if first < len(paces) else (job, report)

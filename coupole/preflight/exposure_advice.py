@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from coupole.devices import FrameFormat
 from coupole.errors import InputError
 from coupole.plan.led_table import LedTable
+from coupole.plan.light_selection import spread_rows
 from coupole.plan.plan import BracketExposure, FixedExposure, LightIds, Plan
 from coupole.plan.shot_id import Light
 from coupole.plan.yamlfile import Document
@@ -118,20 +119,10 @@ def metering_plan(plan: Plan, leds: LedTable, rows: NDArray[np.int64]) -> Plan:
         exposure = BracketExposure(kind="bracket", exposures_us=tuple(exposures_us))
     changes: dict[str, Any] = {"exposure": exposure, "repeats": _REPEATS, "darks_per_view": 0}
     if len(rows):
-        metering_rows = rows[_spread_rows(leds.positions_mm[rows], METERING_LIGHTS)]
+        metering_rows = rows[spread_rows(leds.positions_mm[rows], METERING_LIGHTS)]
         changes["lights"] = LightIds(kind="ids", ids=tuple(int(led) for led in leds.ids[metering_rows]))
         changes["views"] = tuple(view.model_copy(update={"lights": None}) for view in plan.views)
     return plan.model_copy(update=changes)
-
-
-def _spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """`count` of the positions [n, 3], each as far as possible from those before it."""
-    indices = [0]
-    apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
-    while len(indices) < min(count, len(positions_mm)):
-        indices.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[indices[-1]], axis=1))
-    return np.array(sorted(indices))
 
 
 @dataclass
@@ -142,25 +133,34 @@ class Metered:
     samples: dict[Light, dict[int, list[NDArray[np.int32]]]] = field(default_factory=dict)
 
 
-def sample_of(pixels: NDArray[np.uint16]) -> NDArray[np.int32]:
-    """[n] pixels of every n-th Bayer cell of a frame [H, W], DN."""
-    height, width = (size // (2 * _CELL_STEP) * 2 * _CELL_STEP for size in pixels.shape)
-    cells = pixels[:height, :width].reshape(height // (2 * _CELL_STEP), 2 * _CELL_STEP, -1, 2 * _CELL_STEP)
+def sample_of(pixels: NDArray[np.uint16], cell_step: int = _CELL_STEP) -> NDArray[np.int32]:
+    """[n] pixels of every `cell_step`-th Bayer cell, in both directions, of a frame [H, W], DN."""
+    step_px = 2 * cell_step
+    height, width = (size // step_px * step_px for size in pixels.shape)
+    cells = pixels[:height, :width].reshape(height // step_px, step_px, -1, step_px)
     return cells[:, :2, :, :2].astype(np.int32).ravel()
 
 
 def noise_of(views: Iterable[Metered]) -> Noise:
-    """Photon transfer line through all pairs: mean squared difference / 2 against mean signal, in levels with as
-    many pixels each, weighted by the uncertainty of a level's variance; rounding noise only if everything is
-    saturated."""
+    """Noise by all pairs of frames that are alike."""
+    return noise_of_pairs(
+        (a, b, view.frame_format.white_dn - view.frame_format.black_dn)
+        for view in views
+        for by_exposure in view.samples.values()
+        for samples in by_exposure.values()
+        for a, b in zip(samples[::2], samples[1::2], strict=False)
+    )
+
+
+def noise_of_pairs(pairs: Iterable[tuple[NDArray[np.int32], NDArray[np.int32], int]]) -> Noise:
+    """Photon transfer line through pairs of frames (signals [n] of both above black, and the top of their range,
+    DN): mean squared difference / 2 against mean signal, in levels with as many pixels each, weighted by the
+    uncertainty of a level's variance; rounding noise only if everything is saturated."""
     signal, half_squares = [np.zeros(0)], [np.zeros(0)]
-    for view in views:
-        white = view.frame_format.white_dn - view.frame_format.black_dn
-        for samples in (s for by_exposure in view.samples.values() for s in by_exposure.values()):
-            for a, b in zip(samples[::2], samples[1::2], strict=False):
-                below_white = np.maximum(a, b) < white
-                signal.append((a[below_white] + b[below_white]) / 2.0)
-                half_squares.append((a[below_white] - b[below_white]) ** 2 / 2.0)
+    for a, b, white in pairs:
+        below_white = np.maximum(a, b) < white
+        signal.append((a[below_white] + b[below_white]) / 2.0)
+        half_squares.append((a[below_white] - b[below_white]) ** 2 / 2.0)
     if sum(map(len, signal)) < _LEVELS:
         return Noise(_ROUNDING_DN, _ROUNDING_DN)
     order = np.argsort(all_signal := np.concatenate(signal), kind="stable")

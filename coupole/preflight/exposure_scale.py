@@ -87,9 +87,12 @@ def exposed_white(job: Job, scale: ExposureScale) -> list[ExposedWhite]:
     if not len(lit):
         return []
     full_dn = cell.rig.sensor.white_dn - cell.rig.sensor.black_dn
+    exposures_us = job.plan.exposure.exposures_us
+    if job.schedule.is_open:  # among these is chosen
+        exposures_us = (exposures_us[0], exposures_us[-1])
     return [
         ExposedWhite(e, float(lit.max()) * e * 1e-6 / full_dn, float(np.median(lit)) * e * 1e-6 / full_dn)
-        for e in job.plan.exposure.exposures_us
+        for e in exposures_us
     ]
 
 

@@ -15,9 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coupole.errors import InputError
 from coupole.motion.cell_motion import CellMotion
 from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.cell import Cell
+from coupole.plan.choices import Choice
 from coupole.plan.plan import Plan
 from coupole.plan.reading import read_plan
 from coupole.plan.rig_devices import described_arm, runs_tables
@@ -46,6 +48,8 @@ class Job:
     """LEDs left out of views, by name of view."""
     pace: Pace = FASTEST
     """Limits of the schedule's step periods in addition to camera and LEDs."""
+    choices: Mapping[str, Sequence[Choice]] = field(default_factory=dict)
+    """Choices that a run has made for its views so far, by name of view, where its bursts are chosen."""
 
     @property
     def inputs(self) -> Inputs:
@@ -98,7 +102,18 @@ def at_pace(job: Job, pace: Pace) -> Job:
     if pace == job.pace:
         return job
     schedule = schedule_of(job.plan, job.cell, pace).without(job.hidden_leds)
-    return replace(job, schedule=schedule, pace=pace)
+    return with_choices(replace(job, schedule=schedule, pace=pace), job.choices)
+
+
+def with_choices(job: Job, choices: Mapping[str, Sequence[Choice]]) -> Job:
+    """The same job, for a run that has made these choices. Raises InputError for one that the plan does not
+    allow."""
+    if not job.schedule.is_open:
+        return job
+    try:
+        return replace(job, schedule=job.schedule.with_choices(choices), choices=choices)
+    except KeyError as error:
+        raise InputError(f"the run's journal has a choice that its plan does not allow: {error.args[0]}") from None
 
 
 def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = None) -> Job:

@@ -16,6 +16,7 @@ from coupole.devices import NO_LED
 from coupole.geometry import apply
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import BurstTiming
+from coupole.plan.choices import MOST_CHOICES
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
@@ -27,6 +28,8 @@ from coupole.preflight.led_limits import heat_of, refuse_on_times
 
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
+CHOICE_S = 2.0
+"""Time of a choice of bursts in the run, at most, for 1080 LEDs on a busy machine (`tools/bench.py choosing`)."""
 SETTLE_CHECK_S = 0.1
 """Time from the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
 DISK_SHARE = 0.9
@@ -205,6 +208,8 @@ def _time_and_dose(
                 dose += rig.dome.panel_lux * (burst.duration_s + BURST_OVERHEAD_S) / 3600.0
         total += dose
         waiting_s = max(0.0, upload_s(rig, len(bursts[0].table)) - move_s) if not report.views else 0.0
+        if schedule.is_open:  # a table is uploaded when it has been chosen
+            waiting_s += MOST_CHOICES * (CHOICE_S + upload_s(rig, max(len(burst.table) for burst in bursts)))
         report.ideal_s += move_s + burst_s
         report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
         report.views.append(

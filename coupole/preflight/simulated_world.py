@@ -134,7 +134,8 @@ def _camera_config(
     """Settings of the camera's stand-in from the rig; none if a dry run uses another kind of camera."""
     kind = camera_kind(rig, dry_run=dry_run)
     if rehearsed_job is not None:
-        every = max(1, rehearsed_job.schedule.frames // len(rehearsed_job.schedule.views) // DRY_RUN_PICTURES)
+        frames_of_view = rehearsed_job.schedule.frames // len(rehearsed_job.schedule.views)
+        every = 1 if rehearsed_job.schedule.is_open else max(1, frames_of_view // DRY_RUN_PICTURES)
         overrides = {"render_every": every, **overrides}
     if kind != camera_kind(rig, dry_run=False):
         overrides = {name: value for name, value in overrides.items() if name == "render_every"}

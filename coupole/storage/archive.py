@@ -75,7 +75,13 @@ def archive_run(
                 f"{run.folder}: {len(missing)} frames are missing, the first {missing[0]}. Resume the run first, "
                 "or archive its complete views with --partial."
             )
-        result = Archived(incomplete=sorted({shot.view for shot in missing}))
+        open_views = run.open_views()
+        if open_views and not partial:
+            raise UnprovenError(
+                f"{run.folder}: what {open_views[0]} needs is not chosen yet. Resume the run first, or archive "
+                "its complete views with --partial."
+            )
+        result = Archived(incomplete=sorted({shot.view for shot in missing} | set(open_views)))
         for view in run.about["views"]:
             path = run.view_path(view)
             if view in result.incomplete:

@@ -55,13 +55,30 @@ class AsPlanned:
             if label.is_shot and getattr(label.light, "id", None) not in run.hidden_leds.get(view.name, ())
         }
         listed_shots = {shot for shot in run.expected_shots() if shot.is_shot}
+        have_listed = "journal's choices" if self.schedule.is_open else "run.json"
+        left_out = set() if self.schedule.is_open else planned_shots - listed_shots
         for shots, have, lack in (
-            (listed_shots - planned_shots, "run.json", "plan"),
-            (planned_shots - listed_shots, "plan", "run.json"),
+            (listed_shots - planned_shots, have_listed, "plan"),
+            (left_out, "plan", have_listed),
         ):
             if shots:
                 first = min(map(str, shots))
                 yield f"{len(shots)} shots of the run's {have} are not in its {lack}, the first {first}"
+
+    def problems_of_choices(self, run: Run) -> Iterator[str]:
+        """Choices of the journal that the plan does not allow, or that name another time than it has."""
+        choices = run.choices()
+        for number, view in enumerate(self.schedule.views if self.schedule.is_open else ()):
+            open_view = self.schedule.open_view(number)
+            for chosen_burst in (burst for choice in choices.get(view.name, ()) for burst in choice.bursts):
+                try:
+                    exposure_us = open_view.burst_of(chosen_burst).timing.exposure_us
+                except KeyError as error:
+                    yield f"the journal has a choice that the run's plan does not allow: {error.args[0]}"
+                    continue
+                if exposure_us != chosen_burst.exposure_us:
+                    message = f"{view.name}: e{chosen_burst.exposure} was chosen as {chosen_burst.exposure_us} us"
+                    yield f"{message}, where the run's plan has {exposure_us} us"
 
     def problem(self, shot: ShotId, record: Any, pose: Any) -> str:
         """Say how a frame's record (FRAME_DTYPE) and pose (POSE_DTYPE) differ from the plan; empty if they do
@@ -81,7 +98,7 @@ class AsPlanned:
     def _planned_exposures(self, view: str) -> dict[ShotLabel, tuple[int, int]]:
         """LED and exposure, us, of each frame of a view."""
         light_of_label: dict[ShotLabel, tuple[int, int]] = {}
-        for pose, bursts in zip(self.schedule.views, self.schedule.bursts, strict=True):
+        for pose, bursts in zip(self.schedule.views, self.schedule.planned_bursts(), strict=True):
             for burst in bursts if pose.name == view else ():
                 for label, led in zip(burst.labels, burst.table["led"], strict=True):
                     if label is not None:

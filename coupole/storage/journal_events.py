@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
 
+from coupole.plan.choices import ChosenBurst
 from coupole.plan.shot_id import ShotId
 from coupole.storage.inner_path import InnerPath
 from coupole.storage.line_file import utc_now
@@ -131,6 +132,21 @@ class FrameProven(JournalEvent):
     """Number that the camera gave the frame."""
     xxh3: str
     """Checksum of the frame's bytes, 16 hexadecimal digits."""
+
+
+class BurstsChosen(JournalEvent):
+    """The next bursts of a view were chosen; synced before the first of them gives light. A resumed run repeats
+    them."""
+
+    event: Literal["chosen"] = "chosen"
+    view: str
+    """Name of the view."""
+    bursts: tuple[ChosenBurst, ...]
+    """The bursts, in their order; none: the view has enough."""
+    reason: str
+    """The reason for these, or for no more."""
+    figures: dict[str, Any] = Field(default_factory=dict)
+    """Numbers behind the reason, and what else was weighed."""
 
 
 class BurstBegun(JournalEvent):
@@ -277,6 +293,7 @@ Event: TypeAlias = (
     | MoveBegun
     | ArmSettled
     | FrameProven
+    | BurstsChosen
     | BurstBegun
     | BurstEnded
     | GapFound

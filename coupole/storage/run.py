@@ -29,11 +29,13 @@ from typing import Any
 
 import coupole
 from coupole.errors import InputError, StorageError
+from coupole.plan.choices import Choice, has_enough
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
 from coupole.storage import journal, manifest
 from coupole.storage.durable import make_folder, sync_folder, write_synced
 from coupole.storage.journal_events import (
     JOURNAL_VERSION,
+    BurstsChosen,
     FrameProven,
 )
 from coupole.storage.line_file import utc_now
@@ -96,8 +98,36 @@ class Run:
         archived."""
         return sum(map(_settled_bytes, (self.folder / "views").glob("*.h5")))
 
+    @property
+    def is_open(self) -> bool:
+        """True if its bursts are chosen while it runs."""
+        return bool(self.about.get("chosen_in_the_run", False))
+
+    def choices(self) -> dict[str, list[Choice]]:
+        """The choices that were made for each view, by the journal; empty where the plan says all."""
+        choices: dict[str, list[Choice]] = {}
+        for event in journal.read_events(self.journal_path) if self.is_open else ():
+            if isinstance(event, BurstsChosen):
+                choice = Choice(bursts=event.bursts, reason=event.reason, figures=event.figures)
+                choices.setdefault(event.view, []).append(choice)
+        return choices
+
+    def open_views(self) -> list[str]:
+        """Views for which more bursts may be chosen, in the plan's order."""
+        if not self.is_open:
+            return []
+        choices = self.choices()
+        return [view for view in self.about["views"] if not has_enough(choices.get(view, ()))]
+
     def expected_shots(self) -> Iterable[ShotId]:
-        """All shots and dark frames of the plan, without those whose LEDs are occluded in their view."""
+        """All shots and dark frames of the plan, without those whose LEDs are occluded in their view; where they
+        are chosen while it runs, all that were chosen so far."""
+        if self.is_open:
+            choices = self.choices()
+            for view in self.about["views"]:
+                bursts = (burst for choice in choices.get(view, ()) for burst in choice.bursts)
+                yield from (ShotId(view, label) for burst in bursts for label in burst.labels())
+            return
         labels: list[str] | dict[str, list[str]] = self.about["labels"]
         for view in self.about["views"]:
             hidden_lights = set(map(Led, self.hidden_leds.get(view, ())))

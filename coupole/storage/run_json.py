@@ -73,6 +73,8 @@ class _Description(_Part):
     views: list[View]
     labels: list[Label] | dict[str, list[Label]]
     """One list for all views, or one for each."""
+    chosen_in_the_run: bool = False
+    """True: which frames there are stands in the journal, not in `labels`."""
     hidden_leds: dict[str, list[int]] = Field(default_factory=dict)
     plan: _File
     rig: _File

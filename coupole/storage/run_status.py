@@ -17,6 +17,7 @@ from coupole.storage.journal_events import (
     ArmSettled,
     BurstBegun,
     BurstEnded,
+    BurstsChosen,
     Continued,
     Event,
     FaultNoted,
@@ -84,7 +85,9 @@ class Status:
     """Failures of the run. That somebody stopped the run is none."""
     sessions: list[Session] = field(default_factory=list)
     views: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Proven and expected frames of each view."""
+    """Proven and expected frames of each view; where they are chosen in the run, expected as far as chosen."""
+    open_views: list[str] = field(default_factory=list)
+    """Views of which it is not yet decided what else they need, where that is chosen in the run."""
     last_event: str = ""
     dose_lux_h: float = 0.0
     """Light on the object in all sessions."""
@@ -130,14 +133,18 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     status.proven = sum(shot.is_shot for shot in proven)
     status.darks_proven = len(proven) - status.proven
     proven_per_view = Counter(shot.view for shot in proven)
-    status.views = {view: (proven_per_view[view], count) for view, count in per_view.items()}
+    status.open_views = run.open_views()
+    status.views = {
+        view: (proven_per_view[view], count)
+        for view, count in (dict.fromkeys(status.open_views, 0) | per_view).items()
+    }
     if in_use and status.state == CREATED:
         status.state = RUNNING
     if not in_use and status.state in (RUNNING, PAUSED):
         status.state, status.reason = "interrupted", KILLED
     holder = run.holder if in_use else None
     status.stopped_pid = holder if holder and is_stopped(holder) else None
-    if status.frames_left and not in_use:
+    if (status.frames_left or status.open_views) and not in_use:
         status.go_on = run.go_on_command
         if status.faults:
             status.before_that = _confirmation(run)
@@ -185,7 +192,7 @@ def _note_event(found: Status, event: Event) -> None:
             session.light_s += event.on_s
         case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
-        case BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
+        case BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
             pass
         case _:
             assert_never(event)
@@ -211,5 +218,6 @@ def newest_run(parent: Path, name: str, plan: Path, say: Callable[[str], object]
 
 
 def is_complete(folder: Path) -> bool:
-    """Tell whether all frames of a run are proven."""
-    return not status(Run(folder)).missing
+    """Tell whether all frames of a run are proven, and none are left to choose."""
+    found = status(Run(folder))
+    return not found.missing and not found.open_views

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from coupole.errors import InputError, StorageError
+from coupole.plan.shot_id import ShotId
 from coupole.storage import frame_file, journal, manifest
 from coupole.storage.as_planned import AsPlanned, as_planned
-from coupole.storage.journal_events import FrameProven
+from coupole.storage.journal_events import BurstsChosen, FrameProven
 from coupole.storage.run import Run
 
 
@@ -41,6 +42,8 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     result = Verification()
     proven = run.proven()
     result.missing = [str(shot) for shot in run.expected_shots() if shot not in proven]
+    result.missing += [f"{view}: what else it needs is not chosen yet" for view in run.open_views()]
+    result.bad += _unchosen(run)
     by_file: dict[str, list[FrameProven]] = {}
     for frame in proven.values():
         by_file.setdefault(frame.file, []).append(frame)
@@ -79,13 +82,25 @@ def verify(run: Run, progress: Callable[[int, int], None] = lambda done, total: 
     return result
 
 
+def _unchosen(run: Run) -> list[str]:
+    """Frames that the journal has before it has the choice that they belong to, where frames are chosen."""
+    chosen_shots: set[ShotId] = set()
+    problems = []
+    for event in journal.read_events(run.journal_path) if run.is_open else ():
+        if isinstance(event, BurstsChosen):
+            chosen_shots |= {ShotId(event.view, label) for burst in event.bursts for label in burst.labels()}
+        elif isinstance(event, FrameProven) and event.shot not in chosen_shots:
+            problems.append(f"{event.shot}: was not chosen before it was proven")
+    return problems
+
+
 def _read_as_planned(run: Run, result: Verification) -> AsPlanned | None:
     try:
         plan = as_planned(run)
     except InputError as error:
         result.not_compared = str(error)
         return None
-    result.bad += plan.problems_of_the_list(run)
+    result.bad += [*plan.problems_of_the_list(run), *plan.problems_of_choices(run)]
     return plan
 
 

@@ -8,6 +8,7 @@ from coupole.storage.journal_events import (
     ArmSettled,
     BurstBegun,
     BurstEnded,
+    BurstsChosen,
     Continued,
     Event,
     FaultNoted,
@@ -42,6 +43,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return f"view {event.view}{hidden_words}"
         case MoveBegun():
             return f"the arm moves to {event.view}"
+        case BurstsChosen():
+            return f"{event.view}: {event.reason}"
         case BurstBegun():
             return f"{event.view}: a burst begins, at most {max(event.planned_lux_h, default=0.0):.3f} lux h"
         case BurstEnded():

@@ -11,7 +11,7 @@ from coupole.console.runs.event_words import words_of
 from coupole.console.runs.run_files import RunFiles
 from coupole.plan.shot_id import Led
 from coupole.storage.journal import Follower
-from coupole.storage.journal_events import BurstEnded, FrameProven, ReshootBegun
+from coupole.storage.journal_events import BurstEnded, BurstsChosen, FrameProven, ReshootBegun
 from coupole.storage.run import Run
 
 _NO_OFTENER_S = 0.4
@@ -53,6 +53,8 @@ class _Followed:
                         self.newest = event
                 case ReshootBegun():
                     self.reshot += len(event.shots)
+                case BurstsChosen():
+                    self.expected_counts[event.view] += sum(len(list(burst.labels())) for burst in event.bursts)
                 case BurstEnded():
                     self.hottest_board_c = event.hottest_board_c
                 case _:
@@ -76,7 +78,9 @@ class RunWatch:
             followed_run = self._followed
             if followed_run is None or followed_run.run.folder.name != name:
                 run = self._runs.run(name)
-                shots_of_view = Counter(shot.view for shot in run.expected_shots())
+                shots_of_view = Counter(dict.fromkeys(run.about["views"], 0) if run.is_open else {})
+                if not run.is_open:  # else the journal has them
+                    shots_of_view.update(shot.view for shot in run.expected_shots())
                 followed_run = self._followed = _Followed(run, Follower(run.journal_path), shots_of_view)
                 self._read_s = 0.0
             if self._known is None or self._known.run != name or time.monotonic() - self._read_s > _NO_OFTENER_S:

@@ -1,0 +1,142 @@
+"""The bursts of each view: those of the plan, or those that are chosen in the run (`coupole.plan.choices`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from coupole.acquisition.recorder import Recorder
+from coupole.plan import schedule
+from coupole.plan.bursts import Burst
+from coupole.plan.choices import Choice, FrameSample, OpenView, has_enough, refuse_beyond
+from coupole.plan.schedule import chosen_bursts
+from coupole.plan.shot_id import ShotId, ShotLabel
+from coupole.preflight.checking import LED_DUTIES
+from coupole.preflight.choosers import chooser_of
+from coupole.preflight.job import Job
+from coupole.preflight.led_limits import heat_of
+from coupole.storage.journal_events import BurstsChosen
+
+
+class BurstsOfViews:
+    """Bursts that each view of a job still gets. Views are named by their numbers in the job's schedule."""
+
+    def __init__(self, job: Job, recorder: Recorder) -> None:
+        self._job, self._recorder = job, recorder
+        self._chooser = chooser_of(job)
+        self._choices: dict[str, list[Choice]] = {view: list(choices) for view, choices in job.choices.items()}
+        self._open_views: dict[int, OpenView] = {}
+        self._frames: dict[int, int] = {}
+        """Frames of each view, as far as they are chosen."""
+        self._fired: list[list[Burst]] = []
+        """Bursts of the session's views whose bursts are chosen, for the heat of their boards."""
+        recorder.sample_frames(is_wanted=self._chooser is not None)
+
+    def bursts(self, number: int) -> tuple[Burst, ...]:
+        """All bursts of a view, as far as they are known."""
+        if self._chooser is None:
+            return self._job.schedule.bursts[number]
+        return chosen_bursts(self._open_view(number), self._choices_of(number))
+
+    def bursts_left(self, number: int) -> list[Burst]:
+        """The bursts with unproven frames, reduced to these."""
+        return schedule.bursts_left(self.bursts(number), self._recorder.proven())
+
+    def may_want_more(self, number: int) -> bool:
+        """True if more bursts may be chosen."""
+        return self._chooser is not None and not has_enough(self._choices_of(number))
+
+    def bound(self, number: int) -> tuple[Burst, ...]:
+        """Bursts that are at least what a view gets in all."""
+        return self._job.schedule.bursts[number] if self.may_want_more(number) else self.bursts(number)
+
+    def expected_frames(self, number: int) -> int:
+        """Frames that a view gets, as far as it is known; one of each LED, and marks, if nothing is chosen yet."""
+        if self._chooser is None or self._choices_of(number):
+            return self._frames.get(number) or self._frames.setdefault(number, _frames(self.bursts(number)))
+        return len(self._open_view(number).burst(0).labels)
+
+    def slots(self, number: int) -> int:
+        """Frames that a view's file must have room for."""
+        return _frames(self.bound(number))
+
+    def begin_view(self) -> None:
+        """The arm goes to another view."""
+        self._fired.append([])
+
+    def more(self, number: int) -> list[Burst]:
+        """The next bursts of a view all of whose bursts were fired; none if it has enough. The choice is on the
+        disk when this returns. Raises RuntimeError if it exceeds the view's bound."""
+        if self._chooser is None or not self.may_want_more(number):
+            return []
+        view, choices = self._open_view(number), self._choices_of(number)
+        choice = view.with_darks(
+            choices, self._chooser.choose(view, tuple(choices), _Seen(view.name, choices, self._recorder))
+        )
+        bursts = [view.burst_of(burst) for burst in choice.bursts]
+        refuse_beyond(view.bound, [*self.bursts(number), *bursts])
+        self._recorder.note(
+            BurstsChosen(view=view.name, bursts=choice.bursts, reason=choice.reason, figures=choice.figures)
+        )
+        self._recorder.commit(now=True)
+        choices.append(choice)
+        self._frames.pop(number, None)
+        return self._cool(bursts)
+
+    def _open_view(self, number: int) -> OpenView:
+        if number not in self._open_views:
+            self._open_views[number] = self._job.schedule.open_view(number)
+        return self._open_views[number]
+
+    def _choices_of(self, number: int) -> list[Choice]:
+        return self._choices.setdefault(self._job.schedule.views[number].name, [])
+
+    def _cool(self, bursts: list[Burst]) -> list[Burst]:
+        """The same bursts, slowed down if boards would get too hot after what this session has lit: LEDs that are
+        chosen may lie together on one board."""
+        limits, leds = self._job.cell.rig.led_limits, self._job.cell.leds
+        before = self._fired or [[]]
+        for duty in (1.0, *LED_DUTIES):
+            cool_bursts = [_at_duty(burst, duty) for burst in bursts]
+            views = [*before[:-1], [*before[-1], *cool_bursts]]
+            if not heat_of(views, [0.0] * len(views), limits, leds).too_hot:
+                break
+        before[-1] += cool_bursts
+        self._fired = before
+        return cool_bursts
+
+
+def _frames(bursts: Iterable[Burst]) -> int:
+    return sum(len(burst.labels) for burst in bursts)
+
+
+def _at_duty(burst: Burst, duty: float) -> Burst:
+    """The burst with an LED lit for at most that share of a step."""
+    period_us = int(np.ceil(burst.timing.on_us / duty))
+    if period_us <= burst.timing.period_us:
+        return burst
+    timing = replace(burst.timing, period_us=period_us, bound="heat")
+    return replace(burst, timing=timing).only({label for label in burst.labels if label})
+
+
+class _Seen(Mapping[ShotLabel, FrameSample]):
+    """Samples of the proven frames of a view's choices; read when they are asked for."""
+
+    def __init__(self, view: str, choices: list[Choice], recorder: Recorder) -> None:
+        self._view, self._recorder = view, recorder
+        proven = recorder.proven()
+        chosen_labels = (label for choice in choices for burst in choice.bursts for label in burst.labels())
+        self._labels = dict.fromkeys(label for label in chosen_labels if ShotId(view, label) in proven)
+
+    def __getitem__(self, label: ShotLabel) -> FrameSample:
+        if label not in self._labels:
+            raise KeyError(str(label))
+        return self._recorder.sample(ShotId(self._view, label))
+
+    def __iter__(self) -> Iterator[ShotLabel]:
+        return iter(self._labels)
+
+    def __len__(self) -> int:
+        return len(self._labels)

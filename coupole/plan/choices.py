@@ -1,0 +1,196 @@
+"""Bursts that are chosen during a run, from what has been proven of their view.
+
+A plan with a `Chooser` leaves open which bursts a view gets. Before the run there are two lists for each view: the
+bursts *from which* is chosen (each exposure with all LEDs), and a *bound*, bursts that together are longer, hotter
+and larger than whatever may be chosen, and give more light; preflight checks the bound as if it were the plan. In
+the run the chooser is asked again and again, until it has enough:
+
+    choice = chooser.choose(view, choices before, samples of the frames that are proven)
+
+A choice is written into the journal, with its reason, and synced before its first light. A resumed run repeats the
+choices of its journal and goes on from there. So a chooser must be a function of its arguments alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from coupole.plan.bursts import Burst
+from coupole.plan.plan import ExposureUs, LedId, Model
+from coupole.plan.shot_id import Dark, Led, Light, ShotLabel
+
+MOST_BURSTS = 16
+"""Bursts of one view, at most, where they are chosen."""
+MOST_CHOICES = 6
+"""Choices for one view, at most: preflight reckons with the time that each takes."""
+Number = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class ChosenBurst(Model):
+    """One burst: LEDs at one exposure."""
+
+    exposure: Number
+    """Place among the plan's exposures, as in shot ids."""
+    exposure_us: ExposureUs
+    """The exposure time."""
+    repeat: Number = 0
+    """Number of the repeat, as in shot ids."""
+    leds: tuple[LedId, ...]
+    """LEDs, in the order of the LED table."""
+    darks: Number = 0
+    """Dark frames and marks that are kept of it: those of the first burst of an exposure."""
+
+    def labels(self) -> Iterator[ShotLabel]:
+        """Labels of the frames that it is to give."""
+        lights: list[Light] = [*map(Led, self.leds), *map(Dark, range(self.darks))]
+        for light in lights:
+            yield ShotLabel(light, self.exposure, self.repeat)
+
+
+class Choice(Model):
+    """The next bursts of a view; none: it has enough."""
+
+    bursts: tuple[ChosenBurst, ...]
+    """The bursts, in their order."""
+    reason: str
+    """The reason, in words for the journal and the report."""
+    figures: dict[str, Any] = Field(default_factory=dict)
+    """Numbers behind the reason, and what else was weighed; JSON's values only."""
+
+
+def has_enough(choices: Sequence[Choice]) -> bool:
+    """True if the last of a view's choices is that it needs no more."""
+    return bool(choices) and not choices[-1].bursts
+
+
+@dataclass(frozen=True)
+class FrameSample:
+    """The pixels of one proven frame that a chooser knows."""
+
+    clipped_share: float
+    """Share of all its pixels at the top of the range."""
+    signal_dn: NDArray[np.int16]
+    """[n] pixels above black, of Bayer cells that are spread evenly over the frame."""
+    full_dn: int
+    """The top of the range above black."""
+
+
+@dataclass(frozen=True)
+class OpenView:
+    """A view whose bursts are chosen."""
+
+    name: str
+    target_mm: tuple[float, float, float] | None
+    """The point in the picture's middle, in the support frame; None where the plan gives joints."""
+    bursts: tuple[Burst, ...]
+    """Bursts from which is chosen: one for each exposure and repeat, each with all LEDs of the view."""
+    bound: tuple[Burst, ...]
+    """Bursts that are at least what may be chosen."""
+
+    @cached_property
+    def leds(self) -> NDArray[np.int64]:
+        """[n] ids of the LEDs that may be lit, in the order of a burst."""
+        lights = [label.light for label in self.bursts[0].labels if label]
+        return np.array([light.id for light in lights if isinstance(light, Led)], np.int64)
+
+    @property
+    def leds_taken_twice(self) -> list[int]:
+        """Ids of the LEDs that may be lit once more at one exposure."""
+        again = [burst for burst in self.bound if burst.repeat]
+        return sorted({int(led) for burst in again for led in burst.table["led"][burst.is_light()]})
+
+    def burst(self, exposure: int, repeat: int = 0) -> Burst:
+        """Return the burst of all LEDs. Raises KeyError for an exposure or repeat that the plan does not have."""
+        for burst in self.bursts:
+            if (burst.exposure_index, burst.repeat) == (exposure, repeat):
+                return burst
+        raise KeyError(f"{self.name}: the plan has no e{exposure}/r{repeat} to choose")
+
+    def burst_of(self, chosen_burst: ChosenBurst) -> Burst:
+        """Return the burst that a choice means. Raises KeyError if the view has no such burst or LED."""
+        whole = self.burst(chosen_burst.exposure, chosen_burst.repeat)
+        wanted_labels = set(chosen_burst.labels())
+        if unknown := wanted_labels - set(whole.labels):
+            raise KeyError(f"{self.name}: the plan has no {min(map(str, unknown))} to choose")
+        return replace(whole.only(wanted_labels), view=self.name)
+
+    def with_darks(self, choices: Sequence[Choice], choice: Choice) -> Choice:
+        """The choice with dark frames in the first burst of each exposure, as `choices` before it have left it."""
+        with_darks = {burst.exposure for before in choices for burst in before.bursts}
+        bursts = []
+        for burst in choice.bursts:
+            darks = 0 if burst.exposure in with_darks else _darks(self.burst(burst.exposure, burst.repeat))
+            bursts.append(burst.model_copy(update={"darks": darks}))
+            with_darks.add(burst.exposure)
+        return choice.model_copy(update={"bursts": tuple(bursts)})
+
+
+def _darks(burst: Burst) -> int:
+    return sum(label is not None and label.is_dark for label in burst.labels)
+
+
+class Chooser(Protocol):
+    """Chooses the bursts of views; one object for a whole plan."""
+
+    def choose(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> Choice:
+        """The next bursts of a view after these `choices`, all of which have been fired. `samples` has the frames
+        of them that are proven; a frame of an earlier session is read when it is asked for. Same arguments, same
+        choice: a resumed run depends on it."""
+        ...
+
+
+def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int]) -> tuple[Burst, ...]:
+    """The bound of a view from which `whole` bursts (shortest exposure first) can be chosen: the longest
+    `frames_of_light` of them with all LEDs, the longest two once more with the LEDs `again`, and marks and dark
+    frames of as many more as a view may have."""
+    in_first = [burst for burst in whole if burst.repeat == 0]
+    longest = in_first[-1]
+    bursts = in_first[-frames_of_light:]
+    for burst in [burst for burst in whole if burst.repeat == 1][-2:]:
+        bursts.append(burst.only({ShotLabel(Led(led), burst.exposure_index, 1) for led in again}))
+    darks = {label for label in longest.labels if label and label.is_dark}
+    for number in range(MOST_BURSTS - len(bursts)):
+        shorter_burst = (
+            in_first[-frames_of_light - 1 - number] if number < len(in_first) - frames_of_light else None
+        )
+        marks = longest.only(darks if shorter_burst else set())
+        if shorter_burst is not None:
+            labels = tuple(
+                ShotLabel(label.light, shorter_burst.exposure_index, 0) if label else None
+                for label in marks.labels
+            )
+            marks = replace(marks, labels=labels, exposure_index=shorter_burst.exposure_index)
+        bursts.append(marks)
+    return tuple(bursts)
+
+
+def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
+    """Raise RuntimeError if `bursts`, all that were chosen for a view, are more than its bound: more bursts, more
+    frames, or an LED lit for longer. Preflight would not have known of it."""
+    allowed_us, asked_us = _on_us(bound), _on_us(bursts)
+    too_long = {led for led, on_us in asked_us.items() if on_us > allowed_us[led]}
+    frames = sum(label is not None for burst in bursts for label in burst.labels)
+    allowed_frames = sum(label is not None for burst in bound for label in burst.labels)
+    if too_long or frames > allowed_frames or len(bursts) > len(bound):
+        raise RuntimeError(
+            f"{bound[0].view}: {len(bursts)} bursts with {frames} frames were chosen, where preflight has checked "
+            f"{len(bound)} with {allowed_frames}; LEDs that would be lit for longer: {sorted(too_long)[:5]}"
+        )
+
+
+def _on_us(bursts: Iterable[Burst]) -> Counter[int]:
+    on_us: Counter[int] = Counter()
+    for burst in bursts:
+        for step in np.flatnonzero(burst.is_light()):
+            on_us[int(burst.table["led"][step])] += int(burst.table["on_us"][step])
+    return on_us

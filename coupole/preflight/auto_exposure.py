@@ -1,0 +1,291 @@
+"""Chooses exposures in the run, for each LED of a view, by what its frames show (`exposure: {kind: auto}`).
+
+1. *First pass.* Some LEDs, spread over the dome, at the middle of the times; each fourth twice, which gives the
+   noise (`exposure_advice.noise_of_pairs`). LEDs that clip are taken again four stops shorter; if all is dark,
+   some are taken four stops longer.
+2. *All LEDs.* From the rates of the pixels (DN per us) under the first LEDs, two times follow for each: beyond the
+   one more than the allowed share is clipped, below the other too few of the object's pixels reach the
+   signal-to-noise ratio. Both go from LED to LED by the illuminance of the LED table, between the nearest LEDs of
+   the first pass by direction (inverse squares of the distance, logarithms). `exposure_times` chooses.
+3. *Corrections.* Each LED's own frames are judged, clipping by all pixels. An LED that is not exposed as asked for
+   gets one more exposure, twice at most.
+
+Light that a pixel gets only by way of other surfaces is not asked to reach the ratio (`exposure_evidence`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform, apply
+from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
+from coupole.plan.led_table import LedTable
+from coupole.plan.light_selection import first_lights
+from coupole.plan.plan import STEPS_PER_STOP, AutoExposure
+from coupole.plan.shot_id import ShotLabel
+from coupole.preflight.exposure_evidence import FULL, Evidence, Judgement
+from coupole.preflight.exposure_times import LightLimits, chosen_times
+
+Floats = NDArray[np.float64]
+
+_UNSEEN_LIGHTS = 0.85
+"""Factor by which LEDs that were not in the first pass may be brighter."""
+_NOISE_MARGIN = 1.05
+_PROBE_STEPS = 4 * STEPS_PER_STOP
+"""Steps between the exposures of the first pass, if one is not enough."""
+_CORRECTION_STEPS = 2 * STEPS_PER_STOP
+_DARK_SHARE = 0.05
+"""Share of full scale that bright pixels of the first pass reach, or it is taken longer."""
+_BRIGHT_QUANTILE = 0.99
+_NEIGHBOURS = 4
+_BURST_S = 0.14
+"""Time of a burst beside its steps, as preflight reckons it."""
+_CORRECTIONS, _BURSTS_OF_A_CORRECTION = 2, 2
+_PROBE = "probe"
+
+
+class AutoExposureChooser:
+    """The `Chooser` of plans with `exposure: {kind: auto}`."""
+
+    def __init__(
+        self, exposure: AutoExposure, leds: LedTable, base_from_support: Transform, *, emission: str = "lambertian"
+    ) -> None:
+        self._exposure, self._leds, self._emission = exposure, leds, emission
+        self._base_from_support = base_from_support
+
+    def choose(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> Choice:
+        """See `coupole.plan.choices.Chooser`."""
+        if not choices:
+            return self._first_pass(view)
+        lux_of_led = dict(zip(view.leds.tolist(), self._lux(view).tolist(), strict=True))
+        evidence = Evidence(self._exposure, lux_of_led, choices[0].bursts[0].leds, samples)
+        if not evidence.first_leds:
+            return Choice(bursts=(), reason="no frame of the first pass is proven: nothing to choose by")
+        if len(choices) == 1 and (probes := self._probes(view, evidence)):
+            reason = _in_words("the first pass clips or is dark", probes)
+            return Choice(bursts=tuple(probes), reason=reason, figures={_PROBE: True})
+        rounds = len([choice for choice in choices[1:] if _PROBE not in choice.figures])
+        if rounds == 0:
+            return self._for_all(view, evidence, lux_of_led)
+        return self._correction(evidence, is_over=rounds > _CORRECTIONS, again=rounds)
+
+    # -- the first pass -----------------------------------------------------------------------------------
+
+    def _first_pass(self, view: OpenView) -> Choice:
+        place = len(self._exposure.exposures_us) // 2
+        spread_leds = first_lights(view.leds, self._leds, self._exposure.first_lights).tolist()
+        bursts = [self._burst(place, {*spread_leds, *view.leds_taken_twice})]
+        if view.leds_taken_twice:
+            bursts.append(self._burst(place, view.leds_taken_twice, repeat=1))
+        return Choice(bursts=tuple(bursts), reason=_in_words("first pass over the dome", bursts))
+
+    def _probes(self, view: OpenView, evidence: Evidence) -> list[ChosenBurst]:
+        """More exposures of the first LEDs, where one does not show their rates."""
+        leds, exposure = evidence.first_leds, self._exposure
+        place = evidence.taken[leds[0]][0]
+        first_samples = {led: evidence.sample(led, place) for led in leds}
+        bursts = []
+        clipped_leds = [led for led in leds if first_samples[led].clipped_share > exposure.clipped_share]
+        if clipped_leds and place > 0:
+            bursts.append(self._burst(max(0, place - _PROBE_STEPS), clipped_leds))
+        bright_dn = np.median(
+            [np.quantile(sample.signal_dn, _BRIGHT_QUANTILE) for sample in first_samples.values()]
+        )
+        longer = min(place + _PROBE_STEPS, len(exposure.exposures_us) - 1)
+        if bright_dn < _DARK_SHARE * evidence.full_dn and view.leds_taken_twice and longer > place:
+            dark_leds = [led for led in view.leds_taken_twice if led not in clipped_leds]
+            bursts += (
+                [self._burst(longer, dark_leds), self._burst(longer, dark_leds, repeat=1)] if dark_leds else []
+            )
+        return bursts
+
+    # -- all LEDs -----------------------------------------------------------------------------------------
+
+    def _for_all(self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]) -> Choice:
+        limits = self._limits(view, evidence, lux_of_led)
+        bursts = [view.burst(place) for place in range(len(evidence.times_us))]
+        dark_s = np.median([burst.duration_s - len(burst.inner) * _period_s(burst) for burst in bursts])
+        places_of_leds = chosen_times(
+            limits,
+            [_period_s(burst) for burst in bursts],
+            range_steps=evidence.range_steps,
+            most=self._exposure.most_exposures,
+            burst_s=_BURST_S + float(dark_s),
+        )
+        leds_at: dict[int, list[int]] = {}
+        for led, places in zip(view.leds.tolist(), places_of_leds, strict=True):
+            taken_places = evidence.taken.get(led, [])
+            new_places = [p for p in self._still_needed(places, taken_places) if p not in taken_places]
+            for place in new_places[: self._exposure.most_exposures - len(taken_places)]:
+                leds_at.setdefault(place, []).append(led)
+        chosen_bursts = sorted(
+            (self._burst(place, leds) for place, leds in leds_at.items()), key=lambda b: len(b.leds)
+        )
+        figures = _figures(evidence) | {
+            "longest_us": _quartiles(evidence.times_us[np.maximum(limits.longest, 0)]),
+            "shortest_us": _quartiles(evidence.times_us[limits.shortest]),
+        }
+        return Choice(
+            bursts=tuple(chosen_bursts),
+            reason=_in_words("all LEDs, by the first pass", chosen_bursts),
+            figures=figures,
+        )
+
+    @staticmethod
+    def _still_needed(places: Sequence[int], taken_places: Sequence[int]) -> list[int]:
+        """The places that exposures at `taken_places` do not replace: the ends that lie beyond them first."""
+        if not taken_places:
+            return list(places)
+        ends = [places[0]] if places[0] < taken_places[0] else []
+        ends += [places[-1]] if places[-1] > taken_places[-1] and places[-1] not in ends else []
+        return ends
+
+    def _limits(self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]) -> LightLimits:
+        """Limits of all LEDs, from those of the first pass."""
+        judgement = [evidence.judge(led) for led in evidence.first_leds]
+        first_lux = np.array([lux_of_led[led] for led in evidence.first_leds])
+        lux = np.array([lux_of_led[led] for led in view.leds.tolist()])
+        weights = self._weights(view, evidence.first_leds)
+        full_rates = lux * np.exp(weights @ np.log([max(j.full_rate, 1e-9) for j in judgement] / first_lux))
+        dim_rates = lux * np.exp(weights @ np.log([max(_dim_rate(j), 1e-9) for j in judgement] / first_lux))
+        seen_before = np.isin(view.leds, evidence.first_leds)
+        longest_us = FULL * evidence.full_dn / full_rates * np.where(seen_before, 1.0, _UNSEEN_LIGHTS)
+        shortest_us = _NOISE_MARGIN * evidence.noise.signal_for(self._exposure.snr) / dim_rates
+        return LightLimits(
+            longest=np.searchsorted(evidence.times_us, longest_us, side="right") - 1,
+            shortest=np.minimum(np.searchsorted(evidence.times_us, shortest_us), len(evidence.times_us) - 1),
+        )
+
+    def _weights(self, view: OpenView, first_leds: Sequence[int]) -> Floats:
+        """[leds, first] of the first LEDs for each LED, by direction from the view's target."""
+        target_mm = apply(self._base_from_support, np.array([view.target_mm or (0.0, 0.0, 0.0)]))
+        ways, first_ways = (
+            way / np.linalg.norm(way, axis=1, keepdims=True)
+            for way in (
+                self._leds.positions_mm[self._leds.rows(ids)] - target_mm for ids in (view.leds, first_leds)
+            )
+        )
+        square = np.maximum(2.0 - 2.0 * ways @ first_ways.T, 1e-9)
+        nearest = np.sort(square, axis=1)[:, [min(_NEIGHBOURS, len(first_leds)) - 1]]
+        weights = np.where(square <= nearest, 1.0 / square, 0.0)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    # -- corrections --------------------------------------------------------------------------------------
+
+    def _correction(self, evidence: Evidence, *, is_over: bool, again: int) -> Choice:
+        """One more exposure for each LED that is not exposed as asked for; none if all are, or the rounds
+        `is_over`."""
+        exposure, last = self._exposure, len(evidence.times_us) - 1
+        shorter: dict[int, int] = {}
+        longer: dict[int, int] = {}
+        clipped_count, noisy_count = 0, 0
+        for led, places in evidence.taken.items():
+            judgement = evidence.judge(led)
+            remaining = exposure.most_exposures - len(places)
+            if judgement.clipped_share > exposure.clipped_share:
+                clipped_count += 1
+                if remaining > 0 and places[0] > 0:
+                    shorter[led], remaining = max(0, places[0] - _CORRECTION_STEPS * again), remaining - 1
+            if judgement.reached_share < exposure.object_share:
+                noisy_count += 1
+                if remaining > 0 and places[-1] < last:
+                    stops = 2.0 * math.log2(
+                        max(_NOISE_MARGIN * exposure.snr / max(judgement.snr_of_dim, 1e-3), 1.0)
+                    )
+                    steps = max(1, math.ceil(STEPS_PER_STOP * stops))
+                    longer[led] = min(last, places[-1] + steps)
+        figures = _figures(evidence) | {
+            "leds": len(evidence.taken),
+            "clipped_leds": clipped_count,
+            "noisy_leds": noisy_count,
+        }
+        if is_over or not (shorter or longer):
+            return Choice(
+                bursts=(), reason=_conclusion(len(evidence.taken), clipped_count, noisy_count), figures=figures
+            )
+        bursts = [self._burst(place, leds) for place, leds in _in_groups(shorter, min).items()]
+        bursts += [self._burst(place, leds) for place, leds in _in_groups(longer, max).items()]
+        reason = _in_words(f"{clipped_count} LEDs clip, {noisy_count} are too noisy", bursts)
+        return Choice(bursts=tuple(_one_for_each_exposure(bursts)), reason=reason, figures=figures)
+
+    # -- small things -------------------------------------------------------------------------------------
+
+    def _lux(self, view: OpenView) -> Floats:
+        """[leds] illuminance at the view's target by the LED table, over its median."""
+        target_mm = np.array([view.target_mm or (0.0, 0.0, 0.0)])
+        lux = self._leds.illuminance_lux(apply(self._base_from_support, target_mm), emission=self._emission)
+        of_view = lux[0, self._leds.rows(view.leds)]
+        relative: Floats = np.maximum(of_view / max(float(np.median(of_view)), 1e-12), 1e-3)
+        return relative
+
+    def _burst(self, place: int, leds: Iterable[int], *, repeat: int = 0) -> ChosenBurst:
+        exposure_us = self._exposure.exposures_us[place]
+        return ChosenBurst(exposure=place, exposure_us=exposure_us, repeat=repeat, leds=tuple(sorted(leds)))
+
+
+def _dim_rate(judgement: Judgement) -> float:
+    """The rate by which the shortest exposure of an LED follows; one that lights nothing asks for none."""
+    return judgement.dim_rate if judgement.dim_rate > 0.0 else judgement.full_rate
+
+
+def _period_s(burst: Any) -> float:
+    return float(burst.timing.period_us) * 1e-6
+
+
+def _in_groups(place_of_led: Mapping[int, int], representative: Any) -> dict[int, list[int]]:
+    """LEDs by place, of at most two places: where there are more, the widest gap divides them, and each part gets
+    what its outermost asks for."""
+    places = sorted(set(place_of_led.values()))
+    if not places:
+        return {}
+    parts = [places]
+    if len(places) >= _BURSTS_OF_A_CORRECTION:
+        widest = 1 + int(np.argmax(np.diff(places)))
+        parts = [places[:widest], places[widest:]]
+    place_for = {place: representative(part) for part in parts for place in part}
+    leds_at: dict[int, list[int]] = {}
+    for led, place in place_of_led.items():
+        leds_at.setdefault(place_for[place], []).append(led)
+    return leds_at
+
+
+def _one_for_each_exposure(bursts: Iterable[ChosenBurst]) -> list[ChosenBurst]:
+    """The same with one burst for each exposure, the smallest first: its table is in the box soonest."""
+    leds_at: dict[int, ChosenBurst] = {}
+    for burst in bursts:
+        before = leds_at.get(burst.exposure)
+        leds = tuple(sorted({*burst.leds, *(before.leds if before else ())}))
+        leds_at[burst.exposure] = burst.model_copy(update={"leds": leds})
+    return sorted(leds_at.values(), key=lambda burst: (len(burst.leds), burst.exposure))
+
+
+def _in_words(purpose: str, bursts: Iterable[ChosenBurst]) -> str:
+    parts = [
+        f"{len(burst.leds)} LEDs at {burst.exposure_us / 1e3:g} ms" + (" again" if burst.repeat else "")
+        for burst in bursts
+    ]
+    return f"{purpose}: {', '.join(parts) or 'no more'}"
+
+
+def _conclusion(leds: int, clipped_count: int, noisy_count: int) -> str:
+    if not clipped_count and not noisy_count:
+        return f"all {leds} LEDs are exposed as asked for"
+    parts = [f"{clipped_count} of {leds} LEDs clip more than allowed"] if clipped_count else []
+    parts += [f"{noisy_count} of {leds} LEDs are noisier than asked for"] if noisy_count else []
+    return f"{' and '.join(parts)}; the plan allows no more"
+
+
+def _figures(evidence: Evidence) -> dict[str, Any]:
+    noise = evidence.noise
+    return {"read_dn": round(noise.read_dn, 4), "gain_dn": round(noise.gain_dn, 6)}
+
+
+def _quartiles(values: Floats) -> list[float]:
+    return [round(float(value), 1) for value in np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))]

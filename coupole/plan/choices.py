@@ -174,11 +174,26 @@ def bound_of(whole: Sequence[Burst], frames_of_light: int, again: Collection[int
     return tuple(bursts)
 
 
+def bound_of_lights(whole: Burst, sizes: Iterable[int]) -> tuple[Burst, ...]:
+    """The bound of a view whose LEDs are chosen among those of the burst `whole`: its first LEDs, in bursts of
+    these sizes."""
+    labels = [label for label in whole.labels if label and label.is_shot]
+    darks = {label for label in whole.labels if label and label.is_dark}
+    bursts, begin = [], 0
+    for size in sizes:
+        if part := labels[begin : begin + size]:
+            bursts.append(whole.only({*part, *(darks if begin == 0 else ())}))
+        begin += size
+    return tuple(bursts)
+
+
 def refuse_beyond(bound: Sequence[Burst], bursts: Sequence[Burst]) -> None:
     """Raise RuntimeError if `bursts`, all that were chosen for a view, are more than its bound: more bursts, more
-    frames, or an LED lit for longer. Preflight would not have known of it."""
-    allowed_us, asked_us = _on_us(bound), _on_us(bursts)
-    too_long = {led for led, on_us in asked_us.items() if on_us > allowed_us[led]}
+    frames, or LEDs lit for longer, the longest compared with the longest. Preflight would not have known of it."""
+    allowed_us = sorted(_on_us(bound).values(), reverse=True)
+    asked_us = sorted(_on_us(bursts).items(), key=lambda item: -item[1])
+    allowed_us += [0] * (len(asked_us) - len(allowed_us))
+    too_long = {led for (led, on_us), most_us in zip(asked_us, allowed_us, strict=False) if on_us > most_us}
     frames = sum(label is not None for burst in bursts for label in burst.labels)
     allowed_frames = sum(label is not None for burst in bound for label in burst.labels)
     if too_long or frames > allowed_frames or len(bursts) > len(bound):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform, direction, inverse
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import (
+    AdaptiveLights,
     AllLights,
     EveryLight,
     LightBoards,
@@ -51,6 +52,8 @@ def select_leds(lights: Lights, leds: LedTable, base_from_support: Transform) ->
             towards = position / np.linalg.norm(position, axis=1, keepdims=True)
             cosine = towards @ direction(cone.azimuth_deg, cone.elevation_deg)
             return np.flatnonzero(cosine >= np.cos(np.radians(cone.half_angle_deg)))
+        case AdaptiveLights(among=among):
+            return select_leds(among, leds, base_from_support)
         case Panels() | NoLights():
             return np.zeros(0, np.int64)
         case _:
@@ -61,7 +64,7 @@ def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) 
     """Return what each burst of one exposure lights: one burst for all LEDs, in which neighbours in time are on
     different boards, or one for each panel. Raises KeyError as `select_leds`."""
     match lights:
-        case AllLights() | LightIds() | LightBoards() | EveryLight() | LightCone() | NoLights():
+        case AllLights() | LightIds() | LightBoards() | EveryLight() | LightCone() | AdaptiveLights() | NoLights():
             rows = select_leds(lights, leds, base_from_support)
             return [[Led(int(led)) for led in leds.ids[rows[interleave(leds.boards[rows])]]]]
         case Panels(panels=panels):
@@ -117,6 +120,8 @@ def _missing(
             return [(("offset",), f"expected less than the dome's {len(leds.ids)} LEDs, found {offset}")]
         case LightCone() if not len(select_leds(lights, leds, base_from_support)):
             return [((), "expected lights, none of the dome's LEDs lies in that cone")]
+        case AdaptiveLights(among=among):
+            return [(("among", *key), message) for key, message in _missing(among, leds, base_from_support)]
         case AllLights() | EveryLight() | LightCone() | Panels() | NoLights():
             return []
         case _:

@@ -153,8 +153,58 @@ class NoLights(Model):
     """Dark frames only."""
 
 
+MOST_ADAPTIVE_BURSTS = 128
+"""Bursts of one view whose LEDs are chosen, at most."""
+
+LedSelection = Annotated[AllLights | LightIds | LightBoards | EveryLight | LightCone, Field(discriminator="kind")]
+
+
+class EnoughLights(Model):
+    """What ends the choice of LEDs of a view; what comes first counts."""
+
+    lights: Annotated[int, Field(ge=6, le=65535)]
+    """LEDs of one view, at most: it bounds time, heat, bytes and light."""
+    relit_rms: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Expected rms error of pictures interpolated for the LEDs not lit, as a share of the view's bright level."""
+    seconds: Annotated[float, Field(gt=0)] | None = None
+    """Time of the view's bursts, at most."""
+    lux_h: Annotated[float, Field(gt=0)] | None = None
+    """Light at the view's target by the LED table, at most."""
+
+
+class AdaptiveLights(Model):
+    """LEDs that are chosen in the run, by what those before them have shown of the view."""
+
+    kind: Literal["adaptive"]
+    """LEDs that are chosen in the run, by what those before them have shown of the view."""
+    until: EnoughLights
+    """What ends the choice."""
+    among: LedSelection = AllLights(kind="all")
+    """LEDs from which is chosen."""
+    first_lights: Annotated[int, Field(ge=6, le=200)] = 24
+    """LEDs of the first burst, spread over the dome."""
+    burst_lights: Annotated[int, Field(ge=1, le=256)] = 32
+    """LEDs of each burst after it."""
+
+    @property
+    def burst_sizes(self) -> tuple[int, ...]:
+        """LEDs of each burst of a view, if all are lit that may be."""
+        first = min(self.first_lights, self.until.lights)
+        full, rest = divmod(self.until.lights - first, self.burst_lights)
+        return (first, *(self.burst_lights,) * full, *((rest,) if rest else ()))
+
+    @model_validator(mode="after")
+    def _few_bursts(self) -> AdaptiveLights:
+        if (bursts := len(self.burst_sizes)) > MOST_ADAPTIVE_BURSTS:
+            raise ValueError(
+                f"at most {MOST_ADAPTIVE_BURSTS} bursts of a view, found {bursts}: raise `burst_lights`"
+            )
+        return self
+
+
 Lights = Annotated[
-    AllLights | LightIds | LightBoards | EveryLight | LightCone | Panels | NoLights, Field(discriminator="kind")
+    AllLights | LightIds | LightBoards | EveryLight | LightCone | AdaptiveLights | Panels | NoLights,
+    Field(discriminator="kind"),
 ]
 
 
@@ -374,6 +424,21 @@ class Plan(Model):
         lights = [view.lights or self.lights for view in self.views]
         if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
             raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
+        return self
+
+    @property
+    def chooses_lights(self) -> bool:
+        """True if LEDs of some view are chosen in the run."""
+        return any(isinstance(view.lights or self.lights, AdaptiveLights) for view in self.views)
+
+    @model_validator(mode="after")
+    def _one_exposure_of_chosen_lights(self) -> Plan:
+        if not self.chooses_lights:
+            return self
+        if not isinstance(self.exposure, FixedExposure) or self.repeats > 1:
+            raise ValueError("`exposure: {kind: fixed}` and `repeats: 1` with `lights: {kind: adaptive}`")
+        if any(isinstance(view.lights or self.lights, NoLights | Panels) for view in self.views):
+            raise ValueError("LEDs in each view with `lights: {kind: adaptive}` in one; no panels, no darks alone")
         return self
 
     @model_validator(mode="after")

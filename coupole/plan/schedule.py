@@ -8,11 +8,11 @@ from typing import assert_never
 
 from coupole.geometry import Transform, look_at
 from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
-from coupole.plan.choices import Choice, OpenView, bound_of, has_enough
+from coupole.plan.choices import Choice, OpenView, bound_of, bound_of_lights, has_enough
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights, lit_in_bursts
 from coupole.plan.marks import MARKS, Marks
-from coupole.plan.plan import AutoExposure, Grid, Joints, Lights, LookAt, Plan, View
+from coupole.plan.plan import AdaptiveLights, AutoExposure, Grid, Joints, Lights, LookAt, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
@@ -76,7 +76,15 @@ class Schedule:
             )
 
         choosable = without_hidden(self.choosable) if self.choosable else ()
-        return replace(self, bursts=without_hidden(self.bursts), choosable=choosable)
+        if not all(len(of_view) == 1 for of_view in choosable):  # exposures are chosen, not LEDs
+            return replace(self, bursts=without_hidden(self.bursts), choosable=choosable)
+        if not choosable:
+            return replace(self, bursts=without_hidden(self.bursts))
+        bounds = tuple(
+            bound_of_lights(whole[0], [int(burst.is_light().sum()) for burst in bound])
+            for whole, bound in zip(choosable, self.bursts, strict=True)
+        )
+        return replace(self, bursts=bounds, choosable=choosable)
 
     def with_choices(self, choices: Mapping[str, Sequence[Choice]]) -> Schedule:
         """The same with the bursts that were chosen for views that have enough (by name of view), in place of
@@ -203,7 +211,25 @@ def build_schedule(
         tuple(label for burst in view_bursts for label in burst.labels if label) for view_bursts in bursts
     )
     schedule = Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
-    return _open_schedule(schedule, plan.exposure, leds) if isinstance(plan.exposure, AutoExposure) else schedule
+    if isinstance(plan.exposure, AutoExposure):
+        return _open_schedule(schedule, plan.exposure, leds)
+    return _with_open_lights(schedule, plan) if plan.chooses_lights else schedule
+
+
+def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
+    """The schedule of a plan whose LEDs are chosen in the run, in some of its views."""
+    bounds: dict[tuple[int, Lights], tuple[Burst, ...]] = {}
+    bursts_of_views = []
+    lights_of_views = [view.lights or plan.lights for view in plan.views for _ in expand_view(view)]
+    for view, lights, bursts in zip(schedule.views, lights_of_views, schedule.bursts, strict=True):
+        if isinstance(lights, AdaptiveLights):
+            key = id(bursts[0].table), lights  # views with the same lights share tables
+            if key not in bounds:
+                bounds[key] = bound_of_lights(bursts[0], lights.burst_sizes)
+            bursts_of_views.append(tuple(replace(burst, view=view.name) for burst in bounds[key]))
+        else:
+            bursts_of_views.append(bursts)
+    return replace(schedule, bursts=tuple(bursts_of_views), choosable=schedule.bursts)
 
 
 def _open_schedule(schedule: Schedule, exposure: AutoExposure, leds: LedTable) -> Schedule:

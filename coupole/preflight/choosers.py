@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from coupole.plan.choices import Chooser
 from coupole.plan.plan import AutoExposure
+from coupole.plan.schedule import expand_view
+from coupole.preflight.adaptive_lights import AdaptiveLightsChooser
 from coupole.preflight.auto_exposure import AutoExposureChooser
 from coupole.preflight.job import Job
 
 
 def chooser_of(job: Job) -> Chooser | None:
     """The chooser that the job's plan asks for; None if the plan says all bursts itself."""
-    exposure, rig = job.plan.exposure, job.cell.rig
-    if not isinstance(exposure, AutoExposure):
-        return None
+    plan, rig, leds = job.plan, job.cell.rig, job.cell.leds
     base_from_support = rig.support.base_from_support.matrix()
-    return AutoExposureChooser(exposure, job.cell.leds, base_from_support, emission=rig.dome.emission)
+    if isinstance(plan.exposure, AutoExposure):
+        return AutoExposureChooser(plan.exposure, leds, base_from_support, emission=rig.dome.emission)
+    if plan.chooses_lights:
+        lights = {pose.name: view.lights or plan.lights for view in plan.views for pose in expand_view(view)}
+        return AdaptiveLightsChooser(lights, leds, base_from_support, emission=rig.dome.emission)
+    return None

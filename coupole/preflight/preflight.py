@@ -6,6 +6,7 @@ LED, the limit and the value.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from coupole.devices import NO_LED
 from coupole.geometry import apply
 from coupole.motion.itinerary import Itinerary
 from coupole.plan.bursts import BurstTiming
-from coupole.plan.choices import MOST_CHOICES
+from coupole.plan.choices import MOST_CHOICES, OpenView
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
@@ -198,7 +199,9 @@ def _time_and_dose(
         move_s = (visit.leg.duration_s if visit and visit.leg.waypoints else 0.0) + rig.motion.settle_dwell_s
         burst_s = sum(b.duration_s for b in bursts)
         dose = np.zeros(len(total))
-        for burst in bursts:
+        if plan.chooses_lights:
+            dose = _most_dose(schedule.open_view(index), lux, row_of_id)
+        for burst in () if plan.chooses_lights else bursts:
             if id(burst.table) not in dose_of_table:
                 lit = burst.table[burst.table["led"] != NO_LED]
                 rows = [row_of_id[int(led)] for led in lit["led"]]
@@ -209,7 +212,8 @@ def _time_and_dose(
         total += dose
         waiting_s = max(0.0, upload_s(rig, len(bursts[0].table)) - move_s) if not report.views else 0.0
         if schedule.is_open:  # a table is uploaded when it has been chosen
-            waiting_s += MOST_CHOICES * (CHOICE_S + upload_s(rig, max(len(burst.table) for burst in bursts)))
+            choices = len(bursts) if plan.chooses_lights else MOST_CHOICES
+            waiting_s += choices * (CHOICE_S + upload_s(rig, max(len(burst.table) for burst in bursts)))
         report.ideal_s += move_s + burst_s
         report.duration_s += move_s + SETTLE_CHECK_S + waiting_s + burst_s + BURST_OVERHEAD_S * len(bursts)
         report.views.append(
@@ -229,6 +233,14 @@ def _time_and_dose(
             f"object {plan.object.id}: the plan gives it {report.dose_lux_h:.2f} lux.h after "
             f"{report.dose_before_lux_h:.2f} lux.h before; its budget is {budget:g} lux.h"
         )
+
+
+def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int, int]) -> NDArray[np.float64]:
+    """[points] light of a view whose LEDs are chosen: at each point the brightest there may be among them."""
+    on_us = np.concatenate([burst.table["on_us"][burst.is_light()] for burst in view.bound])
+    rows = [row_of_id[led] for led in view.leds.tolist()]
+    brightest = np.sort(lux[:, rows], axis=1)[:, ::-1][:, : len(on_us)]
+    return np.asarray(brightest @ np.sort(on_us)[::-1].astype(np.float64) / 3.6e9)
 
 
 def _storage(report: Report, rig: Rig, schedule: Schedule, storage: StorageFacts) -> None:

@@ -1,0 +1,161 @@
+"""Chooses LEDs in the run, by what those before them have shown of the view (`lights: {kind: adaptive}`).
+
+The first burst is spread over the dome. After each burst `next_lights` says by how much pictures for the LEDs not
+yet lit would miss, and which LEDs tell most beside those lit. Pixels are divided by the illuminance that the LED
+table gives at the view's target. Neither mesh nor records are needed: what is judged are the frames themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import Transform, apply
+from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
+from coupole.plan.led_table import LedTable
+from coupole.plan.plan import AdaptiveLights, Lights
+from coupole.plan.shot_id import Led, ShotLabel
+from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights, spread_lights
+
+Floats = NDArray[np.float64]
+
+_SITES = 2048
+"""Pixels by which LEDs are judged, about."""
+BRIGHT_QUANTILE = 0.999
+"""Share of the pixels and LEDs below the view's bright level."""
+
+
+class AdaptiveLightsChooser:
+    """The `Chooser` of plans with `lights: {kind: adaptive}` in some view; other views get all their LEDs."""
+
+    def __init__(
+        self,
+        lights: Mapping[str, Lights],
+        leds: LedTable,
+        base_from_support: Transform,
+        *,
+        emission: str = "lambertian",
+    ) -> None:
+        """`lights`: by name of view."""
+        self._lights, self._leds, self._emission = lights, leds, emission
+        self._base_from_support = base_from_support
+
+    def choose(
+        self, view: OpenView, choices: Sequence[Choice], samples: Mapping[ShotLabel, FrameSample]
+    ) -> Choice:
+        """See `coupole.plan.choices.Chooser`."""
+        lights = self._lights[view.name]
+        if not isinstance(lights, AdaptiveLights):
+            every = tuple(sorted(view.leds.tolist()))
+            return self._choice(view, () if choices else every, "all LEDs of the plan" if not choices else "all")
+        if not choices:
+            spread_ids = view.leds[spread_lights(self._ways(view), np.arange(len(view.leds)), lights.first_lights)]
+            first_ids = self._affordable(view, lights, spread_ids[: lights.until.lights].tolist(), 0, 0)
+            return self._choice(view, first_ids, f"{len(first_ids)} LEDs spread over the dome")
+        return self._next(view, lights, choices, samples)
+
+    def _next(
+        self,
+        view: OpenView,
+        lights: AdaptiveLights,
+        choices: Sequence[Choice],
+        samples: Mapping[ShotLabel, FrameSample],
+    ) -> Choice:
+        lit_ids = [led for choice in choices for burst in choice.bursts for led in burst.leds]
+        is_seen = [ShotLabel(Led(led), view.bursts[0].exposure_index, 0) in samples for led in lit_ids]
+        seen_ids = [led for led, seen in zip(lit_ids, is_seen, strict=True) if seen]
+        if len(seen_ids) < FEWEST_TAKEN:
+            return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few to choose by")
+        values = self._values(view, seen_ids, samples)
+        row_of = {led: row for row, led in enumerate(view.leds.tolist())}
+        unlit = np.setdiff1d(np.arange(len(view.leds)), [row_of[led] for led in lit_ids])
+        count = min(lights.burst_lights, lights.until.lights - len(lit_ids))
+        following = next_lights(
+            values, self._ways(view), np.array([row_of[led] for led in seen_ids]), unlit, count
+        )
+        bright = float(np.quantile(values, BRIGHT_QUANTILE)) or 1.0
+        next_ids = view.leds[following.lights].tolist()
+        affordable_ids = self._affordable(view, lights, next_ids, len(lit_ids), len(choices))
+        figures = _figures(view, following, bright, len(lit_ids))
+        if reason := _enough(lights, figures, len(unlit), len(affordable_ids)):
+            return Choice(bursts=(), reason=reason, figures=figures)
+        missed, after = 100.0 * figures["relit_rms"], 100.0 * figures["relit_rms_after"]
+        reason = (
+            f"{len(affordable_ids)} LEDs that tell most: expected error {missed:.2f} %, {after:.2f} % after them"
+        )
+        return self._choice(view, affordable_ids, reason, figures)
+
+    def _affordable(
+        self, view: OpenView, lights: AdaptiveLights, ids: list[int], lit_before: int, bursts_before: int
+    ) -> list[int]:
+        """The first of the LEDs, as many as time and light allow, if `lit_before` were lit in `bursts_before`.
+        Each LED counts as bright as the brightest."""
+        until, whole = lights.until, view.bursts[0]
+        count = len(ids)
+        if until.seconds is not None:
+            period_s = whole.timing.period_us * 1e-6
+            marks_s = whole.duration_s - len(view.leds) * period_s
+            left_s = until.seconds - lit_before * period_s - (bursts_before + 1) * marks_s
+            count = min(count, int(left_s / period_s) if left_s > 0 else 0)
+        if until.lux_h is not None:
+            led_lux_h = float(self._lux(view).max()) * whole.timing.on_us / 3.6e9
+            count = min(count, max(0, int(until.lux_h / led_lux_h) - lit_before))
+        return ids[:count]
+
+    def _values(self, view: OpenView, seen_ids: Sequence[int], samples: Mapping[ShotLabel, FrameSample]) -> Floats:
+        """[seen, sites] signal for unit illuminance."""
+        exposure = view.bursts[0].exposure_index
+        signals = [samples[ShotLabel(Led(led), exposure, 0)].signal_dn for led in seen_ids]
+        step = max(1, len(signals[0]) // _SITES) | 1  # odd: pixels of all colours
+        row_of = {led: row for row, led in enumerate(view.leds.tolist())}
+        lux = self._lux(view)[[row_of[led] for led in seen_ids]]
+        shown = np.stack([signal[::step] for signal in signals]).astype(np.float64)
+        return np.asarray(shown / (lux / lux.mean())[:, None])
+
+    def _choice(
+        self, view: OpenView, ids: Sequence[int], reason: str, figures: Mapping[str, Any] | None = None
+    ) -> Choice:
+        burst = view.bursts[0]
+        chosen_burst = ChosenBurst(
+            exposure=burst.exposure_index, exposure_us=burst.timing.exposure_us, leds=tuple(sorted(ids))
+        )
+        return Choice(bursts=(chosen_burst,) if len(ids) else (), reason=reason, figures=dict(figures or {}))
+
+    def _target_base_mm(self, view: OpenView) -> Floats:
+        return np.asarray(apply(self._base_from_support, np.array([view.target_mm or (0.0, 0.0, 0.0)])))
+
+    def _lux(self, view: OpenView) -> Floats:
+        """[leds] illuminance at the view's target by the LED table, lux."""
+        lux = self._leds.illuminance_lux(self._target_base_mm(view), emission=self._emission)[0]
+        of_view = lux[self._leds.rows(view.leds)]
+        return np.asarray(np.maximum(of_view, 1e-6 * float(of_view.max())))
+
+    def _ways(self, view: OpenView) -> Floats:
+        """[leds, 3] unit vectors from the view's target."""
+        ways = self._leds.positions_mm[self._leds.rows(view.leds)] - self._target_base_mm(view)
+        return np.asarray(ways / np.linalg.norm(ways, axis=1, keepdims=True))
+
+
+def _figures(view: OpenView, following: NextLights, bright: float, lit: int) -> dict[str, Any]:
+    return {
+        "lights": lit,
+        "relit_rms": float(f"{following.expected_rms / bright:.4g}"),
+        "relit_rms_after": float(f"{following.expected_rms_after / bright:.4g}"),
+        "first": [int(led) for led in view.leds[following.lights[:1]]],
+        "next_best": [int(view.leds[light]) for light in following.alternatives],
+    }
+
+
+def _enough(lights: AdaptiveLights, figures: Mapping[str, Any], unlit: int, affordable: int) -> str:
+    """The reason for no more LEDs; empty if there is none."""
+    missed, until = f"expected error {100.0 * figures['relit_rms']:.2f} %", lights.until
+    if until.relit_rms is not None and figures["relit_rms"] <= until.relit_rms:
+        return f"enough by `relit_rms`: {missed} of at most {100.0 * until.relit_rms:g} %"
+    if unlit == 0:
+        return f"all LEDs of the view are lit; {missed}"
+    if figures["lights"] >= until.lights:
+        return f"enough by `lights`: {until.lights} LEDs are lit; {missed}"
+    return f"enough by `seconds` or `lux_h`: the plan allows no more LEDs; {missed}" if affordable == 0 else ""

@@ -86,6 +86,10 @@ EXAMPLES: dict[str, tuple[str, str]] = {
         "reflectance cluster RESULT --clusters 40",
         "reflectance cluster RESULT --degrees 12 --memory 4GB",
     ),
+    "reflectance choose": (
+        "reflectance choose --pictures PICTURES --lights lights.lp --count 16",
+        "reflectance choose --pictures PICTURES --lights lights.lp --count 40 --until 0.02 --to chosen.json",
+    ),
     "reflectance refine": (
         "reflectance refine RUN --out refined",
         "reflectance refine RUN RUN2 --out refined --arm-mm 0.2",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coupole.commands.choose_pictures import choose
 from coupole.commands.common import JobOrStep, JsonOption, ResultArgument
 from coupole.commands.common import fail as fail_with
 from coupole.commands.option_groups import flatten_options
@@ -299,5 +300,6 @@ def _do(step: Callable[[Said], dict[str, Any]], *, as_json: bool) -> None:
         print(f"report {document['report']}")
 
 
+reflectance_app.command()(choose)
 reflectance_app.command()(refine)
 reflectance_app.command()(relight)

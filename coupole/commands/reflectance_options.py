@@ -13,6 +13,7 @@ from coupole.commands.common import MeshOption, RecordsOption
 from coupole.errors import InputError
 
 if TYPE_CHECKING:
+    from coupole.reflectance.picture_set import PictureSet
     from coupole.reflectance.run_job import RunRequest
 
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder of the result.", show_default=False)]
@@ -155,6 +156,27 @@ class PicturesWithoutRecords:
     mask: MaskOption = None
     is_uncalibrated: UncalibratedOption = False
     view: ViewOption = None
+
+
+@dataclass(frozen=True)
+class KnownPictures:
+    """Pictures under known lights."""
+
+    pictures: PicturesOption = None
+    lights: LightsOption = None
+    srgb: SrgbOption = False
+    intensities: IntensitiesOption = None
+    mask: MaskOption = None
+
+    def read(self) -> PictureSet:
+        """The set, without its pictures. Raises InputError."""
+        from coupole.reflectance.picture_set import read_pictures
+
+        if self.pictures is None or self.lights is None:
+            raise InputError("expected --pictures with the folder, and --lights with the file of the directions")
+        return read_pictures(
+            self.pictures, self.lights, intensities=self.intensities, mask=self.mask, srgb=self.srgb
+        )
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ FEWEST_TAKEN = 6
 _RANGE_RAD = np.radians(60.0)
 """Angle over which errors are alike; 25 degrees choose about the same."""
 _NUGGET = 1e-6
+_LEAST_SPACING_RAD = 1e-3
 _LEAST_SHARE = 1e-6
 """Least error of a light, as a share of the largest: nothing is known for certain."""
 _ALTERNATIVES = 3
@@ -62,10 +63,10 @@ def left_out_squares(values: Floats, directions: Floats) -> Floats:
     from `directions` [n, 3]."""
     count = len(directions)
     tail = np.hstack([np.ones((count, 1)), directions])
-    system = np.zeros((count + 4, count + 4))
-    system[:count, :count] = -np.linalg.norm(directions[:, None] - directions[None], axis=2)
-    system[:count, count:], system[count:, :count] = tail, tail.T
-    inverse = np.linalg.pinv(system, rcond=1e-12)[:count, :count]
+    apart = np.sqrt(np.maximum(2.0 - 2.0 * directions @ directions.T, 0.0))
+    # the small terms let lights stand twice in a direction, or all in one plane
+    system = np.block([[_NUGGET * np.eye(count) - apart, tail], [tail.T, -_NUGGET * np.eye(4)]])
+    inverse = np.linalg.inv(system)[:count, :count]
     own = np.diag(inverse)
     is_fixed = np.abs(own) < 1e-9 * np.abs(own).max()  # a light that the others do not predict at all
     errors = inverse @ values / np.where(is_fixed, np.inf, own)[:, None]
@@ -116,7 +117,7 @@ def _error_covariance(values: Floats, directions: Floats, taken: NDArray[np.int6
     strength = left_out_squares(values, directions[taken]) / left_out_variance
     strength = np.maximum(strength, _LEAST_SHARE * strength.max() + 1e-300)
     between = angle[np.ix_(taken, taken)] + np.pi * np.eye(len(taken))
-    spacing = float(between.min(axis=1).mean())
+    spacing = max(float(between.min(axis=1).mean()), _LEAST_SPACING_RAD)
     weights = np.exp(-0.5 * (angle[:, taken] / spacing) ** 2) + 1e-12
     local = np.exp(0.5 * (weights @ np.log(strength)) / weights.sum(axis=1))
     covariance: Floats = plain * np.outer(local, local)

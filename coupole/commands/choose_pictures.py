@@ -1,0 +1,68 @@
+"""The command `coupole reflectance choose`: few pictures instead of all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coupole.commands.common import JsonOption
+from coupole.commands.common import fail as fail_with
+from coupole.commands.option_groups import flatten_options
+from coupole.commands.reflectance_options import KnownPictures
+from coupole.errors import CoupoleError
+
+
+@flatten_options
+def choose(
+    count: Annotated[int, typer.Option("--count", min=6, help="Lights that are chosen, at most.")],
+    *,
+    known: KnownPictures,
+    until: Annotated[
+        float | None,
+        typer.Option(
+            "--until",
+            min=1e-6,
+            max=1.0,
+            help="Stop when pictures interpolated for the lights not chosen are expected to be off by no more "
+            "than this (rms, as a share of the pictures' bright level).",
+        ),
+    ] = None,
+    first: Annotated[int, typer.Option("--first", min=6, help="Lights to begin with, spread over the dome.")] = 6,
+    at_a_time: Annotated[int, typer.Option("--at-a-time", min=1, help="Lights chosen before the next look.")] = 1,
+    to: Annotated[Path | None, typer.Option("--to", help="Write the choice into this file (JSON).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Choose, among pictures under known distant lights, the few that tell most; only those are read.
+
+    Lights are counted from 0. `left_out` of the JSON is what `coupole reflectance --leave-out` takes.
+    """
+    from coupole.viewing.terminal import make_console, step_bars
+
+    console = make_console(quiet=as_json)
+    try:
+        from coupole.reflectance.picture_choice import HowMany, choose_pictures
+        from coupole.storage.durable import write_synced
+
+        pictures = known.read()
+        with step_bars(console) as say:
+            choice = choose_pictures(
+                pictures,
+                HowMany(count, until, first, at_a_time),
+                say=lambda done, of: say("pictures that are read", done, of),
+            )
+        if to is not None:
+            write_synced(to, json.dumps(choice, indent=1) + "\n")
+    except CoupoleError as error:
+        fail_with(error, as_json=as_json)
+        raise
+    for step in choice["steps"]:
+        following = ", ".join(f"{light} ({pictures.files[light].name})" for light in step["next"]) or "no more"
+        console.print(
+            f"{step['lights']:4d} lights, expected error {100 * step['relit_rms']:.2f} %; next {following}"
+        )
+    console.print(f"chosen: {','.join(map(str, choice['chosen']))}")
+    if as_json:
+        print(json.dumps(choice))

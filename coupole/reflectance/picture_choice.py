@@ -1,0 +1,103 @@
+"""Chooses, among pictures under known lights, the few that tell most; only those that are chosen are read.
+
+The same choice as `lights: {kind: adaptive}` makes in a run (`coupole.preflight.next_lights`), for domes that take
+pictures in another way, and to see on old pictures how many would have been enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError
+from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights, spread_lights
+from coupole.reflectance.picture_set import PictureSet
+
+Floats = NDArray[np.float64]
+
+_SITES = 4096
+"""Pixels by which lights are judged, about."""
+_BRIGHT_QUANTILE = 0.999
+
+
+@dataclass(frozen=True)
+class HowMany:
+    """How many lights are chosen, and in what steps."""
+
+    most: int
+    """Lights that are chosen, at most."""
+    relit_rms: float | None = None
+    """Expected error at which is stopped, as a share of the pictures' bright level."""
+    first: int = FEWEST_TAKEN
+    """Lights to begin with, spread over the dome."""
+    at_a_time: int = 1
+    """Lights that are chosen before the next look."""
+
+
+def choose_pictures(
+    pictures: PictureSet, how_many: HowMany, *, say: Callable[[int, int], None] = lambda done, of: None
+) -> dict[str, Any]:
+    """Numbers of the lights chosen, in their order, each step with its expected error; JSON's values only.
+
+    Raises InputError for fewer or more lights than can be chosen, or for a picture that cannot be read.
+    """
+    _refuse(pictures, how_many)
+    every = np.arange(len(pictures))
+    chosen = spread_lights(pictures.directions, every, how_many.first)
+    values = np.empty((0, 0))
+    steps: list[dict[str, Any]] = []
+    while True:
+        values = _with_new(pictures, values, chosen, say, how_many.most)
+        bright = float(np.quantile(values, _BRIGHT_QUANTILE)) or 1.0
+        count = min(how_many.at_a_time, how_many.most - len(chosen))
+        following = next_lights(values, pictures.directions, chosen, every, count)
+        steps.append(_step(len(chosen), following, bright))
+        is_enough = how_many.relit_rms is not None and steps[-1]["relit_rms"] <= how_many.relit_rms
+        if is_enough or not len(following.lights):
+            break
+        chosen = np.append(chosen, following.lights)
+    return {
+        "chosen": chosen.tolist(),
+        "pictures": [pictures.files[light].name for light in chosen],
+        "of": len(pictures),
+        "relit_rms": steps[-1]["relit_rms"],
+        "stopped_by": "relit_rms" if is_enough else "count",
+        "steps": steps,
+        "left_out": np.setdiff1d(every, chosen).tolist(),
+    }
+
+
+def _refuse(pictures: PictureSet, how_many: HowMany) -> None:
+    if not FEWEST_TAKEN <= how_many.first <= how_many.most:
+        raise InputError(
+            f"--first: expected {FEWEST_TAKEN} lights or more, and no more than --count {how_many.most}; "
+            f"got {how_many.first}"
+        )
+    if how_many.most > len(pictures):
+        raise InputError(f"--count: expected at most the {len(pictures)} lights there are, got {how_many.most}")
+
+
+def _with_new(
+    pictures: PictureSet, values: Floats, chosen: NDArray[np.int64], say: Callable[[int, int], None], most: int
+) -> Floats:
+    """[chosen, sites] grey values, in full scales; those of lights chosen before stand in `values`."""
+    rows = list(values)
+    step = max(1, pictures.pixels // _SITES)
+    for light in chosen[len(rows) :].tolist():
+        say(len(rows), most)
+        picture = pictures.raw_values(light)[::step] / pictures.full_scale / pictures.intensities[light]
+        rows.append(picture.mean(axis=1))
+    return np.stack(rows)
+
+
+def _step(count: int, following: NextLights, bright: float) -> dict[str, Any]:
+    return {
+        "lights": count,
+        "relit_rms": float(f"{following.expected_rms / bright:.4g}"),
+        "next": following.lights.tolist(),
+        "next_best": list(following.alternatives),
+    }

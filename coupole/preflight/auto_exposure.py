@@ -15,7 +15,6 @@ Light that a pixel gets only by way of other surfaces is not asked to reach the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -28,20 +27,21 @@ from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights
 from coupole.plan.plan import STEPS_PER_STOP, AutoExposure
 from coupole.plan.shot_id import ShotLabel
-from coupole.preflight.exposure_evidence import FULL, Evidence, Judgement
-from coupole.preflight.exposure_times import LightLimits, chosen_times
+from coupole.preflight.exposure_evidence import FULL, QUANTILES, Evidence, Judgement
+from coupole.preflight.exposure_times import LightLimits, Wish, chosen_times
 
 Floats = NDArray[np.float64]
 
 _UNSEEN_LIGHTS = 0.85
 """Factor by which LEDs that were not in the first pass may be brighter."""
 _NOISE_MARGIN = 1.05
+_LEAST_RATE = 1e-9
 _PROBE_STEPS = 4 * STEPS_PER_STOP
 """Steps between the exposures of the first pass, if one is not enough."""
 _CORRECTION_STEPS = 2 * STEPS_PER_STOP
-_DARK_SHARE = 0.05
+_DARK_SHARE = 0.02
 """Share of full scale that bright pixels of the first pass reach, or it is taken longer."""
-_BRIGHT_QUANTILE = 0.99
+_BRIGHT_QUANTILE = 0.999
 _NEIGHBOURS = 4
 _BURST_S = 0.14
 """Time of a burst beside its steps, as preflight reckons it."""
@@ -109,34 +109,27 @@ class AutoExposureChooser:
     # -- all LEDs -----------------------------------------------------------------------------------------
 
     def _for_all(self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]) -> Choice:
-        limits = self._limits(view, evidence, lux_of_led)
+        limits, group_of = self._limits(view, evidence, lux_of_led)
         bursts = [view.burst(place) for place in range(len(evidence.times_us))]
-        dark_s = np.median([burst.duration_s - len(burst.inner) * _period_s(burst) for burst in bursts])
-        places_of_leds = chosen_times(
-            limits,
-            [_period_s(burst) for burst in bursts],
-            range_steps=evidence.range_steps,
+        wish = Wish(
+            precisions=evidence.precisions(limits.rates),
+            snr=_NOISE_MARGIN * self._exposure.snr,
+            share=self._exposure.object_share,
             most=self._exposure.most_exposures,
-            burst_s=_BURST_S + float(dark_s),
+            step_s=np.array([_period_s(burst) for burst in bursts]),
+            burst_s=np.array([_BURST_S + b.duration_s - len(view.leds) * _period_s(b) for b in bursts]),
         )
+        places_of_groups = chosen_times(limits, wish)
         leds_at: dict[int, list[int]] = {}
-        for led, places in zip(view.leds.tolist(), places_of_leds, strict=True):
+        for led, group in zip(view.leds.tolist(), group_of.tolist(), strict=True):
             taken_places = evidence.taken.get(led, [])
-            new_places = [p for p in self._still_needed(places, taken_places) if p not in taken_places]
+            new_places = self._still_needed(places_of_groups[group], taken_places)
             for place in new_places[: self._exposure.most_exposures - len(taken_places)]:
                 leds_at.setdefault(place, []).append(led)
-        chosen_bursts = sorted(
-            (self._burst(place, leds) for place, leds in leds_at.items()), key=lambda b: len(b.leds)
-        )
-        figures = _figures(evidence) | {
-            "longest_us": _quartiles(evidence.times_us[np.maximum(limits.longest, 0)]),
-            "shortest_us": _quartiles(evidence.times_us[limits.shortest]),
-        }
-        return Choice(
-            bursts=tuple(chosen_bursts),
-            reason=_in_words("all LEDs, by the first pass", chosen_bursts),
-            figures=figures,
-        )
+        chosen_bursts = sorted((self._burst(place, leds) for place, leds in leds_at.items()), key=_leds_of)
+        figures = _figures(evidence) | {"groups": len(limits.counts)}
+        reason = _in_words("all LEDs, by the first pass", chosen_bursts)
+        return Choice(bursts=tuple(chosen_bursts), reason=reason, figures=figures)
 
     @staticmethod
     def _still_needed(places: Sequence[int], taken_places: Sequence[int]) -> list[int]:
@@ -147,21 +140,33 @@ class AutoExposureChooser:
         ends += [places[-1]] if places[-1] > taken_places[-1] and places[-1] not in ends else []
         return ends
 
-    def _limits(self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]) -> LightLimits:
-        """Limits of all LEDs, from those of the first pass."""
-        judgement = [evidence.judge(led) for led in evidence.first_leds]
-        first_lux = np.array([lux_of_led[led] for led in evidence.first_leds])
+    def _limits(
+        self, view: OpenView, evidence: Evidence, lux_of_led: Mapping[int, float]
+    ) -> tuple[LightLimits, NDArray[np.int64]]:
+        """Limits of all LEDs, from those of the first pass, and the group [leds] of each: LEDs which clip, and
+        whose dim pixels reach the ratio, at the same times."""
+        judgements = [evidence.judge(led) for led in evidence.first_leds]
         lux = np.array([lux_of_led[led] for led in view.leds.tolist()])
+        first_lux = np.array([lux_of_led[led] for led in evidence.first_leds])
         weights = self._weights(view, evidence.first_leds)
-        full_rates = lux * np.exp(weights @ np.log([max(j.full_rate, 1e-9) for j in judgement] / first_lux))
-        dim_rates = lux * np.exp(weights @ np.log([max(_dim_rate(j), 1e-9) for j in judgement] / first_lux))
+        full_rates = np.array([max(judgement.full_rate, _LEAST_RATE) for judgement in judgements])
+        lit_rates = np.stack([_lit_rates(judgement) for judgement in judgements])
+        log_full = weights @ np.log(full_rates / first_lux)
+        log_lit = weights @ np.log(lit_rates / first_lux[:, None])
         seen_before = np.isin(view.leds, evidence.first_leds)
-        longest_us = FULL * evidence.full_dn / full_rates * np.where(seen_before, 1.0, _UNSEEN_LIGHTS)
-        shortest_us = _NOISE_MARGIN * evidence.noise.signal_for(self._exposure.snr) / dim_rates
-        return LightLimits(
-            longest=np.searchsorted(evidence.times_us, longest_us, side="right") - 1,
-            shortest=np.minimum(np.searchsorted(evidence.times_us, shortest_us), len(evidence.times_us) - 1),
+        longest_us = (
+            FULL * evidence.full_dn / (lux * np.exp(log_full)) * np.where(seen_before, 1.0, _UNSEEN_LIGHTS)
         )
+        rates = (lux[:, None] * np.exp(log_lit)).astype(np.float32)
+        dim_rates = rates[:, round((1.0 - self._exposure.object_share) * (QUANTILES - 1))]
+        shortest_us = evidence.noise.signal_for(self._exposure.snr) / dim_rates
+        longest = np.searchsorted(evidence.times_us, longest_us, side="right") - 1
+        keys = np.stack([longest, np.searchsorted(evidence.times_us, shortest_us)], axis=1)
+        pairs, group_of = np.unique(keys, axis=0, return_inverse=True)
+        group_of = group_of.ravel()
+        counts = np.bincount(group_of, minlength=len(pairs))
+        log_rates = np.stack([np.log(rates[group_of == group]).mean(axis=0) for group in range(len(pairs))])
+        return LightLimits(pairs[:, 0], np.exp(log_rates).astype(np.float32), counts), group_of
 
     def _weights(self, view: OpenView, first_leds: Sequence[int]) -> Floats:
         """[leds, first] of the first LEDs for each LED, by direction from the view's target."""
@@ -182,7 +187,7 @@ class AutoExposureChooser:
     def _correction(self, evidence: Evidence, *, is_over: bool, again: int) -> Choice:
         """One more exposure for each LED that is not exposed as asked for; none if all are, or the rounds
         `is_over`."""
-        exposure, last = self._exposure, len(evidence.times_us) - 1
+        exposure = self._exposure
         shorter: dict[int, int] = {}
         longer: dict[int, int] = {}
         clipped_count, noisy_count = 0, 0
@@ -195,12 +200,8 @@ class AutoExposureChooser:
                     shorter[led], remaining = max(0, places[0] - _CORRECTION_STEPS * again), remaining - 1
             if judgement.reached_share < exposure.object_share:
                 noisy_count += 1
-                if remaining > 0 and places[-1] < last:
-                    stops = 2.0 * math.log2(
-                        max(_NOISE_MARGIN * exposure.snr / max(judgement.snr_of_dim, 1e-3), 1.0)
-                    )
-                    steps = max(1, math.ceil(STEPS_PER_STOP * stops))
-                    longer[led] = min(last, places[-1] + steps)
+                if remaining > 0 and (helping := evidence.place_that_helps(led)) is not None:
+                    longer[led] = helping
         figures = _figures(evidence) | {
             "leds": len(evidence.taken),
             "clipped_leds": clipped_count,
@@ -210,8 +211,10 @@ class AutoExposureChooser:
             return Choice(
                 bursts=(), reason=_conclusion(len(evidence.taken), clipped_count, noisy_count), figures=figures
             )
-        bursts = [self._burst(place, leds) for place, leds in _in_groups(shorter, min).items()]
-        bursts += [self._burst(place, leds) for place, leds in _in_groups(longer, max).items()]
+        bursts = []
+        for place, leds in (*_in_groups(shorter, min).items(), *_in_groups(longer, max).items()):
+            lacking = [led for led in leds if place not in evidence.taken[led]]
+            bursts += [self._burst(place, lacking)] if lacking else []
         reason = _in_words(f"{clipped_count} LEDs clip, {noisy_count} are too noisy", bursts)
         return Choice(bursts=tuple(_one_for_each_exposure(bursts)), reason=reason, figures=figures)
 
@@ -230,9 +233,14 @@ class AutoExposureChooser:
         return ChosenBurst(exposure=place, exposure_us=exposure_us, repeat=repeat, leds=tuple(sorted(leds)))
 
 
-def _dim_rate(judgement: Judgement) -> float:
-    """The rate by which the shortest exposure of an LED follows; one that lights nothing asks for none."""
-    return judgement.dim_rate if judgement.dim_rate > 0.0 else judgement.full_rate
+def _lit_rates(judgement: Judgement) -> Floats:
+    """[quantiles] DN per us; an LED that lights nothing is taken for one that lights all well."""
+    rates = judgement.lit_rates if len(judgement.lit_rates) else np.full(QUANTILES, judgement.full_rate)
+    return np.maximum(rates.astype(np.float64), _LEAST_RATE)
+
+
+def _leds_of(burst: ChosenBurst) -> int:
+    return len(burst.leds)
 
 
 def _period_s(burst: Any) -> float:
@@ -285,7 +293,3 @@ def _conclusion(leds: int, clipped_count: int, noisy_count: int) -> str:
 def _figures(evidence: Evidence) -> dict[str, Any]:
     noise = evidence.noise
     return {"read_dn": round(noise.read_dn, 4), "gain_dn": round(noise.gain_dn, 6)}
-
-
-def _quartiles(values: Floats) -> list[float]:
-    return [round(float(value), 1) for value in np.quantile(values, (0.0, 0.25, 0.5, 0.75, 1.0))]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.plan.choices import FrameSample
-from coupole.plan.plan import STEPS_PER_STOP, AutoExposure
+from coupole.plan.plan import AutoExposure
 from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.exposure_advice import Noise, noise_of_pairs
 
@@ -20,6 +20,11 @@ Booleans = NDArray[np.bool_]
 
 FULL = 0.95
 """Share of the range above black that counts as full, so that noise does not reach saturation."""
+QUANTILES = 48
+"""Rates by which those of all pixels in an LED's light are told."""
+_JUDGED_MARGIN, _HELP_MARGIN = 1.03, 1.05
+"""Ratio over that which is asked for, by which frames are judged: a pixel's ratio is known from noisy pixels."""
+_SOME_PIXELS = 1000
 _LIT = 0.1
 """A pixel is lit by an LED where its rate is at least so much of its reference."""
 _REFERENCE_QUANTILE = 0.75
@@ -50,10 +55,8 @@ class Judgement:
     """Share of the object's pixels in its light that reach the ratio; 1 if it lights none."""
     full_rate: float
     """Rate that all but the allowed share of pixels stay below, DN per us."""
-    dim_rate: float
-    """Rate that all but the rest of the object's share of lit pixels exceed, DN per us; 0 if it lights none."""
-    snr_of_dim: float
-    """Ratio that all but the rest of the object's share of lit pixels exceed."""
+    lit_rates: Floats
+    """[quantiles] rates of the object's pixels in its light, DN per us, rising; empty if it lights none."""
 
 
 class Evidence:
@@ -96,13 +99,6 @@ class Evidence:
                 pairs.append((a.signal_dn.astype(np.int32), b.signal_dn.astype(np.int32), a.full_dn))
         return noise_of_pairs(pairs)
 
-    @property
-    def range_steps(self) -> int:
-        """Steps between two exposures at which the longer one's clipped pixels just reach the ratio in the
-        shorter."""
-        stops = math.log2(max(FULL * self.full_dn / self.noise.signal_for(self._exposure.snr), 1.0))
-        return max(1, math.floor(STEPS_PER_STOP * stops))
-
     def merge(self, led: int) -> Merged:
         """An LED's frames together. Raises KeyError if none is proven."""
         noise, shape = self.noise, self.sample(led, self.taken[led][0]).signal_dn.shape
@@ -135,26 +131,46 @@ class Evidence:
     def judge(self, led: int) -> Judgement:
         """Compare an LED's frames with what the plan asks for. Raises KeyError if none is proven."""
         frames, exposure = self.merge(led), self._exposure
-        reference, is_object = self.reference
-        is_lit = is_object & (frames.rate >= _LIT * self._lux_of_led[led] * reference)
+        is_lit = self._is_lit(led, frames)
         shortest = self.taken[led][0]
         full_rate = _upper(frames.rate, exposure.clipped_share)
         if not math.isfinite(full_rate):
             full_rate = _CLIPPED_FACTOR * self.full_dn / self.times_us[shortest]
         clipped_share = self.sample(led, shortest).clipped_share
         if not is_lit.any():
-            return Judgement(clipped_share, 1.0, full_rate, 0.0, math.inf)
-        snr, rate = frames.snr[is_lit], frames.rate[is_lit]
-        reached_share = float(np.mean(snr >= exposure.snr))
-        return Judgement(
-            clipped_share, reached_share, full_rate, _upper(rate, exposure.object_share), _dim(snr, exposure)
-        )
+            return Judgement(clipped_share, 1.0, full_rate, np.zeros(0, np.float32))
+        rates = np.minimum(frames.rate[is_lit], np.float32(self.full_dn / self.times_us[shortest]))
+        places = np.linspace(0, len(rates) - 1, QUANTILES).round().astype(np.int64)
+        reached_share = float(np.mean(frames.snr[is_lit] >= _JUDGED_MARGIN * exposure.snr))
+        return Judgement(clipped_share, reached_share, full_rate, np.sort(rates)[places])
 
+    def place_that_helps(self, led: int) -> int | None:
+        """The first exposure that an LED does not have yet and that lets enough of its pixels reach the ratio; the
+        last that it does not have, if none is enough; None if it has all."""
+        frames, exposure = self.merge(led), self._exposure
+        lit_pixels = np.flatnonzero(self._is_lit(led, frames))
+        some_pixels = lit_pixels[:: max(1, len(lit_pixels) // _SOME_PIXELS)]
+        pixels = some_pixels[np.isfinite(frames.rate[some_pixels])]
+        rate, precision = frames.rate[pixels], (frames.snr[pixels] / np.maximum(frames.rate[pixels], 1e-12)) ** 2
+        other_places = [place for place in range(len(self.times_us)) if place not in self.taken[led]]
+        precisions = self.precisions(rate)
+        for place in other_places:
+            snr = rate * np.sqrt(precision + precisions[place])
+            if np.sum(snr >= _HELP_MARGIN * exposure.snr) >= exposure.object_share * len(some_pixels):
+                return place
+        return other_places[-1] if other_places else None
 
-def _dim(snr: Floats, exposure: AutoExposure) -> float:
-    """The ratio of the dim pixels; pixels that clip have none and are not dim."""
-    exposed_snr = snr[snr > 0.0]
-    return _upper(exposed_snr, exposure.object_share) if len(exposed_snr) else math.inf
+    def precisions(self, rates: Floats) -> Floats:
+        """[places, ...] inverse variances of `rates` [...] in one frame of each exposure; 0 where it clips."""
+        times_us = self.times_us.astype(np.float32).reshape(-1, *(1,) * rates.ndim)
+        signal = rates * times_us
+        variance = self.noise.read_dn**2 + self.noise.gain_dn * np.maximum(signal, 0.0)
+        precisions: Floats = np.where(signal < FULL * self.full_dn, times_us**2 / variance, 0.0).astype(np.float32)
+        return precisions
+
+    def _is_lit(self, led: int, frames: Merged) -> Booleans:
+        reference, is_object = self.reference
+        return is_object & (frames.rate >= _LIT * self._lux_of_led[led] * reference)
 
 
 def _upper(values: Floats, share: float) -> float:

@@ -4,66 +4,83 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 Integers = NDArray[np.int64]
+Floats = NDArray[np.float32]
 
 _TIMES_OF_A_VIEW = 3
-_STEP_S = 1.0
-"""Time that one step of one LED beyond its limits is worth."""
-_CLIPPED_OVER_NOISE = 4.0
+_CLIPPED_STEP_S = 4.0
+"""Time that one step of one LED beyond its longest exposure is worth."""
+_NOISY_S, _NOISY_SHARE_S = 0.3, 5.0
+"""Time that an LED is worth that is noisier than asked for, and the whole share of its pixels."""
+_SUBSETS_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
 class LightLimits:
-    """Limits of the exposure of some LEDs, in places among the plan's exposures."""
+    """Groups of LEDs that need the same exposures, in places among the plan's."""
 
     longest: Integers
-    """[n] last place at which not too much is clipped; -1: none."""
-    shortest: Integers
-    """[n] first place at which the ratio is reached; the last of all if none."""
+    """[groups] last place at which not too much is clipped; -1: none."""
+    rates: Floats
+    """[groups, quantiles] rates of the object's pixels in their light, DN per us."""
+    counts: Integers
+    """[groups] LEDs."""
 
 
-def chosen_times(
-    limits: LightLimits, periods_s: Sequence[float], *, range_steps: int, most: int, burst_s: float
-) -> list[tuple[int, ...]]:
-    """[n] places of the exposures of each LED: at most three for the view, `most` for an LED, such that all LEDs
-    together take least time; of times that cost the same, the shortest, which give the least light. Two exposures
-    of an LED are at most `range_steps` apart. A step takes `periods_s` [places], a burst `burst_s` beside its
-    steps."""
-    pairs, group_of = np.unique(np.stack([limits.longest, limits.shortest], axis=1), axis=0, return_inverse=True)
-    counts = np.bincount(group_of.ravel(), minlength=len(pairs)).astype(np.float64)
-    ends = max(0, int(limits.longest.min())), int(limits.shortest.max())
-    places = range(min(ends), max(ends) + 1)
-    subsets = [
-        subset for size in range(1, min(_TIMES_OF_A_VIEW, most) + 1) for subset in combinations(places, size)
-    ]
-    costs = np.stack([_cost_s(subset, pairs, np.array(periods_s), range_steps) for subset in subsets])
+@dataclass(frozen=True)
+class Wish:
+    """Noise that is asked for, and what exposures cost."""
+
+    precisions: Floats
+    """[places, groups, quantiles] inverse variances of the rates in one frame; 0 where it clips."""
+    snr: float
+    share: float
+    """Share of the pixels that reach the ratio."""
+    most: int
+    """Exposures of one LED."""
+    step_s: NDArray[np.float64]
+    """[places] time of a step."""
+    burst_s: NDArray[np.float64]
+    """[places] time of a burst beside the steps of its LEDs."""
+
+
+def chosen_times(limits: LightLimits, wish: Wish) -> list[tuple[int, ...]]:
+    """[groups] places of the exposures of each LED: at most three for the view, such that all LEDs together take
+    least time; of times that cost the same, the shortest, which give the least light."""
+    first = max(0, int(limits.longest.min()))
+    places = range(first, len(wish.step_s))
+    sizes = range(1, _TIMES_OF_A_VIEW + 1)
+    subsets = [subset for size in sizes for subset in combinations(places, size)]
+    costs_s = _costs_s([subset for subset in subsets if len(subset) <= wish.most], limits, wish)
     number_of = {subset: number for number, subset in enumerate(subsets)}
-    best_s, best = np.inf, subsets[0]
-    for times in (t for size in range(1, _TIMES_OF_A_VIEW + 1) for t in combinations(places, size)):
-        within = [number_of[part] for part in _parts(times, most)]
-        total_s = float(costs[within].min(axis=0) @ counts) + burst_s * len(times)
-        if total_s < best_s - 1e-9:
-            best_s, best = total_s, times
-    parts = _parts(best, most)
-    of_group = costs[[number_of[part] for part in parts]].argmin(axis=0)
-    return [parts[of_group[group]] for group in group_of.ravel()]
+    parts_of = [[number_of[part] for part in _parts(times, wish.most)] for times in subsets]
+    totals_s = [
+        float(costs_s[parts].min(axis=0) @ limits.counts) + float(wish.burst_s[list(times)].sum())
+        for times, parts in zip(subsets, parts_of, strict=True)
+    ]
+    best = parts_of[int(np.argmin(np.round(totals_s, 6)))]
+    return [subsets[best[part]] for part in costs_s[best].argmin(axis=0)]
 
 
 def _parts(times: tuple[int, ...], most: int) -> list[tuple[int, ...]]:
     return [part for size in range(1, min(len(times), most) + 1) for part in combinations(times, size)]
 
 
-def _cost_s(
-    subset: tuple[int, ...], pairs: Integers, periods_s: NDArray[np.float64], range_steps: int
-) -> NDArray[np.float64]:
-    """[groups] time of these exposures of one LED, and what they are beyond its limits worth."""
-    too_long = np.maximum(subset[0] - pairs[:, 0], 0) * _CLIPPED_OVER_NOISE
-    too_short = np.maximum(pairs[:, 1] - subset[-1], 0)
-    gaps = sum(max(longer - shorter - range_steps, 0) for shorter, longer in pairwise(subset))
-    beyond = too_long + too_short + gaps
-    return np.asarray(periods_s[list(subset)].sum() + _STEP_S * beyond)
+def _costs_s(subsets: Sequence[tuple[int, ...]], limits: LightLimits, wish: Wish) -> NDArray[np.float64]:
+    """[subsets, groups] time of these exposures of one LED, and what they lack is worth."""
+    square = (limits.rates / np.float32(wish.snr)) ** 2
+    reached_shares = np.empty((len(subsets), len(limits.longest)))
+    for begin in range(0, len(subsets), _SUBSETS_AT_ONCE):
+        some = subsets[begin : begin + _SUBSETS_AT_ONCE]
+        precision = np.stack([wish.precisions[list(subset)].sum(axis=0) for subset in some])
+        reached_shares[begin : begin + len(some)] = (precision * square >= 1.0).mean(axis=2)
+    lack = np.maximum(wish.share - reached_shares, 0.0)
+    shortest = np.array([subset[0] for subset in subsets])
+    too_long = np.maximum(shortest[:, None] - limits.longest, 0) * _CLIPPED_STEP_S
+    steps_s = np.array([wish.step_s[list(subset)].sum() for subset in subsets])
+    return np.asarray(steps_s[:, None] + too_long + np.where(lack > 0.0, _NOISY_S, 0.0) + _NOISY_SHARE_S * lack)

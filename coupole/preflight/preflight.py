@@ -30,7 +30,7 @@ from coupole.preflight.led_limits import heat_of, refuse_on_times
 BURST_OVERHEAD_S = 0.14
 """Arm the camera, read the table's CRC back, start, wait for the last frame, sync (simulated cell)."""
 CHOICE_S = 2.0
-"""Time of a choice of bursts in the run, at most, for 1080 LEDs on a busy machine (`tools/bench.py choosing`)."""
+"""Time of a choice of bursts in the run, for 1080 LEDs on a busy machine (`tools/prove_auto_exposure.py`)."""
 SETTLE_CHECK_S = 0.1
 """Time from the end of a motion to 'settled', without the dwell (measured on the simulated cell)."""
 DISK_SHARE = 0.9

@@ -49,6 +49,7 @@ def _page(run: Run, run_status: Status) -> str:
     sections = {
         "measured": ("What was measured", _measured_views(run, events, views)),
         "exposure": ("Exposure", exposures(views, run.about.get("scaling") or "")),
+        "choices": ("Chosen in the run", run_facts.choices(events)),
         "coverage": (
             "Coverage of the object",
             coverages(object_coverage) if isinstance(object_coverage, Coverage) else "",

@@ -10,7 +10,15 @@ from typing import Any
 from coupole.calibration.record import read_record
 from coupole.errors import InputError
 from coupole.storage import run_dose
-from coupole.storage.journal_events import BurstBegun, BurstEnded, Event, FaultNoted, GapFound, SessionStopped
+from coupole.storage.journal_events import (
+    BurstBegun,
+    BurstEnded,
+    BurstsChosen,
+    Event,
+    FaultNoted,
+    GapFound,
+    SessionStopped,
+)
 from coupole.storage.run import Run
 from coupole.storage.run_status import KILLED, Session, Status
 from coupole.viewing.page_parts import facts, link, moment, table, text
@@ -45,6 +53,16 @@ def light(events: Sequence[Event], views: Iterable[SampledView], run_status: Sta
         '<p class="note">A burst in which a session was killed counts as it was planned.</p>' if was_killed else ""
     )
     return table("Light on the point that received most", ("view", "lux h"), rows) + note
+
+
+def choices(events: Iterable[Event]) -> str:
+    """Choices that were made in the run, with their reasons; nothing where the plan says all."""
+    rows = []
+    for event in events:
+        if isinstance(event, BurstsChosen):
+            frames = sum(len(burst.leds) for burst in event.bursts)
+            rows.append((text(event.view), text(event.reason), str(frames)))
+    return table("Choices, in the order in which they were made", ("view", "choice", "frames"), rows)
 
 
 def duration_in_words(run_status: Status) -> str:

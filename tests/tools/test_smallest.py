@@ -68,6 +68,7 @@ RUNS = (
     ),
     Run("full_proofs.py --list", r"python tools/prove_clusters\.py --triangles"),
     Run("mutants.py --check", r"\d+ mutants fit the code"),
+    Run("prove_auto_exposure.py --smallest", r"duration: auto \d.* ratio \d", full=True),
     Run("prove_calibrations.py --smallest", r"camera_mm.* median \d", full=True),
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),

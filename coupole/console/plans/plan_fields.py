@@ -45,6 +45,8 @@ class PlanFields:
     """The views are not those of the form."""
     own_lights: bool = False
     """The lights are not those of the form."""
+    own_exposure: bool = False
+    """The exposure is chosen in the run; times in the form would replace it."""
 
 
 def fields_of(path: Path, text: str) -> PlanFields:
@@ -54,13 +56,15 @@ def fields_of(path: Path, text: str) -> PlanFields:
     data = yamlfile.parse(path, text).data
     object_keys = data.get("object") if isinstance(data.get("object"), dict) else {}
     assert isinstance(object_keys, dict)
+    exposure = data.get("exposure")
     fields = PlanFields(
         object_id=str(object_keys.get("id", "")),
         mesh=str(object_keys.get("mesh") or ""),
         mesh_unit=str(object_keys.get("mesh_unit", "mm")),
         budget_lux_h=_number(object_keys.get("dose_budget_lux_h")),
         darks_per_view=_whole(data.get("darks_per_view")),
-        exposures_us=_exposures(data.get("exposure")),
+        exposures_us=_exposures(exposure),
+        own_exposure=isinstance(exposure, dict) and exposure.get("kind") == "auto",
     )
     return _with_lights(_with_views(fields, data.get("views")), data.get("lights"))
 

@@ -182,6 +182,7 @@ class _Screen:
             for is_own, words in (
                 (fields.own_views, "the views are as the YAML has them"),
                 (fields.own_lights, "the lights are as the YAML has them"),
+                (fields.own_exposure, "exposures are chosen in the run, as the YAML has it"),
             )
             if is_own
         ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coupole.errors import StorageError, reason
 from coupole.pages import palettes
@@ -16,11 +16,16 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 
-def render(page: Page) -> str:
-    """The page as HTML, with style and pictures in it; a script only where it has maps."""
+def render(page: Page, template: str = "page.html", **more: Any) -> str:
+    """The page as HTML, with style and pictures in it; a script only where it has maps. `more` is what another
+    template than that of all reports asks for."""
     palette_names = sorted({figure.palette for figure in page.maps() if figure.palette})
     tables = {name: palettes.hexadecimal(name) for name in palette_names}
-    return _environment().get_template("page.html").render(page=page, palettes=tables, has_maps=bool(page.maps()))
+    return (
+        _environment()
+        .get_template(template)
+        .render(page=page, palettes=tables, has_maps=bool(page.maps()), **more)
+    )
 
 
 def write_page(path: Path, page: Page) -> None:

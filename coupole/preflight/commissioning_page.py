@@ -11,6 +11,8 @@ from coupole.pages.page_rendering import write_page
 from coupole.preflight.commissioned import STEPS, CommissioningRecord, StepResult
 from coupole.preflight.commissioned_rig import Step
 
+_MOST_BARS = 12
+
 
 def write(record_path: Path, record: CommissioningRecord) -> Path:
     """Write `NAME.html` beside the record `NAME.yaml`; returns its path. Raises StorageError."""
@@ -54,7 +56,8 @@ def _limits(results: dict[Step, StepResult | None]) -> list[Plot]:
         for limit in (result.limits if result else ())
         if limit.limit > 0
     ]
-    return [bars("Figures over their limits", shares, "limit")] if shares else []
+    nearest = sorted(shares, key=lambda share: -share[1])[:_MOST_BARS]
+    return [bars("The figures nearest to their limits, as shares of them", nearest, "limit")] if nearest else []
 
 
 def _quality(record: CommissioningRecord, results: dict[Step, StepResult | None]) -> Inline:

@@ -31,14 +31,11 @@ def write(comparison: Comparison, folder: Path) -> None:
     scale_mm = _scale(comparison.distance_mm, comparison.u_mm)
     shape = distance_colours(comparison.distance_mm, scale_mm)
     _write_maps(comparison, shape, folder / MAPS)
-    pictures, marks = _shape(comparison, shape, scale_mm), _marks(comparison.moved_points)
-    changed_picture = _image(comparison, marks, "Points whose shape changed significantly are orange")
     page = Page(
         title=f"{comparison.before.name} and {comparison.after.name}: compared",
-        pictures=[pictures],
+        pictures=[_shape(comparison, shape, scale_mm)],
         summary=f"{int(np.isfinite(comparison.distance_mm).sum()):,} points of {comparison.before.name} were "
-        "compared with "
-        f"the surface of {comparison.after.name}.",
+        f"compared with the surface of {comparison.after.name}.",
         quality=_quality(comparison),
         next_step=_next_step(comparison),
         sections=[
@@ -50,7 +47,7 @@ def write(comparison: Comparison, folder: Path) -> None:
             Section(
                 "shape",
                 "Shape",
-                figures=[changed_picture],
+                figures=_drawing_of_changed(comparison, comparison.moved_points, "shape"),
                 figure_size="wide",
                 tables=[_regions("Regions that changed in shape", comparison.shape_regions)],
             ),
@@ -69,10 +66,12 @@ _FILES = (
 
 def _quality(comparison: Comparison) -> str:
     u_mm = float(np.nanmedian(comparison.u_mm))
+    count = len(comparison.shape_regions)
+    regions = "1 region" if count == 1 else f"{count} regions"
     return (
         f"A distance has a standard uncertainty of {u_mm:.2g} mm (median): "
         f"{int(comparison.moved_points.sum()):,} points "
-        f"changed significantly, in {len(comparison.shape_regions)} regions."
+        f"changed significantly, in {regions}."
     )
 
 
@@ -134,7 +133,6 @@ def _colour(comparison: Comparison) -> Section:
     colours = np.where(
         np.isfinite(comparison.de00)[:, None], colours_of(np.nan_to_num(comparison.de00) / most), _UNKNOWN
     )
-    changed_picture = _marks(comparison.recoloured_points)
     return Section(
         "colour",
         "Colour",
@@ -142,7 +140,7 @@ def _colour(comparison: Comparison) -> Section:
             _map(
                 comparison, comparison.de00, colours, ("Colour difference under D65", "dE00", 0.0, most, "amount")
             ),
-            _image(comparison, changed_picture, "Points whose colour changed significantly are orange"),
+            *_drawing_of_changed(comparison, comparison.recoloured_points, "colour"),
         ],
         figure_size="wide",
         tables=[_regions("Regions that changed in colour", comparison.colour_regions)],
@@ -165,6 +163,13 @@ def _map(
 
 def _marks(is_marked: NDArray[np.bool_]) -> Points:
     return np.asarray(np.where(is_marked[:, None], _ENDS[2], _ENDS[1]))
+
+
+def _drawing_of_changed(comparison: Comparison, is_changed: NDArray[np.bool_], quantity: str) -> list[Figure]:
+    """A drawing of the points that changed; none if there are none."""
+    if not is_changed.any():
+        return []
+    return [_image(comparison, _marks(is_changed), f"Points whose {quantity} changed significantly are orange")]
 
 
 def _image(comparison: Comparison, colours: Points, title: str) -> Picture:

@@ -20,7 +20,7 @@ def page(
     doubts: Sequence[str] = (),
 ) -> str:
     """The whole page as HTML; `picture` is the PNG, `doubts` are reasons not to rely on the records."""
-    names = ", ".join(case.name for case in cases)
+    names = ", ".join(dict.fromkeys(case.name for case in cases))
     return render(
         Page(
             title=f"{names or 'The cell'}: uncertainty of a reflectance",

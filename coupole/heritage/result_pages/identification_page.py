@@ -57,7 +57,7 @@ def _quality(findings: Sequence[PigmentFinding]) -> Inline:
         (word, sum(finding.verdict == word for finding in findings))
         for word in ("match", "mixture", "ambiguous", "unknown")
     ]
-    return f"{', '.join(f'{count} {word}' for word, count in counts if count)}."
+    return f"Of {len(findings)} spectra: {', '.join(f'{count} {word}' for word, count in counts if count)}."
 
 
 def _next_step(findings: Sequence[PigmentFinding]) -> Inline:
@@ -90,6 +90,7 @@ def _section(number: int, finding: PigmentFinding) -> Section:
         f"s{number}",
         finding.name,
         figures=[_plot(finding)] if number else [],
+        figure_size="wide",
         facts={
             "verdict": _verdict(finding),
             "why": finding.reason,

@@ -43,8 +43,13 @@ def layer_page(
                 "Bands": f"{len(nm)} of {nm[0]:g} to {nm[-1]:g} nm; S is told in {int(sure.sum())} of them",
             },
             sections=[
-                Section("fit", "Measured and fitted", figures=[_measured_and_fitted(description, samples, fit)]),
-                Section("four", "Four fluxes", figures=_four_fluxes(nm, four, unit)),
+                Section(
+                    "fit",
+                    "Measured and fitted",
+                    figures=[_measured_and_fitted(description, samples, fit)],
+                    figure_size="wide",
+                ),
+                Section("four", "Four fluxes", figures=_four_fluxes(nm, four, unit), figure_size="wide"),
             ],
         )
     )

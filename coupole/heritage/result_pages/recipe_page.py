@@ -38,7 +38,10 @@ def recipe_page(name: str, search: Found, matches: Sequence[Sequence[Match]]) ->
             sections=[
                 Section("shares", "Shares", tables=[_shares(best)]),
                 Section(
-                    "spectra", "Spectra", figures=[chart("Reflectance in air", WAVELENGTHS_NM[bands], curves)]
+                    "spectra",
+                    "Spectra",
+                    figures=[chart("Reflectance in air", WAVELENGTHS_NM[bands], curves)],
+                    figure_size="wide",
                 ),
                 Section(
                     "fewer", "With fewer paints", tables=[Table("Best recipes by number of paints", head, fewer)]

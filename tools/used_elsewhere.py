@@ -20,6 +20,8 @@ _.__getattr__  # drivers/kuka/rsi, drivers/ur: Python, for names that are import
 _.open_run, _.open_result, _.open_cell, _.fit_reflectance  # coupole/__init__.py, by its table
 _.residual_rms_us, _.residual_max_us  # the report, coupole/viewing/report_facts.py
 _.white_at_us  # coupole/preflight/simulated_world.py, in the rig's settings
+_.href, _.alternative, _.is_broad, _.shade_png, _.numeric_columns, _.figure_size  # coupole/pages/templates
+_.is_folded, _.quality, _.next_step, _.shown_sections, _.is_cut  # the same
 _.adaptive, _.author, _.refined  # ExportOptions.given_options, which lists all fields
 
 # ---- by files that are written from all fields ----

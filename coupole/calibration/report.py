@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,21 +13,12 @@ import numpy as np
 from coupole.calibration.adjustment import coverage_factor
 from coupole.calibration.record import Parameter, Record, write_record
 from coupole.errors import StorageError
+from coupole.pages.page_parts import Code, Inline, Link, Page, Picture, Section, Table, Verdict
+from coupole.pages.page_rendering import render
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-HEAD = (
-    '<!doctype html><html lang="en"><meta charset="utf-8">'
-    '<meta name="viewport" content="width=device-width,initial-scale=1">'
-)
-"""First words of every page of results."""
-STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}
-table{border-collapse:collapse;margin:.5em 0}td,th{padding:.15em 1em .15em 0;text-align:left}
-td.n,th.n{text-align:right;font-variant-numeric:tabular-nums}
-.bad{color:#b00}.ok{color:#070}img{max-width:100%}code{font-size:13px}
-"""
 BLUE, RED, GREY, DARK = "#2a6f97", "#c1121f", "#b8bec5", "#333333"
 
 
@@ -57,7 +46,7 @@ def write_outcome(record_path: Path, outcome: Outcome) -> tuple[Path, Path]:
         for file, content in outcome.files.items():
             (folder / file).write_bytes(content)
         png.write_bytes(picture)
-        page.write_text(_page(outcome.record, picture), encoding="utf-8")
+        page.write_text(render(_page(outcome.record, picture)), encoding="utf-8")
     except OSError as error:
         raise StorageError(f"{folder}: cannot write the report: {error.strerror}. Free its disk.") from error
     write_record(record_path, outcome.record)
@@ -89,67 +78,97 @@ def draw(outcome: Outcome) -> bytes:
 # -- the page ---------------------------------------------------------------------------------------------
 
 
-def _page(record: Record, picture: bytes) -> str:
-    name = html.escape(f"{record.kind} calibration {record.name}")
-    simulated_note = "<p>Simulated: no real camera.</p>" if record.simulated else ""
-    data = base64.b64encode(picture).decode()
-    remarks = "".join(f"<li>{html.escape(remark)}" for remark in record.remarks)
-    return (
-        f"{HEAD}<title>{name}</title><style>{STYLE}</style><h1>{name}</h1>"
-        f"{simulated_note}{_limits(record)}<h2>Result</h2>{_transforms(record)}{_parameters(record)}{_noise(record)}"
-        + (f"<h2>Remarks</h2><ul>{remarks}</ul>" if remarks else "")
-        + f'<h2>Residuals</h2><img src="data:image/png;base64,{data}" alt="residuals">{_validity(record)}'
+def _page(record: Record, picture: bytes) -> Page:
+    return Page(
+        title=f"{record.name}: {record.kind} calibration, {'accepted' if record.is_accepted else 'not accepted'}",
+        pictures=[Picture("Residuals and what was found", picture, is_broad=True)],
+        summary=_summary(record),
+        quality=_quality(record),
+        next_step=_next_step(record),
+        remark="Simulated: no real camera." if record.simulated else "",
+        sections=[
+            Section("limits", "Limits", tables=[_limits(record)]),
+            Section("result", "Result", tables=[_transforms(record), _parameters(record), _noise(record)]),
+            Section("remarks", "Remarks", items=record.remarks),
+            _validity(record),
+        ],
     )
 
 
-def table(head: str, rows: Sequence[str]) -> str:
-    """An HTML table of rows of cells, as `<td>a<td>b`."""
-    return f"<table><tr>{head}{''.join(f'<tr>{row}' for row in rows)}</table>"
+def _summary(record: Record) -> str:
+    sources = f"{len(record.images)} images" if record.images else f"{len(record.inputs)} files"
+    return f"The {record.kind} calibration {record.name} was made on {record.created:%Y-%m-%d} from {sources}."
 
 
-def _limits(record: Record) -> str:
-    verdict = "<p class=ok><b>Accepted.</b>" if record.is_accepted else "<p class=bad><b>Not accepted.</b>"
+def _quality(record: Record) -> Inline:
+    missed = [limit for limit in record.limits if not limit.is_met]
+    verdict = Verdict("Accepted.", "ok") if record.is_accepted else Verdict("Not accepted.", "bad")
+    if not record.limits:
+        return verdict
+    worst = max(record.limits, key=lambda limit: limit.found / limit.limit if limit.limit else limit.found)
+    met = f"{len(missed)} of {len(record.limits)} limits are missed" if missed else "All limits are met"
+    return [
+        verdict,
+        f" {met}; {'the worst' if missed else 'the nearest'}: {worst.what}, {worst.found:.3g} of at most "
+        f"{worst.limit:.3g} {worst.unit}".rstrip(),
+        ".",
+    ]
+
+
+def _next_step(record: Record) -> Inline:
+    record_file = Code(f"{record.name}.yaml")
+    if record.is_accepted:
+        return [
+            "Keep ",
+            record_file,
+            f" with the cell's records: it holds until {record.validity.expires:%Y-%m-%d}.",
+        ]
+    return [
+        "Remove the cause and calibrate again",
+        [" (", Link("#remarks", "Remarks"), " say where to look)"] if record.remarks else "",
+        "; the record is refused wherever records are used.",
+    ]
+
+
+def _limits(record: Record) -> Table:
+    rows: list[Sequence[Inline]] = []
+    for limit in record.limits:
+        verdict = Verdict("met", "ok") if limit.is_met else Verdict("missed", "bad")
+        usual = "" if limit.usual is None else f", usually {limit.usual:.3g}"
+        option: Inline = [Code(limit.name), usual] if limit.name else usual
+        rows.append((limit.what, f"{limit.found:.3g}", f"{limit.limit:.3g}", limit.unit, verdict, option))
+    head = ("limit", "found", "at most", "unit", "verdict", "set by --limit")
+    return Table("Figures that decide whether the record is accepted", head, rows)
+
+
+def _transforms(record: Record) -> Table:
     rows = [
-        f"<td>{html.escape(limit.what)}<td class=n>{limit.found:.3g}<td class=n>{limit.limit:.3g}"
-        f"<td>{limit.unit}<td class={'ok>met' if limit.is_met else 'bad>missed'}"
-        f"<td>{'' if limit.name is None else f'<code>{limit.name}</code>'}"
-        f"{'' if limit.usual is None else f', usually {limit.usual:.3g}'}"
-        for limit in record.limits
+        (name, *(f"{v:.4f}" for v in pose.translation_mm), *(f"{v:.5f}" for v in pose.abc_deg))
+        for name, pose in record.transforms.items()
     ]
-    return verdict + table("<th>limit<th class=n>found<th class=n>at most<th><th><th>set by --limit", rows)
+    head = ("transform", "x mm", "y mm", "z mm", "A deg", "B deg", "C deg")
+    return Table("Transforms", head, rows)
 
 
-def _transforms(record: Record) -> str:
-    rows = []
-    for name, pose in record.transforms.items():
-        numbers = [*(f"{v:.4f}" for v in pose.translation_mm), *(f"{v:.5f}" for v in pose.abc_deg)]
-        rows.append(f"<td>{html.escape(name)}" + "".join(f"<td class=n>{n}" for n in numbers))
-    head = "<th>transform" + "".join(
-        f"<th class=n>{h}" for h in ("x mm", "y mm", "z mm", "A deg", "B deg", "C deg")
-    )
-    return table(head, rows) if rows else ""
-
-
-def _parameters(record: Record) -> str:
+def _parameters(record: Record) -> Table:
     rows = [_parameter(parameter) for parameter in record.parameters]
-    rows += [
-        f"<td>{html.escape(n)}<td class=n>{v:.6g}<td class=n>held<td><td><td>" for n, v in record.fixed.items()
-    ]
+    rows += [(name, f"{value:.6g}", "", "", "", "held, not fitted") for name, value in record.fixed.items()]
     head = (
-        "<th>parameter<th class=n>value<th class=n>expanded uncertainty (95 %)<th class=n>k"
-        "<th class=n>degrees of freedom<th>most of it from"
+        "parameter",
+        "value",
+        "expanded uncertainty (95 %)",
+        "k",
+        "degrees of freedom",
+        "most of it from",
     )
-    return table(head, rows)
+    return Table("Parameters", head, rows)
 
 
-def _parameter(parameter: Parameter) -> str:
+def _parameter(parameter: Parameter) -> tuple[str, ...]:
     k = float(coverage_factor(parameter.degrees_of_freedom))
     value = "" if parameter.value is None else f"{parameter.value:.{_decimals(k * parameter.u)}f}"
     freedom = f"{parameter.degrees_of_freedom:.0f}" if parameter.degrees_of_freedom < 1e5 else "many"
-    return (
-        f"<td>{html.escape(parameter.name)}<td class=n>{value}<td class=n>{k * parameter.u:.2g}<td class=n>{k:.2f}"
-        f"<td class=n>{freedom}<td>{html.escape(parameter.dominated_by)}"
-    )
+    return (parameter.name, value, f"{k * parameter.u:.2g}", f"{k:.2f}", freedom, parameter.dominated_by)
 
 
 def _decimals(uncertainty: float) -> int:
@@ -157,23 +176,19 @@ def _decimals(uncertainty: float) -> int:
     return int(np.clip(1 - np.floor(np.log10(max(uncertainty, 1e-12))), 0, 12))
 
 
-def _noise(record: Record) -> str:
+def _noise(record: Record) -> Table:
     rows = [
-        f"<td>{html.escape(n.name)}<td class=n>{n.found:.3g}<td class=n>{f'{n.stated:.3g}' if n.stated else ''}"
-        f"<td>{n.unit}<td class=n>{n.redundancy:.0f}"
+        (n.name, f"{n.found:.3g}", f"{n.stated:.3g}" if n.stated else "", n.unit, f"{n.redundancy:.0f}")
         for n in record.noise
     ]
-    return table("<th>noise of<th class=n>found<th class=n>stated<th><th class=n>redundancy", rows)
+    return Table("Noise", ("noise of", "found", "stated", "unit", "redundancy"), rows)
 
 
-def _validity(record: Record) -> str:
+def _validity(record: Record) -> Section:
     holds = record.validity.model_dump(exclude_none=True)
-    rows = [
-        f"<td>{html.escape(key.replace('_', ' '))}<td>{html.escape(str(value))}" for key, value in holds.items()
-    ]
-    rows += [f"<td>{html.escape(i.name)}<td><code>{i.sha256}</code>" for i in record.inputs]
-    rows += [
-        f"<td>made<td>{record.created:%Y-%m-%d %H:%M} UTC by {html.escape(record.software)}",
-        f"<td>record<td><code>{record.sha256}</code>",
-    ]
-    return "<h2>Validity and inputs</h2>" + table("<th><th>", rows)
+    facts: dict[str, Inline] = {key.replace("_", " "): str(value) for key, value in holds.items()}
+    facts["made"] = f"{record.created:%Y-%m-%d %H:%M} UTC by {record.software}"
+    facts["record"] = Code(record.sha256)
+    rows = [(one.name, Code(one.sha256)) for one in record.inputs]
+    inputs = Table("Files that it was made from", ("file", "SHA-256"), rows)
+    return Section("validity", "Validity and inputs", facts=facts, tables=[inputs])

@@ -113,7 +113,7 @@ def identify(
         findings = _findings(console, spectra, library, classes, unit)
         page = None
         if report is not None:
-            from coupole.viewing.identification_page import write
+            from coupole.heritage.result_pages.identification_page import write
 
             page = write(report, [finding for _, finding in findings], str(library))
     except CoupoleError as error:

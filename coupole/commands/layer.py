@@ -215,7 +215,7 @@ def _coefficients_document(
         document["grains"] = _grains(paint, other_paint_path)
     if out is not None:
         from coupole.appearance.matter.paint_file import ENDING, encode
-        from coupole.viewing.layer_page import layer_page
+        from coupole.heritage.result_pages.layer_page import layer_page
 
         stem = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in layer.name)
         files = {

@@ -146,7 +146,7 @@ def _recipe_facts(recipe: Recipe, under: Sequence[Match]) -> dict[str, Any]:
 
 
 def _write(path: Path, name: str, search: Found, matches: Sequence[Sequence[Match]]) -> None:
-    from coupole.viewing.recipe_page import recipe_page
+    from coupole.heritage.result_pages.recipe_page import recipe_page
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -66,7 +66,7 @@ def refine(
     from coupole.calibration.record import records_named
     from coupole.reflectance.alignment.refine_job import RefineRequest, refine_runs
     from coupole.reflectance.extraction.pointing import Doubts
-    from coupole.viewing import refinement_page
+    from coupole.reflectance.result_pages import refinement_page
     from coupole.viewing.terminal import make_console, step_bars
 
     doubts = Doubts(**vars(stated))

@@ -109,7 +109,7 @@ def _of_pictures(
 ) -> Made:
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
-    from coupole.viewing import reflectance_page
+    from coupole.reflectance.result_pages import reflectance_page
 
     if options.lights is None:
         raise InputError("--lights: expected the file of the lights' directions")
@@ -146,7 +146,7 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
     from coupole.reflectance import uncalibrated
     from coupole.reflectance.picture_job import fit_pictures
     from coupole.reflectance.picture_set import read_pictures
-    from coupole.viewing import reflectance_page
+    from coupole.reflectance.result_pages import reflectance_page
 
     folder = out.with_name(f"{out.name}-pictures")
     view_pictures = uncalibrated.write_pictures(run, view, folder, say)
@@ -160,8 +160,8 @@ def _of_uncalibrated(run: Path, view: str | None, left_out: list[int], out: Path
 
 
 def _of_runs(request: RunRequest, out: Path, scheduler: str | None, say: Said, *, with_texels: bool) -> Made:
+    from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.scripting.analyses import fit_runs
-    from coupole.viewing import run_reflectance_page
 
     about = fit_runs(request, out, scheduler, say, with_texels=with_texels)
     return about, list(run_reflectance_page.remarks(about)), run_reflectance_page.write(out)
@@ -222,8 +222,8 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
     """The third step alone: what the fits miss under the LEDs that were left out, and the report."""
 
     def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.result_pages import run_reflectance_page
         from coupole.reflectance.run_check import check_result
-        from coupole.viewing import run_reflectance_page
 
         about = check_result(result, bytes_of(memory), say=say)
         return {**about, "report": str(run_reflectance_page.write(result))}
@@ -236,8 +236,8 @@ def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
     """What the fits would miss with fewer LEDs, without grazing light, with fewer coefficients: one page."""
 
     def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.result_pages import ablation_page
         from coupole.reflectance.run_ablation import ablate_result
-        from coupole.viewing import ablation_page
 
         document = ablate_result(result, say=say)
         return {**document, "report": str(ablation_page.write(result, document))}
@@ -273,8 +273,8 @@ def cluster(
     for a material borrow one. Beside each material, harmonics of pairs of directions, which suppose no model."""
 
     def step(say: Said) -> dict[str, Any]:
+        from coupole.reflectance.result_pages import cluster_page
         from coupole.reflectance.run_clusters import cluster_result
-        from coupole.viewing import cluster_page
 
         document = cluster_result(
             result, clusters, bytes_of(memory), degrees=degrees, without_view=without_view, say=say

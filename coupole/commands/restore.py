@@ -73,7 +73,7 @@ def restore(
     """
     from coupole.heritage.restoration.restoring import render_all
     from coupole.heritage.restoration.shown_hypotheses import show_all
-    from coupole.viewing import restoration_page
+    from coupole.heritage.result_pages import restoration_page
     from coupole.viewing.terminal import make_console, step_bars
 
     console = make_console(quiet=as_json)

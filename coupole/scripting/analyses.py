@@ -52,9 +52,9 @@ def fit_reflectance(
     Raises InputError: no runs, or records that do not belong to them; StorageError, ChecksumMismatch.
     """
     from coupole.calibration.record import records_named
+    from coupole.reflectance.result_pages import run_reflectance_page
     from coupole.reflectance.run_job import RunRequest
     from coupole.scripting.opened_result import open_result
-    from coupole.viewing import run_reflectance_page
 
     request = RunRequest(
         tuple(_paths(runs, "runs")),

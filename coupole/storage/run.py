@@ -271,6 +271,11 @@ def _settled_bytes(view_file: Path) -> int:
     return layout.frames * layout.frame_bytes if layout.is_archived else view_file.stat().st_blocks * 512
 
 
+def name_without_time(folder_name: str) -> str:
+    """The name that a run was given, which its folder's name has after the time; other names stay."""
+    return folder_name.partition("Z-")[2] or folder_name
+
+
 def user_name() -> str:
     """Whoever is logged in."""
     try:

@@ -1,8 +1,8 @@
-"""`report.html` and `maps.ply` of a comparison: where shape and colour changed, by how much, and how surely."""
+"""`report.html` and `maps.ply` of a comparison: where shape and colour changed_picture, by how much, and how "
+"surely."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.heritage.comparison.state_comparison import Comparison, Region
-from coupole.viewing.page_parts import facts, link, page, picture, section, table, text
-from coupole.viewing.registration_page import sheet_of_sides
+from coupole.pages.maps import shaded_map
+from coupole.pages.page_parts import Figure, Inline, Link, Page, Picture, Section, Table
+from coupole.pages.page_rendering import render
+from coupole.pages.palettes import ANCHORS, colours_of
+from coupole.viewing.registration_page import picture_of, sheet_of_sides, solid_drawn, values_from_sides
 from coupole.viewing.view_solids import Points, Solid
 
 REPORT, MAPS = "report.html", "maps.ply"
-_ENDS = (np.array([0.13, 0.33, 0.62]), np.array([0.93, 0.93, 0.91]), np.array([0.70, 0.35, 0.05]))
-"""Colours of distances inwards, of none, and outwards; blue and orange differ to all eyes."""
+_ENDS = np.array(ANCHORS["signed"])
+"""Colours of distances inwards, of none, and outwards."""
 _UNKNOWN = np.array([0.55, 0.55, 0.58])
-_STRONG = np.array([0.35, 0.0, 0.35])
 _REGIONS_SHOWN = 20
 _SHOWN_QUANTILE = 0.999
 
@@ -29,16 +31,56 @@ def write(comparison: Comparison, folder: Path) -> None:
     scale_mm = _scale(comparison.distance_mm, comparison.u_mm)
     shape = distance_colours(comparison.distance_mm, scale_mm)
     _write_maps(comparison, shape, folder / MAPS)
-    title = f"{text(comparison.before.name)} and {text(comparison.after.name)} compared"
-    body = f"<h1>{title}</h1><ul>" + "".join(f"<li>{text(remark)}." for remark in remarks(comparison)) + "</ul>"
-    body += section("shape", "Shape", _shape(comparison, shape, scale_mm))
-    body += section("colour", "Colour", _colour(comparison))
-    files = {
-        link(MAPS): "points with distance, uncertainty, colour difference and marks",
-        link("comparison.json"): "the regions in figures",
-    }
-    body += section("files", "Files", facts(files))
-    (folder / REPORT).write_text(page("States compared", body), encoding="utf-8")
+    page = Page(
+        title=f"{comparison.before.name} and {comparison.after.name}: compared",
+        pictures=[_shape(comparison, shape, scale_mm)],
+        summary=f"{int(np.isfinite(comparison.distance_mm).sum()):,} points of {comparison.before.name} were "
+        f"compared with the surface of {comparison.after.name}.",
+        quality=_quality(comparison),
+        next_step=_next_step(comparison),
+        sections=[
+            Section(
+                "known",
+                "What must be known",
+                items=[f"{remark[0].upper()}{remark[1:]}." for remark in remarks(comparison)],
+            ),
+            Section(
+                "shape",
+                "Shape",
+                figures=_drawing_of_changed(comparison, comparison.moved_points, "shape"),
+                figure_size="wide",
+                tables=[_regions("Regions that changed in shape", comparison.shape_regions)],
+            ),
+            _colour(comparison),
+            Section("files", "Files", tables=[Table("Files", ("file", "holds"), _FILES)]),
+        ],
+    )
+    (folder / REPORT).write_text(render(page), encoding="utf-8")
+
+
+_FILES = (
+    (Link(MAPS), "points with distance, uncertainty, colour difference and marks"),
+    (Link("comparison.json"), "the regions in figures"),
+)
+
+
+def _quality(comparison: Comparison) -> str:
+    u_mm = float(np.nanmedian(comparison.u_mm))
+    count = len(comparison.shape_regions)
+    regions = "1 region" if count == 1 else f"{count} regions"
+    return (
+        f"A distance has a standard uncertainty of {u_mm:.2g} mm (median): "
+        f"{int(comparison.moved_points.sum()):,} points "
+        f"changed significantly, in {regions}."
+    )
+
+
+def _next_step(comparison: Comparison) -> Inline:
+    regions = len(comparison.shape_regions) + len(comparison.colour_regions)
+    if not regions:
+        return "Nothing: keep both states, and compare the next one with the first."
+    link = Link("#shape", "shape") if comparison.shape_regions else Link("#colour", "colour")
+    return ["Look at the object where regions of ", link, " are named, the largest first."]
 
 
 def remarks(comparison: Comparison) -> Iterator[str]:
@@ -75,53 +117,72 @@ def _scale(distance_mm: Points, u_mm: Points) -> float:
 
 def distance_colours(distance_mm: Points, scale_mm: float) -> Points:
     """[n, 3] of distances, full at `scale_mm`; grey where there is none."""
-    share = np.clip(np.nan_to_num(distance_mm / scale_mm), -1, 1)[:, None]
-    inward, none, outward = _ENDS
-    colours = none + np.where(share < 0, -share * (inward - none), share * (outward - none))
+    colours = colours_of(0.5 + 0.5 * np.nan_to_num(distance_mm / scale_mm), "signed")
     return np.where(np.isfinite(distance_mm)[:, None], colours, _UNKNOWN)
 
 
-def _shape(comparison: Comparison, colours: Points, scale_mm: float) -> str:
-    figures = _image(comparison, colours, f"Distances: blue {scale_mm:.3g} mm inwards, orange as much outwards")
-    figures += _image(comparison, _marks(comparison.moved_points), "Points whose shape changed significantly")
-    return figures + _regions("Regions that changed in shape", comparison.shape_regions)
+def _shape(comparison: Comparison, colours: Points, scale_mm: float) -> Figure:
+    title = "Distance of the later state, outwards positive"
+    return _map(comparison, comparison.distance_mm, colours, (title, "mm", -scale_mm, scale_mm, "signed"))
 
 
-def _colour(comparison: Comparison) -> str:
+def _colour(comparison: Comparison) -> Section:
     if comparison.de00 is None or comparison.recoloured_points is None:
-        return ""
+        return Section("colour", "Colour")
     most = max(3.0, float(np.nanquantile(comparison.de00, _SHOWN_QUANTILE)))
-    share = np.clip(np.nan_to_num(comparison.de00 / most), 0, 1)[:, None]
-    colours = np.where(np.isfinite(comparison.de00)[:, None], _ENDS[1] + share * (_STRONG - _ENDS[1]), _UNKNOWN)
-    figures = _image(comparison, colours, f"Colour differences, dE00 under D65: 0 light, {most:.2g} dark")
-    figures += _image(
-        comparison, _marks(comparison.recoloured_points), "Points whose colour changed significantly"
+    colours = np.where(
+        np.isfinite(comparison.de00)[:, None], colours_of(np.nan_to_num(comparison.de00) / most), _UNKNOWN
     )
-    return figures + _regions("Regions that changed in colour", comparison.colour_regions)
+    return Section(
+        "colour",
+        "Colour",
+        figures=[
+            _map(
+                comparison, comparison.de00, colours, ("Colour difference under D65", "dE00", 0.0, most, "amount")
+            ),
+            *_drawing_of_changed(comparison, comparison.recoloured_points, "colour"),
+        ],
+        figure_size="wide",
+        tables=[_regions("Regions that changed in colour", comparison.colour_regions)],
+    )
+
+
+def _map(
+    comparison: Comparison, values: Points, colours: Points, scale: tuple[str, str, float, float, str]
+) -> Figure:
+    """Values of the points [n] on the surface; points without triangles are drawn in `colours`. `scale`: title,
+    unit, lowest and highest value, palette."""
+    title, unit, low, high, palette = scale
+    state = comparison.before
+    if not len(state.triangles):
+        return _image(comparison, colours, f"{title}: {low:.3g} to {high:.3g} {unit}")
+    solid = Solid("state", state.points_mm, state.triangles)
+    value_sheet, shade = values_from_sides(solid, values[state.triangles].mean(axis=1))
+    return shaded_map(title, value_sheet, shade, unit, high, low=low, palette=palette)
 
 
 def _marks(is_marked: NDArray[np.bool_]) -> Points:
-    return np.where(is_marked[:, None], _ENDS[2], _ENDS[1])
+    return np.asarray(np.where(is_marked[:, None], _ENDS[2], _ENDS[1]))
 
 
-def _image(comparison: Comparison, colours: Points, caption: str) -> str:
+def _drawing_of_changed(comparison: Comparison, is_changed: NDArray[np.bool_], quantity: str) -> list[Figure]:
+    """A drawing of the points that changed; none if there are none."""
+    if not is_changed.any():
+        return []
+    return [_image(comparison, _marks(is_changed), f"Points whose {quantity} changed significantly are orange")]
+
+
+def _image(comparison: Comparison, colours: Points, title: str) -> Picture:
     state = comparison.before
     if len(state.triangles):
-        solid = Solid("state", state.points_mm, state.triangles)
         of_faces = colours[state.triangles].mean(axis=1)
-        sheet = sheet_of_sides(state.points_mm, lambda canvas: canvas.fill([solid], [of_faces], has_outline=False))
-    else:
-        some = np.random.default_rng(0).permutation(len(state.points_mm))[:40_000]
-        sheet = sheet_of_sides(
-            state.points_mm, lambda canvas: canvas.dots(state.points_mm[some], colours[some], 1.5)
-        )
-    buffer = io.BytesIO()
-    sheet.save(buffer, "PNG", optimize=True)
-    image = picture("png", buffer.getvalue(), caption)
-    return f"<figure>{image}<figcaption>{text(caption)}.</figcaption></figure>"
+        return picture_of(solid_drawn(Solid("state", state.points_mm, state.triangles), of_faces), title)
+    some = np.random.default_rng(0).permutation(len(state.points_mm))[:40_000]
+    sheet = sheet_of_sides(state.points_mm, lambda canvas: canvas.dots(state.points_mm[some], colours[some], 1.5))
+    return picture_of(sheet, title)
 
 
-def _regions(caption: str, regions: Sequence[Region]) -> str:
+def _regions(caption: str, regions: Sequence[Region]) -> Table:
     rows = [
         (
             ", ".join(f"{value:.1f}" for value in region.middle_mm),
@@ -132,7 +193,7 @@ def _regions(caption: str, regions: Sequence[Region]) -> str:
         )
         for region in regions[:_REGIONS_SHOWN]
     ]
-    return table(caption, ("middle x, y, z, mm", "points", "across, mm", "mean distance, mm", "mean dE00"), rows)
+    return Table(caption, ("middle x, y, z, mm", "points", "across, mm", "mean distance, mm", "mean dE00"), rows)
 
 
 def _write_maps(comparison: Comparison, colours: Points, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.geometry import look_at
+from coupole.pages.page_parts import Code, Inline, Link, Page, Picture, Section, Table
+from coupole.pages.page_rendering import render
 from coupole.scan.mesh_bytes import MeshFile
 from coupole.scan.mesh_ply import read_ply
 from coupole.scan.registration.merging import Merged
 from coupole.scan.registration.registering import Registration
 from coupole.scan.registration.small_motions import moved_points
 from coupole.scan.registration.summary import point_uncertainty_mm, remarks, worst_loop_mm
-from coupole.viewing.page_parts import facts, link, page, picture, section, table, text
-from coupole.viewing.view_canvas import Canvas, Lookout
+from coupole.viewing.view_canvas import Canvas, Lookout, seen_faces
 from coupole.viewing.view_solids import Points, Solid, with_fewer_faces
 
 REPORT = "report.html"
@@ -31,31 +32,61 @@ _LOOPS_SHOWN, _TARGETS_SHOWN = 12, 60
 
 def write(registration: Registration, merged_mesh: Merged | None, folder: Path) -> None:
     """Write the report beside what was merged. Raises OSError."""
-    body = f"<h1>{len(registration.names)} scans registered</h1><ul>"
-    body += "".join(f"<li>{text(remark[0].upper() + remark[1:])}." for remark in remarks(registration)) + "</ul>"
-    body += section("pictures", "Pictures", _pictures(registration, merged_mesh, folder))
-    body += section("files", "Files", _files(merged_mesh))
-    body += section("scans", "Scans", _scans(registration))
-    body += section("loops", "Loops", _loops(registration))
-    body += section("targets", "Targets", _targets(registration))
-    (folder / REPORT).write_text(page("Scans registered", body), encoding="utf-8")
+    placed_count = len(registration.placed_numbers)
+    page = Page(
+        title=f"{folder.resolve().name}: {placed_count} of {len(registration.names)} scans registered",
+        pictures=_pictures(registration, merged_mesh, folder),
+        summary=f"{len(registration.names)} scans were brought into one frame by {registration.pairs} overlapping "
+        "pairs.",
+        quality=_quality(registration),
+        next_step=_next_step(registration, merged_mesh, folder),
+        sections=[
+            Section(
+                "known",
+                "What must be known",
+                items=[f"{remark[0].upper()}{remark[1:]}." for remark in remarks(registration)],
+            ),
+            _scans(registration),
+            _loops(registration),
+            Section("targets", "Targets", tables=[_targets(registration)]),
+            Section("files", "Files", tables=[_files(merged_mesh)]),
+        ],
+    )
+    (folder / REPORT).write_text(render(page), encoding="utf-8")
 
 
-def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> str:
-    figures = _image(scans_drawn(registration), "Each scan in its place in a colour of its own, from three sides")
-    if merged_mesh is not None:
-        mesh = read_ply(MeshFile(folder / "mesh.ply"))
-        vertices = mesh.vertices.astype(np.float64)
-        solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
-        figures += _image(solid_drawn(solid, _STONE), "The merged mesh, from three sides")
-    return figures
+def _quality(registration: Registration) -> str:
+    surfaces = f"Surfaces lie on each other within {registration.fit.rms_mm:.3g} mm"
+    if not registration.loops:
+        return f"{surfaces}; no loop of pairs closes, so that a wrong pair would not be noticed."
+    return f"{surfaces}; loops of pairs close within {worst_loop_mm(registration):.3g} mm at worst."
 
 
-def _image(sheet: Any, alternative: str) -> str:
+def _next_step(registration: Registration, merged_mesh: Merged | None, folder: Path) -> Inline:
+    if registration.unplaced_numbers:
+        return "Scan again where scans were not placed, so that they overlap others; or give targets."
+    if merged_mesh is None:
+        return "Say it again without --no-mesh to merge the scans."
+    return ["Look at the mesh from all sides, then plan its views: ", Code(f"{folder.name}/mesh.ply"), "."]
+
+
+def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> list[Picture]:
+    scans = picture_of(
+        scans_drawn(registration), "Each scan in its place in a colour of its own, from three sides"
+    )
+    if merged_mesh is None:
+        return [scans]
+    mesh = read_ply(MeshFile(folder / "mesh.ply"))
+    vertices = mesh.vertices.astype(np.float64)
+    solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
+    return [picture_of(solid_drawn(solid, _STONE), "The merged mesh, from three sides"), scans]
+
+
+def picture_of(sheet: Any, title: str) -> Picture:
+    """A PIL image as a picture as wide as the page."""
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG", optimize=True)
-    image = picture("png", buffer.getvalue(), alternative)
-    return f"<figure>{image}<figcaption>{text(alternative)}.</figcaption></figure>"
+    return Picture(title, buffer.getvalue(), is_broad=True)
 
 
 def scans_drawn(registration: Registration) -> Any:
@@ -81,19 +112,35 @@ def sheet_of_sides(points: Points, draw: Callable[[Canvas], None]) -> Any:
     """A PIL image from three sides; `draw` draws on a canvas."""
     from PIL import Image, ImageDraw
 
-    low, high = points.min(axis=0), points.max(axis=0)
-    size_mm = float(np.linalg.norm(high - low))
-    up = _upright(points)
     sheet = Image.new("RGB", (len(_SIDES) * _WIDTH_PX, _HEIGHT_PX), "white")
-    for place, (name, elevation_deg, azimuth_deg) in enumerate(_SIDES):
-        eye = look_at((0, 0, 0), 3 * size_mm, azimuth_deg, elevation_deg)
-        eye[:3] = up @ eye[:3]
-        eye[:3, 3] += (low + high) / 2
-        canvas = Canvas(Lookout(eye, 1.1 * _HEIGHT_PX / size_mm, _WIDTH_PX, _HEIGHT_PX, perspective=False))
+    for place, (name, lookout) in enumerate(_lookouts(points)):
+        canvas = Canvas(lookout)
         draw(canvas)
         sheet.paste(canvas.image(), (place * _WIDTH_PX, 0))
         ImageDraw.Draw(sheet).text((place * _WIDTH_PX + 10, 8), name, fill="black", font_size=16)
     return sheet
+
+
+def values_from_sides(solid: Solid, values: Points) -> tuple[Points, Points]:
+    """Values [faces] of a solid as seen from three sides, and its brightness, both [h, w]; NaN beside it."""
+    sheets, shades = [], []
+    for _, lookout in _lookouts(solid.vertices_mm):
+        face, brightness = seen_faces(lookout, solid)
+        sheets.append(np.where(face >= 0, values[face], np.nan))
+        shades.append(np.where(face >= 0, brightness[face].astype(np.float64), np.nan))
+    return np.concatenate(sheets, axis=1), np.concatenate(shades, axis=1)
+
+
+def _lookouts(points: Points) -> Iterator[tuple[str, Lookout]]:
+    """Three sides, and where from each is looked at all of the points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    size_mm = float(np.linalg.norm(high - low))
+    up = _upright(points)
+    for name, elevation_deg, azimuth_deg in _SIDES:
+        eye = look_at((0, 0, 0), 3 * size_mm, azimuth_deg, elevation_deg)
+        eye[:3] = up @ eye[:3]
+        eye[:3, 3] += (low + high) / 2
+        yield name, Lookout(eye, 1.1 * _HEIGHT_PX / size_mm, _WIDTH_PX, _HEIGHT_PX, perspective=False)
 
 
 def _upright(points: Points) -> NDArray[np.float64]:
@@ -108,64 +155,63 @@ def _hue(share: float) -> NDArray[np.float64]:
     return np.asarray(0.5 + 0.35 * np.cos(thirds))
 
 
-def _files(merged_mesh: Merged | None) -> str:
-    rows = {link("registration.json"): "poses with covariances, loops, rejected pairs"}
+def _files(merged_mesh: Merged | None) -> Table:
+    rows: list[Sequence[Inline]] = [(Link("registration.json"), "poses with covariances, loops, rejected pairs")]
     if merged_mesh is not None:
-        rows[link("mesh.ply")] = f"{merged_mesh.triangles:,} triangles, from cells of {merged_mesh.cell_mm:.3g} mm"
-        rows |= {link(name): f"{count:,} points" for name, count in merged_mesh.levels.items()}
-    return facts(rows)
+        cells = f"{merged_mesh.triangles:,} triangles, from cells of {merged_mesh.cell_mm:.3g} mm"
+        rows.append((Link("mesh.ply"), cells))
+        rows += [(Link(name), f"{count:,} points") for name, count in merged_mesh.levels.items()]
+    return Table("Files", ("file", "holds"), rows)
 
 
-def _scans(registration: Registration) -> str:
+def _scans(registration: Registration) -> Section:
     rows = []
     for number, scan in enumerate(registration.scans):
         is_placed = number in registration.placed_numbers
         rows.append(
             (
-                text(scan.name),
+                scan.name,
                 f"{scan.survey.count:,}",
                 f"{scan.survey.spacing_mm:.3g}",
-                text(scan.viewpoint.stand),
+                scan.viewpoint.stand,
                 f"{point_uncertainty_mm(registration, number):.3g}" if is_placed else "not placed",
             )
         )
     head = ("scan", "points", "spacing, mm", "seen from", "u of its points, mm")
+    control = ", or of the control points" if registration.site_from_first is not None else ""
     note = (
-        "<p>u: standard uncertainty (68 %) of where a scan's pose puts its points, in the frame of the first scan"
+        "u: standard uncertainty (68 %) of where a scan's pose puts its points, in the frame of the first scan"
+        f"{control}."
     )
-    note += ", or of the control points." if registration.site_from_first is not None else "."
-    return table("Scans", head, rows) + note
+    return Section("scans", "Scans", tables=[Table("Scans", head, rows)], notes=[note])
 
 
-def _loops(registration: Registration) -> str:
-    rows: Sequence[Sequence[str]] = [
-        (
-            text(" - ".join(registration.names[k] for k in loop.scans)),
-            f"{loop.error_mm:.3g}",
-            f"{loop.error_deg:.3g}",
-        )
+def _loops(registration: Registration) -> Section:
+    rows = [
+        (" - ".join(registration.names[k] for k in loop.scans), f"{loop.error_mm:.3g}", f"{loop.error_deg:.3g}")
         for loop in registration.loops[:_LOOPS_SHOWN]
     ]
     if not rows:
-        return "<p>No pairs form a ring."
-    summary = f"<p>{len(registration.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
-    summary += (
-        f"{worst_loop_mm(registration):.3g} mm. All uncertainties hold a factor of {registration.loop_factor:.2f} "
-        "by the loops."
+        return Section("loops", "Loops", words=["No pairs form a ring."])
+    words = (
+        f"{len(registration.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
+        f"{worst_loop_mm(registration):.3g} mm. All uncertainties hold a factor of "
+        f"{registration.loop_factor:.2f} by "
+        "the loops."
     )
-    return summary + table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
+    table = Table("The worst loops", ("scans in a ring", "mm", "degrees"), rows)
+    return Section("loops", "Loops", words=[words], tables=[table])
 
 
-def _targets(registration: Registration) -> str:
+def _targets(registration: Registration) -> Table:
+    sightings = sorted(registration.fit.sightings, key=lambda entry: -entry.left_mm / entry.u_mm)
     rows = [
         (
-            text(sighting.name),
-            text(registration.names[registration.placed_numbers[sighting.scan]]),
+            sighting.name,
+            registration.names[registration.placed_numbers[sighting.scan]],
             f"{sighting.u_mm:.3g}",
             f"{sighting.left_mm:.3g}",
         )
-        for sighting in sorted(registration.fit.sightings, key=lambda entry: -entry.left_mm / entry.u_mm)[
-            :_TARGETS_SHOWN
-        ]
+        for sighting in sightings[:_TARGETS_SHOWN]
     ]
-    return table("Targets", ("target", "scan", "stated u, mm", "off, mm"), rows)
+    return Table("Targets", ("target", "scan", "stated u, mm", "off, mm"), rows)

@@ -1,4 +1,4 @@
-"""`report.html` of a run: what was measured and how well, light and time, then trouble; technical tables last.
+"""`report.html` of a run: a picture, what was measured and how well, light and time, then trouble; tables last.
 
 It is made from the run's folder alone, at any time, also while the run goes on and after a crash.
 """
@@ -9,20 +9,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from coupole.errors import InputError, StorageError
+from coupole.pages.page_parts import Code, Inline, Link, Page, Section, Table, Verdict
+from coupole.pages.page_rendering import write_page
 from coupole.plan import yamlfile
 from coupole.plan.plan import Plan
 from coupole.storage import journal
-from coupole.storage.durable import write_synced
 from coupole.storage.journal_events import Event, FrameProven, ViewBegun
-from coupole.storage.run import Run
+from coupole.storage.run import Run, name_without_time
 from coupole.storage.run_status import Status, status
 from coupole.viewing import report_facts as run_facts
-from coupole.viewing.page_parts import facts, page, section, table, text
 from coupole.viewing.report_pictures import (
     coverage_in_words,
     coverages,
     exposure_in_words,
     exposures,
+    first_pictures,
     pictures,
 )
 from coupole.viewing.run_coverage import Coverage, coverage_of
@@ -31,47 +32,79 @@ from coupole.viewing.run_sample import SampledView, sampled_views
 
 def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
     """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
-    run's lock says whether it is `in_use`."""
+    run's lock says whether it is `in_use`. Raises StorageError."""
     path = path or run.report_path
-    content = _page(run, status(run, in_use=in_use))
-    try:
-        write_synced(path, content)
-    except OSError as error:
-        raise StorageError(f"{path}: {error.strerror}") from error
+    write_page(path, _page(run, status(run, in_use=in_use)))
     return path
 
 
-def _page(run: Run, run_status: Status) -> str:
+def _page(run: Run, run_status: Status) -> Page:
     events = list(journal.read_events(run.journal_path))
     views = sampled_views(run, (event for event in events if isinstance(event, FrameProven)))
     object_coverage = _coverage(run, views)
     lines = run_facts.troubles(events, views, run_status)
-    sections = {
-        "measured": ("What was measured", _measured_views(run, events, views)),
-        "exposure": ("Exposure", exposures(views, run.about.get("scaling") or "")),
-        "choices": ("Chosen in the run", run_facts.choices(events)),
-        "coverage": (
-            "Coverage of the object",
-            coverages(object_coverage) if isinstance(object_coverage, Coverage) else "",
-        ),
-        "light": ("Light on the object", run_facts.light(events, views, run_status)),
-        "time": ("Time", run_facts.sessions(run_status)),
-        "calibrations": ("Calibrations", run_facts.calibrations(run)),
-        "trouble": ("What went wrong", run_facts.trouble(lines)),
-        "pictures": ("Pictures", pictures(views)),
-        "technical": ("Devices and software", run_facts.technical(run, events, run_status)),
-    }
-    parts = {name: part for name, part in sections.items() if part[1]}
-    remark = "<p>Simulated: no real light, no real object.</p>" if run.is_simulated else ""
-    glance = facts(_glance(run, run_status, views, object_coverage, lines))
-    body = "".join(section(name, *part) for name, part in parts.items())
-    head = f"<header><h1>{text(run.folder.name)}</h1>{remark}</header>"
-    return page(run.folder.name, f"{head}<main>{glance}{_contents(parts)}{body}</main>")
+    is_known = isinstance(object_coverage, Coverage)
+    sections = [
+        _measured_views(run, events, views),
+        exposures(views, run.about.get("scaling") or ""),
+        *run_facts.choices(events),
+        *([coverages(object_coverage)] if isinstance(object_coverage, Coverage) else []),
+        run_facts.light(events, views, run_status),
+        run_facts.sessions(run_status),
+        run_facts.calibrations(run),
+        run_facts.trouble(lines),
+        pictures(views),
+        run_facts.technical(run, events, run_status),
+    ]
+    views_text = "1 view" if len(views) == 1 else f"{len(views)} views"
+    return Page(
+        title=f"{run.about.get('object') or name_without_time(run.folder.name)}: {views_text} acquired",
+        pictures=first_pictures(views),
+        summary=_summary(run, run_status, views),
+        quality=_quality(views, object_coverage, lines),
+        next_step=_next_step(run, run_status, views, has_mesh=is_known),
+        remark="Simulated: no real light, no real object." if run.is_simulated else "",
+        facts=_glance(run, run_status, views, object_coverage, lines),
+        sections=sections,
+    )
 
 
-def _contents(sections: Mapping[str, tuple[str, str]]) -> str:
-    links = "".join(f'<li><a href="#{name}">{heading}</a></li>' for name, (heading, _) in sections.items())
-    return f'<nav aria-label="Contents"><ul>{links}</ul></nav>'
+def _summary(run: Run, run_status: Status, views: Sequence[SampledView]) -> str:
+    leds = max((view.leds for view in views), default=0)
+    day = str(run.about.get("created", ""))[:10]
+    under = f" under {leds} LEDs" if leds else ""
+    return (
+        f"The plan {name_without_time(run.folder.name)} was acquired{f' on {day}' if day else ''}: "
+        f"{run_status.proven} of "
+        f"{run_status.shots} shots are proven, in {len(views)} view{'' if len(views) == 1 else 's'}{under}."
+    )
+
+
+def _quality(views: Sequence[SampledView], object_coverage: Coverage | str, lines: Sequence[Inline]) -> Inline:
+    parts = [exposure_in_words(views) or "there is no picture yet"]
+    if isinstance(object_coverage, Coverage):
+        parts.append(coverage_in_words(object_coverage))
+    parts.append(f"{_things(lines)} went wrong" if lines else "nothing went wrong")
+    sentence = "; ".join(parts)
+    return f"{sentence[0].upper()}{sentence[1:]}."
+
+
+def _next_step(run: Run, run_status: Status, views: Sequence[SampledView], *, has_mesh: bool) -> Inline:
+    name = run.folder.name
+    if run_status.go_on:
+        return ["Take what is left, ", f"{run_status.frames_left} frames: ", Code(run_status.go_on)]
+    if run_status.missing:
+        return ["Read ", Link("#trouble", "what went wrong"), "."]
+    verdicts = {view.verdict() for view in views}
+    if verdicts & {"over-exposed", "under-exposed"}:
+        return ["Read ", Link("#exposure", "Exposure"), ", then acquire the plan again at another exposure."]
+    if has_mesh:
+        return ["Find its reflectance: ", Code(f"coupole reflectance {name} --out {name}-reflectance")]
+    return ["Keep it safe: ", Code(f"coupole archive {name}")]
+
+
+def _things(lines: Sequence[Inline]) -> str:
+    return "one thing" if len(lines) == 1 else f"{len(lines)} things"
 
 
 def _coverage(run: Run, views: Sequence[SampledView]) -> Coverage | str:
@@ -79,7 +112,7 @@ def _coverage(run: Run, views: Sequence[SampledView]) -> Coverage | str:
     try:
         return coverage_of(run, views) or "not known: the object has no mesh, or no view a measured pose"
     except (InputError, StorageError, OSError, ValueError) as error:
-        return f"not known: {text(str(error).splitlines()[0] if str(error) else type(error).__name__)}"
+        return f"not known: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
 
 
 def _glance(
@@ -87,20 +120,17 @@ def _glance(
     run_status: Status,
     views: Sequence[SampledView],
     object_coverage: Coverage | str,
-    lines: Sequence[str],
-) -> dict[str, str]:
-    kind = {"done": "ok", "failed": "bad"}.get(run_status.state, "stopped")
-    why = f": {text(run_status.reason)}" if run_status.reason and run_status.state != "done" else ""
-    whole = "ok" if run_status.missing == 0 else kind
-    things = "one thing" if len(lines) == 1 else f"{len(lines)} things"
+    lines: Sequence[Inline],
+) -> Mapping[str, Inline]:
+    sign = run_facts.sign_of(run_status.state)
+    why = f": {run_status.reason}" if run_status.reason and run_status.state != "done" else ""
+    proven = f"{run_status.proven} of {run_status.shots} proven"
+    taken_again = f", {run_status.reshot} re-shot, {run_status.darks_proven} dark frames"
     return {
-        "outcome": f"<b class={kind}>{run_status.state}</b>{why}",
-        "go on with": f"<code>{text(run_status.go_on)}</code> ({run_status.frames_left} frames are left)"
-        if run_status.go_on
-        else "",
-        "object": text(run.about.get("object") or "none"),
-        "shots": f"<span class={whole}>{run_status.proven} of {run_status.shots} proven</span>, "
-        f"{run_status.reshot} re-shot, {run_status.darks_proven} dark frames",
+        "outcome": [Verdict(run_status.state, sign), why],
+        "run": run.folder.name,
+        "object": run.about.get("object") or "none",
+        "shots": [Verdict(proven, "ok" if run_status.missing == 0 else sign), taken_again],
         "exposure": _exposure_in_words(run, views),
         "coverage": coverage_in_words(object_coverage)
         if isinstance(object_coverage, Coverage)
@@ -108,7 +138,7 @@ def _glance(
         "light": run_facts.light_in_words(run_status, run_status.dose_budget_lux_h or _plans_budget_lux_h(run)),
         "duration": run_facts.duration_in_words(run_status),
         "calibrations": run_facts.calibrations_in_words(run),
-        "trouble": f'<a href="#trouble">{things} went wrong</a>' if lines else "none",
+        "trouble": Link("#trouble", f"{_things(lines)} went wrong") if lines else "none",
     }
 
 
@@ -127,21 +157,24 @@ def _plans_budget_lux_h(run: Run) -> float | None:
     return plan.object.dose_budget_lux_h if plan.object else None
 
 
-def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> str:
+def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledView]) -> Section:
     """Views, their lights and what of them is proven."""
     hidden_counts = {event.view: len(event.hidden_leds) for event in events if isinstance(event, ViewBegun)}
-    rows = []
+    rows: list[Sequence[Inline]] = []
     for view in views:
         share = f"{view.proven} of {view.expected_frames}"
-        if view.proven < view.expected_frames:
-            share = f"<span class=stopped>{share}</span>"
         left_out = len(run.hidden_leds.get(view.name, ()))
         hidden_text = f"{left_out}, left out" if left_out else str(hidden_counts.get(view.name, "")) or "not known"
         times = ", ".join(f"{exposure.exposure_us / 1e3:g} ms" for exposure in view.exposures)
-        rows.append((text(view.name), share, str(view.leds), times, str(view.darks), hidden_text))
+        proven: Inline = share if view.proven >= view.expected_frames else Verdict(share, "stopped")
+        rows.append((view.name, proven, str(view.leds), times, str(view.darks), hidden_text))
     head = ("view", "frames proven", "LEDs", "exposures", "dark frames", "hidden LEDs")
-    return (
-        table("Views, in the plan's order", head, rows)
-        + '<p class="note">Proven: box and camera show of which light and exposure the frame is. Hidden: LEDs '
-        "that light nothing which the view sees, because arm, camera or object stand between.</p>"
+    return Section(
+        "measured",
+        "What was measured",
+        tables=[Table("Views, in the plan's order", head, rows)],
+        notes=[
+            "Proven: box and camera show of which light and exposure the frame is. Hidden: LEDs that light "
+            "nothing which the view sees, because arm, camera or object stand between."
+        ],
     )

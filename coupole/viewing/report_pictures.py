@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from coupole.pages.page_parts import Drawing, Inline, Legend, Link, Picture, Section, Shape, Table, Verdict, anchor
 from coupole.preflight.framing import SHARP_PX
-from coupole.viewing.page_parts import anchor, facts, picture, table, text
 from coupole.viewing.progress import OVER_EXPOSED, UNDER_EXPOSED
 from coupole.viewing.raw_preview import BINS
 from coupole.viewing.run_coverage import MOST, Coverage
@@ -17,6 +19,33 @@ from coupole.viewing.view_colours import css, of_share
 
 _WIDTH, _HEIGHT = 192, 56
 _SPOKEN = {"R": "red", "G": "green", "B": "blue", "Y": "grey"}
+_MOST_FIRST = 3
+"""Views that the top of the page shows."""
+
+
+def first_pictures(views: Iterable[SampledView]) -> list[Picture]:
+    """The first views, each as the mean of its pictures: as if many lights were on together."""
+    with_pictures = [view for view in views if view.pictures][:_MOST_FIRST]
+    return [
+        Picture(f"{view.name}: mean of {len(view.pictures)} pictures, each under one LED", _mean(view), "jpeg")
+        for view in with_pictures
+    ]
+
+
+def _mean(view: SampledView) -> bytes:
+    """The mean of a view's pictures as a JPEG, with the brightest two hundredth white."""
+    from PIL import Image
+
+    total: NDArray[np.float64] | None = None
+    for _, data in view.pictures:
+        with Image.open(io.BytesIO(data)) as picture:
+            pixels = np.asarray(picture.convert("RGB"), np.float64)
+        total = pixels if total is None else total + pixels
+    assert total is not None
+    white = max(float(np.quantile(total, 0.995)), 1.0)
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * np.clip(total / white, 0, 1)).astype(np.uint8)).save(buffer, "JPEG", quality=88)
+    return buffer.getvalue()
 
 
 def exposure_in_words(views: Sequence[SampledView]) -> str:
@@ -27,15 +56,15 @@ def exposure_in_words(views: Sequence[SampledView]) -> str:
     return ", ".join(phrases)
 
 
-def exposures(views: Sequence[SampledView], scaling: str) -> str:
+def exposures(views: Sequence[SampledView], scaling: str) -> Section:
     """A row for each exposure of each view. `scaling`: how a simulated cell chose its light; else empty."""
-    rows = [
+    rows: list[Sequence[Inline]] = [
         (
-            f'<a href="#view-{anchor(view.name)}">{text(view.name)}</a>',
+            Link(f"#view-{anchor(view.name)}", view.name),
             f"{exposure.exposure_us / 1e3:g} ms",
             f"{exposure.sample.pictures} of {exposure.frames}",
             f"{exposure.sample.brightest:.0%}",
-            f"{exposure.sample.saturated_share:.2%}" + (f"<br>{text(exposure.worst)}" if exposure.worst else ""),
+            f"{exposure.sample.saturated_share:.2%}" + (f", {exposure.worst}" if exposure.worst else ""),
             _histogram(view.name, exposure),
             exposure.sample.verdict(),
         )
@@ -44,36 +73,37 @@ def exposures(views: Sequence[SampledView], scaling: str) -> str:
         if exposure.sample.pictures
     ]
     if not rows:
-        return ""
+        return Section("exposure", "Exposure")
     head = ("view", "exposure", "pictures looked at", "brightest", "saturated", "histogram", "verdict")
     colours = {name for view in views for exposure in view.exposures for name in exposure.histograms}
     lines = ", ".join(f"{_SPOKEN.get(name, name)}" for name in sorted(colours, key="RGBY".find))
-    remark = f"<p>The light is simulated: {text(scaling)}. A real cell's may differ.</p>" if scaling else ""
-    return (
-        remark
-        + table("Exposure of each view, by pictures spread over its lights", head, rows)
-        + '<p class="note">Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above '
-        "black. Saturated: the largest share of a picture's pixels at full scale, and the shot that has it. "
-        f"Over-exposed: more than {OVER_EXPOSED:.1%} saturated; under-exposed: the brightest of half of the "
-        f"pictures is below {UNDER_EXPOSED:.0%}. Histograms: pixels (logarithmic) "
-        f"from 0 to full scale, {lines}; dashed: black.</p>"
+    return Section(
+        "exposure",
+        "Exposure",
+        words=[f"The light is simulated: {scaling}. A real cell's may differ."] if scaling else [],
+        tables=[Table("Exposure of each view, by pictures spread over its lights", head, rows)],
+        notes=[
+            "Brightest: the highest 99.9 % quantile of a picture, as a share of full scale above black. "
+            "Saturated: the largest share of a picture's pixels at full scale, and the shot that has it. "
+            "Over-exposed: "
+            f"more than {OVER_EXPOSED:.1%} saturated; under-exposed: the brightest of half of the pictures is "
+            "below "
+            f"{UNDER_EXPOSED:.0%}. Histograms: pixels (logarithmic) from 0 to full scale, {lines}; dashed: black."
+        ],
     )
 
 
-def _histogram(view: str, exposure: SampledExposure) -> str:
+def _histogram(view: str, exposure: SampledExposure) -> Drawing:
     most = math.log1p(max((int(counts.max()) for counts in exposure.histograms.values()), default=1)) or 1.0
-    lines = []
+    shapes = []
     for name, counts in exposure.histograms.items():
         heights = _HEIGHT * (1 - np.log1p(counts) / most)
         points = " ".join(f"{(n + 0.5) * _WIDTH / BINS:.1f},{y:.1f}" for n, y in enumerate(heights))
-        lines.append(f'<polyline class="{name}" points="{points}"/>')
-    black = exposure.black_share * _WIDTH
-    lines.append(f'<line x1="{black:.1f}" x2="{black:.1f}" y1="0" y2="{_HEIGHT}"/>')
-    caption = f"Histogram of view {view} at {exposure.exposure_us / 1e3:g} ms"
-    return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
-        f'aria-label="{text(caption)}">{"".join(lines)}</svg>'
-    )
+        shapes.append(Shape("polyline", {"class": name, "points": points}))
+    black = round(exposure.black_share * _WIDTH, 1)
+    shapes.append(Shape("line", {"x1": black, "x2": black, "y1": 0, "y2": _HEIGHT}))
+    title = f"Histogram of view {view} at {exposure.exposure_us / 1e3:g} ms"
+    return Drawing(title, _WIDTH, _HEIGHT, shapes, most_px=_WIDTH)
 
 
 def coverage_in_words(coverage: Coverage) -> str:
@@ -81,7 +111,7 @@ def coverage_in_words(coverage: Coverage) -> str:
     return f"{coverage.shares[0]:.0%} of the surface that can be seen from above the disk is in a view"
 
 
-def coverages(coverage: Coverage) -> str:
+def coverages(coverage: Coverage) -> Section:
     """Shares of the surface by number of views, drawings, and what each view has of the object."""
     size = " x ".join(
         f"{high - low:.0f}"
@@ -92,25 +122,26 @@ def coverages(coverage: Coverage) -> str:
         for n, share in enumerate(coverage.shares)
     )
     near, far = coverage.sharp_mm
-    drawings = "".join(
-        f"<figure>{picture('png', data, f'The object {whence}, coloured by the number of views')}"
-        f"<figcaption>{whence}</figcaption></figure>"
-        for whence, data in coverage.drawings.items()
-    )
-    return (
-        facts(
-            {
-                "surface": f"{at_least}; of what can be seen from above the disk ({coverage.reachable:.0%} of "
-                "all)",
-                "object": f"{size} mm",
-                "sharp": f"{near:.0f} mm to {f'{far:.0f} mm' if math.isfinite(far) else 'infinity'} from the lens "
-                f"(blurred over at most {SHARP_PX:g} pixels)",
-            }
-        )
-        + f'<div class="drawings">{drawings}</div>{_legend()}'
-        + table("What each view has of the object", _FRAMED, _framings(coverage))
-        + '<p class="note">By the mesh, the measured poses and the rig\'s lens. Of the arm, which may stand in a '
-        "view's way, nothing is counted; nor which lights reach a point.</p>"
+    return Section(
+        "coverage",
+        "Coverage of the object",
+        figures=[
+            Picture(whence, data, alternative=f"The object {whence}, coloured by the number of views")
+            for whence, data in coverage.drawings.items()
+        ],
+        figure_size="medium",
+        legend=_legend(),
+        facts={
+            "surface": f"{at_least}; of what can be seen from above the disk ({coverage.reachable:.0%} of all)",
+            "object": f"{size} mm",
+            "sharp": f"{near:.0f} mm to {f'{far:.0f} mm' if math.isfinite(far) else 'infinity'} from the lens "
+            f"(blurred over at most {SHARP_PX:g} pixels)",
+        },
+        tables=[Table("What each view has of the object", _FRAMED, list(_framings(coverage)))],
+        notes=[
+            "By the mesh, the measured poses and the rig's lens. Of the arm, which may stand in a view's way, "
+            "nothing is counted; nor which lights reach a point."
+        ],
     )
 
 
@@ -122,27 +153,25 @@ def _framings(coverage: Coverage) -> Iterable[Sequence[str]]:
         away = f"{view.nearest_mm:.0f} to {view.farthest_mm:.0f}" if math.isfinite(view.nearest_mm) else "-"
         scale = f"{view.px_per_mm[0]:.1f} to {view.px_per_mm[1]:.1f}" if math.isfinite(view.px_per_mm[0]) else "-"
         shares = f"{view.in_field:.0%}", f"{view.fills:.0%}"
-        yield text(view.view), *shares, away, f"{view.in_focus:.0%}", scale
+        yield view.view, *shares, away, f"{view.in_focus:.0%}", scale
 
 
-def _legend() -> str:
+def _legend() -> Legend:
     names = ("no view", "1 view", *(f"{n} views" for n in range(2, MOST)), f"{MOST} views or more")
-    items = "".join(
-        f'<li><span class="swatch" style="background:{css(of_share(n / MOST))}"></span>{name}</li>'
-        for n, name in enumerate(names)
-    )
-    return f'<ul class="legend">{items}</ul>'
+    return Legend({name: css(of_share(n / MOST)) for n, name in enumerate(names)})
 
 
-def pictures(views: Iterable[SampledView]) -> str:
+def pictures(views: Iterable[SampledView]) -> Section:
     """The sampled pictures of each view; a view whose file cannot be read says so."""
-    parts = []
-    for view in views:
-        heading = f'<h3 id="view-{anchor(view.name)}">{text(view.name)}</h3>'
-        figures = "".join(
-            f"<figure>{picture('jpeg', data, shot)}<figcaption>{text(shot)}</figcaption></figure>"
-            for shot, data in view.pictures
+    parts = [
+        Section(
+            f"view-{anchor(view.name)}",
+            view.name,
+            words=[Verdict(view.trouble, "bad")] if view.trouble else [],
+            figures=[Picture(shot, data, "jpeg") for shot, data in view.pictures],
+            figure_size="small",
         )
-        trouble = f"<p class=bad>{text(view.trouble)}</p>" if view.trouble else ""
-        parts.append(f'{heading}{trouble}<div class="pictures">{figures}</div>')
-    return '<p class="note">Previews; saturated pixels are red.</p>' + "".join(parts) if parts else ""
+        for view in views
+    ]
+    words = ["Previews; saturated pixels are red."] if parts else []
+    return Section("pictures", "Pictures", words=words, sections=parts)

@@ -87,7 +87,7 @@ class Canvas:
         face = np.full(layer.shape, -1, np.int32)
         _rasterise(pixels, near, layer, face)
         is_front = (face >= 0) & (layer >= self._near)
-        pixel_colours = (colour * self._shade(corners_mm)[:, None])[face[is_front]]
+        pixel_colours = (colour * _brightness(self._lookout, corners_mm)[:, None])[face[is_front]]
         if has_outline:
             pixel_colours[_edges(np.where(face >= 0, body[face], -1))[is_front]] *= _OUTLINE
         self._colour[is_front] += opacity * (pixel_colours - self._colour[is_front])
@@ -123,20 +123,6 @@ class Canvas:
         pixels, near = self._lookout.project(points_mm)
         return pixels * OVERSAMPLING, near
 
-    def _shade(self, corners_mm: Points) -> NDArray[np.float32]:
-        """Brightness [faces]: Lambert's law, on both sides of a face."""
-        normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-        length = np.linalg.norm(normals, axis=1)
-        normals /= np.where(length > 0, length, 1.0)[:, None]
-        eye = self._lookout.world_from_eye
-        away = np.einsum("nk,nk->n", normals, corners_mm[:, 0] - eye[:3, 3]) > 0
-        if not self._lookout.perspective:
-            away = normals @ eye[:3, 2] > 0
-        normals[away] *= -1
-        lambert = np.clip(normals @ eye[:3, :3] @ (_TO_LIGHT / np.linalg.norm(_TO_LIGHT)), 0, None)
-        shade: NDArray[np.float32] = (_AMBIENT + (1 - _AMBIENT) * lambert).astype(np.float32)
-        return shade
-
     def _stamp(
         self,
         centers: NDArray[np.float64],
@@ -163,6 +149,30 @@ class Canvas:
         strength[of[is_front]] = opacity
         pixels = self._colour.reshape(-1, 3)
         pixels[at] += strength * (np.asarray(colour, np.float32) - pixels[at])
+
+
+def _brightness(lookout: Lookout, corners_mm: Points) -> NDArray[np.float32]:
+    """Brightness [faces]: Lambert's law, on both sides of a face."""
+    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals /= np.where(length > 0, length, 1.0)[:, None]
+    eye = lookout.world_from_eye
+    away = np.einsum("nk,nk->n", normals, corners_mm[:, 0] - eye[:3, 3]) > 0
+    if not lookout.perspective:
+        away = normals @ eye[:3, 2] > 0
+    normals[away] *= -1
+    lambert = np.clip(normals @ eye[:3, :3] @ (_TO_LIGHT / np.linalg.norm(_TO_LIGHT)), 0, None)
+    shade: NDArray[np.float32] = (_AMBIENT + (1 - _AMBIENT) * lambert).astype(np.float32)
+    return shade
+
+
+def seen_faces(lookout: Lookout, solid: Solid) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """The face that each pixel [h, w] sees, -1 where it sees none, and the brightness of all faces [faces]."""
+    pixels, near = lookout.project(solid.corners_mm)
+    nearest = np.full((lookout.height_px, lookout.width_px), -np.inf)
+    face = np.full(nearest.shape, -1, np.int32)
+    _rasterise(pixels, near, nearest, face)
+    return face, _brightness(lookout, solid.corners_mm)
 
 
 def _edges(body: NDArray[np.int64]) -> NDArray[np.bool_]:

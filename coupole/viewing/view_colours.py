@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coupole.pages.palettes import colours_of
+
 Colour = tuple[float, float, float]
 """Red, green and blue from 0 to 1."""
 
@@ -21,14 +23,10 @@ SIGHT: Colour = (0.10, 0.25, 0.50)
 UNUSED: Colour = (0.80, 0.80, 0.80)
 INK: Colour = (0.13, 0.15, 0.18)
 
-_SHARE = np.array([(0.16, 0.16, 0.32), (0.20, 0.42, 0.55), (0.35, 0.68, 0.55), (0.95, 0.85, 0.30)])
-"""Colours of shares from 0 to 1: from dark to light, without red, so that they are readable in grey too."""
-
 
 def of_share(share: ArrayLike) -> NDArray[np.float64]:
-    """Colours [..., 3] of shares [...] from 0 to 1."""
-    at = np.clip(np.asarray(share, np.float64), 0, 1) * (len(_SHARE) - 1)
-    return np.stack([np.interp(at, np.arange(len(_SHARE)), column) for column in _SHARE.T], axis=-1)
+    """Colours [..., 3] of shares [...] from 0 to 1: those of amounts on all pages."""
+    return colours_of(share)
 
 
 def css(colour: ArrayLike) -> str:

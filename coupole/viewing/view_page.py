@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.motion.occlusion import AWAY, BY_ARM, BY_OBJECT, BY_TOOL
+from coupole.pages.page_parts import Code, Inline, Link, Page, Section, Verdict
+from coupole.pages.page_rendering import render
 from coupole.viewing import view_colours as colours
 from coupole.viewing.terminal import duration_text
 from coupole.viewing.view_colours import Colour, css
@@ -27,28 +29,6 @@ _SUPPORT_THICKNESS_MM = 15.0
 _OVERVIEW, _ALWAYS = 0, -1
 """Steps of the slider, beside the views' numbers, at which a part of the drawing is shown."""
 
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8">
-<meta name="viewport" content="width=device-width,initial-scale=1">
-<title>{title}</title><style>
-:root {{ color-scheme: light; }}
-body {{ font-family: system-ui, sans-serif; color: #22262d; background: #fff; margin: 1.2em; }}
-h1 {{ font-size: 1.5em; font-weight: normal; margin: 0 0 .2em; overflow-wrap: anywhere; }}
-p, ol {{ margin: .2em 0; }}
-.refused {{ color: {red}; }}
-.views {{ display: flex; flex-wrap: wrap; gap: .2em 1em; align-items: center; margin: .6em 0; }}
-.views input {{ flex: 1 1 16em; max-width: 40em; }}
-#view {{ display: block; min-height: 3em; }}
-</style></head><body><main>
-<h1>{title}</h1>
-<p>{about}</p>
-{refusals}
-<div class="views"><label for="step">view</label>
-<input id="step" type="range" min="0" max="{last}" value="0"></div>
-<output id="view" for="step"></output>
-{figure}
-</main></body></html>
-"""
 _SCRIPT = """
 const steps = %s, slider = document.getElementById("step");
 function show() {
@@ -66,28 +46,38 @@ _BUTTONS = [["toImage"], ["orbitRotation", "tableRotation", "pan3d", "zoom3d"], 
 
 
 def write_page(scene: Scene, path: Path) -> None:
-    """Write the HTML page, plotly.js in it."""
-    clear = sum(not stop.refusal for stop in scene.stops)
-    remark = "" if scene.paths_checked else " Paths were not checked for collisions."
-    why = "".join(f"<li>{escape(refusal)}</li>" for refusal in scene.refusals)
+    """Write the HTML page, plotly.js in it. Raises OSError."""
     figure, steps = _figure(scene)
-    page = _PAGE.format(
-        title=escape(scene.plan),
-        red=css(colours.RED),
-        about=f"{len(scene.stops)} views on {escape(scene.rig.name)}, {clear} of them clear.{remark} "
-        "Drag to rotate, scroll to zoom, point at a part for its name; the slider (arrow keys) goes from view "
-        "to view. LEDs are lighter the more they reach of what the camera sees.",
-        refusals=f'<p class="refused">The plan is refused:</p><ol class="refused">{why}</ol>' if why else "",
-        last=len(scene.stops),
-        figure=figure.to_html(
-            full_html=False,
-            include_plotlyjs=True,
-            default_height="75vh",
-            config={"displaylogo": False, "responsive": True, "modeBarButtons": _BUTTONS},
-            post_script=_SCRIPT % json.dumps(steps).replace("<", "\\u003c"),
-        ),
+    drawing = figure.to_html(
+        full_html=False,
+        include_plotlyjs=True,
+        default_height="75vh",
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": _BUTTONS},
+        post_script=_SCRIPT % json.dumps(steps).replace("<", "\\u003c"),
     )
+    page = render(_words_of(scene), "plan.html", drawing=drawing, last_step=len(scene.stops))
     path.write_text(page, encoding="utf-8")
+
+
+def _words_of(scene: Scene) -> Page:
+    views = "1 view" if len(scene.stops) == 1 else f"{len(scene.stops)} views"
+    clear = sum(not stop.refusal for stop in scene.stops)
+    paths_remark = "" if scene.paths_checked else " Paths were not checked for collisions."
+    next_step: Inline = ["Take its frames: ", Code(f"coupole acquire {scene.plan}.yaml")]
+    if scene.refusals:
+        next_step = ["Read ", Link("#refusals", "why the plan is refused"), ", and change these views."]
+    return Page(
+        title=f"{scene.plan}: {views} planned",
+        pictures=[],
+        summary=f"Postures and paths of {views} were planned on {scene.rig.name}.",
+        quality=f"{clear} of {len(scene.stops)} views are clear.{paths_remark}",
+        next_step=next_step,
+        sections=[
+            Section(
+                "refusals", "The plan is refused", items=[Verdict(refusal, "bad") for refusal in scene.refusals]
+            )
+        ],
+    )
 
 
 def _figure(scene: Scene) -> tuple[Any, list[dict[str, Any]]]:

@@ -13,6 +13,7 @@ from relight_cases import waves
 from residual_cases import write_backscatter
 
 from coupole.commands import completion
+from coupole.pages.page_rendering import render
 from coupole.reflectance import run_fits
 from coupole.reflectance.fits import (
     FITS,
@@ -25,13 +26,13 @@ from coupole.reflectance.fits import (
     ViewFit,
     fitted_together,
 )
+from coupole.reflectance.result_pages import ablation_page
 from coupole.reflectance.run_fits import predict_samples
 from coupole.reflectance.run_result import RunResult
 from coupole.reflectance.run_result_files import begin_slices
 from coupole.reflectance.slice_basis import HARMONICS, fewer
 from coupole.reflectance.slice_fit import fit_slices, slice_values
 from coupole.reflectance.triangle_fit import model_values
-from coupole.viewing import ablation_page
 
 LOW = ViewFit("low", "harmonics of few degrees", "#000000", fewer(HARMONICS, 16))
 
@@ -66,7 +67,7 @@ def test_a_new_fit_is_made_and_foretells_by_its_place_in_the_registry_alone(resu
             begin_slices(file, LOW, view, result.channels)[...] = found
         made = predict_samples(result, LOW.name, view, rows, samples)
         mae = {key: [[1.0, dict.fromkeys(FITS, 0.01)]] for key in ("LEDs", "coefficients")}
-        page = "".join(ablation_page._page("x", {"triangles": 1, "mae": mae}))
+        page = render(ablation_page._page("x", {"triangles": 1, "mae": mae}))
     np.testing.assert_array_equal(made, slice_values(samples, found, LOW.basis))
     assert LOW.title in page
 

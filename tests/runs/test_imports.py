@@ -18,8 +18,9 @@ OURS = ("coupole", "drivers", "sim")
 HEAVY = {"PIL", "cv2", "embreex", "h5py", "matplotlib", "numba", "numpy", "rich", "ruamel", "scipy", "trimesh"}
 LATE = {"pwd", "encodings.ascii"}
 """Python's own, that tell who acquires and spell a name: nothing that a stop or a safe end waits for."""
-PICTURE = "PIL"
-"""Writes the report's pictures, when the cell is safe."""
+REPORT = {"PIL", "jinja2", "markupsafe", "encodings"}
+"""Write the report's pictures and its page, when the cell is safe; `encodings.unicode_escape` is the "
+"template's."""
 
 
 def watched(file: Path, *arguments: str | Path) -> subprocess.Popen[str]:
@@ -68,7 +69,7 @@ def test_an_acquisition_that_is_stopped_imports_nothing_while_its_devices_are_op
     assert ended.code == 130, ended.err
     opened, safe, end = (modules(tmp_path / "seen", when) for when in ("opened", "safe", "end"))
     assert safe - opened <= LATE
-    assert {name.split(".")[0] for name in end - safe} <= {PICTURE}
+    assert {name.split(".")[0] for name in end - safe} <= REPORT
     assert ours(opened) <= 262
     assert heavy(opened) == {"embreex", "h5py", "numba", "numpy", "rich", "ruamel", "scipy"}
 

@@ -191,7 +191,7 @@ def test_one_material_for_all_views_misses_less_with_what_was_refined(tmp_path: 
     assert mae["refined"] < 0.4 * mae["given"]
     assert mae["refined"] < 1.3 * mae["true"]
     assert told["refined"]["refined"]["disagreement"] == one.told["disagreement"]
-    assert "views were refined" in (tmp_path / "refined/report.html").read_text()
+    assert "Views were refined" in (tmp_path / "refined/report.html").read_text()
     print(mae)
 
 
@@ -224,7 +224,7 @@ def test_the_page_shows_arrows_before_and_after(made: Made) -> None:
     page = (made.out / "report.html").read_text()
     assert page.count("<svg") == 2 * len(drawn_views.VIEWS)
     assert page.count("<line") == sum(made.told["disagreement"][when]["matches"] for when in ("before", "after"))
-    assert "views disagree by" in page
+    assert "Views disagree by" in page
 
 
 def test_refined_geometry_is_what_samples_are_made_with(made: Made, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ def test_what_is_just_small_enough_passes(tmp_path: Path) -> None:
         ({"sim__world": function_of(61)}, "sim/world.py:1: f has 61 lines"),
         ({"tools__make": "@decorated\n" + function_of(60)}, "tools/make.py:1: f has 61 lines"),
         ({"coupole__plan__shots": "", "coupole__scan__shots": ""}, "plan, scan each have a module shots"),
-        ({f"coupole__room{number}__m{number}": "" for number in range(19)}, "19 rooms"),
+        ({f"coupole__room{number}__m{number}": "" for number in range(20)}, "20 rooms"),
         ({f"coupole__file{number}": "" for number in range(10)}, "10 files"),
     ],
 )

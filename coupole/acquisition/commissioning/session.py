@@ -31,6 +31,7 @@ from coupole.motion.collisions import CellBodies
 from coupole.motion.itinerary import bodies_of
 from coupole.plan.cell import Cell
 from coupole.plan.rig_devices import in_world
+from coupole.preflight import commissioning_page
 from coupole.preflight.commissioned import (
     STEPS,
     CommissioningRecord,
@@ -45,7 +46,6 @@ from coupole.preflight.commissioned import (
     write_commissioning,
 )
 from coupole.storage.arm_faults import faults_of
-from coupole.viewing import commissioning_page
 from coupole.viewing.terminal import alarm, step_bars
 
 ACTS: Mapping[Step, Callable[[Bench], None]] = {

@@ -1,0 +1,194 @@
+"""`identification.html`: what identified spectra show, and which bands say so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from coupole.appearance.spectra.grid import Array
+from coupole.errors import StorageError, reason
+from coupole.heritage.analysis.identification import Evidence, PigmentFinding
+from coupole.heritage.analysis.references import HeldOutRates
+from coupole.pages.page_charts import mark, points
+from coupole.pages.page_parts import Code, Drawing, Inline, Link, Page, Plot, Section, Shape, Table, Verdict
+from coupole.pages.page_rendering import write_page
+
+PAGE = "identification.html"
+_CANDIDATES = 6
+_WIDTH, _LEFT, _CURVES, _BARS = 720.0, 46.0, 240.0, 110.0
+_HEIGHT = _CURVES + _BARS + 60.0
+
+
+def write(folder: Path, findings: Sequence[PigmentFinding], library: str) -> Path:
+    """Write the page of findings that share a library. Raises StorageError."""
+    path = folder / PAGE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{path}: {reason(error)}") from error
+    write_page(path, _page(findings, library))
+    return path
+
+
+def _page(findings: Sequence[PigmentFinding], library: str) -> Page:
+    first = findings[0]
+    is_one = len(findings) == 1
+    return Page(
+        title=f"{first.name if is_one else f'{len(findings)} spectra'}: pigments identified",
+        pictures=[_plot(first)],
+        summary=["Reflectance was compared with the library ", Code(library), ", band by band."],
+        quality=_quality(findings),
+        next_step=_next_step(findings),
+        sections=[
+            Section("spectra", "Spectra", tables=[] if is_one else [_overview(findings)]),
+            *(_section(number, finding) for number, finding in enumerate(findings)),
+            _worth(findings[-1].rates),
+        ],
+    )
+
+
+def _quality(findings: Sequence[PigmentFinding]) -> Inline:
+    if len(findings) == 1:
+        only = findings[0]
+        return [_verdict(only), f": {only.class_name}, probable by {_percent(only)}; {only.reason}."]
+    counts = [
+        (word, sum(finding.verdict == word for finding in findings))
+        for word in ("match", "mixture", "ambiguous", "unknown")
+    ]
+    return f"Of {len(findings)} spectra: {', '.join(f'{count} {word}' for word, count in counts if count)}."
+
+
+def _next_step(findings: Sequence[PigmentFinding]) -> Inline:
+    if all(finding.verdict in ("match", "mixture") for finding in findings):
+        return [
+            "Weigh it by ",
+            Link("#library", "what the verdicts are worth"),
+            "; ask another method before it is published.",
+        ]
+    return "Where it is ambiguous or unknown, add references of the classes in question, or ask another method."
+
+
+def _overview(findings: Sequence[PigmentFinding]) -> Table:
+    rows: list[Sequence[Inline]] = [
+        (Link(f"#s{number}", finding.name), _verdict(finding), finding.class_name, _percent(finding))
+        for number, finding in enumerate(findings)
+    ]
+    return Table("Spectra", ("spectrum", "verdict", "class", "probability"), rows)
+
+
+def _section(number: int, finding: PigmentFinding) -> Section:
+    nm = finding.evidence.wavelengths_nm
+    extent = f"{nm[0]:g} to {nm[-1]:g} nm{', near infrared too' if finding.near_infrared else ''}"
+    parts = [(part.class_name, part.name, f"{part.share:.0%}") for part in finding.parts]
+    candidates = [
+        (candidate.class_name, f"{candidate.probability:.1%}", candidate.name)
+        for candidate in finding.candidates[:_CANDIDATES]
+    ]
+    return Section(
+        f"s{number}",
+        finding.name,
+        figures=[_plot(finding)] if number else [],
+        figure_size="wide",
+        facts={
+            "verdict": _verdict(finding),
+            "why": finding.reason,
+            "compared": "; ".join((extent, *finding.remarks)),
+            "not in the library": f"{finding.not_in_library:.0%}",
+        },
+        tables=[
+            Table("Parts of the mixture", ("class", "reference", "share of K/S"), parts),
+            Table("Most probable classes", ("class", "probability", "nearest reference"), candidates),
+        ],
+        notes=[] if number else ["Its spectrum is the picture at the top."],
+    )
+
+
+def _plot(finding: PigmentFinding) -> Plot:
+    best, second = (candidate.class_name for candidate in finding.candidates[:2])
+    words = (
+        f"Above: the spectrum (solid), the nearest reference of {best} (long dashes) and of {second} (short "
+        "dashes), "
+        "their K/S by the factors that suit best. Below: what each band says, upwards for the first class, "
+        "downwards "
+        "for the second, in units of the spread within classes"
+    )
+    title = f"{finding.name}: reflectance, and evidence by wavelength for {best} against {second}"
+    return Plot(Drawing(title, _WIDTH, _HEIGHT, _shapes(finding.evidence)), words=words)
+
+
+def _verdict(finding: PigmentFinding) -> Verdict:
+    return Verdict(finding.verdict, "ok" if finding.verdict in ("match", "mixture") else "stopped")
+
+
+def _percent(finding: PigmentFinding) -> str:
+    return f"{finding.candidates[0].probability:.0%}"
+
+
+def _worth(rates: HeldOutRates) -> Section:
+    return Section(
+        "library",
+        "What the verdicts are worth",
+        words=[
+            "Each spectrum of the library was identified as if the library lacked it, and as if it lacked its "
+            "class. In "
+            "brackets are 95 % intervals (Clopper and Pearson). Another instrument, binder or ground does worse."
+        ],
+        facts={
+            "first class right": str(rates.right),
+            "match, right": str(rates.matches),
+            "match, wrong": str(rates.false_matches),
+            "unknown, class left out": str(rates.unknown),
+        },
+    )
+
+
+def _shapes(evidence: Evidence) -> list[Shape]:
+    """Three curves above, a bar for each band below, and their scales."""
+    nm = evidence.wavelengths_nm
+    curves = (evidence.reflectance, evidence.best, evidence.runner_up)
+    highest = max(0.1, 1.05 * max(float(curve.max()) for curve in curves))
+    x = np.asarray(_LEFT + (_WIDTH - _LEFT - 10.0) * (nm - nm[0]) / (nm[-1] - nm[0]))
+    shapes = [
+        Shape(
+            "polyline", {"class": name, "stroke-dasharray": dashes, "points": points(x, _height(curve / highest))}
+        )
+        for curve, name, dashes in zip(curves, "YBR", ("none", "9 4", "3 3"), strict=True)
+    ]
+    scale = [
+        mark(_LEFT - 6, float(_height(np.array(tick / highest))) + 4, f"{tick:.0%}", "end")
+        for tick in _ticks(highest)
+    ]
+    return [*shapes, *scale, *_bands(evidence, x), *_wavelengths(nm)]
+
+
+def _height(share: Array) -> Array:
+    return np.asarray(10.0 + _CURVES * (1.0 - share))
+
+
+def _bands(evidence: Evidence, x: Array) -> list[Shape]:
+    middle = 30.0 + _CURVES + _BARS / 2
+    shapes = [Shape("line", {"x1": _LEFT, "x2": _WIDTH - 10, "y1": middle, "y2": middle})]
+    strongest = max(1.0, float(np.abs(evidence.log_odds).max()))
+    width = 0.8 * (_WIDTH - _LEFT - 10.0) / len(x)
+    for at, odds in zip(x, evidence.log_odds / strongest * _BARS / 2, strict=True):
+        top, kind = (middle - odds, "for") if odds > 0.0 else (middle, "against")
+        size = {"width": f"{width:.1f}", "height": f"{abs(odds):.1f}"}
+        shapes.append(Shape("rect", {"x": f"{at - width / 2:.1f}", "y": f"{top:.1f}", **size, "class": kind}))
+    shapes.append(mark(_LEFT - 6, middle - _BARS / 2 + 10, f"{strongest:.0f}", "end"))
+    return [*shapes, mark(_LEFT - 6, middle + _BARS / 2, f"-{strongest:.0f}", "end")]
+
+
+def _wavelengths(nm: Array) -> list[Shape]:
+    step = 50.0 if nm[-1] - nm[0] < 600.0 else 200.0
+    shapes = []
+    for tick in np.arange(np.ceil(nm[0] / step) * step, nm[-1] + 1.0, step):
+        at = _LEFT + (_WIDTH - _LEFT - 10.0) * (tick - nm[0]) / (nm[-1] - nm[0])
+        shapes.append(mark(float(at), _HEIGHT - 8, f"{tick:g}{' nm' if tick + step > nm[-1] else ''}", "middle"))
+    return shapes
+
+
+def _ticks(highest: float) -> list[float]:
+    step = next(step for step in (0.02, 0.05, 0.1, 0.2, 0.5) if highest / step <= 6.0 or step == 0.5)
+    return [float(tick) for tick in np.arange(0.0, highest, step)]

@@ -71,6 +71,7 @@ RUNS = (
     Run("prove_calibrations.py --smallest", r"camera_mm.* median \d", full=True),
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),
+    Run("prove_finishes.py --smallest", r"peaks up to 60 degrees .*: off by up to \d", full=True),
     Run(f"prove_identification.py {PIGMENTS} --smallest", r"\(its class|its class left out: \d", True, PIGMENTS),
     Run("prove_layers.py --smallest", r"photons, another ground: 95 % intervals hold \d", full=True),
     Run("prove_paper_table.py --smallest", r"hold the truth: 68 %: \d", full=True),

@@ -94,12 +94,16 @@ def makie(
         document |= {"clamped": parts.clamped_share, "unknown": float(is_unknown.mean()), "known": checks}
         print(json.dumps(document))
         return
+    _say(console, out, parts, checks, float(is_unknown.mean()))
+
+
+def _say(console: Any, out: Path, parts: Makie, checks: list[dict[str, Any]], unknown: float) -> None:
     console.print(f"{out}: {float(parts.alpha.mean()):.1%} of the picture is metal", markup=False)
     for one in checks:
         told = f"share {one['found']:.3f} +- {one['u_found']:.3f}, known {one['share']:g}"
         console.print(f"at {one['x']},{one['y']}: {told}, off by {one['found'] - one['share']:+.3f}", markup=False)
-    if is_unknown.any():
-        console.print(f"{is_unknown.mean():.2%} of the pixels are saturated or dark; they have no metal here")
+    if unknown:
+        console.print(f"{unknown:.2%} of the pixels are saturated or dark; they have no metal here")
     if parts.clamped_share > _TOLD_FROM:
         console.print(
             f"of {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "

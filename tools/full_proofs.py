@@ -93,6 +93,13 @@ PROOFS = (
         "tools/prove_auto_exposure.py",
     ),
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
+    Proof("brackets", "intervals of merged photographs hold for random cameras", "tools/prove_brackets.py"),
+    Proof(
+        "finishes",
+        "peaks of finishes measured from spheres, by Mitsuba and by formulas",
+        "tools/prove_finishes.py",
+    ),
+    Proof("materials", "no material creates light; drawn ways are those evaluated", "tools/prove_materials.py"),
     Proof("layers", "intervals of K and S hold, by matrix exponentials and photons", "tools/prove_layers.py"),
     Proof("paths", "500 random plans touch nothing, by python-fcl", "tools/replay_plans.py --plans 500 --seed 1"),
     *_rooms(),

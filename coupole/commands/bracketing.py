@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,19 +98,26 @@ def sphere_brdf(
             setup = yamlfile.read_document(sample).validate(fitting.SphereSample)
             pictures = [read_known(sample.parent / lit.path) for lit in setup.photographs]
             samples = fitting.samples_of(setup, pictures)
-            table = fitting.table_of(samples)
-            off = fitting.misses(samples, table)
+            finish = fitting.finish_of(samples)
+            off = fitting.misses(samples, finish)
         with console.status("writing"):
-            write_synced(out, encode_reflectance(fitting.table_function(table)))
+            write_synced(out, encode_reflectance(fitting.finish_function(finish)))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     document = {"table": str(out), "samples": len(samples.f), "median_miss": off[0], "miss_of_95_percent": off[1]}
+    paths = [str(lit.path) for lit in setup.photographs]
+    left_out = [{"path": paths[one.photograph]} | asdict(one) for one in finish.left_out]
     if as_json:
-        print(json.dumps(document))
-    else:
-        text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
-        console.print(text, markup=False)
+        print(json.dumps(document | {"left_out": left_out}))
+        return
+    text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
+    console.print(text, markup=False)
+    if len(paths) > 1:
+        console.print("each photograph as the others predict it: incidence at its peak, miss there, median miss")
+    for one in left_out if len(paths) > 1 else []:
+        told = f"{one['incidence_deg']:.0f} degrees, {one['peak_miss']:+.1%}, {one['median_miss']:.1%}"
+        console.print(f"  {one['path']}: {told}", markup=False)
 
 
 def _document(

@@ -26,7 +26,10 @@ _TOLD_FROM = 0.01
 
 def makie(
     photograph: Annotated[
-        Path, typer.Argument(help="PNG, TIFF or JPEG of 8 or 16 bits, in sRGB.", show_default=False)
+        Path,
+        typer.Argument(
+            help="PNG, TIFF or JPEG in sRGB, a raw file, or an .exr of `coupole bracket`.", show_default=False
+        ),
     ],
     metal: Annotated[
         str,
@@ -49,6 +52,14 @@ def makie(
         bool,
         typer.Option("--inside", help="Pixels hold metal and lacquer only, no shadow: exact for three colours."),
     ] = False,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--known",
+            metavar="X,Y,SHARE",
+            help="A place whose share of metal is known, to check the result; repeat.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Take a photograph of makie apart: alpha is the share of metal, colours are the lacquers' part.
@@ -60,6 +71,8 @@ def makie(
 
     console = make_console(quiet=as_json)
     try:
+        import numpy as np
+
         from coupole.appearance.matter.makie import decompose
 
         if out.suffix.lower() != ".png":
@@ -67,17 +80,30 @@ def makie(
         picture = _linear_values(photograph, linear=linear)
         colour = _colour_at(picture, metal, "--metal")
         bare = [_colour_at(picture, place, "--lacquer") for place in lacquer]
+        is_unknown = np.asarray(~np.isfinite(picture).all(axis=2))
+        picture = np.where(is_unknown[..., None], 0.0, picture)
         parts = decompose(picture, colour, bare, region="inside" if inside else "anywhere")
-        _write(out, parts)
+        checks = [_checked(parts.alpha, is_unknown, place) for place in known or ()]
+        _write(out, parts, max(1.0, float(colour.max()), *(float(one.max()) for one in bare)))
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
         lacquers = [rgb.tolist() for rgb in bare]
         document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers}
-        print(json.dumps(document | {"clamped": parts.clamped_share}))
+        document |= {"clamped": parts.clamped_share, "unknown": float(is_unknown.mean()), "known": checks}
+        print(json.dumps(document))
         return
+    _say(console, out, parts, checks, float(is_unknown.mean()))
+
+
+def _say(console: Any, out: Path, parts: Makie, checks: list[dict[str, Any]], unknown: float) -> None:
     console.print(f"{out}: {float(parts.alpha.mean()):.1%} of the picture is metal", markup=False)
+    for one in checks:
+        told = f"share {one['found']:.3f} +- {one['u_found']:.3f}, known {one['share']:g}"
+        console.print(f"at {one['x']},{one['y']}: {told}, off by {one['found'] - one['share']:+.3f}", markup=False)
+    if unknown:
+        console.print(f"{unknown:.2%} of the pixels are saturated or dark; they have no metal here")
     if parts.clamped_share > _TOLD_FROM:
         console.print(
             f"of {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
@@ -87,9 +113,17 @@ def makie(
 
 
 def _linear_values(path: Path, *, linear: bool) -> NDArray[np.float64]:
-    """[h, w, 3] proportional to light, 0 to 1."""
+    """[h, w, 3] proportional to light: 0 to 1, or of a merged bracket in its unit, NaN where nothing is known."""
     import numpy as np
 
+    if path.suffix.lower() == ".exr":
+        from coupole.exchange.bracket.merged_files import read_known
+
+        return read_known(path).astype(float)
+    from coupole.exchange.bracket.photographs import PLAIN, read_photograph
+
+    if path.suffix.lower() not in PLAIN:
+        return read_photograph(path)[0].astype(float)
     from coupole.reflectance.picture_set import linear_of_srgb, read_picture
 
     pixels = read_picture(path)
@@ -101,23 +135,58 @@ def _colour_at(picture: NDArray[np.float64], place: str, option: str) -> NDArray
     """[3] mean about a place X,Y."""
     import numpy as np
 
+    return np.asarray(_about(picture, place.split(","), f"{option} {place}", "X,Y").mean(axis=(0, 1)))
+
+
+def _checked(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], known: str) -> dict[str, Any]:
+    """What is found at a place X,Y,SHARE: the mean about it, and its standard uncertainty by the scatter."""
+    import numpy as np
+
+    *place, word = known.split(",")
+    try:
+        share = float(word)
+    except ValueError:
+        share = -1.0
+    if not 0.0 <= share <= 1.0:
+        raise InputError(f"--known {known}: expected X,Y,SHARE, with a share of metal from 0 to 1")
+    shown = np.where(is_unknown, np.nan, alpha)[..., None]
+    values = _about(shown, place, f"--known {known}", "X,Y,SHARE")
+    u_found = float(values.std() / np.sqrt(values.size))
+    return {
+        "x": int(place[0]),
+        "y": int(place[1]),
+        "share": share,
+        "found": float(values.mean()),
+        "u_found": u_found,
+    }
+
+
+def _about(picture: NDArray[np.float64], place: list[str], told: str, form: str) -> NDArray[np.float64]:
+    """The pixels about a place. Raises InputError for a place that is none, or has nothing known."""
+    import numpy as np
+
     height, width = picture.shape[:2]
-    words = place.split(",")
-    numbers = [int(word) for word in words if word.strip().isascii() and word.strip().isdigit()]
-    if len(words) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
-        raise InputError(f"{option} {place}: expected X,Y of a pixel of a picture of {width} x {height}, from 0")
+    numbers = [int(word) for word in place if word.strip().isascii() and word.strip().isdigit()]
+    if len(place) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
+        raise InputError(f"{told}: expected {form} of a pixel of a picture of {width} x {height}, from 0")
     columns, rows = (slice(max(0, number - _AROUND_PX), number + _AROUND_PX + 1) for number in numbers)
-    return np.asarray(picture[rows, columns].mean(axis=(0, 1)))
+    pixels = picture[rows, columns]
+    if not np.isfinite(pixels).all():
+        raise InputError(
+            f"{told}: is saturated or dark in the merged photograph; expected a place that is neither"
+        )
+    return pixels
 
 
-def _write(path: Path, makie: Makie) -> None:
+def _write(path: Path, makie: Makie, unit: float) -> None:
+    """The drawing; `unit` is what becomes white."""
     import numpy as np
     from PIL import Image
 
     from coupole.exchange.srgb import srgb
     from coupole.storage.durable import write_synced
 
-    channels: Any = np.concatenate([srgb(makie.residual), makie.alpha[..., None]], axis=2)
+    channels: Any = np.concatenate([srgb(makie.residual / unit), makie.alpha[..., None]], axis=2)
     buffer = io.BytesIO()
     Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(buffer, "PNG")
     write_synced(path, buffer.getvalue())

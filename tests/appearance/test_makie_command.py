@@ -61,6 +61,35 @@ def test_a_scene_reads_the_drawing(tmp_path: Path) -> None:
     assert drawn(np.array([[-20.0, 20.0], [0.0, 20.0], [29.0, -20.0]])) == pytest.approx([1.0, 0.0, 1.0], abs=0.03)
 
 
+def test_a_merged_bracket_with_noise_gives_the_share_within_0_02(tmp_path: Path) -> None:
+    import OpenEXR
+
+    share = photograph(tmp_path / "truth.png")
+    rng = np.random.default_rng(1)
+    lacquer = np.tile(RED, (SIDE_PX, SIDE_PX, 1))
+    lacquer[:, 40:] = BLACK
+    seen = 7.0 * (share[..., None] * METAL + (1.0 - share[..., None]) * lacquer)  # in a unit of its own
+    seen *= rng.normal(1.0, 0.01, seen.shape)
+    channels = {one: np.ascontiguousarray(seen[..., k], np.float32) for k, one in enumerate("RGB")}
+    channels["saturated"] = np.zeros((SIDE_PX, SIDE_PX), np.float32)
+    channels["saturated"][50:, :5] = 1.0
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "box.exr"))
+    known = ("--known", "30,40,0.508", "--known", "45,40,0.763")
+    ended = cells.here("makie", tmp_path / "box.exr", *SAMPLES, *known, "--out", tmp_path / "a.png", "--json")
+    assert ended.code == 0, ended.err
+    for check in ended.document["known"]:
+        assert check["found"] == pytest.approx(check["share"], abs=0.005)
+        assert 0.0 < check["u_found"] < 0.01
+    assert ended.document["unknown"] == pytest.approx(50 / 3600)
+    written = np.asarray(Image.open(tmp_path / "a.png"), float)[..., 3] / 255.0
+    off = (written - share)[:50]
+    assert np.abs(off.reshape(10, 5, 12, 5).mean(axis=(1, 3))).max() < 0.02
+    assert np.quantile(np.abs(off), 0.95) < 0.02
+    refused = cells.here("makie", tmp_path / "box.exr", *SAMPLES, "--known", "2,55,0", "--out", tmp_path / "b.png")
+    assert refused.code == 2
+    assert "saturated or dark" in " ".join(refused.err.split())
+
+
 def test_noise_and_shadow_are_told(tmp_path: Path) -> None:
     photograph(tmp_path / "box.png")
     powder = ("--metal", "35,40", "--lacquer", "30,10")
@@ -77,6 +106,8 @@ def test_noise_and_shadow_are_told(tmp_path: Path) -> None:
         (["--metal", "10,10", "--lacquer", "12,10"], "of another colour than the lacquers"),
         (["--metal", "10,10", *["--lacquer", "30,10"] * 4], "one to three"),
         (["--metal", "10,10"], "--lacquer"),
+        (["--metal", "10,10", "--lacquer", "30,10", "--known", "5,5,2"], "--known 5,5,2: expected X,Y,SHARE"),
+        (["--metal", "10,10", "--lacquer", "30,10", "--known", "5,0.5"], "--known 5,0.5: expected X,Y,SHARE"),
     ],
 )
 def test_what_tells_nothing_is_refused(tmp_path: Path, options: list[str], words: str) -> None:

@@ -1,10 +1,13 @@
 """A camera's response from photographs of one scene with several exposure times.
 
 Debevec and Malik, "Recovering high dynamic range radiance maps from photographs" (SIGGRAPH 1997), Eq. 3: the
-logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs, by
-least squares, with hat weights. What is different: the pixels' ln E are eliminated, so that thousands of
-pixels cost no more than a few; g shall be smooth over ln z instead of z, which costs a power law nothing; and
-it has a standard uncertainty, from what the photographs leave over.
+logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. What is
+different: the pixels' ln E are eliminated, so that thousands of pixels cost no more than a few. Noise is that of
+values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
+difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
+contradict). And g is a Gaussian process: its slope over ln z wanders, by an amount that the photographs themselves
+make most likely. Where they cannot tell, as with waves of the period of all steps, this is what the uncertainty
+holds. A power law costs nothing, so that a linear sensor comes out straight.
 """
 
 from __future__ import annotations
@@ -22,12 +25,28 @@ NODES = 256
 SATURATED, DARK = 0.98, 0.01
 """Values from which on, and up to which, a pixel says nothing but a bound."""
 _PIXELS = 3000
-_SMOOTH = 0.3
 _WIDE = 2.6
 """Least factor between exposure times that leaves waves of the response open: 4 does, 2 does not."""
-_ROUNDS, _OUTLIER = 8, 4.0
-"""Rounds of the fit; standard deviations from which on a sample counts for less in the next round."""
+_ROUNDS, _SMOOTH_ROUNDS, _OUTLIER = 10, 6, 4.0
+"""Rounds of the fit, of which the first have a stiff response; standard deviations from which on a sample counts
+for less in the next round."""
+_LEAST_FITTED, _MOST_FITTED = 0.02, 0.97
+"""Predicted values between which a sample is fitted; a choice by noisy values would favour high noise."""
+_STIFF, _WANDERS = -2.0, np.arange(-7.0, 2.1, 0.25)
+"""ln of the wander of the slope, in the first rounds and to choose from."""
+_POWER_WIDTH = 0.35
+"""Of the window in ln z over which a slope is taken for weights."""
+_LEAST_POWER, _MOST_POWER = 0.3, 8.0
+_QUANTIZATION = 0.29
+"""Standard deviation of rounding, in levels."""
+_WIDENED = 2.0
+"""Factor of the covariance: the wander that is likeliest tells little of waves that no pixel contradicts. It was
+found with the cameras of `tools/prove_brackets.py`, which are others now."""
 _MIDDLE = NODES // 2
+_LOG_NODES = np.log(np.maximum(np.arange(NODES), 0.5))
+"""ln of the nodes' values in steps; between nodes g is linear over it."""
+_OTHERS = np.arange(NODES) != _MIDDLE
+"""g is 0 at the middle."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +55,30 @@ class Response:
 
     log_exposure: Array
     """[NODES, 3] at evenly spaced values from 0 to 1."""
-    uncertainty: Array
-    """[NODES, 3], standard, of `log_exposure`; inf where no photograph has such values."""
+    covariance: Array
+    """[3, NODES, NODES], of `log_exposure`."""
+    is_shown: NDArray[np.bool_]
+    """[NODES, 3], false where no photograph has such values."""
     noise: Array
     """[3], standard deviation of values, as the fit leaves it over."""
 
-    def exposure(self, values: NDArray[np.float32], channel: int) -> Array:
+    @property
+    def uncertainty(self) -> Array:
+        """[NODES, 3], standard, of `log_exposure`; inf where no photograph has such values."""
+        sigma = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2).T, 0.0))
+        return np.where(self.is_shown, sigma, np.inf)
+
+    def exposure(self, values: NDArray[np.floating], channel: int) -> Array:
         """Relative exposure of values."""
         return np.asarray(np.exp(_at(self.log_exposure[:, channel], values)))
 
     def slope(self, values: NDArray[np.floating], channel: int) -> Array:
         """d ln(exposure) / d value."""
-        steps = np.gradient(self.log_exposure[:, channel], 1.0 / (NODES - 1))
-        return np.asarray(np.maximum(_at(steps, values), 1e-3))
+        return _slope(_powers(self.log_exposure[:, channel]), values)
 
     def value(self, exposure: Array, channel: int) -> Array:
         """The value of an exposure."""
-        rising = np.maximum.accumulate(self.log_exposure[:, channel])
-        return np.interp(np.log(np.maximum(exposure, 1e-300)), rising, np.linspace(0.0, 1.0, NODES))
+        return _value_of(np.log(np.maximum(exposure, 1e-300)), self.log_exposure[:, channel])
 
     def straightness(self) -> float:
         """Most relative departure from a straight line through 0, for values of 0.1 to 0.9."""
@@ -65,34 +90,33 @@ class Response:
 
 def linear_response(noise: Array) -> Response:
     """Return the response of a sensor whose values are proportional to exposure."""
-    z = np.maximum(np.linspace(0.0, 1.0, NODES), 0.5 / NODES)
-    curve = np.repeat((np.log(z) - np.log(z[_MIDDLE]))[:, None], 3, axis=1)
-    return Response(curve, np.zeros((NODES, 3)), noise)
+    curve = np.repeat((_LOG_NODES - _LOG_NODES[_MIDDLE])[:, None], 3, axis=1)
+    return Response(curve, np.zeros((3, NODES, NODES)), np.ones((NODES, 3), bool), noise)
 
 
 def found_response(photographs: Photographs) -> Response:
     """Raises InputError where the photographs have too little in common."""
-    curves, uncertain, noise = [], [], []
-    for channel in range(3):
-        samples = _samples(photographs.values[..., channel])
-        curve, sigma, value_noise = _solve_curve(samples, np.log(photographs.exposure_s))
-        curves.append(curve)
-        uncertain.append(sigma)
-        noise.append(value_noise)
-    return Response(np.stack(curves, axis=1), np.stack(uncertain, axis=1), np.array(noise))
+    least_noise = _QUANTIZATION / (photographs.levels - 1)
+    channels = [
+        _solve_curve(_samples(photographs.values[..., one]), np.log(photographs.exposure_s), least_noise)
+        for one in range(3)
+    ]
+    curves, covariances, is_shown, noise = zip(*channels, strict=True)
+    return Response(np.stack(curves, axis=1), np.stack(covariances), np.stack(is_shown, axis=1), np.array(noise))
 
 
 def left_open(exposure_s: Array) -> str:
     """Return, in words, what photographs of these times cannot tell of a response; empty if they can tell all.
 
-    With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts.
+    With all times a factor apart, g(z) may have any wave of that period in ln E, which no pixel contradicts; the
+    uncertainty has what waves the smoothness of the response leaves.
     """
     factor = float(np.exp(np.diff(np.sort(np.log(exposure_s))).min()))
     if factor < _WIDE:
         return ""
     return (
-        f"no two photographs are nearer than {factor:.1f} times in exposure: the response may have waves of "
-        "several percent, which the uncertainty does not have; take steps of 2, or raw files"
+        f"no two photographs are nearer than {factor:.1f} times in exposure: waves of the response are known by "
+        "its smoothness alone, and u is wider for them; steps of 2, or raw files, know it better"
     )
 
 
@@ -117,73 +141,158 @@ def _samples(values: NDArray[np.float32]) -> Array:
     return np.asarray(pixels[order[np.linspace(0, len(order) - 1, min(_PIXELS, len(order))).astype(int)]])
 
 
-def _solve_curve(samples: Array, log_t: Array) -> tuple[Array, Array, float]:
-    """g [NODES], its uncertainty, and the noise of values. What moved between photographs counts for little."""
-    weights = hat(samples)
-    for _ in range(_ROUNDS):
-        g, inverse = _fit_curve(samples, weights, log_t)
-        off, noise = _left_over(samples, weights, g, log_t)
-        slope = np.maximum(_at(np.gradient(g, 1.0 / (NODES - 1)), samples), 1e-3)
-        weights = hat(samples) / (1.0 + (off / (_OUTLIER * noise * slope)) ** 2) ** 2
-    free = max(1, int((weights > 0.0).sum()) - len(samples) - NODES // 8)
-    uncertain = np.sqrt(np.maximum(np.diag(inverse) * float((weights * off**2).sum() / free), 0.0))
-    bins = np.flatnonzero(np.histogram(samples[weights > 0.0], bins=NODES, range=(0.0, 1.0))[0])
-    uncertain[: bins.min()] = np.inf
-    uncertain[bins.max() + 1 :] = np.inf
-    return g, uncertain, noise
+@dataclass(frozen=True)
+class _Fit:
+    """What one round hands to the next."""
+
+    g: Array
+    robust: Array
+    """[pixels, photographs], weights of what did not move."""
+    noise: float
 
 
-def _fit_curve(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:
-    """g [NODES], and the inverse of its normal equations."""
-    matrix, target = _normal_equations(samples, weights, log_t)
-    gauge = np.zeros((NODES, NODES))
-    gauge[_MIDDLE, _MIDDLE] = max(np.trace(matrix), 1.0)
-    inverse = np.linalg.inv(matrix + _SMOOTH * np.trace(matrix) / NODES * _roughness() + gauge)
-    g = inverse @ target
-    return g - g[_MIDDLE], inverse
+def _solve_curve(
+    samples: Array, log_t: Array, least_noise: float
+) -> tuple[Array, Array, NDArray[np.bool_], float]:
+    """g [NODES], its covariance, where it is shown, and the noise of values."""
+    start = 1.5 * (_LOG_NODES - _LOG_NODES[_MIDDLE])
+    fit = _Fit(start, np.ones_like(samples), max(1.0 / 255.0, least_noise))
+    for number in range(_ROUNDS):
+        wanders = _WANDERS if number >= _SMOOTH_ROUNDS else np.array([_STIFF])
+        fit, inverse, weights = _next_fit(fit, samples, log_t, wanders, least_noise)
+    covariance = np.zeros((NODES, NODES))
+    covariance[np.ix_(_OTHERS, _OTHERS)] = _WIDENED * inverse
+    counts = np.histogram(samples[weights > 0.0], bins=NODES, range=(0.0, 1.0))[0]
+    bins, is_shown = np.flatnonzero(counts), np.zeros(NODES, bool)
+    is_shown[bins.min() : bins.max() + 1] = True
+    return fit.g, covariance, is_shown, fit.noise
 
 
-def _left_over(samples: Array, weights: Array, g: Array, log_t: Array) -> tuple[Array, float]:
-    """Each sample less its pixel's mean, in ln of exposure; and the noise of values that this means."""
-    logs = _at(g, samples) - log_t
-    mean = (weights * logs).sum(axis=1, keepdims=True) / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-    slope = np.maximum(_at(np.gradient(g, 1.0 / (NODES - 1)), samples), 1e-3)
-    typical = np.median(np.abs((logs - mean) / slope)[weights > 0.2])
-    return logs - mean, float(1.4826 * typical * np.sqrt(samples.shape[1] / (samples.shape[1] - 1.0)))
+def _next_fit(
+    fit: _Fit, samples: Array, log_t: Array, wanders: Array, least_noise: float
+) -> tuple[_Fit, Array, Array]:
+    """One round: the fit, the inverse of its normal equations without the middle, and the weights."""
+    rising, powers = np.maximum.accumulate(fit.g) + 1e-9 * np.arange(NODES), _powers(fit.g)
+    weights = ((samples > DARK) & (samples < SATURATED)) * fit.robust
+    predicted = _predicted(samples, weights, log_t, rising, powers)
+    usable = (predicted > _LEAST_FITTED) & (predicted < _MOST_FITTED) & (samples < SATURATED)
+    usable &= usable.sum(axis=1, keepdims=True) > 1
+    slope = _slope(powers, predicted)
+    weights = usable * fit.robust / (slope * fit.noise) ** 2
+    target = log_t - slope * (samples - predicted)
+    normal = _normal_equations(predicted, weights, target)
+    g, inverse = _likeliest(*normal, wanders)
+    return _judged(g, weights, _at(g, predicted) - target, slope, least_noise), inverse, weights
 
 
-def _normal_equations(samples: Array, weights: Array, log_t: Array) -> tuple[Array, Array]:
-    """Return the normal equations of g alone: each pixel's ln E is its weighted mean."""
-    place = np.clip(samples, 0.0, 1.0) * (NODES - 1)
-    low = np.minimum(place.astype(int), NODES - 2)
-    share = place - low
-    matrix, target = np.zeros((NODES, NODES)), np.zeros(NODES)
-    mean = np.zeros((len(samples), NODES))
-    pixels = np.arange(len(samples))
-    for photograph, t in enumerate(log_t):
-        w, a, s = weights[:, photograph], low[:, photograph], share[:, photograph]
-        for first, of_first in ((a, 1.0 - s), (a + 1, s)):
-            np.add.at(mean, (pixels, first), w * of_first)
-            np.add.at(target, first, w * of_first * t)
-            for second, of_second in ((a, 1.0 - s), (a + 1, s)):
-                np.add.at(matrix, (first, second), w * of_first * of_second)
-    total = np.maximum(weights.sum(axis=1), 1e-12)
-    matrix -= mean.T @ (mean / total[:, None])
-    target -= mean.T @ ((weights @ log_t) / total)
-    return matrix, target
+def _predicted(samples: Array, weights: Array, log_t: Array, g: Array, powers: Array) -> Array:
+    """[pixels, photographs], the values that each pixel's mean predicts; in three steps, as slopes are there."""
+    predicted = samples
+    for _ in range(3):
+        slope = _slope(powers, predicted)
+        logs = _at(g, predicted) + slope * (samples - predicted) - log_t
+        predicted = _value_of(_pixel_means(weights / slope**2, logs) + log_t, g)
+    return predicted
+
+
+def _judged(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
+    """The fit with the noise that samples have left over; `off` are their ln of exposure less that of the time."""
+    free = 1.0 - weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    left = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))
+    noise = max(float(1.4826 * np.median(np.abs(left[(weights > 0.0) & (free > 0.2)]))), least_noise)
+    return _Fit(g, 1.0 / (1.0 + (left / (_OUTLIER * noise)) ** 2) ** 2, noise)
+
+
+def _pixel_means(weights: Array, logs: Array) -> Array:
+    """[pixels, 1]."""
+    total = np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    return np.asarray((weights * logs).sum(axis=1, keepdims=True) / total)
+
+
+def _normal_equations(predicted: Array, weights: Array, target: Array) -> tuple[Array, Array, float]:
+    """Matrix and right side of g alone, and the sum of squares: each pixel's ln E is its weighted mean."""
+    from scipy.sparse import csr_matrix
+
+    pixels, photographs = predicted.shape
+    low, share = _place(predicted.ravel())
+    rows = np.repeat(np.arange(len(low)), 2)
+    columns = np.stack([low, low + 1], axis=1).ravel()
+    shares = np.stack([1.0 - share, share], axis=1).ravel()
+    design = csr_matrix((shares, (rows, columns)), (len(low), NODES))
+    weighted = design.multiply(weights.reshape(-1, 1)).tocsr()
+    owners = np.repeat(np.arange(pixels), photographs), np.arange(len(low))
+    sums = (csr_matrix((np.ones(len(low)), owners), (pixels, len(low))) @ weighted).toarray()
+    total = np.maximum(weights.sum(axis=1), 1e-300)
+    seen = (weights * target).sum(axis=1)
+    matrix = (design.T @ weighted).toarray() - sums.T @ (sums / total[:, None])
+    right = np.asarray(weighted.T @ target.ravel()) - sums.T @ (seen / total)
+    return matrix, right, float((weights * target**2).sum() - (seen**2 / total).sum())
+
+
+def _likeliest(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
+    """g [NODES] and its covariance without the middle, for the wander that makes the samples likeliest."""
+    matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()
+    best, likeliest, chosen = np.zeros(NODES - 1), -np.inf, matrix
+    for wander in wanders:
+        stiff = matrix + roughness * np.exp(-2.0 * wander)
+        solved = np.linalg.solve(stiff, right)
+        log_likelihood = -0.5 * (
+            np.linalg.slogdet(stiff)[1] + 2.0 * (NODES - 2) * wander + squares - right @ solved
+        )
+        if log_likelihood > likeliest:
+            best, likeliest, chosen = solved, float(log_likelihood), stiff
+    g = np.zeros(NODES)
+    g[_OTHERS] = best
+    return g, np.asarray(np.linalg.inv(chosen), float)
 
 
 def _roughness() -> Array:
-    """[NODES, NODES], squares of the change of slope over ln z, which a power law does not have."""
-    u = np.log(np.arange(NODES) + 0.5)
-    step = np.diff(u)
+    """[NODES - 1, NODES - 1], squares of the change of slope over ln z, which a power law does not have.
+
+    The slope wanders most at small values: the variance of a step is that of z, over the root of z.
+    """
+    step = np.diff(_LOG_NODES)
     change = np.zeros((NODES - 2, NODES))
     rows = np.arange(NODES - 2)
     change[rows, rows] = 1.0 / step[:-1]
     change[rows, rows + 1] = -1.0 / step[:-1] - 1.0 / step[1:]
     change[rows, rows + 2] = 1.0 / step[1:]
-    return np.asarray(change.T @ change / NODES)
+    z = np.arange(1, NODES - 1) / (NODES - 1.0)
+    change *= np.sqrt(NODES * np.sqrt(z))[:, None]
+    return np.asarray((change.T @ change)[np.ix_(_OTHERS, _OTHERS)])
+
+
+def _powers(g: Array) -> Array:
+    """[NODES], d g / d ln z by straight lines over a window."""
+    even = np.linspace(_LOG_NODES[0], _LOG_NODES[-1], 600)
+    at_even = np.interp(even, _LOG_NODES, g)
+    window = np.exp(-0.5 * ((even[:, None] - even) / _POWER_WIDTH) ** 2)
+    window /= window.sum(axis=1, keepdims=True)
+    middle = window @ even
+    slope = (window @ (even * at_even) - middle * (window @ at_even)) / (window @ even**2 - middle**2)
+    return np.asarray(np.interp(_LOG_NODES, even, np.clip(slope, _LEAST_POWER, _MOST_POWER)))
+
+
+def _slope(powers: Array, values: NDArray[np.floating]) -> Array:
+    return np.asarray(_at(powers, values) / np.maximum(values, 0.5 / (NODES - 1)))
+
+
+def _value_of(log_exposure: Array, g: Array) -> Array:
+    rising = np.maximum.accumulate(g) + 1e-12 * np.arange(NODES)
+    return np.asarray(np.exp(np.interp(log_exposure, rising, _LOG_NODES)) / (NODES - 1))
 
 
 def _at(nodes: Array, values: NDArray[np.floating]) -> Array:
-    return np.asarray(np.interp(values, np.linspace(0.0, 1.0, NODES), nodes))
+    """Of nodes, at values: linear over ln z."""
+    return np.asarray(np.interp(_logs(values), _LOG_NODES, nodes))
+
+
+def _place(values: Array) -> tuple[NDArray[np.intp], Array]:
+    """The node below each value, and the share of the one above."""
+    low = np.minimum((np.clip(values, 0.0, 1.0) * (NODES - 1)).astype(int), NODES - 2)
+    share = (_logs(values) - _LOG_NODES[low]) / (_LOG_NODES[low + 1] - _LOG_NODES[low])
+    return low, np.clip(share, 0.0, 1.0)
+
+
+def _logs(values: NDArray[np.floating]) -> Array:
+    return np.asarray(np.log(np.maximum(np.asarray(values, float) * (NODES - 1), 0.5)))

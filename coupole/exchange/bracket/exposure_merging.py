@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.exchange.bracket.camera_response import DARK, SATURATED, Response, hat
+from coupole.exchange.bracket.camera_response import DARK, NODES, SATURATED, Response, hat
 from coupole.exchange.bracket.photographs import Photographs
 
 _CONTRADICTS = 5.0
@@ -17,6 +17,8 @@ _LEAST_CONTRADICTION = 0.05
 _LEAST_WEIGHT = 0.1
 """Hat weight of values below which noise is no longer Gaussian; such a value contradicts nobody."""
 _ROUNDS = 2
+_MARGIN = 4.0
+"""Standard deviations of noise from both ends within which a value says nothing: noise is cut off there."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +44,13 @@ def merge_exposures(photographs: Photographs, response: Response) -> Merged:
     contradicting = np.zeros(photographs.values.shape[:3], bool)
     for channel in range(3):
         values = photographs.values[..., channel]
-        usable = (values > DARK) & (values < SATURATED)
+        margin = _MARGIN * float(response.noise[channel])
+        usable = (values > max(DARK, margin)) & (values < min(SATURATED, 1.0 - margin))
         radiances = response.exposure(values, channel) / photographs.exposure_s[:, None, None]
         off = _contradicting(radiances, values, usable, response, channel)
         contradicting |= off
-        mean, sigma = _mean(radiances, usable & ~off, photographs.exposure_s, response, channel)
-        is_saturated[..., channel] = ~usable.any(axis=0) & (values[0] >= SATURATED)
+        mean, sigma = _mean(radiances, usable & ~off, photographs, response, channel)
+        is_saturated[..., channel] = ~usable.any(axis=0) & (values[0] >= 0.5)
         dark[..., channel] = ~usable.any(axis=0) & ~is_saturated[..., channel]
         bound = np.where(is_saturated[..., channel], radiances[0], radiances[-1])
         is_usable = usable.any(axis=0)
@@ -59,28 +62,39 @@ def merge_exposures(photographs: Photographs, response: Response) -> Merged:
 def _mean(
     radiances: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    exposure_s: NDArray[np.float64],
+    photographs: Photographs,
     response: Response,
     channel: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted mean and its relative uncertainty. Weights follow from the mean, not from the pixel's own values,
     whose noise would favour the darker of two."""
-    noise = max(float(response.noise[channel]), 0.29 / 255.0)
+    noise = float(response.noise[channel])
     mean = np.where(usable, radiances, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     for _ in range(_ROUNDS):
-        total, sums, curve = np.zeros_like(mean), np.zeros_like(mean), np.zeros_like(mean)
-        for radiance, is_usable, time in zip(radiances, usable, exposure_s, strict=True):
-            model = response.value(mean * time, channel)
-            sigma = response.slope(model, channel) * noise  # relative
-            weight = np.where(is_usable, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
-            total, sums = total + weight, sums + weight * radiance
-            u_curve = np.where(
-                np.isfinite(response.uncertainty[:, channel]), response.uncertainty[:, channel], 0.0
-            )
-            curve += weight * np.interp(model, np.linspace(0.0, 1.0, len(u_curve)), u_curve)
-        mean = sums / np.maximum(total, 1e-300)
-    relative = 1.0 / (np.sqrt(np.maximum(total, 1e-300)) * np.maximum(mean, 1e-30))
-    return mean, np.hypot(relative, curve / np.maximum(total, 1e-300))
+        models = [response.value(mean * time, channel) for time in photographs.exposure_s]
+        sigmas = [response.slope(model, channel) * noise for model in models]  # relative
+        weights = [
+            np.where(is_usable, 1.0 / (sigma * np.maximum(mean, 1e-30)) ** 2, 0.0)
+            for sigma, is_usable in zip(sigmas, usable, strict=True)
+        ]
+        total = np.maximum(sum(weights), 1e-300)
+        shares = [weight / total for weight in weights]
+        mean = sum((share * radiance for share, radiance in zip(shares, radiances, strict=True)), np.zeros(1))
+    relative = 1.0 / np.maximum(np.sqrt(total) * mean, 1e-30)
+    return mean, np.sqrt(relative**2 + _response_variance(shares, models, response.covariance[channel]))
+
+
+def _response_variance(
+    shares: list[NDArray[np.float64]], values: list[NDArray[np.float64]], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Relative variance that the response gives a mean with these shares, at these values; by the nearest node."""
+    nodes = [np.rint(value * (NODES - 1)).astype(np.int32) for value in values]
+    variance = np.zeros_like(values[0])
+    for first, (share, node) in enumerate(zip(shares, nodes, strict=True)):
+        variance += share**2 * covariance[node, node]
+        for other in range(first):
+            variance += 2.0 * share * shares[other] * covariance[node, nodes[other]]
+    return np.maximum(variance, 0.0)
 
 
 def _contradicting(
@@ -97,7 +111,7 @@ def _contradicting(
     best = np.take_along_axis(logs, np.argmax(weights, axis=0)[None], axis=0)[0]
     with np.errstate(invalid="ignore"):
         middle = np.where(usable.sum(axis=0) > 2, _median(logs), best)
-        sigma = response.slope(values, channel) * max(float(response.noise[channel]), 0.29 / 255.0)
+        sigma = response.slope(values, channel) * float(response.noise[channel])
         off = np.abs(logs - middle) > np.maximum(_CONTRADICTS * np.sqrt(2.0) * sigma, _LEAST_CONTRADICTION)
     off &= (weights > _LEAST_WEIGHT) & ~lonely
     nobody = (off | ~usable).all(axis=0)

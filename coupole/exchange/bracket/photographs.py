@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from coupole.errors import InputError
 
 _EXIF, _TIME, _APERTURE, _ISO = 34665, 33434, 33437, 34855
-_PLAIN = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+PLAIN = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+"""Suffixes of photographs that are not raw files."""
 _LEAST_RATIO = 1.2
 
 
@@ -40,7 +41,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         raise InputError(
             f"--exposure-s: expected a time for each of {len(paths)} photographs, found {len(exposure_s)}"
         )
-    pictures = [_read_photograph(path) for path in paths]
+    pictures = [read_photograph(path) for path in paths]
     exif_tags = [_exif(path) for path in paths] if exposure_s is None else [{_TIME: time} for time in exposure_s]
     for number, label in ((_APERTURE, "apertures"), (_ISO, "ISO numbers")):
         settings = {tags.get(number) for tags in exif_tags}
@@ -49,7 +50,7 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
     if untold := [str(path) for path, tags in zip(paths, exif_tags, strict=True) if not tags.get(_TIME)]:
         raise InputError(f"{untold[0]}: has no exposure time in its EXIF; give all of them with --exposure-s")
     shapes = {
-        (values.shape, levels, path.suffix.lower() in _PLAIN)
+        (values.shape, levels, path.suffix.lower() in PLAIN)
         for path, (values, levels) in zip(paths, pictures, strict=True)
     }
     if len(shapes) > 1:
@@ -66,13 +67,13 @@ def read_photographs(paths: Sequence[Path], exposure_s: Sequence[float] | None =
         np.stack([pictures[k][0] for k in order]),
         times,
         pictures[0][1],
-        raw=paths[0].suffix.lower() not in _PLAIN,
+        raw=paths[0].suffix.lower() not in PLAIN,
     )
 
 
-def _read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
-    """[h, w, 3], and how many levels."""
-    if path.suffix.lower() not in _PLAIN:
+def read_photograph(path: Path) -> tuple[NDArray[np.float32], int]:
+    """[h, w, 3] as stored, over the largest value, and how many levels. Raises InputError."""
+    if path.suffix.lower() not in PLAIN:
         return _raw(path), 65536
     import cv2
 

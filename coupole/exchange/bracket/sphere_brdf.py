@@ -1,15 +1,17 @@
 """The BRDF of a finish from linear photographs of a sphere of it (seed 002, section 3.1).
 
 Each pixel of the sphere has a normal of its own, so that one photograph under one light from afar has
-thousands of samples of an isotropic BRDF; several lights cover it. Samples are fitted in specular coordinates
-(`tabulated`), the logarithm linear between nodes that crowd about the peak, and smooth where there are no
-samples.
+thousands of samples of an isotropic BRDF; several lights cover it. Two lobes of facets are fitted first
+(`finish_lobes`), then a table of the logarithm of what they miss (`half_angle_table`): it is nearly level, so that
+smoothness between photographs costs a peak nothing. What a pixel's mean takes from the peak is given back by the
+lobes. Each photograph is also predicted from the others, which
+tells what the finish is worth between two of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,15 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from coupole.appearance.matter.tabulated import SpecularTable, specular_coordinates, tabulated_brdf
 from coupole.errors import InputError
+from coupole.exchange.bracket import half_angle_table
+from coupole.exchange.bracket.finish_lobes import Lobes, fitted_lobes
 
 Array = NDArray[np.float64]
-_INCIDENCE_DEG = np.arange(0.0, 85.0, 6.0)
-_THETAS, _PHIS = 24, 5
 _LEAST_COSINE = 0.12
 _MOST_SAMPLES = 60_000
-_SMOOTH = 2e-3
+_SMOOTHNESSES = (2e-4, 2e-3, 2e-2)
+_ROUNDS = 2
+"""Of what a pixel's mean takes from a peak, by the lobes of the round before."""
+_GAUSS = ((-np.sqrt(0.15), 5.0 / 18.0), (0.0, 8.0 / 18.0), (np.sqrt(0.15), 5.0 / 18.0))
+"""Places and weights of Gauss' rule over a side of 1."""
+_NEAREST = 0.005
+"""Share of a photograph's samples that are taken as its peak."""
 _FEWEST = 1000
 _AT_ONCE = 100_000
 
@@ -69,6 +76,46 @@ class Samples:
     ways_out: Array
     f: Array
     """[n, 3] 1/sr."""
+    photograph: NDArray[np.intp]
+    """[n], the number of the photograph that each is from."""
+    places: Array
+    """[n, 2], of the pixels' middles: right and up from the sphere's centre, in radii."""
+    to_lights: Array
+    """[photographs, 3], unit vectors in the camera's frame."""
+    pixel_radii: float
+    """Side of a pixel, in radii of the sphere."""
+
+    def of(self, picks: NDArray[np.intp]) -> Samples:
+        """Only these."""
+        chosen = {
+            name: getattr(self, name)[picks] for name in ("ways_in", "ways_out", "f", "photograph", "places")
+        }
+        return replace(self, **chosen)
+
+
+@dataclass(frozen=True)
+class LeftOutPrediction:
+    """How well the table of all other photographs predicts one."""
+
+    photograph: int
+    incidence_deg: float
+    """At its peak: half of the angle between light and camera."""
+    nearest_to_peak_deg: float
+    """Half angle of the sample that is nearest to the peak."""
+    median_miss: float
+    """Of its samples, relative."""
+    peak_miss: float
+    """Median over the samples nearest to the peak, relative, signed."""
+
+
+@dataclass(frozen=True)
+class Finish:
+    """A finish: lobes, times the exponential of a table of `half_angle_table`."""
+
+    lobes: Lobes
+    log_correction: Array
+    """[entries, 3]."""
+    left_out: tuple[LeftOutPrediction, ...]
 
 
 def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) -> Samples:
@@ -78,8 +125,9 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
     Raises InputError where the sphere is not in the picture, or too few pixels say anything.
     """
     parts = []
-    rho_over_pi = sample.white.reflectance / np.pi
-    for lit, picture in zip(sample.photographs, pictures, strict=True):
+    to_lights = np.array([lit.to_light for lit in sample.photographs])
+    to_lights /= np.linalg.norm(to_lights, axis=1, keepdims=True)
+    for number, (lit, picture) in enumerate(zip(sample.photographs, pictures, strict=True)):
         rows, columns = picture.shape[:2]
         u, v = sample.centre_px
         if min(u, v, columns - 1 - u, rows - 1 - v) < sample.radius_px - 0.5:
@@ -88,90 +136,114 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
             )
         y, x = np.mgrid[:rows, :columns]
         x, y = (x - u) / sample.radius_px, (v - y) / sample.radius_px
-        inside = x**2 + y**2 < 1.0
-        normals = np.stack([x[inside], y[inside], np.sqrt(1.0 - x[inside] ** 2 - y[inside] ** 2)], axis=1)
-        to_light = np.asarray(lit.to_light) / np.linalg.norm(lit.to_light)
-        f = picture[inside] / np.asarray(sample.white.values) * rho_over_pi / (normals @ to_light)[:, None]
-        good = (normals @ to_light > _LEAST_COSINE) & (normals[:, 2] > _LEAST_COSINE)
+        places = np.stack([x, y], axis=2)[x**2 + y**2 < 1.0]
+        seen = picture[x**2 + y**2 < 1.0]
+        ways_in, ways_out = _ways(places, to_lights[number])
+        f = seen / np.asarray(sample.white.values) * sample.white.reflectance / np.pi / ways_in[:, 2:]
+        good = (ways_in[:, 2] > _LEAST_COSINE) & (ways_out[:, 2] > _LEAST_COSINE)
         good &= np.isfinite(f).all(axis=1) & (f > 0.0).all(axis=1)
-        frames = _frames(normals[good])
-        parts.append((frames @ to_light, frames @ np.array([0.0, 0.0, 1.0]), f[good]))
-    ways_in, ways_out, f = (np.concatenate(part) for part in zip(*parts, strict=True))
+        own = np.full(np.count_nonzero(good), number)
+        parts.append((ways_in[good], ways_out[good], f[good], own, places[good]))
+    ways_in, ways_out, f, photograph, places = (np.concatenate(part) for part in zip(*parts, strict=True))
     if len(f) < _FEWEST:
         raise InputError(
             f"sphere: expected at least {_FEWEST} lit pixels, neither dark nor saturated; found {len(f)}"
         )
-    return Samples(ways_in, ways_out, f)
+    return Samples(ways_in, ways_out, f, photograph, places, to_lights, 1.0 / sample.radius_px)
 
 
-def table_of(samples: Samples) -> SpecularTable:
-    """Fit a table by least squares of log f, each sample as it is and with its directions exchanged."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import spsolve
-
-    picks = np.random.default_rng(1).permutation(len(samples.f))[: _MOST_SAMPLES // 2]
-    ways_in, ways_out = samples.ways_in[picks], samples.ways_out[picks]
-    incidence = np.radians(_INCIDENCE_DEG)
-    theta = (0.5 * np.pi + incidence[-1]) * np.linspace(0.0, 1.0, _THETAS) ** 2
-    phi = np.linspace(0.0, np.pi, _PHIS)
-    pairs = zip(specular_coordinates(ways_in, ways_out), specular_coordinates(ways_out, ways_in), strict=True)
-    at = [np.concatenate(pair) for pair in pairs]
-    places = [_between(nodes, where) for nodes, where in zip((incidence, theta, phi), at, strict=True)]
-    shape = (len(incidence), _THETAS, _PHIS)
-    rows, columns, weights = [], [], []
-    for corner in np.ndindex(2, 2, 2):
-        index = [low + side for (low, _), side in zip(places, corner, strict=True)]
-        rows.append(np.arange(len(at[0])))
-        columns.append(np.ravel_multi_index(index, shape))
-        shares = [share if side else 1.0 - share for (_, share), side in zip(places, corner, strict=True)]
-        weights.append(np.prod(shares, axis=0))
-    entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
-    design = coo_matrix(entries, (len(at[0]), int(np.prod(shape)))).tocsr()
-    logs = np.tile(np.log(samples.f[picks]), (2, 1))
-    normal = (design.T @ design + _SMOOTH * len(logs) / np.prod(shape) * _roughness(shape)).tocsc()
-    values = np.stack([spsolve(normal, design.T @ logs[:, band]) for band in range(3)], axis=1)
-    cosines = np.linalg.inv(np.cos(np.outer(phi, np.arange(_PHIS))))
-    return SpecularTable(incidence, theta, np.einsum("kj,itjb->itkb", cosines, values.reshape(*shape, 3)))
+def finish_of(samples: Samples) -> Finish:
+    """Fit lobes, then a table of what they miss; its smoothness is the one with which photographs that are left
+    out are predicted best."""
+    samples = samples.of(np.random.default_rng(1).permutation(len(samples.f))[:_MOST_SAMPLES])
+    ways_in, ways_out, of_photograph = samples.ways_in, samples.ways_out, samples.photograph
+    lobes = fitted_lobes(ways_in, ways_out, samples.f)
+    for _ in range(_ROUNDS):
+        f = samples.f * at_middles_over_means(samples, lobes)
+        lobes = fitted_lobes(ways_in, ways_out, f, (float(lobes.alphas[0]),))
+    design = half_angle_table.interpolation(ways_in, ways_out)
+    missed = np.log(f / lobes.reflectance(ways_in, ways_out))
+    guesses = {
+        smoothness: _left_out(design, missed, of_photograph, smoothness) - missed for smoothness in _SMOOTHNESSES
+    }
+    smoothness = min(guesses, key=lambda one: float(np.median(np.abs(guesses[one]))))
+    theta_h, theta_d, _ = half_angle_table.half_coordinates(ways_in, ways_out)
+    off = np.expm1(guesses[smoothness])
+    predictions = [
+        _prediction(number, off[of_photograph == number], theta_h, theta_d, of_photograph == number)
+        for number in np.unique(of_photograph)
+    ]
+    return Finish(lobes, half_angle_table.smooth_table(design, missed, smoothness), tuple(predictions))
 
 
-def table_function(table: SpecularTable) -> Callable[[Array, Array], Array]:
-    """The table as a function of directions [n, 3], in parts that fit into memory."""
+def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
+    """[n, 3]: the radiance of lobes at each pixel's middle over their mean radiance in the pixel.
+
+    A pixel near the sphere's edge has many normals: a peak at 60 degrees is dulled four times as much as at 0.
+    """
+    mean = np.zeros_like(samples.f)
+    for number, to_light in enumerate(samples.to_lights):
+        own = samples.photograph == number
+        for right, share_right in _GAUSS:
+            for up, share_up in _GAUSS:
+                places = samples.places[own] + samples.pixel_radii * np.array([right, up])
+                ways_in, ways_out = _ways(places, to_light)
+                lit = np.maximum(ways_in[:, 2:], 0.0) * (ways_out[:, 2:] > 0.0)
+                mean[own] += share_right * share_up * lit * lobes.reflectance(ways_in, ways_out)
+    return lobes.reflectance(samples.ways_in, samples.ways_out) * samples.ways_in[:, 2:] / mean
+
+
+def _left_out(design: Any, missed: Array, of_photograph: NDArray[np.intp], smoothness: float) -> Array:
+    """What each photograph's samples are by a table of the others; with one photograph, by the lobes alone."""
+    guess = np.zeros_like(missed)
+    numbers = np.unique(of_photograph)
+    for number in numbers if len(numbers) > 1 else []:
+        own = of_photograph == number
+        guess[own] = design[own] @ half_angle_table.smooth_table(design[~own], missed[~own], smoothness)
+    return guess
+
+
+def _prediction(
+    number: int, off: Array, theta_h: Array, theta_d: Array, own: NDArray[np.bool_]
+) -> LeftOutPrediction:
+    near = theta_h[own] <= np.quantile(theta_h[own], _NEAREST)
+    return LeftOutPrediction(
+        photograph=int(number),
+        incidence_deg=float(np.degrees(np.median(theta_d[own]))),
+        nearest_to_peak_deg=float(np.degrees(theta_h[own].min())),
+        median_miss=float(np.median(np.abs(off))),
+        peak_miss=float(np.median(off[near])),
+    )
+
+
+def finish_function(finish: Finish) -> Callable[[Array, Array], Array]:
+    """The finish as a function of directions [n, 3], in parts that fit into memory."""
 
     def reflectance(ways_in: Array, ways_out: Array) -> Array:
-        parts = range(0, len(ways_in), _AT_ONCE)
-        blocks = [
-            tabulated_brdf(ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE], table=table) for at in parts
-        ]
+        blocks = []
+        for at in range(0, len(ways_in), _AT_ONCE):
+            part = ways_in[at : at + _AT_ONCE], ways_out[at : at + _AT_ONCE]
+            correction = np.exp(half_angle_table.interpolation(*part) @ finish.log_correction)
+            blocks.append(finish.lobes.reflectance(*part) * correction)
         return np.concatenate(blocks)
 
     return reflectance
 
 
-def misses(samples: Samples, table: SpecularTable) -> tuple[float, float]:
-    """Median and 95 % of the relative differences between table and samples."""
-    off = np.abs(table_function(table)(samples.ways_in, samples.ways_out) / samples.f - 1.0)
+def misses(samples: Samples, finish: Finish) -> tuple[float, float]:
+    """Median and 95 % of the relative differences between finish and samples."""
+    off = np.abs(finish_function(finish)(samples.ways_in, samples.ways_out) / samples.f - 1.0)
     median, most = np.quantile(off, [0.5, 0.95])
     return float(median), float(most)
 
 
-def _roughness(shape: tuple[int, int, int]) -> Any:
-    """Squares of second differences along each coordinate; those along theta count least."""
-    from scipy.sparse import diags, eye, kron
-
-    parts = []
-    level = diags([-30.0, 30.0], [0, 1], shape=(1, shape[1]))  # a lobe is level at its peak
-    parts.append(kron(kron(eye(shape[0]), level.T @ level), eye(shape[2])))
-    for axis, weight in ((0, 10.0), (1, 1.0), (2, 10.0)):
-        second = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(shape[axis] - 2, shape[axis]))
-        factors = [eye(count) for count in shape]
-        factors[axis] = second.T @ second
-        parts.append(weight * kron(kron(factors[0], factors[1]), factors[2]))
-    return sum(parts[1:], parts[0])
-
-
-def _between(nodes: Array, where: Array) -> tuple[NDArray[np.intp], Array]:
-    low = np.clip(np.searchsorted(nodes, where) - 1, 0, len(nodes) - 2)
-    return low, np.clip((where - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0)
+def _ways(places: Array, to_light: Array) -> tuple[Array, Array]:
+    """Ways to the light and to the camera [n, 3] at places [n, 2] of the sphere, each in a frame of the normal
+    there; beside the sphere, those at its edge."""
+    radius = np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1.0)
+    up = np.sqrt(np.maximum(1.0 - np.sum(places**2, axis=1, keepdims=True), 0.0))
+    frames = _frames(np.concatenate([places / radius, up], axis=1))
+    return frames @ to_light, frames @ np.array([0.0, 0.0, 1.0])
 
 
 def _frames(normals: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ from coupole.errors import CoupoleError
 def choose(
     count: Annotated[int, typer.Option("--count", min=6, help="Lights that are chosen, at most.")],
     *,
-    known: KnownPictures,
+    picture_options: KnownPictures,
     until: Annotated[
         float | None,
         typer.Option(
@@ -46,12 +47,12 @@ def choose(
         from coupole.reflectance.picture_choice import HowMany, choose_pictures
         from coupole.storage.durable import write_synced
 
-        pictures = known.read()
+        pictures = picture_options.read()
         with step_bars(console) as say:
             choice = choose_pictures(
                 pictures,
                 HowMany(count, until, first, at_a_time),
-                say=lambda done, of: say("pictures that are read", done, of),
+                say=partial(say, "pictures that are read"),
             )
         if to is not None:
             write_synced(to, json.dumps(choice, indent=1) + "\n")

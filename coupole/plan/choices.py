@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from coupole.plan.bursts import Burst
-from coupole.plan.plan import ExposureUs, LedId, Model
+from coupole.plan.model import ExposureUs, LedId, Model
 from coupole.plan.shot_id import Dark, Led, Light, ShotLabel
 
 MOST_BURSTS = 16

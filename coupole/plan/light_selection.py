@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform, direction, inverse
 from coupole.plan.led_table import LedTable
-from coupole.plan.plan import (
+from coupole.plan.lights import (
     AdaptiveLights,
     AllLights,
     EveryLight,
@@ -20,8 +20,8 @@ from coupole.plan.plan import (
     Lights,
     NoLights,
     Panels,
-    Plan,
 )
+from coupole.plan.plan import Plan
 from coupole.plan.shot_id import Led, Panel
 
 

@@ -9,10 +9,12 @@ from typing import assert_never
 from coupole.geometry import Transform, look_at
 from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
 from coupole.plan.choices import Choice, OpenView, bound_of, bound_of_lights, has_enough
+from coupole.plan.exposures import AutoExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights, lit_in_bursts
+from coupole.plan.lights import AdaptiveLights, Lights
 from coupole.plan.marks import MARKS, Marks
-from coupole.plan.plan import AdaptiveLights, AutoExposure, Grid, Joints, Lights, LookAt, Plan, View
+from coupole.plan.plan import Grid, Joints, LookAt, Plan, View
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000

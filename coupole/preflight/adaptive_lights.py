@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform, apply
 from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
 from coupole.plan.led_table import LedTable
-from coupole.plan.plan import AdaptiveLights, Lights
+from coupole.plan.lights import AdaptiveLights, Lights
 from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights, spread_lights
 
@@ -66,7 +66,7 @@ class AdaptiveLightsChooser:
     ) -> Choice:
         lit_ids = [led for choice in choices for burst in choice.bursts for led in burst.leds]
         is_seen = [ShotLabel(Led(led), view.bursts[0].exposure_index, 0) in samples for led in lit_ids]
-        seen_ids = [led for led, seen in zip(lit_ids, is_seen, strict=True) if seen]
+        seen_ids = [led for led, was_proven in zip(lit_ids, is_seen, strict=True) if was_proven]
         if len(seen_ids) < FEWEST_TAKEN:
             return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few to choose by")
         values = self._values(view, seen_ids, samples)
@@ -82,10 +82,8 @@ class AdaptiveLightsChooser:
         figures = _figures(view, following, bright, len(lit_ids))
         if reason := _enough(lights, figures, len(unlit), len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
-        missed, after = 100.0 * figures["relit_rms"], 100.0 * figures["relit_rms_after"]
-        reason = (
-            f"{len(affordable_ids)} LEDs that tell most: expected error {missed:.2f} %, {after:.2f} % after them"
-        )
+        errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
+        reason = f"{len(affordable_ids)} LEDs that tell most: expected error {errors}"
         return self._choice(view, affordable_ids, reason, figures)
 
     def _affordable(
@@ -112,8 +110,8 @@ class AdaptiveLightsChooser:
         step = max(1, len(signals[0]) // _SITES) | 1  # odd: pixels of all colours
         row_of = {led: row for row, led in enumerate(view.leds.tolist())}
         lux = self._lux(view)[[row_of[led] for led in seen_ids]]
-        shown = np.stack([signal[::step] for signal in signals]).astype(np.float64)
-        return np.asarray(shown / (lux / lux.mean())[:, None])
+        signals_dn = np.stack([signal[::step] for signal in signals]).astype(np.float64)
+        return np.asarray(signals_dn / (lux / lux.mean())[:, None])
 
     def _choice(
         self, view: OpenView, ids: Sequence[int], reason: str, figures: Mapping[str, Any] | None = None
@@ -151,11 +149,11 @@ def _figures(view: OpenView, following: NextLights, bright: float, lit: int) -> 
 
 def _enough(lights: AdaptiveLights, figures: Mapping[str, Any], unlit: int, affordable: int) -> str:
     """The reason for no more LEDs; empty if there is none."""
-    missed, until = f"expected error {100.0 * figures['relit_rms']:.2f} %", lights.until
+    error_text, until = f"expected error {100.0 * figures['relit_rms']:.2f} %", lights.until
     if until.relit_rms is not None and figures["relit_rms"] <= until.relit_rms:
-        return f"enough by `relit_rms`: {missed} of at most {100.0 * until.relit_rms:g} %"
+        return f"enough by `relit_rms`: {error_text} of at most {100.0 * until.relit_rms:g} %"
     if unlit == 0:
-        return f"all LEDs of the view are lit; {missed}"
+        return f"all LEDs of the view are lit; {error_text}"
     if figures["lights"] >= until.lights:
-        return f"enough by `lights`: {until.lights} LEDs are lit; {missed}"
-    return f"enough by `seconds` or `lux_h`: the plan allows no more LEDs; {missed}" if affordable == 0 else ""
+        return f"enough by `lights`: {until.lights} LEDs are lit; {error_text}"
+    return f"enough by `seconds` or `lux_h`: the plan allows no more LEDs; {error_text}" if affordable == 0 else ""

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform, apply
 from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
+from coupole.plan.exposures import STEPS_PER_STOP, AutoExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights
-from coupole.plan.plan import STEPS_PER_STOP, AutoExposure
 from coupole.plan.shot_id import ShotLabel
 from coupole.preflight.exposure_evidence import FULL, QUANTILES, Evidence, Judgement
 from coupole.preflight.exposure_times import LightLimits, Wish, chosen_times

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coupole.plan.choices import Chooser
-from coupole.plan.plan import AutoExposure
+from coupole.plan.exposures import AutoExposure
 from coupole.plan.schedule import expand_view
 from coupole.preflight.adaptive_lights import AdaptiveLightsChooser
 from coupole.preflight.auto_exposure import AutoExposureChooser

@@ -22,7 +22,7 @@ from coupole.errors import InputError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
 from coupole.plan.controller_places import places_of_arm
-from coupole.plan.plan import Model, Name
+from coupole.plan.model import Model, Name
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.commissioned_rig import STEPS, Step, covered_settings
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.plan.choices import FrameSample
-from coupole.plan.plan import AutoExposure
+from coupole.plan.exposures import AutoExposure
 from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.exposure_advice import Noise, noise_of_pairs
 

@@ -46,16 +46,16 @@ class NextLights:
     """Indices of the lights that were weighed next best to the first."""
 
 
-def spread_lights(directions: Floats, allowed: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Indices of `count` lights among `allowed` to begin with: the one nearest to the middle of them, then each as
-    far as possible from those before it. `directions` [n, 3] are unit vectors."""
-    candidates = directions[allowed]
+def spread_lights(directions: Floats, allowed_lights: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Indices of `count` lights among `allowed_lights` to begin with: the one nearest to the middle of them, then
+    each as far as possible from those before it. `directions` [n, 3] are unit vectors."""
+    candidates = directions[allowed_lights]
     order = [int(np.argmax(candidates @ candidates.mean(axis=0)))]
     closeness = candidates @ candidates[order[0]]
-    while len(order) < min(count, len(allowed)):
+    while len(order) < min(count, len(allowed_lights)):
         order.append(int(np.argmin(closeness)))
         closeness = np.maximum(closeness, candidates @ candidates[order[-1]])
-    return allowed[order]
+    return allowed_lights[order]
 
 
 def left_out_squares(values: Floats, directions: Floats) -> Floats:
@@ -67,68 +67,76 @@ def left_out_squares(values: Floats, directions: Floats) -> Floats:
     # the small terms let lights stand twice in a direction, or all in one plane
     system = np.block([[_NUGGET * np.eye(count) - apart, tail], [tail.T, -_NUGGET * np.eye(4)]])
     inverse = np.linalg.inv(system)[:count, :count]
-    own = np.diag(inverse)
-    is_fixed = np.abs(own) < 1e-9 * np.abs(own).max()  # a light that the others do not predict at all
-    errors = inverse @ values / np.where(is_fixed, np.inf, own)[:, None]
+    own_terms = np.diag(inverse)
+    is_fixed = np.abs(own_terms) < 1e-9 * np.abs(own_terms).max()  # a light that the others do not predict at all
+    errors = inverse @ values / np.where(is_fixed, np.inf, own_terms)[:, None]
     squares: Floats = np.mean(errors**2, axis=1)
     squares[is_fixed] = np.mean(values[is_fixed] ** 2, axis=1)
     return squares
 
 
 def next_lights(
-    values: Floats, directions: Floats, taken: NDArray[np.int64], allowed: NDArray[np.int64], count: int
+    values: Floats,
+    directions: Floats,
+    taken_lights: NDArray[np.int64],
+    allowed_lights: NDArray[np.int64],
+    count: int,
 ) -> NextLights:
-    """The next `count` lights among `allowed`, fewer if there are no more.
+    """The next `count` lights among `allowed_lights`, fewer if there are no more.
 
-    `values` [len(taken), sites] are what the lights `taken` have shown, in their order, of places spread over the
-    picture; `directions` [n, 3] unit vectors to all lights. Pictures of all that are `allowed` count as wanted.
+    `values` [taken, sites] are what the lights `taken_lights` have shown, in their order, of places spread over the
+    picture; `directions` [n, 3] are unit vectors to all lights. A picture is wanted of each of `allowed_lights`.
     Raises ValueError for fewer than `FEWEST_TAKEN` lights.
     """
-    if len(taken) < FEWEST_TAKEN:
-        raise ValueError(f"expected at least {FEWEST_TAKEN} lights that were taken, got {len(taken)}")
-    wanted = np.union1d(allowed, taken)
-    covariance = _error_covariance(values, directions[wanted], np.searchsorted(wanted, taken))
-    is_candidate = np.isin(wanted, allowed) & ~np.isin(wanted, taken)
+    if len(taken_lights) < FEWEST_TAKEN:
+        raise ValueError(f"expected at least {FEWEST_TAKEN} lights that were taken, got {len(taken_lights)}")
+    wanted_lights = np.union1d(allowed_lights, taken_lights)
+    covariance = _error_covariance(values, directions[wanted_lights], np.searchsorted(wanted_lights, taken_lights))
+    is_candidate = np.isin(wanted_lights, allowed_lights) & ~np.isin(wanted_lights, taken_lights)
     remaining = max(int(np.count_nonzero(is_candidate)), 1)
     rms = _rms(covariance, is_candidate, remaining)
-    chosen: list[int] = []
+    chosen_rows: list[int] = []
     alternatives: tuple[int, ...] = ()
     for _ in range(min(count, int(np.count_nonzero(is_candidate)))):
         gain = np.where(is_candidate, _gains(covariance), -1.0)
         order = np.argsort(-gain, kind="stable")
-        if not chosen:
-            others = [light for light in order[1 : 1 + _ALTERNATIVES] if gain[light] >= 0.0]
-            alternatives = tuple(int(wanted[light]) for light in others)
+        if not chosen_rows:
+            other_lights = [light for light in order[1 : 1 + _ALTERNATIVES] if gain[light] >= 0.0]
+            alternatives = tuple(int(wanted_lights[light]) for light in other_lights)
         best = int(order[0])
-        chosen.append(best)
+        chosen_rows.append(best)
         is_candidate[best] = False
         column = covariance[:, best].copy()
         covariance -= np.outer(column, column / max(column[best], 1e-300))
-    left = max(int(np.count_nonzero(is_candidate)), 1)
-    return NextLights(wanted[chosen], rms, _rms(covariance, is_candidate, left), alternatives)
+    remaining_after = max(int(np.count_nonzero(is_candidate)), 1)
+    return NextLights(
+        wanted_lights[chosen_rows], rms, _rms(covariance, is_candidate, remaining_after), alternatives
+    )
 
 
-def _error_covariance(values: Floats, directions: Floats, taken: NDArray[np.int64]) -> Floats:
+def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[np.int64]) -> Floats:
     """[n, n] covariance of the errors of pictures, given those that were taken."""
     angle = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
     plain = np.exp(-angle / _RANGE_RAD)
-    among_taken = np.linalg.inv(plain[np.ix_(taken, taken)] + _NUGGET * np.eye(len(taken)))
+    among_taken = np.linalg.inv(plain[np.ix_(taken_lights, taken_lights)] + _NUGGET * np.eye(len(taken_lights)))
     left_out_variance = 1.0 / np.diag(among_taken)  # of the unit field, each given the others
-    strength = left_out_squares(values, directions[taken]) / left_out_variance
+    strength = left_out_squares(values, directions[taken_lights]) / left_out_variance
     strength = np.maximum(strength, _LEAST_SHARE * strength.max() + 1e-300)
-    between = angle[np.ix_(taken, taken)] + np.pi * np.eye(len(taken))
+    between = angle[np.ix_(taken_lights, taken_lights)] + np.pi * np.eye(len(taken_lights))
     spacing = max(float(between.min(axis=1).mean()), _LEAST_SPACING_RAD)
-    weights = np.exp(-0.5 * (angle[:, taken] / spacing) ** 2) + 1e-12
+    weights = np.exp(-0.5 * (angle[:, taken_lights] / spacing) ** 2) + 1e-12
     local = np.exp(0.5 * (weights @ np.log(strength)) / weights.sum(axis=1))
     covariance: Floats = plain * np.outer(local, local)
-    given = covariance[np.ix_(taken, taken)] + _NUGGET * np.diag(local[taken] ** 2)
-    return covariance - covariance[:, taken] @ np.linalg.solve(given, covariance[taken])
+    taken_covariance = covariance[np.ix_(taken_lights, taken_lights)] + _NUGGET * np.diag(local[taken_lights] ** 2)
+    return covariance - covariance[:, taken_lights] @ np.linalg.solve(taken_covariance, covariance[taken_lights])
 
 
 def _gains(covariance: Floats) -> Floats:
     """[n] by how much the sum of all variances falls when one light is taken."""
-    own = np.diag(covariance)
-    return np.asarray((covariance**2).sum(axis=0) / np.maximum(own, 1e-9 * max(float(own.max()), 1e-300)))
+    own_terms = np.diag(covariance)
+    return np.asarray(
+        (covariance**2).sum(axis=0) / np.maximum(own_terms, 1e-9 * max(float(own_terms.max()), 1e-300))
+    )
 
 
 def _rms(covariance: Floats, is_open: NDArray[np.bool_], count: int) -> float:

@@ -26,7 +26,7 @@ _BRIGHT_QUANTILE = 0.999
 
 @dataclass(frozen=True)
 class HowMany:
-    """How many lights are chosen, and in what steps."""
+    """Number of lights that are chosen, and the steps in which they are."""
 
     most: int
     """Lights that are chosen, at most."""
@@ -47,27 +47,27 @@ def choose_pictures(
     """
     _refuse(pictures, how_many)
     every = np.arange(len(pictures))
-    chosen = spread_lights(pictures.directions, every, how_many.first)
+    chosen_lights = spread_lights(pictures.directions, every, how_many.first)
     values = np.empty((0, 0))
     steps: list[dict[str, Any]] = []
     while True:
-        values = _with_new(pictures, values, chosen, say, how_many.most)
+        values = _with_new(pictures, values, chosen_lights, say, how_many.most)
         bright = float(np.quantile(values, _BRIGHT_QUANTILE)) or 1.0
-        count = min(how_many.at_a_time, how_many.most - len(chosen))
-        following = next_lights(values, pictures.directions, chosen, every, count)
-        steps.append(_step(len(chosen), following, bright))
+        count = min(how_many.at_a_time, how_many.most - len(chosen_lights))
+        following = next_lights(values, pictures.directions, chosen_lights, every, count)
+        steps.append(_step(len(chosen_lights), following, bright))
         is_enough = how_many.relit_rms is not None and steps[-1]["relit_rms"] <= how_many.relit_rms
         if is_enough or not len(following.lights):
             break
-        chosen = np.append(chosen, following.lights)
+        chosen_lights = np.append(chosen_lights, following.lights)
     return {
-        "chosen": chosen.tolist(),
-        "pictures": [pictures.files[light].name for light in chosen],
+        "chosen": chosen_lights.tolist(),
+        "pictures": [pictures.files[light].name for light in chosen_lights],
         "of": len(pictures),
         "relit_rms": steps[-1]["relit_rms"],
         "stopped_by": "relit_rms" if is_enough else "count",
         "steps": steps,
-        "left_out": np.setdiff1d(every, chosen).tolist(),
+        "left_out": np.setdiff1d(every, chosen_lights).tolist(),
     }
 
 
@@ -82,12 +82,16 @@ def _refuse(pictures: PictureSet, how_many: HowMany) -> None:
 
 
 def _with_new(
-    pictures: PictureSet, values: Floats, chosen: NDArray[np.int64], say: Callable[[int, int], None], most: int
+    pictures: PictureSet,
+    values: Floats,
+    chosen_lights: NDArray[np.int64],
+    say: Callable[[int, int], None],
+    most: int,
 ) -> Floats:
     """[chosen, sites] grey values, in full scales; those of lights chosen before stand in `values`."""
     rows = list(values)
     step = max(1, pictures.pixels // _SITES)
-    for light in chosen[len(rows) :].tolist():
+    for light in chosen_lights[len(rows) :].tolist():
         say(len(rows), most)
         picture = pictures.raw_values(light)[::step] / pictures.full_scale / pictures.intensities[light]
         rows.append(picture.mean(axis=1))

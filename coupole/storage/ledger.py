@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from coupole.errors import InputError, StorageError
 from coupole.plan.cell import Cell
-from coupole.plan.plan import Name
+from coupole.plan.model import Name
 from coupole.storage.ledger_lines import (
     NO_FILE,
     Asked,

@@ -24,7 +24,7 @@ from coupole.calibration.record import Input, Noise, Parameter, Validity, seal_r
 from coupole.devices import ArmState, FrameFormat
 from coupole.geometry import abc_from_rotation
 from coupole.plan.led_table import COLUMNS, LedTable
-from coupole.plan.plan import Pose
+from coupole.plan.model import Pose
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.errors import InputError, Problem
-from coupole.plan.plan import Model, Plan
+from coupole.plan.model import Model
+from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.yamlfile import read_document
 

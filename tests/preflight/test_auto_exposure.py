@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from preflight_cases import DOME, TOP, plan_of, rig_of, schedule_of
 
 from coupole.plan.choices import MOST_BURSTS, Choice, ChosenBurst, FrameSample, OpenView, has_enough, refuse_beyond
-from coupole.plan.plan import AutoExposure
+from coupole.plan.exposures import AutoExposure
 from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.auto_exposure import AutoExposureChooser
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from coupole.devices import FrameFormat
 from coupole.errors import InputError
-from coupole.plan.plan import FixedExposure
+from coupole.plan.exposures import FixedExposure
 from coupole.plan.yamlfile import read_document
 from coupole.preflight.exposure_advice import Metered, Noise, Request, advise, advise_view, noise_of, write_plan
 

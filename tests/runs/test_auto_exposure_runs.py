@@ -16,7 +16,7 @@ from in_part import in_part
 
 from coupole.acquisition.frame_samples import frame_sample
 from coupole.plan.choices import FrameSample
-from coupole.plan.plan import AutoExposure
+from coupole.plan.exposures import AutoExposure
 from coupole.plan.shot_id import ShotLabel
 from coupole.preflight.choosers import chooser_of
 from coupole.preflight.job import read_job

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from coupole.calibration.rotations import Floats
 from coupole.plan import yamlfile
-from coupole.plan.plan import Model, Pose
+from coupole.plan.model import Model, Pose
 
 
 class Tile(Model):

@@ -12,7 +12,7 @@ from coupole.console.runs.run_files import RunFiles, RunRow
 from coupole.errors import CoupoleError, InputError, StorageError
 from coupole.plan import yamlfile
 from coupole.plan.cell import Cell
-from coupole.plan.plan import NAME_PATTERN
+from coupole.plan.model import NAME_PATTERN
 from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.ledger import ledger_of, similar_ids
 from coupole.storage.ledger_lines import History

@@ -32,7 +32,7 @@ from pydantic import Field, model_validator
 
 from coupole.errors import InputError
 from coupole.plan.cell import Cell
-from coupole.plan.plan import Model
+from coupole.plan.model import Model
 from coupole.plan.yamlfile import read_document
 from coupole.storage.line_file import utc_now
 

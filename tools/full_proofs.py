@@ -92,6 +92,11 @@ PROOFS = (
         "gilding beside lacquer: as asked, in 1.15 of the best bracket's time",
         "tools/prove_auto_exposure.py",
     ),
+    Proof(
+        "adaptive-lights",
+        "LEDs chosen in the run, beside spread and random ones, on seven rendered objects",
+        "tools/prove_adaptive_lights.py",
+    ),
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
     Proof("brackets", "intervals of merged photographs hold for random cameras", "tools/prove_brackets.py"),
     Proof(

@@ -1,4 +1,4 @@
-"""What all models of plans and rigs share: names, numbers with their bounds, poses.
+"""The ground of all models of plans and rigs: names, numbers with their bounds, poses.
 
 Every model is frozen and refuses unknown keys.
 """

@@ -84,7 +84,7 @@ def next_lights(
 ) -> NextLights:
     """The next `count` lights among `allowed_lights`, fewer if there are no more.
 
-    `values` [taken, sites] are what the lights `taken_lights` have shown, in their order, of places spread over the
+    `values` [taken, sites] are what the lights `taken_lights` have shown, in their order, of places all over the
     picture; `directions` [n, 3] are unit vectors to all lights. A picture is wanted of each of `allowed_lights`.
     Raises ValueError for fewer than `FEWEST_TAKEN` lights.
     """

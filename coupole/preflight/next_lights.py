@@ -4,9 +4,8 @@ Pictures between lights are made of the pictures taken, by radial basis function
 5.2). Each light taken is left out in turn and predicted from the others; Rippa (1999) gives all these errors from
 one inverse. Where such an error is large, a highlight or an edge of shadow passes the object. So the errors of
 pictures are modelled over the directions of light as a random field of exponential covariance, as strong in each
-place as the errors found near it. The next light is the one that leaves least expected error in all pictures not
-taken (integrated variance; Sacks et al. 1989, Seo et al. 2000). It counts as taken while the one after it is
-chosen.
+place as the errors found near it. The next light is the one whose picture is expected to be off the most (MacKay
+1992). It counts as taken while the one after it is chosen.
 
 Everything is a function of its arguments, without a draw: a resumed run chooses the same.
 """
@@ -98,10 +97,10 @@ def next_lights(
     chosen_rows: list[int] = []
     alternatives: tuple[int, ...] = ()
     for _ in range(min(count, int(np.count_nonzero(is_candidate)))):
-        gain = np.where(is_candidate, _gains(covariance), -1.0)
-        order = np.argsort(-gain, kind="stable")
+        variance = np.where(is_candidate, np.diag(covariance), -1.0)
+        order = np.argsort(-variance, kind="stable")
         if not chosen_rows:
-            other_lights = [light for light in order[1 : 1 + _ALTERNATIVES] if gain[light] >= 0.0]
+            other_lights = [light for light in order[1 : 1 + _ALTERNATIVES] if variance[light] >= 0.0]
             alternatives = tuple(int(wanted_lights[light]) for light in other_lights)
         best = int(order[0])
         chosen_rows.append(best)
@@ -129,14 +128,6 @@ def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[
     covariance: Floats = plain * np.outer(local, local)
     taken_covariance = covariance[np.ix_(taken_lights, taken_lights)] + _NUGGET * np.diag(local[taken_lights] ** 2)
     return covariance - covariance[:, taken_lights] @ np.linalg.solve(taken_covariance, covariance[taken_lights])
-
-
-def _gains(covariance: Floats) -> Floats:
-    """[n] by how much the sum of all variances falls when one light is taken."""
-    own_terms = np.diag(covariance)
-    return np.asarray(
-        (covariance**2).sum(axis=0) / np.maximum(own_terms, 1e-9 * max(float(own_terms.max()), 1e-300))
-    )
 
 
 def _rms(covariance: Floats, is_open: NDArray[np.bool_], count: int) -> float:

@@ -40,7 +40,7 @@ def srgb(v: np.ndarray) -> np.ndarray:
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * np.maximum(v, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def waved(v: np.ndarray) -> np.ndarray:
+def wavy(v: np.ndarray) -> np.ndarray:
     return np.asarray(v**0.55 * (1.0 + 0.06 * np.sin(2.0 * np.pi * v**0.55)))
 
 
@@ -70,36 +70,38 @@ def drawn_curve(rng: np.random.Generator) -> Curve:
 def scene(rng: np.random.Generator) -> np.ndarray:
     """[80, 120, 3], over a range of some 500 times, with colours that change."""
     y, x = np.mgrid[:80, :120] / 80.0
-    turn = rng.uniform(0.0, 2.0 * np.pi, 3)
-    colours = [1.0 + 0.3 * np.sin(3.0 * x + 2.0 * y + one) for one in turn]
+    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    colours = [1.0 + 0.3 * np.sin(3.0 * x + 2.0 * y + phase) for phase in phases]
     return np.asarray(
         np.exp(3.2 * (x - 1.0) + 0.4 * np.sin(9.0 * y))[..., None] * np.stack(colours, axis=2) * [0.9, 0.7, 0.4]
     )
 
 
-def tried(curve: Curve, step: float, noise_levels: float, rng: np.random.Generator) -> tuple[float, float, float]:
+def try_camera(
+    curve: Curve, step: float, noise_levels: float, rng: np.random.Generator
+) -> tuple[float, float, float]:
     """Share of pixels within their intervals, most that the response is off, and how often its intervals hold."""
     times = step ** np.arange(np.ceil(-4.0 / np.log2(step)), 4.0 / np.log2(step) - 1e-9)
     radiance = scene(rng)
-    exposed = np.clip(0.5 * radiance * times[:, None, None, None], 0.0, 1.0)
-    noisy = np.clip(curve(exposed) + rng.normal(0.0, noise_levels / LEVELS, exposed.shape), 0.0, 1.0)
+    exposures = np.clip(0.5 * radiance * times[:, None, None, None], 0.0, 1.0)
+    noisy = np.clip(curve(exposures) + rng.normal(0.0, noise_levels / LEVELS, exposures.shape), 0.0, 1.0)
     values = (np.rint(LEVELS * noisy) / LEVELS).astype(np.float32)
     photographs = Photographs((), values, times, LEVELS + 1, raw=False)
     response = camera_response.found_response(photographs)
-    merged = exposure_merging.merge_exposures(photographs, response)
+    picture = exposure_merging.merge_exposures(photographs, response)
     curve_values = curve(_FINE)
     middle = camera_response.NODES // 2 / (camera_response.NODES - 1)
     unit = 0.5 / np.interp(middle, curve_values, _FINE)
-    known = np.isfinite(merged.uncertainty)
-    off = np.abs(merged.radiance[known] / (radiance[known] * unit) - 1.0)
-    shares = float((off < _COVERAGE_FACTOR * merged.uncertainty[known]).mean())
+    is_known = np.isfinite(picture.uncertainty)
+    off = np.abs(picture.radiance[is_known] / (radiance[is_known] * unit) - 1.0)
+    shares = float((off < _COVERAGE_FACTOR * picture.uncertainty[is_known]).mean())
     nodes = slice(13, 243)
     z = np.linspace(0.0, 1.0, camera_response.NODES)
     true = np.log(np.interp(z[nodes], curve_values, _FINE)) - np.log(np.interp(middle, curve_values, _FINE))
-    missed = np.abs(response.log_exposure[nodes] - true[:, None])
-    shown = np.isfinite(response.uncertainty[nodes])
-    hold = missed[shown] < _COVERAGE_FACTOR * np.maximum(response.uncertainty[nodes][shown], 1e-4)
-    return shares, float(missed[shown].max()), float(hold.mean())
+    log_misses = np.abs(response.log_exposure[nodes] - true[:, None])
+    is_shown = np.isfinite(response.uncertainty[nodes])
+    hold = log_misses[is_shown] < _COVERAGE_FACTOR * np.maximum(response.uncertainty[nodes][is_shown], 1e-4)
+    return shares, float(log_misses[is_shown].max()), float(hold.mean())
 
 
 def main() -> int:
@@ -110,9 +112,9 @@ def main() -> int:
     good = True
     for step in STEPS:
         rng = np.random.default_rng(6)
-        curves = [srgb, straight, waved, *(drawn_curve(rng) for _ in range(options.cameras))][-options.cameras :]
+        curves = [srgb, straight, wavy, *(drawn_curve(rng) for _ in range(options.cameras))][-options.cameras :]
         rows = np.array(
-            [tried(curve, step, NOISES[number % len(NOISES)], rng) for number, curve in enumerate(curves)]
+            [try_camera(curve, step, NOISES[number % len(NOISES)], rng) for number, curve in enumerate(curves)]
         )
         pixels, _, hold = rows.mean(axis=0)
         good &= LEAST <= pixels <= MOST

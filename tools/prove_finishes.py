@@ -45,19 +45,19 @@ def lights() -> list[np.ndarray]:
     return [np.array([np.sin(a) * np.cos(n), np.sin(a) * np.sin(n), np.cos(a)]) for n, a in angles]
 
 
-def lacquered(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+def lacquer_on_gold(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """Beckmann facets over a rough diffuse ground."""
     ground = brdf.oren_nayar(wi, wo, reflectance=[0.1, 0.05, 0.02], roughness=0.5)
     return brdf.cook_torrance(wi, wo, slope=0.2, fresnel=_GOLD) + ground
 
 
-def worn(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+def two_facets(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """Two kinds of facets, of two shapes."""
     narrow = brdf.cook_torrance(wi, wo, slope=0.12, fresnel=_GOLD)
     return 0.6 * narrow + 0.4 * brdf.ggx(wi, wo, roughness=0.4, fresnel=_GOLD) + 0.002
 
 
-def powdered(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
+def powder(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """GGX facets and a little of a diffuse body."""
     return brdf.ggx(wi, wo, roughness=0.25, fresnel=_GOLD) + 0.01
 
@@ -79,8 +79,8 @@ class Mitsuba:
         for way_in, way_out in zip(wi, wo, strict=True):
             place = mi.SurfaceInteraction3f()
             place.wi = mi.Vector3f(*way_out.tolist())
-            seen = self._bsdf.eval(mi.BSDFContext(), place, mi.Vector3f(*way_in.tolist()))
-            values.append(np.array(seen).ravel() / way_in[2])
+            value = self._bsdf.eval(mi.BSDFContext(), place, mi.Vector3f(*way_in.tolist()))
+            values.append(np.array(value).ravel() / way_in[2])
         return np.array(values)
 
     def photograph(self, to_light: np.ndarray, radius_px: float) -> np.ndarray:
@@ -126,7 +126,7 @@ def _side(radius_px: float) -> int:
     return 2 * int(radius_px + 5.0) + 1
 
 
-def measured(
+def measure(
     finish: Any,
     radius_px: float,
     noise: float,
@@ -196,18 +196,18 @@ def main() -> int:
     spheres: list[tuple[str, Any, dict[str, float]]] = [
         (f"Mitsuba, gold, alpha {alpha:g}", Mitsuba(alpha, options.samples), {}) for alpha in (0.25, 0.1)
     ]
-    spheres += [("powdered", powdered, {}), ("lacquered", lacquered, {}), ("worn", worn, {})]
+    spheres += [("powdered", powder, {}), ("lacquered", lacquer_on_gold, {}), ("worn", two_facets, {})]
     spheres += [
-        ("powdered, centre 0.5 px off", powdered, {"centre_off_px": 0.5}),
-        ("powdered, radius 0.5 px off", powdered, {"radius_off_px": 0.5}),
-        ("powdered, lights 1 degree off", powdered, {"light_off_deg": 1.0}),
+        ("powdered, centre 0.5 px off", powder, {"centre_off_px": 0.5}),
+        ("powdered, radius 0.5 px off", powder, {"radius_off_px": 0.5}),
+        ("powdered, lights 1 degree off", powder, {"light_off_deg": 1.0}),
     ]
     worst = 0.0
     print(
         "sphere | peaks at " + ", ".join(f"{angle}" for angle in PEAKS_DEG) + " degrees, % off | 99 % about them"
     )
     for name, finish, mistake in spheres[:: len(spheres) - 1] if options.smallest else spheres:
-        table = measured(finish, options.radius_px, options.noise, **(straight | mistake))
+        table = measure(finish, options.radius_px, options.noise, **(straight | mistake))
         peaks = peak_errors(table, finish)
         about = error_about_peaks(table, finish)
         print(f"{name} | " + ", ".join(f"{100 * peak:+.1f}" for peak in peaks) + f" | {100 * about:.1f}")

@@ -78,10 +78,9 @@ class Loaded:
     def __init__(self, description: dict[str, Any], folder: Path) -> None:
         self._mi = variant.mitsuba("scalar_spectral")
         material = TypeAdapter(materials.Material).validate_python(description)
-        described = bands.for_group(materials.bsdf(material, folder), GROUP, 5, folder)
-        self.bsdf = self._mi.load_dict(described)
-        middles = 380.0 + 5.0 * np.array(GROUP, float)
-        self._wavelengths = self._mi.Color0f() if not len(middles) else middles.tolist()
+        group_description = bands.for_group(materials.bsdf(material, folder), GROUP, 5, folder)
+        self.bsdf = self._mi.load_dict(group_description)
+        self._wavelengths = (380.0 + 5.0 * np.array(GROUP, float)).tolist()
         self._context = self._mi.BSDFContext()
 
     def place(self, way: np.ndarray) -> Any:
@@ -126,23 +125,24 @@ def hemisphere_nodes() -> tuple[np.ndarray, np.ndarray]:
     return ways(cosine.ravel(), turn.ravel()), area.ravel()
 
 
-def figures(loaded: Loaded, count: int, rng: np.random.Generator) -> tuple[float, float, float]:
+def figures(material: Loaded, count: int, rng: np.random.Generator) -> tuple[float, float, float]:
     """Largest albedo, largest difference of drawn ways, largest of exchanged ways."""
     over, area = hemisphere_nodes()
-    albedos, apart, exchanged = [], [0.0], [0.0]
+    albedos, apart, exchange_errors = [], [0.0], [0.0]
     for z in COSINES:
         wo = ways(np.array([z]), np.array([_TURN]))[0]
-        weights = loaded.drawn_weights(wo, count, rng)
-        drawn, error = weights.mean(axis=0), weights.std(axis=0) / np.sqrt(count)
-        evaluated = area @ loaded.times_cosine(wo, over)
-        albedos.append(float(evaluated.max()))
-        apart.append(float((np.abs(evaluated - drawn) - 3.0 * error).max()))
+        weights = material.drawn_weights(wo, count, rng)
+        mean_weight, error = weights.mean(axis=0), weights.std(axis=0) / np.sqrt(count)
+        albedo = area @ material.times_cosine(wo, over)
+        albedos.append(float(albedo.max()))
+        apart.append(float((np.abs(albedo - mean_weight) - 3.0 * error).max()))
         some = ways(rng.uniform(0.1, 1.0, 200), rng.uniform(0.0, 2.0 * np.pi, 200))
-        there = loaded.times_cosine(wo, some) / some[:, 2:]
-        back = np.array([loaded.times_cosine(way, wo[None])[0] for way in some]) / wo[2]
-        counted = np.maximum(there, back) > 1e-3 * there.max()
-        exchanged.append(float((np.abs(there - back) / np.maximum(np.maximum(there, back), 1e-30))[counted].max()))
-    return max(albedos), max(apart), max(exchanged)
+        there = material.times_cosine(wo, some) / some[:, 2:]
+        back = np.array([material.times_cosine(way, wo[None])[0] for way in some]) / wo[2]
+        is_bright = np.maximum(there, back) > 1e-3 * there.max()
+        relative = np.abs(there - back) / np.maximum(np.maximum(there, back), 1e-30)
+        exchange_errors.append(float(relative[is_bright].max()))
+    return max(albedos), max(apart), max(exchange_errors)
 
 
 def gold(wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
@@ -155,15 +155,15 @@ def main() -> int:
     add_smallest(parser, samples=200)
     options = parser.parse_args()
     rng, good = np.random.default_rng(1), True
-    chosen = dict(list(MATERIALS.items())[:1]) if options.smallest else MATERIALS
+    selection = dict(list(MATERIALS.items())[:1]) if options.smallest else MATERIALS
     print("material | largest albedo | drawn against evaluated | exchanged ways")
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "gold.binary").write_bytes(encode_reflectance(gold))
-        for name, description in chosen.items():
-            albedo, apart, exchanged = figures(Loaded(description, Path(folder)), options.samples, rng)
+        for name, description in selection.items():
+            albedo, apart, exchange_error = figures(Loaded(description, Path(folder)), options.samples, rng)
             good &= albedo <= HIGHEST_ALBEDO and apart <= MOST_APART
-            print(f"{name} | {albedo:.4f} | {max(apart, 0.0):.4f} | {100 * exchanged:.2g} %", flush=True)
-    print(f"{len(chosen)} materials: {'none creates light' if good else 'a material is WRONG'}")
+            print(f"{name} | {albedo:.4f} | {max(apart, 0.0):.4f} | {100 * exchange_error:.2g} %", flush=True)
+    print(f"{len(selection)} materials: {'none creates light' if good else 'a material is WRONG'}")
     return int(not options.smallest and not good)
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from coupole.exchange.bracket.camera_response import Response
     from coupole.exchange.bracket.exposure_merging import Merged
     from coupole.exchange.bracket.photographs import Photographs
+    from coupole.exchange.bracket.sphere_brdf import Finish
 
 _TOLD_FROM = 1e-3
 """Share of contradicting pixels of a photograph from which it is named."""
@@ -107,17 +108,26 @@ def sphere_brdf(
         raise
     document = {"table": str(out), "samples": len(samples.f), "median_miss": off[0], "miss_of_95_percent": off[1]}
     paths = [str(lit.path) for lit in setup.photographs]
-    left_out = [{"path": paths[one.photograph]} | asdict(one) for one in finish.left_out]
+    left_out = [{"path": paths[miss.photograph]} | asdict(miss) for miss in finish.left_out]
     if as_json:
         print(json.dumps(document | {"left_out": left_out}))
         return
     text = f"{out}: {len(samples.f)} samples, half of them missed by up to {off[0]:.1%}, 95 % by {off[1]:.1%}"
     console.print(text, markup=False)
-    if len(paths) > 1:
-        console.print("each photograph as the others predict it: incidence at its peak, miss there, median miss")
-    for one in left_out if len(paths) > 1 else []:
-        told = f"{one['incidence_deg']:.0f} degrees, {one['peak_miss']:+.1%}, {one['median_miss']:.1%}"
-        console.print(f"  {one['path']}: {told}", markup=False)
+    for line in _prediction_lines(finish, paths) if len(paths) > 1 else []:
+        console.print(line, markup=False)
+
+
+def _prediction_lines(finish: Finish, paths: list[str]) -> list[str]:
+    """One line for each photograph that the others predict."""
+    return [
+        "each photograph as the others predict it: incidence, miss at the peak, median miss, nearest sample",
+        *(
+            f"  {paths[miss.photograph]}: {miss.incidence_deg:.0f} degrees, {miss.peak_miss:+.1%}, "
+            f"{miss.median_miss:.1%}; {miss.nearest_to_peak_deg:.1f} degrees from the peak"
+            for miss in finish.left_out
+        ),
+    ]
 
 
 def _document(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +23,21 @@ _AROUND_PX = 4
 """A colour is the mean of the pixels up to this far from the place that is named."""
 _TOLD_FROM = 0.01
 """Share of clamped pixels from which it is told."""
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A photograph taken apart."""
+
+    parts: Makie
+    metal_rgb: NDArray[np.float64]
+    """[3], linear, in the photograph's unit."""
+    lacquer_rgbs: list[NDArray[np.float64]]
+    """[3] each, as `metal_rgb`."""
+    unknown_share: float
+    """Share of pixels that are saturated or dark in a merged photograph."""
+    checks: list[dict[str, Any]]
+    """Shares found at the places of known share."""
 
 
 def makie(
@@ -52,7 +68,7 @@ def makie(
         bool,
         typer.Option("--inside", help="Pixels hold metal and lacquer only, no shadow: exact for three colours."),
     ] = False,
-    known: Annotated[
+    known_shares: Annotated[
         list[str] | None,
         typer.Option(
             "--known",
@@ -71,39 +87,57 @@ def makie(
 
     console = make_console(quiet=as_json)
     try:
-        import numpy as np
-
-        from coupole.appearance.matter.makie import decompose
-
         if out.suffix.lower() != ".png":
             raise InputError(f"--out {out}: expected a name that ends in .png")
         picture = _linear_values(photograph, linear=linear)
-        colour = _colour_at(picture, metal, "--metal")
-        bare = [_colour_at(picture, place, "--lacquer") for place in lacquer]
-        is_unknown = np.asarray(~np.isfinite(picture).all(axis=2))
-        picture = np.where(is_unknown[..., None], 0.0, picture)
-        parts = decompose(picture, colour, bare, region="inside" if inside else "anywhere")
-        checks = [_checked(parts.alpha, is_unknown, place) for place in known or ()]
-        _write(out, parts, max(1.0, float(colour.max()), *(float(one.max()) for one in bare)))
+        result = _take_apart(picture, metal, lacquer, known_shares or [], is_inside=inside)
+        _write(out, result)
     except CoupoleError as error:
         fail(error, as_json=as_json)
         raise
     if as_json:
-        lacquers = [rgb.tolist() for rgb in bare]
-        document = {"drawing": str(out), "metal": colour.tolist(), "lacquers": lacquers}
-        document |= {"clamped": parts.clamped_share, "unknown": float(is_unknown.mean()), "known": checks}
-        print(json.dumps(document))
+        print(json.dumps(_document(out, result)))
         return
-    _say(console, out, parts, checks, float(is_unknown.mean()))
+    _say(console, out, result)
 
 
-def _say(console: Any, out: Path, parts: Makie, checks: list[dict[str, Any]], unknown: float) -> None:
+def _take_apart(
+    picture: NDArray[np.float64], metal: str, lacquers: list[str], known_shares: list[str], *, is_inside: bool
+) -> _Result:
+    """Take a linear picture [h, w, 3] apart, NaN where nothing is known; places are words of the command line."""
+    import numpy as np
+
+    from coupole.appearance.matter.makie import decompose
+
+    metal_rgb = _colour_at(picture, metal, "--metal")
+    lacquer_rgbs = [_colour_at(picture, place, "--lacquer") for place in lacquers]
+    is_unknown = np.asarray(~np.isfinite(picture).all(axis=2))
+    picture = np.where(is_unknown[..., None], 0.0, picture)
+    parts = decompose(picture, metal_rgb, lacquer_rgbs, region="inside" if is_inside else "anywhere")
+    checks = [_check_share(parts.alpha, is_unknown, place) for place in known_shares]
+    return _Result(parts, metal_rgb, lacquer_rgbs, float(is_unknown.mean()), checks)
+
+
+def _document(out: Path, result: _Result) -> dict[str, Any]:
+    return {
+        "drawing": str(out),
+        "metal": result.metal_rgb.tolist(),
+        "lacquers": [rgb.tolist() for rgb in result.lacquer_rgbs],
+        "clamped": result.parts.clamped_share,
+        "unknown": result.unknown_share,
+        "known": result.checks,
+    }
+
+
+def _say(console: Any, out: Path, result: _Result) -> None:
+    parts = result.parts
     console.print(f"{out}: {float(parts.alpha.mean()):.1%} of the picture is metal", markup=False)
-    for one in checks:
-        told = f"share {one['found']:.3f} +- {one['u_found']:.3f}, known {one['share']:g}"
-        console.print(f"at {one['x']},{one['y']}: {told}, off by {one['found'] - one['share']:+.3f}", markup=False)
-    if unknown:
-        console.print(f"{unknown:.2%} of the pixels are saturated or dark; they have no metal here")
+    for check in result.checks:
+        shares = f"share {check['found']:.3f} +- {check['u_found']:.3f}, known {check['share']:g}"
+        difference = check["found"] - check["share"]
+        console.print(f"at {check['x']},{check['y']}: {shares}, off by {difference:+.3f}", markup=False)
+    if result.unknown_share:
+        console.print(f"{result.unknown_share:.2%} of the pixels are saturated or dark; they have no metal here")
     if parts.clamped_share > _TOLD_FROM:
         console.print(
             f"of {parts.clamped_share:.1%} of the pixels the share of metal was beyond 0 or 1 and was cut off: "
@@ -138,19 +172,19 @@ def _colour_at(picture: NDArray[np.float64], place: str, option: str) -> NDArray
     return np.asarray(_about(picture, place.split(","), f"{option} {place}", "X,Y").mean(axis=(0, 1)))
 
 
-def _checked(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], known: str) -> dict[str, Any]:
-    """What is found at a place X,Y,SHARE: the mean about it, and its standard uncertainty by the scatter."""
+def _check_share(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], known_share: str) -> dict[str, Any]:
+    """Find the share at a place X,Y,SHARE: the mean about it, and its standard uncertainty by the scatter."""
     import numpy as np
 
-    *place, word = known.split(",")
+    *place, word = known_share.split(",")
     try:
         share = float(word)
     except ValueError:
         share = -1.0
     if not 0.0 <= share <= 1.0:
-        raise InputError(f"--known {known}: expected X,Y,SHARE, with a share of metal from 0 to 1")
-    shown = np.where(is_unknown, np.nan, alpha)[..., None]
-    values = _about(shown, place, f"--known {known}", "X,Y,SHARE")
+        raise InputError(f"--known {known_share}: expected X,Y,SHARE, with a share of metal from 0 to 1")
+    alpha_or_nan = np.where(is_unknown, np.nan, alpha)[..., None]
+    values = _about(alpha_or_nan, place, f"--known {known_share}", "X,Y,SHARE")
     u_found = float(values.std() / np.sqrt(values.size))
     return {
         "x": int(place[0]),
@@ -161,32 +195,34 @@ def _checked(alpha: NDArray[np.float64], is_unknown: NDArray[np.bool_], known: s
     }
 
 
-def _about(picture: NDArray[np.float64], place: list[str], told: str, form: str) -> NDArray[np.float64]:
+def _about(picture: NDArray[np.float64], place: list[str], option: str, form: str) -> NDArray[np.float64]:
     """The pixels about a place. Raises InputError for a place that is none, or has nothing known."""
     import numpy as np
 
     height, width = picture.shape[:2]
     numbers = [int(word) for word in place if word.strip().isascii() and word.strip().isdigit()]
     if len(place) != 2 or len(numbers) != 2 or numbers[0] >= width or numbers[1] >= height:
-        raise InputError(f"{told}: expected {form} of a pixel of a picture of {width} x {height}, from 0")
+        raise InputError(f"{option}: expected {form} of a pixel of a picture of {width} x {height}, from 0")
     columns, rows = (slice(max(0, number - _AROUND_PX), number + _AROUND_PX + 1) for number in numbers)
     pixels = picture[rows, columns]
     if not np.isfinite(pixels).all():
         raise InputError(
-            f"{told}: is saturated or dark in the merged photograph; expected a place that is neither"
+            f"{option}: is saturated or dark in the merged photograph; expected a place that is neither"
         )
     return pixels
 
 
-def _write(path: Path, makie: Makie, unit: float) -> None:
-    """The drawing; `unit` is what becomes white."""
+def _write(path: Path, result: _Result) -> None:
+    """Write the drawing. White is 1, or the brightest of the named colours if that is more."""
     import numpy as np
     from PIL import Image
 
     from coupole.exchange.srgb import srgb
     from coupole.storage.durable import write_synced
 
-    channels: Any = np.concatenate([srgb(makie.residual / unit), makie.alpha[..., None]], axis=2)
+    unit = max(1.0, *(float(rgb.max()) for rgb in (result.metal_rgb, *result.lacquer_rgbs)))
+    parts = result.parts
+    channels: Any = np.concatenate([srgb(parts.residual / unit), parts.alpha[..., None]], axis=2)
     buffer = io.BytesIO()
     Image.fromarray(np.rint(255.0 * channels).astype(np.uint8)).save(buffer, "PNG")
     write_synced(path, buffer.getvalue())

@@ -35,7 +35,7 @@ _LEAST_FITTED, _MOST_FITTED = 0.02, 0.97
 _STIFF, _WANDERS = -2.0, np.arange(-7.0, 2.1, 0.25)
 """ln of the wander of the slope, in the first rounds and to choose from."""
 _POWER_WIDTH = 0.35
-"""Of the window in ln z over which a slope is taken for weights."""
+"""Width of the window in ln z over which a slope is taken for weights."""
 _LEAST_POWER, _MOST_POWER = 0.3, 8.0
 _QUANTIZATION = 0.29
 """Standard deviation of rounding, in levels."""
@@ -98,8 +98,8 @@ def found_response(photographs: Photographs) -> Response:
     """Raises InputError where the photographs have too little in common."""
     least_noise = _QUANTIZATION / (photographs.levels - 1)
     channels = [
-        _solve_curve(_samples(photographs.values[..., one]), np.log(photographs.exposure_s), least_noise)
-        for one in range(3)
+        _solve_curve(_samples(photographs.values[..., channel]), np.log(photographs.exposure_s), least_noise)
+        for channel in range(3)
     ]
     curves, covariances, is_shown, noise = zip(*channels, strict=True)
     return Response(np.stack(curves, axis=1), np.stack(covariances), np.stack(is_shown, axis=1), np.array(noise))
@@ -143,7 +143,7 @@ def _samples(values: NDArray[np.float32]) -> Array:
 
 @dataclass(frozen=True)
 class _Fit:
-    """What one round hands to the next."""
+    """The state that one round hands to the next."""
 
     g: Array
     robust: Array
@@ -174,33 +174,33 @@ def _next_fit(
     """One round: the fit, the inverse of its normal equations without the middle, and the weights."""
     rising, powers = np.maximum.accumulate(fit.g) + 1e-9 * np.arange(NODES), _powers(fit.g)
     weights = ((samples > DARK) & (samples < SATURATED)) * fit.robust
-    predicted = _predicted(samples, weights, log_t, rising, powers)
-    usable = (predicted > _LEAST_FITTED) & (predicted < _MOST_FITTED) & (samples < SATURATED)
+    predicted_values = _predict_values(samples, weights, log_t, rising, powers)
+    usable = (predicted_values > _LEAST_FITTED) & (predicted_values < _MOST_FITTED) & (samples < SATURATED)
     usable &= usable.sum(axis=1, keepdims=True) > 1
-    slope = _slope(powers, predicted)
+    slope = _slope(powers, predicted_values)
     weights = usable * fit.robust / (slope * fit.noise) ** 2
-    target = log_t - slope * (samples - predicted)
-    normal = _normal_equations(predicted, weights, target)
+    target = log_t - slope * (samples - predicted_values)
+    normal = _normal_equations(predicted_values, weights, target)
     g, inverse = _likeliest(*normal, wanders)
-    return _judged(g, weights, _at(g, predicted) - target, slope, least_noise), inverse, weights
+    return _with_noise(g, weights, _at(g, predicted_values) - target, slope, least_noise), inverse, weights
 
 
-def _predicted(samples: Array, weights: Array, log_t: Array, g: Array, powers: Array) -> Array:
+def _predict_values(samples: Array, weights: Array, log_t: Array, g: Array, powers: Array) -> Array:
     """[pixels, photographs], the values that each pixel's mean predicts; in three steps, as slopes are there."""
-    predicted = samples
+    predicted_values = samples
     for _ in range(3):
-        slope = _slope(powers, predicted)
-        logs = _at(g, predicted) + slope * (samples - predicted) - log_t
-        predicted = _value_of(_pixel_means(weights / slope**2, logs) + log_t, g)
-    return predicted
+        slope = _slope(powers, predicted_values)
+        logs = _at(g, predicted_values) + slope * (samples - predicted_values) - log_t
+        predicted_values = _value_of(_pixel_means(weights / slope**2, logs) + log_t, g)
+    return predicted_values
 
 
-def _judged(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
+def _with_noise(g: Array, weights: Array, off: Array, slope: Array, least_noise: float) -> _Fit:
     """The fit with the noise that samples have left over; `off` are their ln of exposure less that of the time."""
     free = 1.0 - weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-    left = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))
-    noise = max(float(1.4826 * np.median(np.abs(left[(weights > 0.0) & (free > 0.2)]))), least_noise)
-    return _Fit(g, 1.0 / (1.0 + (left / (_OUTLIER * noise)) ** 2) ** 2, noise)
+    residuals = (off - _pixel_means(weights, off)) / slope / np.sqrt(np.maximum(free, 1e-3))
+    noise = max(float(1.4826 * np.median(np.abs(residuals[(weights > 0.0) & (free > 0.2)]))), least_noise)
+    return _Fit(g, 1.0 / (1.0 + (residuals / (_OUTLIER * noise)) ** 2) ** 2, noise)
 
 
 def _pixel_means(weights: Array, logs: Array) -> Array:
@@ -209,41 +209,41 @@ def _pixel_means(weights: Array, logs: Array) -> Array:
     return np.asarray((weights * logs).sum(axis=1, keepdims=True) / total)
 
 
-def _normal_equations(predicted: Array, weights: Array, target: Array) -> tuple[Array, Array, float]:
+def _normal_equations(predicted_values: Array, weights: Array, target: Array) -> tuple[Array, Array, float]:
     """Matrix and right side of g alone, and the sum of squares: each pixel's ln E is its weighted mean."""
     from scipy.sparse import csr_matrix
 
-    pixels, photographs = predicted.shape
-    low, share = _place(predicted.ravel())
+    pixels, photographs = predicted_values.shape
+    low, share = _place(predicted_values.ravel())
     rows = np.repeat(np.arange(len(low)), 2)
     columns = np.stack([low, low + 1], axis=1).ravel()
     shares = np.stack([1.0 - share, share], axis=1).ravel()
     design = csr_matrix((shares, (rows, columns)), (len(low), NODES))
-    weighted = design.multiply(weights.reshape(-1, 1)).tocsr()
+    weighted_design = design.multiply(weights.reshape(-1, 1)).tocsr()
     owners = np.repeat(np.arange(pixels), photographs), np.arange(len(low))
-    sums = (csr_matrix((np.ones(len(low)), owners), (pixels, len(low))) @ weighted).toarray()
+    sums = (csr_matrix((np.ones(len(low)), owners), (pixels, len(low))) @ weighted_design).toarray()
     total = np.maximum(weights.sum(axis=1), 1e-300)
-    seen = (weights * target).sum(axis=1)
-    matrix = (design.T @ weighted).toarray() - sums.T @ (sums / total[:, None])
-    right = np.asarray(weighted.T @ target.ravel()) - sums.T @ (seen / total)
-    return matrix, right, float((weights * target**2).sum() - (seen**2 / total).sum())
+    target_sums = (weights * target).sum(axis=1)
+    matrix = (design.T @ weighted_design).toarray() - sums.T @ (sums / total[:, None])
+    right = np.asarray(weighted_design.T @ target.ravel()) - sums.T @ (target_sums / total)
+    return matrix, right, float((weights * target**2).sum() - (target_sums**2 / total).sum())
 
 
 def _likeliest(matrix: Array, right: Array, squares: float, wanders: Array) -> tuple[Array, Array]:
     """g [NODES] and its covariance without the middle, for the wander that makes the samples likeliest."""
     matrix, right, roughness = matrix[np.ix_(_OTHERS, _OTHERS)], right[_OTHERS], _roughness()
-    best, likeliest, chosen = np.zeros(NODES - 1), -np.inf, matrix
+    best, likeliest, best_normal = np.zeros(NODES - 1), -np.inf, matrix
     for wander in wanders:
         stiff = matrix + roughness * np.exp(-2.0 * wander)
-        solved = np.linalg.solve(stiff, right)
+        candidate = np.linalg.solve(stiff, right)
         log_likelihood = -0.5 * (
-            np.linalg.slogdet(stiff)[1] + 2.0 * (NODES - 2) * wander + squares - right @ solved
+            np.linalg.slogdet(stiff)[1] + 2.0 * (NODES - 2) * wander + squares - right @ candidate
         )
         if log_likelihood > likeliest:
-            best, likeliest, chosen = solved, float(log_likelihood), stiff
+            best, likeliest, best_normal = candidate, float(log_likelihood), stiff
     g = np.zeros(NODES)
     g[_OTHERS] = best
-    return g, np.asarray(np.linalg.inv(chosen), float)
+    return g, np.asarray(np.linalg.inv(best_normal), float)
 
 
 def _roughness() -> Array:
@@ -283,7 +283,7 @@ def _value_of(log_exposure: Array, g: Array) -> Array:
 
 
 def _at(nodes: Array, values: NDArray[np.floating]) -> Array:
-    """Of nodes, at values: linear over ln z."""
+    """Return the nodes' quantity at values: linear over ln z."""
     return np.asarray(np.interp(_logs(values), _LOG_NODES, nodes))
 
 

@@ -92,8 +92,8 @@ def _response_variance(
     variance = np.zeros_like(values[0])
     for first, (share, node) in enumerate(zip(shares, nodes, strict=True)):
         variance += share**2 * covariance[node, node]
-        for other in range(first):
-            variance += 2.0 * share * shares[other] * covariance[node, nodes[other]]
+        for second in range(first):
+            variance += 2.0 * share * shares[second] * covariance[node, nodes[second]]
     return np.maximum(variance, 0.0)
 
 

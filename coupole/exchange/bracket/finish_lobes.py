@@ -93,8 +93,8 @@ def _lobe(ways_in: Array, ways_out: Array, half_z: Array, alpha: float, tail: fl
     z_h = np.maximum(half_z, 1e-6)
     z_i, z_o = np.maximum(ways_in[:, 2], 1e-9), np.maximum(ways_out[:, 2], 1e-9)
     d = (1.0 + (1.0 / z_h**2 - 1.0) / (alpha2 * (tail - 1.0))) ** -tail / (np.pi * alpha2 * z_h**4)
-    shadowed = z_o * np.sqrt(alpha2 + (1.0 - alpha2) * z_i**2) + z_i * np.sqrt(alpha2 + (1.0 - alpha2) * z_o**2)
-    return np.asarray(d * 0.5 / shadowed)
+    shadowing = z_o * np.sqrt(alpha2 + (1.0 - alpha2) * z_i**2) + z_i * np.sqrt(alpha2 + (1.0 - alpha2) * z_o**2)
+    return np.asarray(d * 0.5 / shadowing)
 
 
 def _even_picks(ways_in: Array, ways_out: Array) -> NDArray[np.intp]:

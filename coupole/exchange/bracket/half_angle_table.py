@@ -29,11 +29,11 @@ _NODES = (
 _BENDS = ((0, 1.0), (1, 10.0), (2, 10.0))
 """Axes, and what a second difference along each costs."""
 _MIXED = 30.0
-"""What it costs if the dependence on theta_d changes with theta_h: within a lobe it is Fresnel's alone."""
+"""Cost of a change of the dependence on theta_d with theta_h: within a lobe it is Fresnel's alone."""
 _POLE = 30.0
-"""What a change costs where the half vector is the normal: there is no azimuth there, and the table is level."""
+"""Cost of a change where the half vector is the normal: there is no azimuth there, and the table is level."""
 _VALUE = 1e-3
-"""What a value costs: where nothing is known, the table corrects nothing."""
+"""Cost of a value: where nothing is known, the table corrects nothing."""
 
 
 def half_coordinates(ways_in: Array, ways_out: Array) -> tuple[Array, Array, Array]:
@@ -92,7 +92,7 @@ def _roughness() -> Any:
     ]
     for axis, weight in _BENDS:
         second = diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(SHAPE[axis] - 2, SHAPE[axis]))
-        parts.append((weight, [second if one == axis else unit[one] for one in range(3)]))
+        parts.append((weight, [second if k == axis else unit[k] for k in range(3)]))
     squares = [weight * _square(kron(kron(a, b), c)) for weight, (a, b, c) in parts]
     return sum(squares[1:], squares[0])
 

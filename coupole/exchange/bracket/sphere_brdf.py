@@ -28,7 +28,7 @@ _LEAST_COSINE = 0.12
 _MOST_SAMPLES = 60_000
 _SMOOTHNESSES = (2e-4, 2e-3, 2e-2)
 _ROUNDS = 2
-"""Of what a pixel's mean takes from a peak, by the lobes of the round before."""
+"""Rounds in which a pixel is given what its mean takes from a peak, by the lobes of the round before."""
 _GAUSS = ((-np.sqrt(0.15), 5.0 / 18.0), (0.0, 8.0 / 18.0), (np.sqrt(0.15), 5.0 / 18.0))
 """Places and weights of Gauss' rule over a side of 1."""
 _NEAREST = 0.005
@@ -86,24 +86,24 @@ class Samples:
     """Side of a pixel, in radii of the sphere."""
 
     def of(self, picks: NDArray[np.intp]) -> Samples:
-        """Only these."""
-        chosen = {
+        """Return the samples of these numbers."""
+        arrays = {
             name: getattr(self, name)[picks] for name in ("ways_in", "ways_out", "f", "photograph", "places")
         }
-        return replace(self, **chosen)
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True)
 class LeftOutPrediction:
-    """How well the table of all other photographs predicts one."""
+    """A test of the table: all other photographs predict one."""
 
     photograph: int
     incidence_deg: float
-    """At its peak: half of the angle between light and camera."""
+    """Half of the angle between light and camera, which is the incidence at the peak."""
     nearest_to_peak_deg: float
     """Half angle of the sample that is nearest to the peak."""
     median_miss: float
-    """Of its samples, relative."""
+    """Median over its samples, relative."""
     peak_miss: float
     """Median over the samples nearest to the peak, relative, signed."""
 
@@ -137,13 +137,13 @@ def samples_of(sample: SphereSample, pictures: Sequence[NDArray[np.float32]]) ->
         y, x = np.mgrid[:rows, :columns]
         x, y = (x - u) / sample.radius_px, (v - y) / sample.radius_px
         places = np.stack([x, y], axis=2)[x**2 + y**2 < 1.0]
-        seen = picture[x**2 + y**2 < 1.0]
+        values = picture[x**2 + y**2 < 1.0]
         ways_in, ways_out = _ways(places, to_lights[number])
-        f = seen / np.asarray(sample.white.values) * sample.white.reflectance / np.pi / ways_in[:, 2:]
+        f = values / np.asarray(sample.white.values) * sample.white.reflectance / np.pi / ways_in[:, 2:]
         good = (ways_in[:, 2] > _LEAST_COSINE) & (ways_out[:, 2] > _LEAST_COSINE)
         good &= np.isfinite(f).all(axis=1) & (f > 0.0).all(axis=1)
-        own = np.full(np.count_nonzero(good), number)
-        parts.append((ways_in[good], ways_out[good], f[good], own, places[good]))
+        numbers = np.full(np.count_nonzero(good), number)
+        parts.append((ways_in[good], ways_out[good], f[good], numbers, places[good]))
     ways_in, ways_out, f, photograph, places = (np.concatenate(part) for part in zip(*parts, strict=True))
     if len(f) < _FEWEST:
         raise InputError(
@@ -162,18 +162,19 @@ def finish_of(samples: Samples) -> Finish:
         f = samples.f * at_middles_over_means(samples, lobes)
         lobes = fitted_lobes(ways_in, ways_out, f, (float(lobes.alphas[0]),))
     design = half_angle_table.interpolation(ways_in, ways_out)
-    missed = np.log(f / lobes.reflectance(ways_in, ways_out))
+    log_misses = np.log(f / lobes.reflectance(ways_in, ways_out))
     guesses = {
-        smoothness: _left_out(design, missed, of_photograph, smoothness) - missed for smoothness in _SMOOTHNESSES
+        smoothness: _left_out(design, log_misses, of_photograph, smoothness) - log_misses
+        for smoothness in _SMOOTHNESSES
     }
-    smoothness = min(guesses, key=lambda one: float(np.median(np.abs(guesses[one]))))
+    smoothness = min(guesses, key=lambda candidate: float(np.median(np.abs(guesses[candidate]))))
     theta_h, theta_d, _ = half_angle_table.half_coordinates(ways_in, ways_out)
     off = np.expm1(guesses[smoothness])
     predictions = [
         _prediction(number, off[of_photograph == number], theta_h, theta_d, of_photograph == number)
         for number in np.unique(of_photograph)
     ]
-    return Finish(lobes, half_angle_table.smooth_table(design, missed, smoothness), tuple(predictions))
+    return Finish(lobes, half_angle_table.smooth_table(design, log_misses, smoothness), tuple(predictions))
 
 
 def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
@@ -183,34 +184,36 @@ def at_middles_over_means(samples: Samples, lobes: Lobes) -> Array:
     """
     mean = np.zeros_like(samples.f)
     for number, to_light in enumerate(samples.to_lights):
-        own = samples.photograph == number
+        is_own = samples.photograph == number
         for right, share_right in _GAUSS:
             for up, share_up in _GAUSS:
-                places = samples.places[own] + samples.pixel_radii * np.array([right, up])
+                places = samples.places[is_own] + samples.pixel_radii * np.array([right, up])
                 ways_in, ways_out = _ways(places, to_light)
                 lit = np.maximum(ways_in[:, 2:], 0.0) * (ways_out[:, 2:] > 0.0)
-                mean[own] += share_right * share_up * lit * lobes.reflectance(ways_in, ways_out)
+                mean[is_own] += share_right * share_up * lit * lobes.reflectance(ways_in, ways_out)
     return lobes.reflectance(samples.ways_in, samples.ways_out) * samples.ways_in[:, 2:] / mean
 
 
-def _left_out(design: Any, missed: Array, of_photograph: NDArray[np.intp], smoothness: float) -> Array:
-    """What each photograph's samples are by a table of the others; with one photograph, by the lobes alone."""
-    guess = np.zeros_like(missed)
+def _left_out(design: Any, log_misses: Array, of_photograph: NDArray[np.intp], smoothness: float) -> Array:
+    """Predict each photograph's samples by a table of the others; with one photograph, by the lobes alone."""
+    guess = np.zeros_like(log_misses)
     numbers = np.unique(of_photograph)
     for number in numbers if len(numbers) > 1 else []:
-        own = of_photograph == number
-        guess[own] = design[own] @ half_angle_table.smooth_table(design[~own], missed[~own], smoothness)
+        is_own = of_photograph == number
+        guess[is_own] = design[is_own] @ half_angle_table.smooth_table(
+            design[~is_own], log_misses[~is_own], smoothness
+        )
     return guess
 
 
 def _prediction(
-    number: int, off: Array, theta_h: Array, theta_d: Array, own: NDArray[np.bool_]
+    number: int, off: Array, theta_h: Array, theta_d: Array, is_own: NDArray[np.bool_]
 ) -> LeftOutPrediction:
-    near = theta_h[own] <= np.quantile(theta_h[own], _NEAREST)
+    near = theta_h[is_own] <= np.quantile(theta_h[is_own], _NEAREST)
     return LeftOutPrediction(
         photograph=int(number),
-        incidence_deg=float(np.degrees(np.median(theta_d[own]))),
-        nearest_to_peak_deg=float(np.degrees(theta_h[own].min())),
+        incidence_deg=float(np.degrees(np.median(theta_d[is_own]))),
+        nearest_to_peak_deg=float(np.degrees(theta_h[is_own].min())),
         median_miss=float(np.median(np.abs(off))),
         peak_miss=float(np.median(off[near])),
     )

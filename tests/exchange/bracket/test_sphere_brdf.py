@@ -95,6 +95,7 @@ def test_gold_on_a_sphere_becomes_a_merl_table_of_its_brdf(tmp_path: Path) -> No
     assert [one["path"] for one in left_out] == [f"{number}.exr" for number in range(10)]
     assert [one["incidence_deg"] for one in left_out] == pytest.approx(np.arange(2.5, 75.0, 7.5), abs=0.05)
     assert max(abs(one["peak_miss"]) for one in left_out[:9]) < 0.02
+    assert max(one["nearest_to_peak_deg"] for one in left_out) < 2.0  # a pixel of 1 degree or so
 
 
 def test_a_sphere_outside_of_its_picture_is_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from types import ModuleType
 from typing import Any
 
 import coupole
-from coupole.plan.model import Model
+from coupole.plan.base_model import Model
 
 REFERENCE = Path(__file__).resolve().parent.parent / "docs" / "reference"
 NAMES, PAGE = REFERENCE / "python-names.txt", REFERENCE / "python.md"

@@ -24,7 +24,7 @@ from coupole.calibration.rotations import Floats, inverses, rotation
 from coupole.errors import InputError
 from coupole.geometry import abc_from_rotation
 from coupole.plan import yamlfile
-from coupole.plan.model import Model
+from coupole.plan.base_model import Model
 
 Rotation = Literal["abc", "xyz", "rotation_vector", "quaternion_wxyz"]
 _AXES = np.eye(3)

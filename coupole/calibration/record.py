@@ -24,7 +24,7 @@ from coupole.errors import InputError, StorageError, reason
 from coupole.geometry import abc_from_rotation
 from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
-from coupole.plan.model import Model, Name, Pose
+from coupole.plan.base_model import Model, Name, Pose
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Positive = Annotated[float, Field(gt=0)]

@@ -201,7 +201,7 @@ def _refuse_name(name: str | None) -> None:
     """Raise InputError for a name that is not valid for a record."""
     from pydantic import TypeAdapter, ValidationError
 
-    from coupole.plan.model import Name
+    from coupole.plan.base_model import Name
 
     try:
         TypeAdapter(Name | None).validate_python(name)

@@ -176,7 +176,7 @@ def plan_new(
     For a calibration in a simulated cell also NAME-rig.yaml, the rig with the board, card or tile on its support,
     and NAME-board.yaml or NAME-tile.yaml, its description for `coupole calibrate`.
     """
-    from coupole.plan.model import NAME_PATTERN
+    from coupole.plan.base_model import NAME_PATTERN
     from coupole.plan.templates import LEDS, TEMPLATES
     from coupole.viewing.terminal import make_console
 

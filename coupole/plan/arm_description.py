@@ -19,7 +19,7 @@ from coupole.intake.input_files import InputFiles
 from coupole.joint_chain import Axis, JointChain
 from coupole.kinematics import Arm, structure_of
 from coupole.plan import yamlfile
-from coupole.plan.model import Degrees, FilePath, Length, Model, Pose, Vector
+from coupole.plan.base_model import Degrees, FilePath, Length, Model, Pose, Vector
 from coupole.plan.registry import ARMS_OF_DRIVERS, UR
 from coupole.plan.shipped_files import shipped_folder, shipped_names
 from coupole.plan.validation_messages import KeyPath

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from coupole.plan.base_model import ExposureUs, LedId, Model
 from coupole.plan.bursts import Burst
-from coupole.plan.model import ExposureUs, LedId, Model
 from coupole.plan.shot_id import Dark, Led, Light, ShotLabel
 
 MOST_BURSTS = 16

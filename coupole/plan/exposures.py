@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from coupole.plan.model import ExposureUs, Model
+from coupole.plan.base_model import ExposureUs, Model
 
 
 class FixedExposure(Model):

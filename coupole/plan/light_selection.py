@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from coupole.geometry import Transform, direction, inverse
 from coupole.plan.led_table import LedTable
-from coupole.plan.lights import (
+from coupole.plan.plan import Plan
+from coupole.plan.plan_lights import (
     AdaptiveLights,
     AllLights,
     EveryLight,
@@ -21,7 +22,6 @@ from coupole.plan.lights import (
     NoLights,
     Panels,
 )
-from coupole.plan.plan import Plan
 from coupole.plan.shot_id import Led, Panel
 
 

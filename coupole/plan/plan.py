@@ -10,9 +10,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from coupole.plan.base_model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.exposures import AutoExposure, Exposures, FixedExposure
-from coupole.plan.lights import AdaptiveLights, Lights, NoLights, Panels
-from coupole.plan.model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
+from coupole.plan.plan_lights import AdaptiveLights, Lights, NoLights, Panels
 
 
 class LookAt(Model):

@@ -8,9 +8,9 @@ from pathlib import Path
 from coupole.errors import InputError, Problem
 from coupole.intake.input_files import InputFiles
 from coupole.plan import yamlfile
+from coupole.plan.base_model import possible_path
 from coupole.plan.cell import Cell, read_cell
 from coupole.plan.light_selection import missing_lights
-from coupole.plan.model import possible_path
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.schedule import names_too_long, too_large

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from coupole.plan.arm_description import ArmDescription
-from coupole.plan.model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
+from coupole.plan.base_model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.registry import WORLD, current_name
 
 DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]

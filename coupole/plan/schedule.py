@@ -12,9 +12,9 @@ from coupole.plan.choices import Choice, OpenView, bound_of, bound_of_lights, ha
 from coupole.plan.exposures import AutoExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import first_lights, lit_in_bursts
-from coupole.plan.lights import AdaptiveLights, Lights
 from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, LookAt, Plan, View
+from coupole.plan.plan_lights import AdaptiveLights, Lights
 from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000

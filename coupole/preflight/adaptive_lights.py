@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coupole.geometry import Transform, apply
 from coupole.plan.choices import Choice, ChosenBurst, FrameSample, OpenView
 from coupole.plan.led_table import LedTable
-from coupole.plan.lights import AdaptiveLights, Lights
+from coupole.plan.plan_lights import AdaptiveLights, Lights
 from coupole.plan.shot_id import Led, ShotLabel
 from coupole.preflight.next_lights import FEWEST_TAKEN, NextLights, next_lights, spread_lights
 

@@ -20,9 +20,9 @@ from coupole.calibration.record import Limit, Sha256, content_sha256, write_seal
 from coupole.devices import Identity
 from coupole.errors import InputError
 from coupole.plan import yamlfile
+from coupole.plan.base_model import Model, Name
 from coupole.plan.cell import Cell
 from coupole.plan.controller_places import places_of_arm
-from coupole.plan.model import Model, Name
 from coupole.plan.rig_devices import in_world
 from coupole.preflight.commissioned_rig import STEPS, Step, covered_settings
 

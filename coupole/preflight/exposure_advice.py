@@ -23,8 +23,8 @@ from coupole.errors import InputError
 from coupole.plan.exposures import BracketExposure, FixedExposure
 from coupole.plan.led_table import LedTable
 from coupole.plan.light_selection import spread_rows
-from coupole.plan.lights import LightIds
 from coupole.plan.plan import Plan
+from coupole.plan.plan_lights import LightIds
 from coupole.plan.shot_id import Light
 from coupole.plan.yamlfile import Document
 

@@ -24,8 +24,8 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from coupole.errors import InputError, StorageError
+from coupole.plan.base_model import Name
 from coupole.plan.cell import Cell
-from coupole.plan.model import Name
 from coupole.storage.ledger_lines import (
     NO_FILE,
     Asked,

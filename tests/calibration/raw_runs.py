@@ -23,8 +23,8 @@ from coupole.calibration.posed_camera import CameraPrior
 from coupole.calibration.record import Input, Noise, Parameter, Validity, seal_record, step_names, write_record
 from coupole.devices import ArmState, FrameFormat
 from coupole.geometry import abc_from_rotation
+from coupole.plan.base_model import Pose
 from coupole.plan.led_table import COLUMNS, LedTable
-from coupole.plan.model import Pose
 from coupole.storage.frame_file_creation import create
 from coupole.storage.journal import Journal
 from coupole.storage.journal_events import FrameProven, SessionStarted, SessionStopped

@@ -25,7 +25,7 @@ from coupole.calibration.optics import project
 from coupole.calibration.record import Input, Limit, Parameter, Validity, seal_record, step_names, write_record
 from coupole.calibration.report import Outcome, write_outcome
 from coupole.errors import InputError
-from coupole.plan.model import Pose
+from coupole.plan.base_model import Pose
 
 NOW = datetime(2026, 5, 2, tzinfo=UTC)
 

@@ -15,7 +15,7 @@ from coupole.calibration.light.spectralon import Tile
 from coupole.calibration.light.tile_views import Positions, TileView, transfer
 from coupole.calibration.optics import Intrinsics
 from coupole.calibration.sources import About
-from coupole.plan.model import Pose
+from coupole.plan.base_model import Pose
 from coupole.plan.shot_id import ShotId
 
 TILE = Tile(reflectance=0.99, minnaert=1.15, support_from_tile=Pose(translation_mm=(0.0, 0.0, 0.0)))

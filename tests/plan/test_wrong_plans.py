@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coupole.errors import InputError, Problem
-from coupole.plan.model import Model
+from coupole.plan.base_model import Model
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
 from coupole.plan.yamlfile import read_document

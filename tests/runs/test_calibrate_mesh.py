@@ -17,7 +17,7 @@ from coupole.calibration.campaign_steps import OBJECT
 from coupole.calibration.record import Input, Parameter, Record, Validity, read_record, seal_record, write_record
 from coupole.errors import InputError
 from coupole.geometry import transform
-from coupole.plan.model import Pose
+from coupole.plan.base_model import Pose
 from sim.devices.scanner import export_scan, scanner_from_thing
 
 BASE_FROM_SUPPORT = transform((200.0, 0.0, 1450.0), (0.0, 0.0, 180.0))

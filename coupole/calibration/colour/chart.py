@@ -19,7 +19,7 @@ from coupole.calibration.colour.colorimetry import lab_of
 from coupole.calibration.rotations import Floats
 from coupole.errors import InputError
 from coupole.plan import yamlfile
-from coupole.plan.model import FilePath, Model, Pose
+from coupole.plan.base_model import FilePath, Model, Pose
 
 _Length = Annotated[float, Field(gt=0)]
 _NEUTRAL_CHROMA = 5.0

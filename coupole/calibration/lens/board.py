@@ -19,7 +19,7 @@ from coupole.calibration.grey_image import Channel, Picture
 from coupole.calibration.lens.corner_fit import enough_pixels, fit_corners
 from coupole.calibration.rotations import Floats
 from coupole.plan import yamlfile
-from coupole.plan.model import Model
+from coupole.plan.base_model import Model
 
 Count = Annotated[int, Field(ge=3, le=200)]
 Millimetres = Annotated[float, Field(gt=0, le=1000)]

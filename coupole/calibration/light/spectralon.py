@@ -18,7 +18,7 @@ from pydantic import Field
 
 from coupole.calibration.rotations import Floats
 from coupole.plan import yamlfile
-from coupole.plan.model import Model, Pose
+from coupole.plan.base_model import Model, Pose
 
 
 class Tile(Model):

@@ -20,8 +20,8 @@ from coupole.console.plans.outlook import at_work_of, too_little_disk, too_much_
 from coupole.console.plans.plan_queue import Entry, Needs, PlanQueue
 from coupole.console.routes.messages import NewEntry
 from coupole.errors import InputError, Problem
+from coupole.plan.base_model import possible_path
 from coupole.plan.cell import Cell, read_cell
-from coupole.plan.model import possible_path
 from coupole.plan.reading import PlanFiles, read_plan
 from coupole.plan.yamlfile import read_document
 from coupole.preflight.files import Files

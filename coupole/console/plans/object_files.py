@@ -11,8 +11,8 @@ from coupole.console.plans.plan_files import PlanFiles
 from coupole.console.runs.run_files import RunFiles, RunRow
 from coupole.errors import CoupoleError, InputError, StorageError
 from coupole.plan import yamlfile
+from coupole.plan.base_model import NAME_PATTERN
 from coupole.plan.cell import Cell
-from coupole.plan.model import NAME_PATTERN
 from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.ledger import ledger_of, similar_ids
 from coupole.storage.ledger_lines import History

@@ -12,7 +12,7 @@ from coupole.console.plans.retaking import name_of_retake, retaking_plan
 from coupole.console.processes.keeping_newest import keep_newest
 from coupole.errors import InputError, StorageError
 from coupole.plan import yamlfile
-from coupole.plan.model import NAME_PATTERN
+from coupole.plan.base_model import NAME_PATTERN
 from coupole.plan.templates import TEMPLATES
 from coupole.storage.durable import write_synced
 from coupole.storage.run import Run

@@ -31,8 +31,8 @@ from urllib.request import HTTPRedirectHandler, Request, build_opener
 from pydantic import Field, model_validator
 
 from coupole.errors import InputError
+from coupole.plan.base_model import Model
 from coupole.plan.cell import Cell
-from coupole.plan.model import Model
 from coupole.plan.yamlfile import read_document
 from coupole.storage.line_file import utc_now
 

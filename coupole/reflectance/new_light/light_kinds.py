@@ -26,7 +26,7 @@ from pydantic import AfterValidator, Field
 
 from coupole.errors import InputError
 from coupole.plan import yamlfile
-from coupole.plan.model import FilePath, Length, Model, Vector
+from coupole.plan.base_model import FilePath, Length, Model, Vector
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from coupole.plan.model import Degrees, LedId, Model
+from coupole.plan.base_model import Degrees, LedId, Model
 
 
 class AllLights(Model):

@@ -14,7 +14,8 @@ from pydantic import BaseModel
 from coupole.exchange.formats import FORMATS, Writer
 from coupole.heritage.restoration import parts_file, restoration_file
 from coupole.heritage.restoration.restoration_file import Stage
-from coupole.plan import arm_description, plan, rig
+from coupole.plan import arm_description, exposures, plan, plan_lights, rig
+from coupole.plan.base_model import Model
 from coupole.reflectance.new_light import light_kinds
 
 REFERENCE = REPO / "docs" / "reference"
@@ -22,14 +23,21 @@ REFERENCE = REPO / "docs" / "reference"
 
 @pytest.mark.parametrize(
     ("module", "page"),
-    [(plan, "plan.md"), (rig, "rig.md"), (arm_description, "robot.md"), (light_kinds, "lights.md")],
+    [
+        (plan, "plan.md"),
+        (plan_lights, "plan.md"),
+        (exposures, "plan.md"),
+        (rig, "rig.md"),
+        (arm_description, "robot.md"),
+        (light_kinds, "lights.md"),
+    ],
 )
 def test_the_reference_names_every_key(module: ModuleType, page: str) -> None:
     text = (REFERENCE / page).read_text(encoding="utf-8")
     models = [
         model
         for _, model in inspect.getmembers(module, inspect.isclass)
-        if issubclass(model, plan.Model) and model.__module__ == module.__name__
+        if issubclass(model, Model) and model.__module__ == module.__name__
     ]
     keys = {f"{model.__name__}.{key}" for model in models for key in model.model_fields}
     assert sorted(key for key in keys if not re.search(rf"\b{key.split('.')[1]}\b", text)) == []

@@ -166,6 +166,8 @@ class Sequencer:
         self.outcome.ideal_s += visit.leg.duration_s + dwell_s
         self._bursts.begin_view()
         next_bursts = next_bursts or self._bursts.more(number)
+        if not next_bursts:  # the view has enough without a frame
+            return
         allowed_s = self._expected_s(number)
         waypoints_deg = tuple(tuple(np.round(place, 6).tolist()) for place in visit.leg.waypoints)
         self._recorder.note(MoveBegun(view=view.name, joints_deg=waypoints_deg))

@@ -13,7 +13,7 @@ from coupole.commands.common import JsonOption
 from coupole.commands.common import fail as fail_with
 from coupole.commands.option_groups import flatten_options
 from coupole.commands.reflectance_options import KnownPictures
-from coupole.errors import CoupoleError
+from coupole.errors import CoupoleError, InputError
 
 
 @flatten_options
@@ -47,6 +47,8 @@ def choose(
         from coupole.reflectance.picture_choice import HowMany, choose_pictures
         from coupole.storage.durable import write_synced
 
+        if to is not None and not to.parent.is_dir():
+            raise InputError(f"--to: expected a folder that exists, {to.parent} does not")
         pictures = picture_options.read()
         with step_bars(console) as say:
             choice = choose_pictures(

@@ -115,8 +115,13 @@ class OpenView:
         raise KeyError(f"{self.name}: the plan has no e{exposure}/r{repeat} to choose")
 
     def burst_of(self, chosen_burst: ChosenBurst) -> Burst:
-        """Return the burst that a choice means. Raises KeyError if the view has no such burst or LED."""
+        """Return the burst that a choice means. Raises KeyError if the view has no such burst, time or LED."""
         whole = self.burst(chosen_burst.exposure, chosen_burst.repeat)
+        if chosen_burst.exposure_us != whole.timing.exposure_us:
+            raise KeyError(
+                f"{self.name}: e{chosen_burst.exposure} was chosen as {chosen_burst.exposure_us} us, where the "
+                f"run's plan has {whole.timing.exposure_us} us"
+            )
         wanted_labels = set(chosen_burst.labels())
         if unknown := wanted_labels - set(whole.labels):
             raise KeyError(f"{self.name}: the plan has no {min(map(str, unknown))} to choose")

@@ -145,6 +145,11 @@ class Plan(Model):
         return self
 
     @property
+    def skips_hidden_lights(self) -> bool:
+        """True if LEDs that light nothing that a view sees are left out of it: a choice never takes them."""
+        return self.hidden_lights == "skip" or self.chooses_lights
+
+    @property
     def chooses_lights(self) -> bool:
         """True if LEDs of some view are chosen in the run."""
         return any(isinstance(view.lights or self.lights, AdaptiveLights) for view in self.views)

@@ -94,9 +94,8 @@ class Schedule:
         bursts = []
         for number, (view, bound) in enumerate(zip(self.views, self.bursts, strict=True)):
             view_choices = choices.get(view.name, ())
-            bursts.append(
-                chosen_bursts(self.open_view(number), view_choices) if has_enough(view_choices) else bound
-            )
+            view_bursts = chosen_bursts(self.open_view(number), view_choices)
+            bursts.append(view_bursts if has_enough(view_choices) else bound)
         return replace(self, bursts=tuple(bursts))
 
     def without_proven(self, proven: Collection[ShotId]) -> Schedule:

@@ -54,7 +54,10 @@ class AdaptiveLightsChooser:
         if not choices:
             spread_ids = view.leds[spread_lights(self._ways(view), np.arange(len(view.leds)), lights.first_lights)]
             first_ids = self._affordable(view, lights, spread_ids[: lights.until.lights].tolist(), 0, 0)
-            return self._choice(view, first_ids, f"{len(first_ids)} LEDs spread over the dome")
+            reason = f"{len(first_ids)} LEDs spread over the dome"
+            return self._choice(
+                view, first_ids, reason if first_ids else "`seconds` or `lux_h` of `until` allow not one LED"
+            )
         return self._next(view, lights, choices, samples)
 
     def _next(
@@ -67,6 +70,8 @@ class AdaptiveLightsChooser:
         lit_ids = [led for choice in choices for burst in choice.bursts for led in burst.leds]
         is_seen = [ShotLabel(Led(led), view.bursts[0].exposure_index, 0) in samples for led in lit_ids]
         seen_ids = [led for led, was_proven in zip(lit_ids, is_seen, strict=True) if was_proven]
+        if len(lit_ids) == len(view.leds):
+            return Choice(bursts=(), reason="all LEDs of the view are lit")
         if len(seen_ids) < FEWEST_TAKEN:
             return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few to choose by")
         values = self._values(view, seen_ids, samples)
@@ -80,7 +85,7 @@ class AdaptiveLightsChooser:
         next_ids = view.leds[following.lights].tolist()
         affordable_ids = self._affordable(view, lights, next_ids, len(lit_ids), len(choices))
         figures = _figures(view, following, bright, len(lit_ids))
-        if reason := _enough(lights, figures, len(unlit), len(affordable_ids)):
+        if reason := _enough(lights, figures, len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
         errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
         reason = f"{len(affordable_ids)} LEDs that tell most: expected error {errors}"
@@ -147,13 +152,11 @@ def _figures(view: OpenView, following: NextLights, bright: float, lit: int) -> 
     }
 
 
-def _enough(lights: AdaptiveLights, figures: Mapping[str, Any], unlit: int, affordable: int) -> str:
+def _enough(lights: AdaptiveLights, figures: Mapping[str, Any], affordable: int) -> str:
     """The reason for no more LEDs; empty if there is none."""
     error_text, until = f"expected error {100.0 * figures['relit_rms']:.2f} %", lights.until
     if until.relit_rms is not None and figures["relit_rms"] <= until.relit_rms:
         return f"enough by `relit_rms`: {error_text} of at most {100.0 * until.relit_rms:g} %"
-    if unlit == 0:
-        return f"all LEDs of the view are lit; {error_text}"
     if figures["lights"] >= until.lights:
         return f"enough by `lights`: {until.lights} LEDs are lit; {error_text}"
     return f"enough by `seconds` or `lux_h`: the plan allows no more LEDs; {error_text}" if affordable == 0 else ""

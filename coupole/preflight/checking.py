@@ -16,6 +16,7 @@ from coupole.plan.bursts import Pace
 from coupole.plan.rig import Rig
 from coupole.plan.rig_devices import in_world, runs_tables, trusted_by_name
 from coupole.plan.shot_id import ShotId
+from coupole.preflight.choosers import refusals_of_choosers
 from coupole.preflight.commissioned import commissioning_refusals
 from coupole.preflight.exposure_scale import ExposedWhite, exposed_white, exposure_scale
 from coupole.preflight.framing import ObjectCheck, check_object
@@ -128,7 +129,7 @@ def check_job(
     if (scale := exposure_scale(job)) is not None:
         report.exposure_scale, report.white = scale.source, tuple(exposed_white(job, scale))
         report.warnings += _badly_exposed(report.white)
-    report.refusals += calibration_refusals(job)
+    report.refusals += calibration_refusals(job) + refusals_of_choosers(job)
     if job.plan.trigger == "hardware" and not runs_tables(rig):
         why = "cannot trigger the camera: it runs no tables. Set `trigger: software` in the plan"
         report.refusals.insert(0, f"led box {rig.ledbox.driver}: {why}")

@@ -10,6 +10,19 @@ from coupole.preflight.auto_exposure import AutoExposureChooser
 from coupole.preflight.job import Job
 
 
+def refusals_of_choosers(job: Job) -> list[str]:
+    """Views of which the chooser would light nothing at all."""
+    chooser = chooser_of(job)
+    if chooser is None:
+        return []
+    first_choices = {
+        view.name: chooser.choose(job.schedule.open_view(number), (), {})
+        for number, view in enumerate(job.schedule.views)
+        if job.schedule.choosable[number]
+    }
+    return [f"view {name}: {choice.reason}" for name, choice in first_choices.items() if not choice.bursts]
+
+
 def chooser_of(job: Job) -> Chooser | None:
     """The chooser that the job's plan asks for; None if the plan says all bursts itself."""
     plan, rig, leds = job.plan, job.cell.rig, job.cell.leds

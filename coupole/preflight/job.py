@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coupole.errors import InputError
+from coupole.errors import InputError, StorageError
 from coupole.motion.cell_motion import CellMotion
 from coupole.plan.bursts import FASTEST, Pace
 from coupole.plan.cell import Cell
@@ -106,24 +106,30 @@ def at_pace(job: Job, pace: Pace) -> Job:
 
 
 def with_choices(job: Job, choices: Mapping[str, Sequence[Choice]]) -> Job:
-    """The same job, for a run that has made these choices. Raises InputError for one that the plan does not
-    allow."""
+    """The same job, for a run that has made these choices. Raises StorageError for one that the plan does not
+    allow: the journal was changed."""
     if not job.schedule.is_open:
         return job
     try:
         return replace(job, schedule=job.schedule.with_choices(choices), choices=choices)
     except KeyError as error:
-        raise InputError(f"the run's journal has a choice that its plan does not allow: {error.args[0]}") from None
+        raise StorageError(
+            f"the run's journal has a choice that its plan does not allow: {error.args[0]}"
+        ) from None
 
 
 def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = None) -> Job:
     """Return the same job without the LEDs that light nothing that a view sees, if the plan has `hidden_lights:
-    skip`. These LEDs are the `known_leds`, if a run began without them, otherwise those for the postures of the
-    paths from home."""
-    if job.plan.hidden_lights != "skip":
+    skip` or chooses LEDs. These LEDs are the `known_leds`, if a run began without them, otherwise those for the
+    postures of the paths from home. Raises InputError if a view has no LED left to choose."""
+    if not job.plan.skips_hidden_lights:
         return job
     hidden_leds = dict(known_leds) if known_leds is not None else _hidden_from_home(job)
-    return replace(job, schedule=job.schedule.without(hidden_leds), hidden_leds=hidden_leds)
+    schedule = job.schedule.without(hidden_leds)
+    for view, bursts in zip(schedule.views, schedule.choosable, strict=False):
+        if not any(burst.is_light().any() for burst in bursts):
+            raise InputError(f"view {view.name}: arm and object hide all LEDs from which is chosen")
+    return replace(job, schedule=schedule, hidden_leds=hidden_leds)
 
 
 def _hidden_from_home(job: Job) -> dict[str, list[int]]:

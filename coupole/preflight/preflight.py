@@ -81,6 +81,8 @@ class Whole:
 class Report:
     """The expected course of a plan, or of what is left of a run, and the refusals."""
 
+    is_bound: bool = False
+    """True if figures are the most that the plan may cost, as bursts are chosen in the run."""
     whole: Whole | None = None
     """Figures of the whole run, if it is resumed; None otherwise."""
     views: list[ViewReport] = field(default_factory=list)
@@ -138,7 +140,7 @@ def check(
 ) -> Report:
     """Check a whole plan, or what is left of the run `whole`. The dose is computed at `object_points_support_mm`
     [n, 3]; the highest counts. `dose_budget_lux_h`: the object's own, by its ledger; a plan's can be stricter."""
-    report = Report(whole, shots=schedule.shots, frames=schedule.frames)
+    report = Report(schedule.is_open, whole, shots=schedule.shots, frames=schedule.frames)
     report.timings = tuple(dict.fromkeys(burst.timing for bursts in schedule.bursts for burst in bursts))
     report.dose_before_lux_h = dose_before_lux_h
     budgets = [dose_budget_lux_h, plan.object.dose_budget_lux_h if plan.object else None]
@@ -230,13 +232,16 @@ def _time_and_dose(
     if budget is not None and report.dose_lux_h + report.dose_before_lux_h > budget:
         assert plan.object is not None
         report.refusals.append(
-            f"object {plan.object.id}: the plan gives it {report.dose_lux_h:.2f} lux.h after "
+            f"object {plan.object.id}: the plan {'may give' if report.is_bound else 'gives'} it "
+            f"{report.dose_lux_h:.2f} lux.h after "
             f"{report.dose_before_lux_h:.2f} lux.h before; its budget is {budget:g} lux.h"
         )
 
 
 def _most_dose(view: OpenView, lux: NDArray[np.float64], row_of_id: Mapping[int, int]) -> NDArray[np.float64]:
     """[points] light of a view whose LEDs are chosen: at each point the brightest there may be among them."""
+    if not view.bound:
+        return np.zeros(len(lux))
     on_us = np.concatenate([burst.table["on_us"][burst.is_light()] for burst in view.bound])
     rows = [row_of_id[led] for led in view.leds.tolist()]
     brightest = np.sort(lux[:, rows], axis=1)[:, ::-1][:, : len(on_us)]

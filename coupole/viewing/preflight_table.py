@@ -28,12 +28,13 @@ def show_preflight(console: Console, report: Report, *, name: str, rig: str) -> 
         counts += f" left of {whole.views}, {whole.shots}, {whole.frames}"
         size += f" left of {bytes_text(whole.bytes)}"
         duration += f" left of {duration_text(whole.duration_s)}"
-    table.add_row("views, shots, frames", counts)
-    table.add_row("on disk", size + (_speeds(report) if report.frames else ""))
+    at_most = ", at most" if report.is_bound else ""
+    table.add_row(f"views, shots, frames{at_most}", counts)
+    table.add_row(f"on disk{at_most}", size + (_speeds(report) if report.frames else ""))
     if report.timings:
         table.add_row("a frame every", "; ".join(map(_pace, report.timings)))
-    table.add_row("duration", f"{duration} (at best {duration_text(report.ideal_s)})")
-    table.add_row("light on the object", _dose(report))
+    table.add_row(f"duration{at_most}", f"{duration} (at best {duration_text(report.ideal_s)})")
+    table.add_row(f"light on the object{at_most}", _dose(report))
     table.add_row("hottest LED board", f"{report.peak_board_c:.1f} C")
     table.add_row("white is exposed to", _white(report))
     if report.object_check is not None:

@@ -38,6 +38,10 @@ def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> 
     return path
 
 
+_MOST_ENDS = 2
+"""Reasons for which views had enough that are said at the top."""
+
+
 def _page(run: Run, run_status: Status) -> Page:
     events = list(journal.read_events(run.journal_path))
     views = sampled_views(run, (event for event in events if isinstance(event, FrameProven)))
@@ -61,7 +65,7 @@ def _page(run: Run, run_status: Status) -> Page:
         title=f"{run.about.get('object') or name_without_time(run.folder.name)}: {views_text} acquired",
         pictures=first_pictures(views),
         summary=_summary(run, run_status, views),
-        quality=_quality(views, object_coverage, lines),
+        quality=_quality(run, views, object_coverage, lines),
         next_step=_next_step(run, run_status, views, has_mesh=is_known),
         remark="Simulated: no real light, no real object." if run.is_simulated else "",
         facts=_glance(run, run_status, views, object_coverage, lines),
@@ -80,10 +84,14 @@ def _summary(run: Run, run_status: Status, views: Sequence[SampledView]) -> str:
     )
 
 
-def _quality(views: Sequence[SampledView], object_coverage: Coverage | str, lines: Sequence[Inline]) -> Inline:
+def _quality(
+    run: Run, views: Sequence[SampledView], object_coverage: Coverage | str, lines: Sequence[Inline]
+) -> Inline:
     parts = [exposure_in_words(views) or "there is no picture yet"]
     if isinstance(object_coverage, Coverage):
         parts.append(coverage_in_words(object_coverage))
+    ends = {choices[-1].reason for choices in run.choices().values() if choices and not choices[-1].bursts}
+    parts += sorted(ends)[:_MOST_ENDS]
     parts.append(f"{_things(lines)} went wrong" if lines else "nothing went wrong")
     sentence = "; ".join(parts)
     return f"{sentence[0].upper()}{sentence[1:]}."

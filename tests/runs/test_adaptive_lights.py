@@ -3,6 +3,8 @@ between them than as many LEDs that are merely spread."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from coupole.acquisition.frame_samples import frame_sample
 from coupole.plan.choices import Choice, FrameSample, refuse_beyond
 from coupole.plan.shot_id import ShotLabel
 from coupole.preflight.choosers import chooser_of
-from coupole.preflight.job import read_job
+from coupole.preflight.job import read_job, without_hidden
 from coupole.storage.run import Run
 from coupole.storage.verification import verify
 
@@ -161,7 +163,9 @@ def test_it_stops_when_the_expected_error_is_small_enough(tmp_path: Path) -> Non
         assert choices[-1].reason.startswith("enough by `relit_rms`")
 
 
-@pytest.mark.parametrize(("until", "lights"), [({"seconds": 0.6}, 40), ({"lux_h": 0.02}, 40)])
+@pytest.mark.parametrize(
+    ("until", "lights"), in_part([({"seconds": 0.6}, 40), ({"lux_h": 0.02}, 40)], ({"lux_h": 0.02}, 40))
+)
 def test_it_stops_before_time_or_light_are_exceeded(tmp_path: Path, until: dict[str, float], lights: int) -> None:
     cell = _cell(tmp_path, until={"lights": 60, **until})
     cell.write(views=[TOP])
@@ -193,6 +197,54 @@ def test_hidden_leds_are_not_chosen_and_others_take_their_place(tmp_path: Path) 
     of_view = job.schedule.without({"top": job.schedule.open_view(0).leds[:40].tolist()}).open_view(0)
     assert len(of_view.leds) == 176
     assert sum(int(burst.is_light().sum()) for burst in of_view.bound) == 60
+
+
+def test_leds_that_arm_and_object_hide_are_not_chosen_though_they_are_only_marked(tmp_path: Path) -> None:
+    cell = _cell(tmp_path, among={"kind": "all"})
+    cell.write(views=[{**TOP, "name": "steep", "elevation_deg": 88}], hidden_lights="mark")
+    job = without_hidden(read_job(cell.plan))
+    hidden_leds = job.hidden_leds["steep"]
+    assert not set(hidden_leds) & set(job.schedule.open_view(0).leds.tolist())
+    cell.write(lights={**ADAPTIVE, "among": {"kind": "ids", "ids": list(hidden_leds)}})
+    refused = cells.here("check", cell.plan)
+    assert refused.code == 2
+    assert "arm and object hide all LEDs" in refused.err
+
+
+@pytest.mark.parametrize("until", [{"seconds": 0.001}, {"lux_h": 1e-9}])
+def test_a_limit_that_allows_no_led_is_refused(tmp_path: Path, until: dict[str, float]) -> None:
+    refused = _cell(tmp_path, until={"lights": 60, **until}).acquire()
+    assert refused.code == 3
+    assert "allow not one LED" in refused.out + refused.err
+
+
+def test_fewer_leds_than_errors_can_be_told_from_are_all_lit(tmp_path: Path) -> None:
+    cell = _cell(tmp_path, among={"kind": "ids", "ids": [3, 500, 77]})
+    cell.write(views=[TOP])
+    assert cell.acquire().code == 0
+    choices = Run(cell.run_folder).choices()["top"]
+    assert _leds(list(choices)) == [3, 77, 500]
+    assert choices[-1].reason == "all LEDs of the view are lit"
+
+
+@pytest.mark.parametrize("change", [{"exposure_us": 2_000_000}, {"leds": [5000]}, {"leds": [1, 2]}])
+def test_a_changed_choice_is_not_gone_on_with(whole: CellFolder, tmp_path: Path, change: dict[str, Any]) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole.run_folder, run)
+    journal = run / "journal.jsonl"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    next(line for line in lines if line["event"] == "chosen")["bursts"][0].update(change)
+    journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    ended = whole.acquire("--resume", run)
+    assert ended.code == 6
+    assert "a choice that its plan does not allow" in ended.err
+
+
+def test_what_a_plan_may_cost_is_said_to_be_the_most(whole: CellFolder) -> None:
+    checked = cells.here("check", whole.plan)
+    said = " ".join((checked.out + checked.err).split())
+    assert "light on the object, at most" in said
+    assert "duration, at most" in said
 
 
 def test_more_than_the_bound_is_never_fired(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def register(
             document = about(registration, mesh)
             (folder / "registration.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
             say("drawing", 0, 1)
-            registration_page.write(registration, mesh, folder)
+            registration_page.write(registration, mesh, folder, name=out.resolve().name)
             say("drawing", 1, 1)
     except CoupoleError as error:
         fail(error, as_json=as_json)

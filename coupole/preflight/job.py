@@ -135,7 +135,9 @@ def without_hidden(job: Job, known_leds: Mapping[str, Sequence[int]] | None = No
 def _hidden_from_home(job: Job) -> dict[str, list[int]]:
     itinerary = job.motion.itinerary(job.schedule.views, job.cell.rig.motion.home_joints_deg)
     hidden_leds: dict[str, list[int]] = {}
-    for view, visit, bursts in zip(job.schedule.views, itinerary.visits, job.schedule.bursts, strict=True):
+    for view, visit, bursts in zip(
+        job.schedule.views, itinerary.visits, job.schedule.planned_bursts(), strict=True
+    ):
         if visit is None:
             continue
         lit = {int(led) for burst in bursts for led in burst.table["led"]}

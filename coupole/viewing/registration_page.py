@@ -30,16 +30,16 @@ _STONE = (0.75, 0.72, 0.66)
 _LOOPS_SHOWN, _TARGETS_SHOWN = 12, 60
 
 
-def write(registration: Registration, merged_mesh: Merged | None, folder: Path) -> None:
-    """Write the report beside what was merged. Raises OSError."""
+def write(registration: Registration, merged_mesh: Merged | None, folder: Path, name: str) -> None:
+    """Write the report beside what was merged. The folder gets its `name` when all is written. Raises OSError."""
     placed_count = len(registration.placed_numbers)
     page = Page(
-        title=f"{folder.resolve().name}: {placed_count} of {len(registration.names)} scans registered",
+        title=f"{name}: {placed_count} of {len(registration.names)} scans registered",
         pictures=_pictures(registration, merged_mesh, folder),
         summary=f"{len(registration.names)} scans were brought into one frame by {registration.pairs} overlapping "
         "pairs.",
         quality=_quality(registration),
-        next_step=_next_step(registration, merged_mesh, folder),
+        next_step=_next_step(registration, merged_mesh, name),
         sections=[
             Section(
                 "known",
@@ -62,24 +62,27 @@ def _quality(registration: Registration) -> str:
     return f"{surfaces}; loops of pairs close within {worst_loop_mm(registration):.3g} mm at worst."
 
 
-def _next_step(registration: Registration, merged_mesh: Merged | None, folder: Path) -> Inline:
+def _next_step(registration: Registration, merged_mesh: Merged | None, name: str) -> Inline:
     if registration.unplaced_numbers:
         return "Scan again where scans were not placed, so that they overlap others; or give targets."
     if merged_mesh is None:
         return "Say it again without --no-mesh to merge the scans."
-    return ["Look at the mesh from all sides, then plan its views: ", Code(f"{folder.name}/mesh.ply"), "."]
+    return ["Look at the mesh from all sides, then plan its views: ", Code(f"{name}/mesh.ply"), "."]
 
 
 def _pictures(registration: Registration, merged_mesh: Merged | None, folder: Path) -> list[Picture]:
+    points, colours = _scan_points(registration)
     scans = picture_of(
-        scans_drawn(registration), "Each scan in its place in a colour of its own, from three sides"
+        sheet_of_sides(points, lambda canvas: canvas.dots(points, colours, 1.5)),
+        "Each scan in its place in a colour of its own, from three sides",
     )
     if merged_mesh is None:
         return [scans]
     mesh = read_ply(MeshFile(folder / "mesh.ply"))
     vertices = mesh.vertices.astype(np.float64)
     solid = with_fewer_faces(Solid("mesh", vertices, mesh.triangles.astype(np.int64)), _DRAWN_FACES)
-    return [picture_of(solid_drawn(solid, _STONE), "The merged mesh, from three sides"), scans]
+    sheet = sheet_of_sides(points, lambda canvas: canvas.fill([solid], [_STONE], has_outline=False))
+    return [picture_of(sheet, "The merged mesh, from the same three sides as the scans"), scans]
 
 
 def picture_of(sheet: Any, title: str) -> Picture:
@@ -89,8 +92,8 @@ def picture_of(sheet: Any, title: str) -> Picture:
     return Picture(title, buffer.getvalue(), is_broad=True)
 
 
-def scans_drawn(registration: Registration) -> Any:
-    """The scans' coarse points, each scan in a colour of its own, as a PIL image."""
+def _scan_points(registration: Registration) -> tuple[Points, Points]:
+    """The scans' coarse points [n, 3], mm, in the first scan's frame, and their colours, one for each scan."""
     clouds = [
         moved_points(registration.first_from_scan[k], registration.scans[k].coarse.points_mm)
         for k in registration.placed_numbers
@@ -100,16 +103,16 @@ def scans_drawn(registration: Registration) -> Any:
     if len(points) > _DRAWN_POINTS:
         some = np.random.default_rng(0).choice(len(points), _DRAWN_POINTS, replace=False)
         points, colour = points[some], colour[some]
-    return sheet_of_sides(points, lambda canvas: canvas.dots(points, colour, 1.5))
+    return points, colour
 
 
 def solid_drawn(solid: Solid, colours: Any) -> Any:
-    """A solid in one colour, or one for each face, from three sides."""
+    """A solid with a colour for each face, from three sides."""
     return sheet_of_sides(solid.vertices_mm, lambda canvas: canvas.fill([solid], [colours], has_outline=False))
 
 
 def sheet_of_sides(points: Points, draw: Callable[[Canvas], None]) -> Any:
-    """A PIL image from three sides; `draw` draws on a canvas."""
+    """A PIL image from three sides, each of which shows all of the points; `draw` draws on a canvas."""
     from PIL import Image, ImageDraw
 
     sheet = Image.new("RGB", (len(_SIDES) * _WIDTH_PX, _HEIGHT_PX), "white")
@@ -193,8 +196,9 @@ def _loops(registration: Registration) -> Section:
     ]
     if not rows:
         return Section("loops", "Loops", words=["No pairs form a ring."])
+    count = len(registration.loops)
     words = (
-        f"{len(registration.loops)} rings of pairs, each pair adjusted by itself. The worst misses by "
+        f"{count} ring{'s' if count > 1 else ''} of pairs, each pair adjusted by itself. The worst misses by "
         f"{worst_loop_mm(registration):.3g} mm. All uncertainties hold a factor of "
         f"{registration.loop_factor:.2f} by "
         "the loops."

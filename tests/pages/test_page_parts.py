@@ -129,6 +129,13 @@ def test_numbers_stand_to_the_right_and_words_to_the_left() -> None:
     assert Table("t", ("n", "x", "y", "z", "e"), rows).numeric_columns == {1, 2}
 
 
+def test_a_caption_that_says_the_heading_again_is_only_for_screen_readers() -> None:
+    tables = [Table("Scans", ("a",), [("1",)]), Table("Points", ("a",), [("1",)])]
+    html = render(Page("t", [], "a", "b", "c", sections=[Section("scans", "Scans", tables=tables)]))
+    assert '<caption class="unseen">Scans</caption>' in html
+    assert "<caption>Points</caption>" in html
+
+
 def test_a_page_that_cannot_be_written_says_where(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match=r"nowhere/page\.html: cannot write the page: No such file"):
         write_page(tmp_path / "nowhere/page.html", everything("a"))

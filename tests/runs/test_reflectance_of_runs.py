@@ -350,7 +350,9 @@ def test_ablation_tells_what_fewer_leds_angles_and_coefficients_cost(made: Made)
     assert {name: few[name] == many[name] for name in few} == {
         "ggx": True, "ggx_normal": True, "sh": False, "rbf": False, "ggx_rbf": False
     }  # fmt: skip
-    assert "Share of the LEDs" in (out / "ablation.html").read_text()
+    page = (out / "ablation.html").read_text()
+    assert "Share of the LEDs" in page
+    assert "At 60 there were not enough samples" in page
 
 
 def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp_path: Path) -> None:

@@ -101,6 +101,9 @@ def test_a_ptx_with_wrong_poses_is_registered_by_shape_and_its_mesh_is_painted(s
     told = json.loads(ran.stdout)
     assert set(told["poses"]) == {"hall.ptx", "hall.ptx#2"}
     assert told["stated_poses_off_mm"]["hall.ptx#2"] == pytest.approx(WRONG_BY_MM, rel=0.02)
+    page = (out / "report.html").read_text()
+    assert "<h1>out: 2 of 2 scans registered</h1>" in page
+    assert "<code>out/mesh.ply</code>" in page
     first = seen.scans[0].world_from_scan
     true = np.linalg.inv(first) @ seen.scans[1].world_from_scan
     points = seen.scans[1].points_mm

@@ -26,6 +26,7 @@ def _page(name: str, document: dict[str, Any]) -> Page:
             f"setting-{number}",
             setting[0].upper() + setting[1:],
             tables=[Table("Mean error, % of range", ("fit", *(f"{value:g}" for value, _ in steps)), _rows(steps))],
+            notes=_notes(steps),
         )
         for number, (setting, steps) in enumerate(document["mae"].items())
     ]
@@ -64,12 +65,17 @@ def _quality(mae: dict[str, Any]) -> str:
     value, errors = max(steps, key=lambda step: float(step[0]))
     known_errors = {name: error for name, error in errors.items() if error is not None}
     if not known_errors:
-        return "It is not known_errors: no LEDs were kept for the check."
+        return "It is not known: no LEDs were kept for the check."
     best = min(known_errors, key=lambda name: known_errors[name])
     return (
         f"With the most ({setting} {value:g}) {FITS[best].title} misses least: "
         f"{100 * known_errors[best]:.3f} % of range."
     )
+
+
+def _notes(steps: list[Any]) -> list[str]:
+    missing = [f"{value:g}" for value, errors in steps if None in errors.values()]
+    return [f"At {', '.join(missing)} there were not enough samples for all of the fits."] if missing else []
 
 
 def _rows(steps: list[Any]) -> list[tuple[str, ...]]:
@@ -83,6 +89,7 @@ def _rows(steps: list[Any]) -> list[tuple[str, ...]]:
 def _plot_png(mae: dict[str, Any]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import StrMethodFormatter
 
     figure = Figure(figsize=(11, 4.5), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
@@ -93,6 +100,9 @@ def _plot_png(mae: dict[str, Any]) -> bytes:
             ax.plot(*places, marker="o", label=fit.title, color=fit.colour)
         ax.set_xlabel(setting)
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))
+        ax.set_xticks([value for value, _ in steps], [f"{value:g}" for value, _ in steps])
         ax.spines[["top", "right"]].set_visible(False)
     figure.axes[0].set_ylabel("mean error, % of range")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)

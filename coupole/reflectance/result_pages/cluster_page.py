@@ -15,6 +15,8 @@ from coupole.pages.page_rendering import write_page
 from coupole.reflectance.run_result import RunResult
 
 PAGE = "clusters.html"
+_GROUND = np.array([0x10, 0x12, 0x14]) / 255
+"""Where no triangle is seen: the colour that maps for the eye have there."""
 _TOLD = {
     "own": "triangles by their own material",
     "clustered": "the same by their cluster's",
@@ -84,7 +86,7 @@ def _notes(document: dict[str, Any]) -> list[str]:
 
 
 def _views(result: RunResult) -> Iterator[tuple[str, Sequence[Figure]]]:
-    """Each view's name, its clusters in any colours, and their diffuse part."""
+    """Each view's name, its clusters in any colours on the ground of maps, and their diffuse part."""
     clusters = result.clusters
     colours = np.random.default_rng(5).uniform(0.2, 1.0, (len(clusters.alpha), 3))
     diffuse = clusters.kd if clusters.kd.shape[1] == 3 else np.repeat(clusters.kd, 3, axis=1)
@@ -93,11 +95,11 @@ def _views(result: RunResult) -> Iterator[tuple[str, Sequence[Figure]]]:
             rows = file["seen"][()]
         number = clusters.cluster[np.searchsorted(result.triangles, view.triangles)]
         numbers = np.where(rows >= 0, number[rows], -1)
-        is_known = numbers[..., None] >= 0
+        is_known, name = numbers[..., None] >= 0, view.path.stem
         yield (
-            view.path.stem,
+            name,
             [
-                colour_picture("clusters, any colours", np.where(is_known, colours[numbers], 1.0)),
-                eye_map("diffuse kd of the clusters", np.where(is_known, diffuse[numbers], np.nan)),
+                colour_picture(f"{name}: clusters, any colours", np.where(is_known, colours[numbers], _GROUND)),
+                eye_map(f"{name}: diffuse kd of the clusters", np.where(is_known, diffuse[numbers], np.nan)),
             ],
         )

@@ -125,10 +125,14 @@ def remarks(registration: Registration) -> Iterator[str]:
     )
     if registration.loops:
         middle = float(np.median([loop.error_mm for loop in registration.loops]))
-        yield (
-            f"{len(registration.loops)} loops of pairs close within {middle:.3g} mm in the median, "
-            f"{worst_loop_mm(registration):.3g} mm at worst"
-        )
+        worst_mm = worst_loop_mm(registration)
+        if len(registration.loops) == 1:
+            yield f"the one loop of pairs closes within {worst_mm:.3g} mm"
+        else:
+            yield (
+                f"{len(registration.loops)} loops of pairs close within {middle:.3g} mm in the median, "
+                f"{worst_mm:.3g} mm at worst"
+            )
     else:
         yield "no loop closes: a wrong pair would not be noticed, and uncertainties are those of noise alone"
     if registration.loop_factor > 1.05:

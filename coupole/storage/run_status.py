@@ -110,6 +110,12 @@ class Status:
         """Shots and dark frames that are not proven."""
         return sum(shots - proven for proven, shots in self.views.values())
 
+    @property
+    def left_in_words(self) -> str:
+        """What is left to take, in words; where bursts are chosen in the run, nobody knows how much more."""
+        frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
+        return f"{frames} and what is yet to be chosen" if self.open_views else frames
+
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""
         sessions = [{**vars(session), "duration_s": round(session.duration_s, 3)} for session in self.sessions]

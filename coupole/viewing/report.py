@@ -100,7 +100,7 @@ def _quality(
 def _next_step(run: Run, run_status: Status, views: Sequence[SampledView], *, has_mesh: bool) -> Inline:
     name = run.folder.name
     if run_status.go_on:
-        return ["Take what is left, ", f"{run_status.frames_left} frames: ", Code(run_status.go_on)]
+        return ["Take what is left, ", f"{run_status.left_in_words}: ", Code(run_status.go_on)]
     if run_status.missing:
         return ["Read ", Link("#trouble", "what went wrong"), "."]
     verdicts = {view.verdict() for view in views}

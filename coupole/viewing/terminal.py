@@ -224,7 +224,7 @@ def show_status(console: Console, status: Status) -> None:
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:
-        console.print(f"  {status.frames_left} frames are left; go on with")
+        console.print(f"  left to take: {status.left_in_words}; go on with")
         if status.before_that:
             console.print(f"  {status.before_that}", markup=False, soft_wrap=True)
             console.print("  (the arm is in a fault: find the cause, see that the cell is clear), and then")

@@ -61,7 +61,9 @@ def test_a_stop_that_version_0_1_noted_as_a_fault_is_none(run: Run) -> None:
 def test_a_failure_is_a_fault_and_the_reason(run: Run) -> None:
     found = told(run, [SessionStarted(), FAULT, SessionStopped(outcome="failed")])
     assert (found.state, found.reason, found.faults) == ("failed", "the box is gone", ["the box is gone"])
-    assert "<li class=bad>" in report.write(run).read_text()
+    page = report.write(run).read_text()
+    trouble = page[page.index('id="trouble"') :]
+    assert "the box is gone" in trouble[: trouble.index("</section>")]
 
 
 def test_the_lock_tells_a_session_that_runs_from_one_that_was_killed(run: Run) -> None:
@@ -101,7 +103,7 @@ def test_a_report_can_be_made_after_a_crash(run: Run) -> None:
     assert "<b class=stopped>interrupted</b>: its last session has no end" in page
     assert "0.750 lux h" in page
     assert "not a view file of a run" in page
-    assert f"<code>coupole acquire --resume {run.folder}</code> (1 frames are left)" in page
+    assert f"Take what is left, 1 frame: <code>coupole acquire --resume {run.folder}</code>" in page
 
 
 def test_a_run_without_copies_is_resumed_with_its_plan_named(run: Run) -> None:

@@ -114,7 +114,9 @@ class _Page:
             self._facts = ui.html(facts_html(self._run_facts(row)), sanitize=False).classes("two-columns")
             self._facts.style("width:100%")
             ui.timer(_LOOK_EVERY_S, self._renew)
-            RunActions(self._visit, row.name, can_resume=bool(status.frames_left), frames=row.proven)
+            RunActions(
+                self._visit, row.name, can_resume=bool(status.frames_left or status.open_views), frames=row.proven
+            )
             TaskList(self._visit, lambda task: task.words.endswith(f" {self._name}"), empty="", most=4)
 
     async def _renew(self) -> None:

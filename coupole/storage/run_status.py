@@ -112,7 +112,7 @@ class Status:
 
     @property
     def left_in_words(self) -> str:
-        """What is left to take, in words; where bursts are chosen in the run, nobody knows how much more."""
+        """Say in words what is left to take; where bursts are chosen in the run, nobody knows how much more."""
         frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
         return f"{frames} and what is yet to be chosen" if self.open_views else frames
 

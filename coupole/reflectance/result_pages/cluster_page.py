@@ -16,7 +16,7 @@ from coupole.reflectance.run_result import RunResult
 
 PAGE = "clusters.html"
 _GROUND = np.array([0x10, 0x12, 0x14]) / 255
-"""Where no triangle is seen: the colour that maps for the eye have there."""
+"""Maps for the eye have this colour where no triangle is seen."""
 _TOLD = {
     "own": "triangles by their own material",
     "clustered": "the same by their cluster's",

@@ -133,6 +133,8 @@ def test_a_demo_that_was_made_is_not_made_again_and_no_other_folder_is_touched(i
 
 def test_the_examples_of_the_python_page_run(installed: Installed) -> None:
     shutil.copy(REPO / "docs/how-to/from_python.py", installed.folder)
+    made = installed.run("coupole", "demo", "coupole-demo", "--short", "--json")
+    assert made.returncode == 0, made.stderr
     ended = installed.run("python", "-W", "error", "from_python.py")
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.splitlines()[-2].endswith("6 of 6")

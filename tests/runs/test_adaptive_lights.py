@@ -118,7 +118,7 @@ def test_pictures_between_are_better_than_with_as_many_spread_leds(whole: CellFo
 
 def _chosen_anew(cell: CellFolder, run: Path) -> dict[str, list[Any]]:
     """What follows from the frames that are on the disk, choice by choice."""
-    job, opened = read_job(cell.plan), Run(run)
+    job, opened = without_hidden(read_job(cell.plan)), Run(run)
     chooser, stored, chosen = chooser_of(job), cells.stored(run), {}
     assert chooser is not None
     made = opened.choices()

@@ -1,4 +1,4 @@
-"""Rigid transforms: 4x4 float64, millimetres and degrees.
+"""Rigid transforms: 4x4 float64, millimetres and degrees; and points that are spread.
 
 A transform is named after the frames it joins: `base_from_camera` maps camera coordinates to base
 coordinates. KUKA's A, B, C are Euler angles about z, y', x'': R = Rz(A) Ry(B) Rx(C).
@@ -6,6 +6,8 @@ The camera frame has x to the right of the image, y down, z forward (the OpenCV 
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -91,6 +93,19 @@ def look_at(
     support_from_camera[:3, 2] = forward
     support_from_camera[:3, 3] = np.asarray(target_mm, dtype=np.float64) + distance_mm * towards_camera
     return support_from_camera
+
+
+def farthest_first(points: ArrayLike, first: int) -> Iterator[tuple[int, float]]:
+    """Give the index of each of points [n, d], after `first` always the one that is farthest from all before it,
+    with that distance (infinite for the first). Of equals comes the one with the lowest index."""
+    points_array = np.asarray(points, dtype=np.float64)
+    index, distance = first, np.inf
+    nearest = np.full(len(points_array), np.inf)
+    for _ in range(len(points_array)):
+        yield index, float(distance)
+        nearest = np.minimum(nearest, np.linalg.norm(points_array - points_array[index], axis=1))
+        index = int(np.argmax(nearest))
+        distance = nearest[index]
 
 
 def rotation_angle_deg(a_from_b: Transform, a_from_c: Transform) -> float:

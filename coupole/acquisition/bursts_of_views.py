@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from coupole.plan.shot_id import ShotId, ShotLabel
 from coupole.preflight.checking import LED_DUTIES
 from coupole.preflight.choosers import chooser_of
 from coupole.preflight.job import Job
-from coupole.preflight.led_limits import heat_of
+from coupole.preflight.led_limits import BoardHeat
 from coupole.storage.journal_events import BurstsChosen
 
 
@@ -30,8 +31,8 @@ class BurstsOfViews:
         self._open_views: dict[int, OpenView] = {}
         self._frames: dict[int, int] = {}
         """Frames of each view, as far as they are chosen."""
-        self._fired: list[list[Burst]] = []
-        """Bursts of the session's views whose bursts are chosen, for the heat of their boards."""
+        self._boards = BoardHeat(job.cell.rig.led_limits, job.cell.leds)
+        """Boards after the session's chosen bursts; moves and waits, in which they cool, are left out."""
         recorder.sample_frames(is_wanted=self._chooser is not None)
 
     def bursts(self, number: int) -> tuple[Burst, ...]:
@@ -61,10 +62,6 @@ class BurstsOfViews:
     def slots(self, number: int) -> int:
         """Frames that a view's file must have room for."""
         return _frames(self.bound(number))
-
-    def begin_view(self) -> None:
-        """The arm goes to another view."""
-        self._fired.append([])
 
     def more(self, number: int) -> list[Burst]:
         """The next bursts of a view all of whose bursts were fired; none if it has enough. The choice is on the
@@ -96,15 +93,12 @@ class BurstsOfViews:
     def _cool(self, bursts: list[Burst]) -> list[Burst]:
         """The same bursts, slowed down if boards would get too hot after what this session has lit: LEDs that are
         chosen may lie together on one board."""
-        limits, leds = self._job.cell.rig.led_limits, self._job.cell.leds
-        before = self._fired or [[]]
         for duty in (1.0, *LED_DUTIES):
-            cool_bursts = [_at_duty(burst, duty) for burst in bursts]
-            views = [*before[:-1], [*before[-1], *cool_bursts]]
-            if not heat_of(views, [0.0] * len(views), limits, leds).too_hot:
+            cool_bursts, boards = [_at_duty(burst, duty) for burst in bursts], deepcopy(self._boards)
+            boards.light(cool_bursts)
+            if not boards.heat().too_hot:
                 break
-        before[-1] += cool_bursts
-        self._fired = before
+        self._boards = boards
         return cool_bursts
 
 

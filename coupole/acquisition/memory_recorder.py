@@ -19,8 +19,8 @@ from coupole.viewing.progress import ViewExposure
 
 
 class MemoryRecorder:
-    """A `coupole.acquisition.recorder.Recorder` that keeps events and proven shots in memory; what it keeps of a
-    frame, its kinds say."""
+    """Part of a `coupole.acquisition.recorder.Recorder`: keeps events and proven shots in memory. Its kinds store
+    frames in ways of their own."""
 
     name = "memory"
 
@@ -49,9 +49,6 @@ class MemoryRecorder:
         self._view, self._format = view, frame_format
         self._samples.begin(frame_format)
 
-    def store(self, frame: Frame, exposure_us: int) -> int:
-        raise NotImplementedError
-
     def sample_frames(self, *, is_wanted: bool) -> None:
         self._samples.is_wanted = is_wanted
 
@@ -70,9 +67,6 @@ class MemoryRecorder:
 
     def commit(self, *, now: bool) -> None:
         """Nothing lasts."""
-
-    def end_view(self) -> None:
-        raise NotImplementedError
 
 
 class DryRecorder(MemoryRecorder):

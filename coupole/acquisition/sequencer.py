@@ -164,7 +164,6 @@ class Sequencer:
         collections = {"shadow": {**occlusion.arrays(patches), "leds": self._job.cell.leds.ids}}
         dwell_s = self._job.cell.rig.motion.settle_dwell_s
         self.outcome.ideal_s += visit.leg.duration_s + dwell_s
-        self._bursts.begin_view()
         next_bursts = next_bursts or self._bursts.more(number)
         if not next_bursts:  # the view has enough without a frame
             return

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.geometry import Transform, direction, inverse
+from coupole.geometry import Transform, direction, farthest_first, inverse
 from coupole.plan.led_table import LedTable
 from coupole.plan.plan import Plan
 from coupole.plan.plan_lights import (
@@ -85,12 +86,7 @@ def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[n
 
 def spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """`count` of the positions [n, 3], each as far as possible from those before it."""
-    indices = [0]
-    apart = np.linalg.norm(positions_mm - positions_mm[0], axis=1)
-    while len(indices) < min(count, len(positions_mm)):
-        indices.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(positions_mm - positions_mm[indices[-1]], axis=1))
-    return np.array(sorted(indices))
+    return np.array(sorted(row for row, _ in islice(farthest_first(positions_mm, 0), count)))
 
 
 def missing_lights(

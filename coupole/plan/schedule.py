@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import assert_never
 
 from coupole.geometry import Transform, look_at
@@ -44,6 +44,8 @@ class Schedule:
     """Labels of all frames that each view can have, before any was left out, in the order of its bursts."""
     choosable: tuple[tuple[Burst, ...], ...] = ()
     """Bursts from which those of each view are chosen in the run; empty if the plan says them all."""
+    burst_sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    """LEDs of the bursts in the bound of each view whose LEDs are chosen, by its name."""
 
     @property
     def shots(self) -> int:
@@ -78,15 +80,22 @@ class Schedule:
             )
 
         choosable = without_hidden(self.choosable) if self.choosable else ()
-        if not all(len(of_view) == 1 for of_view in choosable):  # exposures are chosen, not LEDs
-            return replace(self, bursts=without_hidden(self.bursts), choosable=choosable)
-        if not choosable:
-            return replace(self, bursts=without_hidden(self.bursts))
-        bounds = tuple(
-            bound_of_lights(whole[0], [int(burst.is_light().sum()) for burst in bound])
-            for whole, bound in zip(choosable, self.bursts, strict=True)
-        )
-        return replace(self, bursts=bounds, choosable=choosable)
+        without = replace(self, bursts=without_hidden(self.bursts), choosable=choosable)
+        return without.with_bounds_of_lights() if self.burst_sizes else without
+
+    def with_bounds_of_lights(self) -> Schedule:
+        """The same with the bounds of the views whose LEDs are chosen, from the LEDs that they may have."""
+        bounds: dict[tuple[int, tuple[int, ...]], tuple[Burst, ...]] = {}
+        bursts_of_views = []
+        for view, (whole, *_), bursts in zip(self.views, self.choosable, self.bursts, strict=True):
+            sizes = self.burst_sizes.get(view.name)
+            if sizes is None:
+                bursts_of_views.append(bursts)
+                continue
+            key = id(whole.table), sizes  # views with the same LEDs share tables
+            bounds[key] = bounds.get(key) or bound_of_lights(whole, sizes)
+            bursts_of_views.append(tuple(replace(burst, view=view.name) for burst in bounds[key]))
+        return replace(self, bursts=tuple(bursts_of_views))
 
     def with_choices(self, choices: Mapping[str, Sequence[Choice]]) -> Schedule:
         """The same with the bursts that were chosen for views that have enough (by name of view), in place of
@@ -103,11 +112,12 @@ class Schedule:
         to these."""
         remaining_bursts = [bursts_left(bursts, proven) for bursts in self.bursts]
         numbers = [n for n, bursts in enumerate(remaining_bursts) if bursts]
-        return Schedule(
-            tuple(self.views[n] for n in numbers),
-            tuple(tuple(remaining_bursts[n]) for n in numbers),
-            tuple(self.labels[n] for n in numbers),
-            tuple(self.choosable[n] for n in numbers if self.choosable),
+        return replace(
+            self,
+            views=tuple(self.views[n] for n in numbers),
+            bursts=tuple(tuple(remaining_bursts[n]) for n in numbers),
+            labels=tuple(self.labels[n] for n in numbers),
+            choosable=tuple(self.choosable[n] for n in numbers if self.choosable),
         )
 
 
@@ -213,27 +223,22 @@ def build_schedule(
     )
     schedule = Schedule(tuple(views), tuple(map(tuple, bursts)), labels)
     if isinstance(plan.exposure, AutoExposure):
-        return _open_schedule(schedule, plan.exposure, leds)
+        return _with_open_exposures(schedule, plan.exposure, leds)
     return _with_open_lights(schedule, plan) if plan.chooses_lights else schedule
 
 
 def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
     """The schedule of a plan whose LEDs are chosen in the run, in some of its views."""
-    bounds: dict[tuple[int, Lights], tuple[Burst, ...]] = {}
-    bursts_of_views = []
-    lights_of_views = [view.lights or plan.lights for view in plan.views for _ in expand_view(view)]
-    for view, lights, bursts in zip(schedule.views, lights_of_views, schedule.bursts, strict=True):
-        if isinstance(lights, AdaptiveLights):
-            key = id(bursts[0].table), lights  # views with the same lights share tables
-            if key not in bounds:
-                bounds[key] = bound_of_lights(bursts[0], lights.burst_sizes)
-            bursts_of_views.append(tuple(replace(burst, view=view.name) for burst in bounds[key]))
-        else:
-            bursts_of_views.append(bursts)
-    return replace(schedule, bursts=tuple(bursts_of_views), choosable=schedule.bursts)
+    burst_sizes = {
+        pose.name: lights.burst_sizes
+        for view in plan.views
+        if isinstance(lights := view.lights or plan.lights, AdaptiveLights)
+        for pose in expand_view(view)
+    }
+    return replace(schedule, choosable=schedule.bursts, burst_sizes=burst_sizes).with_bounds_of_lights()
 
 
-def _open_schedule(schedule: Schedule, exposure: AutoExposure, leds: LedTable) -> Schedule:
+def _with_open_exposures(schedule: Schedule, exposure: AutoExposure, leds: LedTable) -> Schedule:
     """The schedule of a plan whose exposures are chosen in the run: of all that may be chosen, and its bound."""
     bounds: dict[int, tuple[Burst, ...]] = {}
     for bursts in schedule.bursts:

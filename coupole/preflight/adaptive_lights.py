@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 
 _SITES = 2048
 """Pixels by which LEDs are judged, about."""
-BRIGHT_QUANTILE = 0.999
-"""Share of the pixels and LEDs below the view's bright level."""
 
 
 class AdaptiveLightsChooser:
@@ -49,8 +47,8 @@ class AdaptiveLightsChooser:
         """See `coupole.plan.choices.Chooser`."""
         lights = self._lights[view.name]
         if not isinstance(lights, AdaptiveLights):
-            every = tuple(sorted(view.leds.tolist()))
-            return self._choice(view, () if choices else every, "all LEDs of the plan" if not choices else "all")
+            every_id = tuple(view.leds.tolist())
+            return self._choice(view, () if choices else every_id, "all LEDs, as the plan says")
         if not choices:
             spread_ids = view.leds[spread_lights(self._ways(view), np.arange(len(view.leds)), lights.first_lights)]
             first_ids = self._affordable(view, lights, spread_ids[: lights.until.lights].tolist(), 0, 0)
@@ -75,16 +73,12 @@ class AdaptiveLightsChooser:
         if len(seen_ids) < FEWEST_TAKEN:
             return Choice(bursts=(), reason=f"{len(seen_ids)} frames are proven: too few to choose by")
         values = self._values(view, seen_ids, samples)
-        row_of = {led: row for row, led in enumerate(view.leds.tolist())}
-        unlit = np.setdiff1d(np.arange(len(view.leds)), [row_of[led] for led in lit_ids])
+        unlit_rows = np.flatnonzero(~np.isin(view.leds, lit_ids))
         count = min(lights.burst_lights, lights.until.lights - len(lit_ids))
-        following = next_lights(
-            values, self._ways(view), np.array([row_of[led] for led in seen_ids]), unlit, count
-        )
-        bright = float(np.quantile(values, BRIGHT_QUANTILE)) or 1.0
+        following = next_lights(values, self._ways(view), _rows(view, seen_ids), unlit_rows, count)
         next_ids = view.leds[following.lights].tolist()
         affordable_ids = self._affordable(view, lights, next_ids, len(lit_ids), len(choices))
-        figures = _figures(view, following, bright, len(lit_ids))
+        figures = _figures(view, following, len(lit_ids))
         if reason := _enough(lights, figures, len(affordable_ids)):
             return Choice(bursts=(), reason=reason, figures=figures)
         errors = f"{100.0 * figures['relit_rms']:.2f} %, {100.0 * figures['relit_rms_after']:.2f} % after them"
@@ -113,8 +107,7 @@ class AdaptiveLightsChooser:
         exposure = view.bursts[0].exposure_index
         signals = [samples[ShotLabel(Led(led), exposure, 0)].signal_dn for led in seen_ids]
         step = max(1, len(signals[0]) // _SITES) | 1  # odd: pixels of all colours
-        row_of = {led: row for row, led in enumerate(view.leds.tolist())}
-        lux = self._lux(view)[[row_of[led] for led in seen_ids]]
+        lux = self._lux(view)[_rows(view, seen_ids)]
         signals_dn = np.stack([signal[::step] for signal in signals]).astype(np.float64)
         return np.asarray(signals_dn / (lux / lux.mean())[:, None])
 
@@ -142,11 +135,17 @@ class AdaptiveLightsChooser:
         return np.asarray(ways / np.linalg.norm(ways, axis=1, keepdims=True))
 
 
-def _figures(view: OpenView, following: NextLights, bright: float, lit: int) -> dict[str, Any]:
+def _rows(view: OpenView, ids: Sequence[int]) -> NDArray[np.int64]:
+    """Rows of the view's LEDs."""
+    row_of_id = {led: row for row, led in enumerate(view.leds.tolist())}
+    return np.array([row_of_id[led] for led in ids], np.int64)
+
+
+def _figures(view: OpenView, following: NextLights, lit: int) -> dict[str, Any]:
     return {
         "lights": lit,
-        "relit_rms": float(f"{following.expected_rms / bright:.4g}"),
-        "relit_rms_after": float(f"{following.expected_rms_after / bright:.4g}"),
+        "relit_rms": float(f"{following.expected_rms:.4g}"),
+        "relit_rms_after": float(f"{following.expected_rms_after:.4g}"),
         "first": [int(led) for led in view.leds[following.lights[:1]]],
         "next_best": [int(view.leds[light]) for light in following.alternatives],
     }

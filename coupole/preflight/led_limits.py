@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,46 +49,64 @@ class Heat:
     refusals: tuple[str, ...]
 
 
-def heat_of(
-    bursts_of_views: Sequence[Sequence[Burst]], moves_s: Sequence[float], limits: LedLimits, leds: LedTable
-) -> Heat:
-    """Board temperatures (first order) and dark times of each LED, over bursts in the order of the visits, with
-    the arm's move before each view."""
-    model = limits.board
-    boards, row_of_board = np.unique(leds.boards, return_inverse=True)
-    board_of_led = dict(zip(leds.ids.tolist(), row_of_board.tolist(), strict=True))
-    n_boards = len(boards)
-    rise = np.zeros(n_boards)
-    off_since = np.full(int(leds.ids.max()) + 1, -np.inf)
-    peak = 0.0
-    t_s = 0.0
-    refusals: list[str] = []
-    for bursts, move_s in zip(bursts_of_views, moves_s, strict=True):
-        rise *= np.exp(-move_s / model.time_constant_s)
-        t_s += move_s
+class BoardHeat:
+    """Board temperatures (first order) and dark times of each LED, burst after burst."""
+
+    def __init__(self, limits: LedLimits, leds: LedTable) -> None:
+        boards, row_of_board = np.unique(leds.boards, return_inverse=True)
+        self._limits = limits
+        self._board_of_led = dict(zip(leds.ids.tolist(), row_of_board.tolist(), strict=True))
+        self._rise = np.zeros(len(boards))
+        self._off_since = np.full(int(leds.ids.max()) + 1, -np.inf)
+        self._peak, self._t_s = 0.0, 0.0
+        self._short_rest = ""
+
+    def light(self, bursts: Iterable[Burst], move_s: float = 0.0) -> None:
+        """Light bursts one after the other, after a move of the arm in the dark."""
+        model = self._limits.board
+        self._rise *= np.exp(-move_s / model.time_constant_s)
+        self._t_s += move_s
         for burst in bursts:
             starts_s = np.concatenate([[0.0], np.cumsum(burst.table["period_us"][:-1], dtype=np.int64)]) / 1e6
             lit = np.flatnonzero(burst.table["led"] != NO_LED)
             led = burst.table["led"][lit]
             on_s = burst.table["on_us"][lit] / 1e6
-            rest_s = t_s + starts_s[lit] - off_since[led]
-            short = rest_s < limits.cooldown_ratio * on_s
-            if short.any() and not refusals:
+            rest_s = self._t_s + starts_s[lit] - self._off_since[led]
+            short = rest_s < self._limits.cooldown_ratio * on_s
+            if short.any() and not self._short_rest:
                 k = int(np.flatnonzero(short)[0])
-                refusals.append(
+                self._short_rest = (
                     f"shot {burst.view}/{burst.labels[lit[k]]}: LED {led[k]} rests {rest_s[k]:.3f} s before it is "
-                    f"lit for {on_s[k]:.3f} s; it needs {limits.cooldown_ratio * on_s[k]:.3f} s"
+                    f"lit for {on_s[k]:.3f} s; it needs {self._limits.cooldown_ratio * on_s[k]:.3f} s"
                 )
-            off_since[led] = t_s + starts_s[lit] + on_s
-            board_numbers = np.array([board_of_led[int(n)] for n in led], np.int64)
-            last_s = np.zeros(n_boards)
-            peak = max(peak, _warm(rise, last_s, board_numbers, starts_s[lit] + on_s, on_s, model))
-            rise *= np.exp(-(burst.duration_s - last_s) / model.time_constant_s)
-            t_s += burst.duration_s
-    peak_c = model.ambient_c + peak
-    if peak_c > model.limit_c:
-        refusals.append(f"LED boards: the hottest would reach {peak_c:.1f} C; the limit is {model.limit_c:g} C")
-    return Heat(peak_c, bool(refusals), tuple(refusals))
+            self._off_since[led] = self._t_s + starts_s[lit] + on_s
+            board_numbers = np.array([self._board_of_led[int(n)] for n in led], np.int64)
+            last_s = np.zeros(len(self._rise))
+            peak = _warm(self._rise, last_s, board_numbers, starts_s[lit] + on_s, on_s, model)
+            self._peak = max(self._peak, peak)
+            self._rise *= np.exp(-(burst.duration_s - last_s) / model.time_constant_s)
+            self._t_s += burst.duration_s
+
+    def heat(self) -> Heat:
+        """The highest temperature so far, and what was beyond the limits."""
+        model = self._limits.board
+        peak_c = model.ambient_c + self._peak
+        refusals = [self._short_rest] if self._short_rest else []
+        if peak_c > model.limit_c:
+            refusals.append(
+                f"LED boards: the hottest would reach {peak_c:.1f} C; the limit is {model.limit_c:g} C"
+            )
+        return Heat(peak_c, bool(refusals), tuple(refusals))
+
+
+def heat_of(
+    bursts_of_views: Sequence[Sequence[Burst]], moves_s: Sequence[float], limits: LedLimits, leds: LedTable
+) -> Heat:
+    """Heat of a whole schedule: bursts in the order of the visits, with the arm's move before each view."""
+    boards = BoardHeat(limits, leds)
+    for bursts, move_s in zip(bursts_of_views, moves_s, strict=True):
+        boards.light(bursts, move_s)
+    return boards.heat()
 
 
 def _warm(

@@ -13,9 +13,12 @@ Everything is a function of its arguments, without a draw: a resumed run chooses
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
+
+from coupole.geometry import farthest_first
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +31,7 @@ _LEAST_SPACING_RAD = 1e-3
 _LEAST_SHARE = 1e-6
 """Least error of a light, as a share of the largest: nothing is known for certain."""
 _ALTERNATIVES = 3
+_BRIGHT_QUANTILE = 0.999
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ class NextLights:
     lights: NDArray[np.int64]
     """Indices of the next lights, the one that tells most first."""
     expected_rms: float
-    """Root mean square error that pictures interpolated for the lights not yet taken are expected to have, in the
-    unit of the values."""
+    """Root mean square error that pictures interpolated for the lights not yet taken are expected to have, as a
+    share of the bright level of the values (their 99.9 % quantile)."""
     expected_rms_after: float
     """The same after the next lights."""
     alternatives: tuple[int, ...]
@@ -49,12 +53,8 @@ def spread_lights(directions: Floats, allowed_lights: NDArray[np.int64], count: 
     """Indices of `count` lights among `allowed_lights` to begin with: the one nearest to the middle of them, then
     each as far as possible from those before it. `directions` [n, 3] are unit vectors."""
     candidates = directions[allowed_lights]
-    order = [int(np.argmax(candidates @ candidates.mean(axis=0)))]
-    closeness = candidates @ candidates[order[0]]
-    while len(order) < min(count, len(allowed_lights)):
-        order.append(int(np.argmin(closeness)))
-        closeness = np.maximum(closeness, candidates @ candidates[order[-1]])
-    return allowed_lights[order]
+    middle = int(np.argmax(candidates @ candidates.mean(axis=0)))
+    return allowed_lights[[row for row, _ in islice(farthest_first(candidates, middle), count)]]
 
 
 def left_out_squares(values: Floats, directions: Floats) -> Floats:
@@ -92,8 +92,8 @@ def next_lights(
     wanted_lights = np.union1d(allowed_lights, taken_lights)
     covariance = _error_covariance(values, directions[wanted_lights], np.searchsorted(wanted_lights, taken_lights))
     is_candidate = np.isin(wanted_lights, allowed_lights) & ~np.isin(wanted_lights, taken_lights)
-    remaining = max(int(np.count_nonzero(is_candidate)), 1)
-    rms = _rms(covariance, is_candidate, remaining)
+    bright = float(np.quantile(values, _BRIGHT_QUANTILE)) or 1.0
+    rms = _rms(covariance, is_candidate)
     chosen_rows: list[int] = []
     alternatives: tuple[int, ...] = ()
     for _ in range(min(count, int(np.count_nonzero(is_candidate)))):
@@ -107,10 +107,8 @@ def next_lights(
         is_candidate[best] = False
         column = covariance[:, best].copy()
         covariance -= np.outer(column, column / max(column[best], 1e-300))
-    remaining_after = max(int(np.count_nonzero(is_candidate)), 1)
-    return NextLights(
-        wanted_lights[chosen_rows], rms, _rms(covariance, is_candidate, remaining_after), alternatives
-    )
+    rms_after = _rms(covariance, is_candidate)
+    return NextLights(wanted_lights[chosen_rows], rms / bright, rms_after / bright, alternatives)
 
 
 def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[np.int64]) -> Floats:
@@ -130,5 +128,6 @@ def _error_covariance(values: Floats, directions: Floats, taken_lights: NDArray[
     return covariance - covariance[:, taken_lights] @ np.linalg.solve(taken_covariance, covariance[taken_lights])
 
 
-def _rms(covariance: Floats, is_open: NDArray[np.bool_], count: int) -> float:
-    return float(np.sqrt(max(float(np.diag(covariance)[is_open].sum()), 0.0) / count))
+def _rms(covariance: Floats, is_candidate: NDArray[np.bool_]) -> float:
+    variances = np.diag(covariance)[is_candidate]
+    return float(np.sqrt(max(float(variances.mean()), 0.0))) if len(variances) else 0.0

@@ -21,7 +21,6 @@ Floats = NDArray[np.float64]
 
 _SITES = 4096
 """Pixels by which lights are judged, about."""
-_BRIGHT_QUANTILE = 0.999
 
 
 @dataclass(frozen=True)
@@ -52,10 +51,9 @@ def choose_pictures(
     steps: list[dict[str, Any]] = []
     while True:
         values = _with_new(pictures, values, chosen_lights, say, how_many.most)
-        bright = float(np.quantile(values, _BRIGHT_QUANTILE)) or 1.0
         count = min(how_many.at_a_time, how_many.most - len(chosen_lights))
         following = next_lights(values, pictures.directions, chosen_lights, every, count)
-        steps.append(_step(len(chosen_lights), following, bright))
+        steps.append(_step(len(chosen_lights), following))
         is_enough = how_many.relit_rms is not None and steps[-1]["relit_rms"] <= how_many.relit_rms
         if is_enough or not len(following.lights):
             break
@@ -98,10 +96,10 @@ def _with_new(
     return np.stack(rows)
 
 
-def _step(count: int, following: NextLights, bright: float) -> dict[str, Any]:
+def _step(count: int, following: NextLights) -> dict[str, Any]:
     return {
         "lights": count,
-        "relit_rms": float(f"{following.expected_rms / bright:.4g}"),
+        "relit_rms": float(f"{following.expected_rms:.4g}"),
         "next": following.lights.tolist(),
         "next_best": list(following.alternatives),
     }

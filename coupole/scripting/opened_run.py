@@ -180,9 +180,15 @@ class Run(Mapping[str, RunView]):
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Ids of the plan's shots and dark frames that are not proven."""
+        """Ids of the plan's shots and dark frames that are not proven; where frames are chosen in the run, of
+        those chosen so far (see `open_views`)."""
         proven = self._run.proven()
         return tuple(str(shot) for shot in self._run.expected_shots() if shot not in proven)
+
+    @property
+    def open_views(self) -> tuple[str, ...]:
+        """Views for which more frames may yet be chosen; none where the plan names all frames."""
+        return tuple(self._run.open_views())
 
     def dataset(self, view: str) -> xr.Dataset:
         """All proven frames of a view as an xarray Dataset on dask: `pixels` [shot, y, x] uint16 DN, a chunk for

@@ -22,6 +22,7 @@ from coupole.intake.input_files import InputFiles
 from coupole.kinematics import Arm, forward
 from coupole.plan import yamlfile
 from coupole.plan.arm_description import arm_named
+from coupole.plan.choices import has_enough
 from coupole.plan.led_table import read_led_table
 from coupole.plan.plan import Plan
 from coupole.plan.rig import Rig
@@ -69,8 +70,10 @@ class AsPlanned:
         """Choices of the journal that the plan does not allow, or that name another time than it has."""
         choices = run.choices()
         for number, view in enumerate(self.schedule.views if self.schedule.is_open else ()):
-            open_view = self.schedule.open_view(number)
-            for chosen_burst in (burst for choice in choices.get(view.name, ()) for burst in choice.bursts):
+            open_view, view_choices = self.schedule.open_view(number), choices.get(view.name, ())
+            if has_enough(view_choices) and not any(choice.bursts for choice in view_choices):
+                yield f"the journal says that {view.name} has enough, though no frame was chosen for it"
+            for chosen_burst in (burst for choice in view_choices for burst in choice.bursts):
                 try:
                     open_view.burst_of(chosen_burst)
                 except KeyError as error:

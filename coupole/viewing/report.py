@@ -14,7 +14,7 @@ from coupole.pages.page_rendering import write_page
 from coupole.plan import yamlfile
 from coupole.plan.plan import Plan
 from coupole.storage import journal
-from coupole.storage.journal_events import Event, FrameProven, ViewBegun
+from coupole.storage.journal_events import BurstsChosen, Event, FrameProven, ViewBegun
 from coupole.storage.run import Run, name_without_time
 from coupole.storage.run_status import Status, status
 from coupole.viewing import report_facts as run_facts
@@ -65,7 +65,7 @@ def _page(run: Run, run_status: Status) -> Page:
         title=f"{run.about.get('object') or name_without_time(run.folder.name)}: {views_text} acquired",
         pictures=first_pictures(views),
         summary=_summary(run, run_status, views),
-        quality=_quality(run, views, object_coverage, lines),
+        quality=_quality(events, views, object_coverage, lines),
         next_step=_next_step(run, run_status, views, has_mesh=is_known),
         remark="Simulated: no real light, no real object." if run.is_simulated else "",
         facts=_glance(run, run_status, views, object_coverage, lines),
@@ -85,13 +85,13 @@ def _summary(run: Run, run_status: Status, views: Sequence[SampledView]) -> str:
 
 
 def _quality(
-    run: Run, views: Sequence[SampledView], object_coverage: Coverage | str, lines: Sequence[Inline]
+    events: Sequence[Event], views: Sequence[SampledView], object_coverage: Coverage | str, lines: Sequence[Inline]
 ) -> Inline:
     parts = [exposure_in_words(views) or "there is no picture yet"]
     if isinstance(object_coverage, Coverage):
         parts.append(coverage_in_words(object_coverage))
-    ends = {choices[-1].reason for choices in run.choices().values() if choices and not choices[-1].bursts}
-    parts += sorted(ends)[:_MOST_ENDS]
+    ends = dict.fromkeys(e.reason for e in events if isinstance(e, BurstsChosen) and not e.bursts)
+    parts += list(ends)[:_MOST_ENDS]
     parts.append(f"{_things(lines)} went wrong" if lines else "nothing went wrong")
     sentence = "; ".join(parts)
     return f"{sentence[0].upper()}{sentence[1:]}."

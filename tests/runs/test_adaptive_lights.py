@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from scipy.interpolate import RBFInterpolator
 from coupole.acquisition.frame_samples import frame_sample
 from coupole.plan.choices import Choice, FrameSample, refuse_beyond
 from coupole.plan.shot_id import ShotLabel
+from coupole.preflight.adaptive_lights import AdaptiveLightsChooser
 from coupole.preflight.choosers import chooser_of
 from coupole.preflight.job import read_job, without_hidden
 from coupole.storage.run import Run
@@ -238,6 +240,33 @@ def test_a_changed_choice_is_not_gone_on_with(whole: CellFolder, tmp_path: Path,
     ended = whole.acquire("--resume", run)
     assert ended.code == 6
     assert "a choice that its plan does not allow" in ended.err
+
+
+@pytest.mark.parametrize("model", in_part(["kuka", "ur10e"], "kuka"))
+def test_a_choice_that_takes_seconds_leaves_all_dark_and_at_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    """Longer than the box's watchdog, and than an arm in motion may be without news."""
+    cell = _cell(tmp_path, speed=1.0, until={"lights": 32})
+    if model != "kuka":
+        cell.moved_by_ur(model)
+    cell.rig_data["ledbox"]["settings"]["watchdog_s"] = 2.0
+    cell.write(views=[TOP])
+    choose = AdaptiveLightsChooser.choose
+
+    def think(chooser: AdaptiveLightsChooser, *arguments: Any) -> Choice:
+        if arguments[1]:  # not of the first burst, which is chosen before the arm moves
+            time.sleep(4.0)
+        return choose(chooser, *arguments)
+
+    monkeypatch.setattr(AdaptiveLightsChooser, "choose", think)
+    ended = cell.acquire()
+    assert ended.code == 0, ended.err
+    assert ended.document["reshot"] == 0
+    assert verify(Run(cell.run_folder)).ok
+    bursts = cells.events(cell.run_folder, "burst")
+    lit_s = 32 * 0.02
+    assert sum(burst["on_s"] for burst in bursts) < lit_s, "no lamp stays on while it thinks"
 
 
 def test_what_a_plan_may_cost_is_said_to_be_the_most(whole: CellFolder) -> None:

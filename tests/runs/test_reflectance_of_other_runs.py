@@ -137,3 +137,12 @@ def test_frames_are_not_read_otherwise_than_those_that_powers_come_from(
     ended = cells.here("reflectance", aged.run_folder, *words, "--out", tmp_path / "result")
     assert ended.code == 2
     assert f"{kind}.yaml too" in " ".join(ended.err.split())
+
+
+def test_records_of_another_camera_are_refused(tmp_path: Path) -> None:
+    cell = CellFolder(tmp_path, speed=10.0)
+    cell.write(lights={"kind": "every", "every": 360})
+    assert cell.acquire().code == 0
+    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
+    assert ended.code == 2
+    assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())

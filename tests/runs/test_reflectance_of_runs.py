@@ -14,7 +14,6 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from cells import CellFolder
 from dask_cluster import cluster
 from relief_cells import DIFFUSE, F0, RECORDS, ROUGHNESS, SIDE, Made, glossy_result, shipped_cell, unit, walter
 
@@ -378,15 +377,6 @@ def test_runs_without_what_is_needed_are_refused_with_the_remedy(made: Made, tmp
     elsewhere = trimesh.creation.box(bounds=[[4e3, 0, 0], [4.1e3, 10, 10]])
     elsewhere.export(tmp_path / "elsewhere.ply")
     assert "shows the mesh" in refused(cell.run_folder, *records, "--mesh", tmp_path / "elsewhere.ply")
-
-
-def test_records_of_another_camera_are_refused(made: Made, tmp_path: Path) -> None:
-    cell = CellFolder(tmp_path, speed=10.0)
-    cell.write(lights={"kind": "every", "every": 360})
-    assert cell.acquire().code == 0
-    ended = cells.here("reflectance", cell.run_folder, "--calibrations", RECORDS, "--out", tmp_path / "result")
-    assert ended.code == 2
-    assert "frames of 512 x 384 pixels" in " ".join(ended.err.split())
 
 
 def test_a_frame_that_is_not_the_one_that_was_proven_is_refused(made: Made, tmp_path: Path) -> None:

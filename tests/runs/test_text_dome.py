@@ -61,7 +61,7 @@ def test_the_run_says_wherever_it_is_asked_that_its_proof_is_of_the_weaker_kind(
         assert file["entry"].attrs["proof"] == PROOF
     assert cells.here("status", run, "--json").document["proof"] == PROOF
     assert cells.here("verify", run, "--json").document["proof"] == PROOF
-    assert "one light, one exposure, one frame; host&#x27;s clock" in (run / "report.html").read_text()
+    assert "one light, one exposure, one frame; host&#39;s clock" in (run / "report.html").read_text()
     for what in ("status", "verify"):
         said = cells.here(what, run)
         assert PROOF in re.sub(r"\s+", " ", said.out + said.err), what

@@ -22,6 +22,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from coupole.calibration.optics import NAMES, Intrinsics
 from coupole.calibration.rotations import moved_transforms, rotation
 from coupole.errors import InputError
+from coupole.geometry import farthest_first
 from coupole.reflectance.extraction.pointing import Doubts
 
 Floats = NDArray[np.float64]
@@ -169,16 +170,17 @@ def vertex_normals(vertices_mm: Floats, triangles: NDArray[np.uint32]) -> Floats
 def control_points(points_mm: Floats, spacing_mm: float) -> Floats:
     """Some of points [n, 3], each the farthest from those before it, until all others are within `spacing_mm` of
     one. Raises InputError if that takes more than `MOST_CONTROLS`."""
-    indices = [int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))]
-    far = np.linalg.norm(points_mm - points_mm[indices[0]], axis=1)
-    while far.max() > spacing_mm and len(indices) < MOST_CONTROLS:
-        indices.append(int(far.argmax()))
-        far = np.minimum(far, np.linalg.norm(points_mm - points_mm[indices[-1]], axis=1))
-    if far.max() > spacing_mm:
-        raise InputError(
-            f"--scale-mm: expected {np.ceil(far.max()):g} or more for an object of this size, got {spacing_mm:g}; "
-            f"the surface is refined at {MOST_CONTROLS} points at most"
-        )
+    middle = int(np.argmin(np.sum((points_mm - points_mm.mean(axis=0)) ** 2, axis=1)))
+    indices: list[int] = []
+    for index, far_mm in farthest_first(points_mm, middle):
+        if far_mm <= spacing_mm:
+            break
+        if len(indices) == MOST_CONTROLS:
+            raise InputError(
+                f"--scale-mm: expected {np.ceil(far_mm):g} or more for an object of this size, "
+                f"got {spacing_mm:g}; the surface is refined at {MOST_CONTROLS} points at most"
+            )
+        indices.append(index)
     return points_mm[indices]
 
 

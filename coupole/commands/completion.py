@@ -37,6 +37,16 @@ def templates(incomplete: str) -> list[str]:
     return _beginning({*TEMPLATES, LEDS}, incomplete)
 
 
+def supposed_materials(incomplete: str) -> list[str]:
+    """Materials of `coupole plan suggest`."""
+    return _beginning({"matt", "glossy", "metal", "unknown"}, incomplete)
+
+
+def mesh_units(incomplete: str) -> list[str]:
+    """Units of meshes."""
+    return _beginning({"mm", "m", "um"}, incomplete)
+
+
 def schemas(incomplete: str) -> list[str]:
     """Files of which `coupole schema` has a schema."""
     return _beginning({"plan", "rig"}, incomplete)

@@ -8,6 +8,10 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     # plan and acquire
     "plan": ("plan new first", "plan new lights --template leds --rig sim"),
     "plan new": ("plan new first", "plan new lights --template leds --rig sim"),
+    "plan suggest": (
+        "plan suggest vase.ply --centre --material glossy --budget 4h --dose 200",
+        "plan suggest vase.ply --rig my-cell.yaml --calibrations records --name vase-2026",
+    ),
     "schema": ("schema plan", "schema rig"),
     "check": ("check first.yaml", "check first.yaml --no-paths --json"),
     "view": ("view first.yaml --show", "view first.yaml --out drawn --no-paths"),

@@ -12,10 +12,12 @@ import typer
 
 from coupole.commands.common import JsonOption, PlanPath, RigOption, fail, plan_of
 from coupole.commands.completion import plans, runs, schemas, templates
+from coupole.commands.suggest_plan import plan_suggest
 from coupole.errors import InputError, PreflightRefused
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
-plan_app = typer.Typer(help="Plan templates.", no_args_is_help=True)
+plan_app = typer.Typer(help="Plans to start from.", no_args_is_help=True)
+plan_app.command("suggest")(plan_suggest)
 
 
 def check(

@@ -147,7 +147,7 @@ def plan_itinerary(
     refusals = _rig_refusals(rig)
     choices: dict[int, NDArray[np.float64]] = {}
     for index, view in enumerate(views):
-        postures, why_not = _postures(view, rig, bodies)
+        postures, why_not = postures_of(view, rig, bodies)
         if why_not:
             refusals.append(f"view {view.name}: {why_not}")
         else:
@@ -183,7 +183,7 @@ def _rig_refusals(rig: Rig) -> list[str]:
     return refusals
 
 
-def _postures(view: ViewPose, rig: Rig, bodies: CellBodies | None) -> tuple[NDArray[np.float64], str]:
+def postures_of(view: ViewPose, rig: Rig, bodies: CellBodies | None) -> tuple[NDArray[np.float64], str]:
     """Joint angles [k, 6] of a view without contacts and singularities, or the reason why there are none."""
     arm = arm_of(rig)
     if view.joints_deg is not None:

@@ -43,7 +43,7 @@ _FEWEST_GROUPS = 6
 _LEAST_KS = 1e-3
 """Least ks, as a share of kd: below it the logarithm's covariance would say nothing of the highlight that may be
 there."""
-_LEAST_KNOWN = 1e-2
+LEAST_KNOWN = 1e-2
 """1 over the variance of the logarithm of a kd of which the samples say nothing."""
 _PART = 256
 
@@ -165,8 +165,8 @@ def _fill(  # type: ignore[no-untyped-def]
         for tilt in range(2):
             bread[tilt, tilt] += normal_stiffness[triangle]
             meat[tilt, tilt] += normal_stiffness[triangle] * normal_stiffness[triangle] / prior[triangle]
-        bread[2, 2] += _LEAST_KNOWN
-        meat[2, 2] += _LEAST_KNOWN
+        bread[2, 2] += LEAST_KNOWN
+        meat[2, 2] += LEAST_KNOWN
         bread[3, 3] += USUAL / SPREAD_KS**2
         meat[3, 3] += USUAL / SPREAD_KS**2
         bread[4, 4] += USUAL

@@ -204,7 +204,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
         _drift(by_kind.get("drift")),
         run.is_simulated and _direct_light_alone(files.cell.rig),
         prior,
-        _u_signal(by_kind),
+        u_signal_of(by_kind),
     )
 
 
@@ -280,7 +280,7 @@ def _drift(path: Path | None) -> Drift:
     return Drift(*(record.value(name) for name in ("level", "rate_per_h", "per_k", "start_s")))
 
 
-def _u_signal(records: Mapping[str, Path]) -> float:
+def u_signal_of(records: Mapping[str, Path]) -> float:
     """Return the uncertainty of the signal, from the figures with which records of the kinds in `U_SIGNAL` were
     accepted."""
     square = 0.0

@@ -1,0 +1,97 @@
+"""Views from which a suggestion is chosen: directions round targets on the object, as far as the arm gets there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.geometry import direction, farthest_first
+from coupole.motion.itinerary import postures_of
+from coupole.plan.plan import LookAt
+from coupole.plan.rig import Rig
+from coupole.plan.schedule import expand_view
+from coupole.preflight.job import Job
+from coupole.reflectance.suggestion.supposed_signal import SeenParts, SupposedCell, Surface
+
+Floats = NDArray[np.float64]
+
+ELEVATIONS_DEG = {85: 1, 65: 6, 45: 8, 25: 8}
+"""Elevations of candidates, and how many azimuths each has."""
+_FIRST_AZIMUTH_DEG = -90.0
+_FIELD_SHARE = 0.45
+"""Distance from a target, as a share of the shorter side of the field, within which a view shows the surface."""
+_LEAST_FACING = 0.25
+"""Least cosine between a target's normal and the direction of a view, where there are several targets."""
+_MOST_TARGETS = 40
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A view that may be taken, and what it would see."""
+
+    view: LookAt
+    seen: SeenParts
+
+
+def candidates_of(job: Job, cell: SupposedCell, say: Callable[[str, int, int], None]) -> list[Candidate]:
+    """All views that the arm can take without contact and that see something in focus; none if there is no such
+    view."""
+    wanted = list(_directions(cell.surface, cell.rig))
+    found = []
+    for number, view in enumerate(wanted, start=1):
+        say("views that the arm can take", number, len(wanted))
+        pose = expand_view(view)[0]
+        postures, why_not = postures_of(pose, cell.rig, job.motion.bodies)
+        if why_not or pose.support_from_camera is None:
+            continue
+        seen = cell.seen_by(postures[0], pose.support_from_camera)
+        if (seen.pixels > 0.0).any():
+            found.append(Candidate(view, seen))
+    return found
+
+
+def field_mm(rig: Rig) -> float:
+    """Shorter side of what the camera shows at its focus."""
+    image_mm = 1.0 / (1.0 / rig.lens.focal_length_mm - 1.0 / rig.lens.focus_distance_mm)
+    sensor_mm = min(rig.sensor.width_px, rig.sensor.height_px) * rig.sensor.pixel_pitch_um * 1e-3
+    return sensor_mm * rig.lens.focus_distance_mm / image_mm
+
+
+def _directions(surface: Surface, rig: Rig) -> Iterator[LookAt]:
+    targets = _targets(surface, _FIELD_SHARE * field_mm(rig))
+    for number, (target_mm, normal) in enumerate(targets, start=1):
+        for elevation_deg, azimuths in ELEVATIONS_DEG.items():
+            for k in range(azimuths):
+                azimuth_deg = (_FIRST_AZIMUTH_DEG + 360.0 * k / azimuths + 180.0) % 360.0 - 180.0
+                if normal is not None and direction(azimuth_deg, elevation_deg) @ normal < _LEAST_FACING:
+                    continue
+                place = f"t{number:02d}-" if len(targets) > 1 else ""
+                yield LookAt(
+                    kind="look_at",
+                    name=f"{place}az{round(azimuth_deg) % 360:03d}-el{elevation_deg:02d}",
+                    target_mm=(target_mm[0], target_mm[1], target_mm[2]),
+                    distance_mm=rig.lens.focus_distance_mm,
+                    azimuth_deg=azimuth_deg,
+                    elevation_deg=elevation_deg,
+                )
+
+
+def _targets(surface: Surface, reach_mm: float) -> list[tuple[list[float], Floats | None]]:
+    """Points to look at, and the normal there; one in the middle, without a normal, if a view shows all from it."""
+    points_mm = surface.points_mm
+    middle_mm = (points_mm.min(axis=0) + points_mm.max(axis=0)) / 2.0
+    if np.linalg.norm(points_mm - middle_mm, axis=1).max() <= reach_mm:
+        return [(_rounded(middle_mm), None)]
+    targets = []
+    for part, distance_mm in farthest_first(points_mm, int(np.argmax(points_mm[:, 2]))):
+        if distance_mm <= reach_mm or len(targets) == _MOST_TARGETS:
+            break
+        targets.append((_rounded(points_mm[part]), surface.normals[part]))
+    return targets
+
+
+def _rounded(point_mm: Floats) -> list[float]:
+    return [round(float(value), 1) + 0.0 for value in point_mm]

@@ -1,0 +1,328 @@
+"""Suggests a plan for an object: views, LEDs and exposures that tell most of it within a budget.
+
+For each exposure and number of LEDs that come into question, views are chosen until time or light are used up, or
+a further view tells little more (`view_choice`); preflight says what a view costs. The best of these plans is
+checked with paths; views to which there are none are replaced.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.errors import InputError, PreflightRefused
+from coupole.geometry import farthest_first
+from coupole.plan.plan import LookAt
+from coupole.preflight.checking import StorageFacts, calibration_refusals, check_job
+from coupole.preflight.job import Job, read_job
+from coupole.preflight.preflight import Report
+from coupole.reflectance.run_job import HELD_OUT_EVERY
+from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
+from coupole.reflectance.suggestion.expected_uncertainty import (
+    Information,
+    information_of,
+    prior_information,
+    signal_quantile,
+)
+from coupole.reflectance.suggestion.plan_text import PlanText
+from coupole.reflectance.suggestion.rehearsal import ExpectedUncertainty, rehearse
+from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial, supposed_materials
+from coupole.reflectance.suggestion.supposed_signal import SupposedCell, Surface
+from coupole.reflectance.suggestion.view_choice import ViewChoice, choose_views
+
+Said = Callable[[str, int, int], None]
+
+LED_NUMBERS = (60, 120, 240, 480)
+"""Numbers of LEDs that are tried beside all."""
+LONGER = 8
+"""Factor between the exposures that are tried: the shorter one saturates nothing."""
+_SATURATED_SHARE = 1e-3
+"""Share of samples that may be brighter than the shorter exposure can hold."""
+_FULL = 0.85
+"""Share of the camera's range that these reach."""
+_ROUNDS = 8
+_TRIAL_VIEWS = 3
+_ENDLESS = StorageFacts(free_bytes=1 << 60)
+_SAME = 0.02
+"""Plans whose values differ by less are equally good; the shortest is taken."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a plan may cost."""
+
+    seconds: float
+    lux_h: float | None = None
+    views: int = 24
+
+
+@dataclass(frozen=True)
+class SuggestionRequest:
+    """What is asked for."""
+
+    text: PlanText
+    """Names of the files, as the plan will have them."""
+    path: Path
+    """Where the plan will be written; its relative paths begin there."""
+    material: str
+    """One of `supposed_materials.SUPPOSED`, or `unknown`."""
+    budget: Budget
+    scan_noise_um: float = 30.0
+    """Standard uncertainty of each coordinate of the mesh's vertices."""
+
+
+class Settings(NamedTuple):
+    """What a plan may have beside its views."""
+
+    exposures_us: tuple[int, ...]
+    leds: int
+    """Place in the numbers of LEDs."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A plan, and what it promises."""
+
+    text: str
+    """The plan's YAML."""
+    report: Report
+    """Preflight's, with paths."""
+    views: tuple[LookAt, ...]
+    """In the order of their worth."""
+    exposures_us: tuple[int, ...]
+    leds: int
+    surface: Surface
+    views_of_part: NDArray[np.int64]
+    """[n] number of views that see each part of the surface."""
+    expected: dict[str, ExpectedUncertainty]
+    """By name of the supposed material."""
+    job: Job
+
+    @property
+    def known_share(self) -> float:
+        """Share of the mesh's triangles that get a material, for the material that fewest get it of."""
+        weights = self.surface.triangles
+        shares = [weights[np.isfinite(u.normal_deg)].sum() / weights.sum() for u in self.expected.values()]
+        return float(min(shares))
+
+    def medians(self) -> dict[str, dict[str, float | None]]:
+        """Median standard uncertainties of the triangles that get a material, by supposed material; None without
+        any."""
+        return {
+            name: {key: _median(values, self.surface.triangles) for key, values in vars(uncertainty).items()}
+            for name, uncertainty in self.expected.items()
+        }
+
+    def figures(self) -> dict[str, Any]:
+        """JSON's values only."""
+        return {
+            "views": [view.name for view in self.views],
+            "leds": self.leds,
+            "exposures_us": list(self.exposures_us),
+            "duration_s": self.report.duration_s,
+            "dose_lux_h": self.report.dose_lux_h,
+            "frames": self.report.frames,
+            "bytes": self.report.bytes,
+            "known_share": self.known_share,
+            "expected": self.medians(),
+            "warnings": self.report.warnings,
+        }
+
+
+def suggest_plan(request: SuggestionRequest, say: Said = lambda step, done, of: None) -> Suggestion:
+    """Raises InputError if no view is possible, or a record is missing; PreflightRefused if the budget allows not
+    even one view, or the cell's records are not valid."""
+    first = LookAt(kind="look_at", name="first", target_mm=(0, 0, 0), distance_mm=300, azimuth_deg=0, elevation_deg=80)
+    job = read_job(request.path, text=request.text.with_views([first], (1000,), None))
+    if refusals := calibration_refusals(job):
+        raise PreflightRefused(refusals)
+    cell = SupposedCell(job)
+    candidates = candidates_of(job, cell, say)
+    if not candidates:
+        raise InputError(
+            f"{request.text.mesh}: the arm can take no view of it at the camera's focus of "
+            f"{cell.rig.lens.focus_distance_mm:g} mm. Is its place on the support right, and its unit?"
+        )
+    trial = _Trial(request, job, cell, candidates, say)
+    return trial.best()
+
+
+class _Trial:
+    """The plans that are compared."""
+
+    def __init__(
+        self, request: SuggestionRequest, job: Job, cell: SupposedCell, candidates: list[Candidate], say: Said
+    ) -> None:
+        self._request, self._job, self._candidates, self._say = request, job, candidates, say
+        self._surface = cell.surface
+        self._materials = supposed_materials(request.material)
+        leds = job.cell.leds
+        self._order = np.array([row for row, _ in farthest_first(leds.positions_mm, 0)])
+        self._numbers = [*(number for number in LED_NUMBERS if number < len(self._order)), len(self._order)]
+        fitted_share = 1.0 - 1.0 / HELD_OUT_EVERY  # the others are kept for the check
+        self._fitted_numbers = [round(fitted_share * number) for number in self._numbers]
+        self._priors = [prior_information(self._surface, request.scan_noise_um) for _ in self._materials]
+        self._exposures = self._exposures_to_try()
+
+    def best(self) -> Suggestion:
+        """The best plan, checked."""
+        choices = self._choices()
+        if not choices:
+            raise PreflightRefused(
+                [f"the budget of {self._request.budget.seconds / 60:.3g} min allows not one view with "
+                 f"{self._numbers[0]} LEDs"]
+            )  # fmt: skip
+        most_value = max(choice.value for choice, _ in choices.values())
+        good = {settings: cost for settings, (choice, cost) in choices.items() if choice.value > most_value - _SAME}
+        settings = min(good, key=lambda one: good[one] * len(choices[one][0].views))
+        return self._with_paths(settings, good[settings])
+
+    def _exposures_to_try(self) -> list[tuple[int, ...]]:
+        """Short, long, and both; for several materials the short one of the brightest, the long of the darkest."""
+        noise, limits = self._surface.noise, self._job.cell.rig.led_limits.on_us
+        seen = [candidate.seen for candidate in self._candidates]
+        brightest = [
+            signal_quantile(self._surface, seen, material, 1.0 - _SATURATED_SHARE)
+            for material in self._materials.values()
+        ]
+        longest_us = min(limits[1], 2_000_000)
+
+        def exposure_us(dn_per_s: float) -> int:
+            wanted_us = _FULL * noise.most_dn / dn_per_s * 1e6
+            digits = 10 ** max(0, math.floor(math.log10(max(wanted_us, 1.0))) - 1)
+            return int(np.clip(math.floor(wanted_us / digits) * digits, max(limits[0], 10), longest_us))
+
+        short_us, long_us = exposure_us(max(brightest)), exposure_us(min(brightest) / LONGER)
+        return [(short_us,)] if long_us <= short_us else [(short_us,), (long_us,), (short_us, long_us)]
+
+    def _choices(self) -> dict[Settings, tuple[ViewChoice, float]]:
+        """Choice and time of a view, for all settings of which one view is within the budget."""
+        choices = {}
+        for count, exposures_us in enumerate(self._exposures, start=1):
+            information = self._information(exposures_us, f"what views tell, exposure {count} of {len(self._exposures)}")
+            for leds in range(len(self._numbers)):
+                settings = Settings(exposures_us, leds)
+                most, view_s = self._most_views(settings)
+                if most > 0:
+                    choices[settings] = self._choose(information, leds, most, range(len(self._candidates))), view_s
+        return choices
+
+    def _information(self, exposures_us: tuple[int, ...], step: str) -> list[list[Information]]:
+        """[candidates][materials]"""
+        pairs = list(product(self._candidates, self._materials.values()))
+
+        def tell(pair: tuple[Candidate, SupposedMaterial]) -> Information:
+            candidate, material = pair
+            return information_of(
+                self._surface, candidate.seen, material, exposures_us, self._order, self._fitted_numbers
+            )
+
+        parts = []
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            for number, part in enumerate(pool.map(tell, pairs), start=1):
+                self._say(step, number, len(pairs))
+                parts.append(part)
+        count = len(self._materials)
+        return [parts[first : first + count] for first in range(0, len(parts), count)]
+
+    def _choose(
+        self, information: list[list[Information]], leds: int, most: int, allowed: Sequence[int]
+    ) -> ViewChoice:
+        some = [[of_material.at(leds) for of_material in information[number]] for number in allowed]
+        choice = choose_views(some, self._priors, self._surface.triangles, most)
+        return replace(choice, views=tuple(allowed[number] for number in choice.views))
+
+    def _most_views(self, settings: Settings) -> tuple[int, float]:
+        """Number of views that the budget allows, and the time of one, by preflight without paths."""
+        budget = self._request.budget
+        some = [candidate.view for candidate in self._candidates[: _TRIAL_VIEWS]]
+        _, report = self._checked(some, settings, paths=False)
+        view_s, view_lux_h = report.duration_s / len(some), report.dose_lux_h / len(some)
+        by_time = int(budget.seconds / view_s)
+        by_light = budget.views if budget.lux_h is None else int(budget.lux_h / max(view_lux_h, 1e-9))
+        return min(by_time, by_light, budget.views), view_s
+
+    def _checked(self, views: Sequence[LookAt], settings: Settings, *, paths: bool) -> tuple[Job, Report]:
+        return check_job(read_job(self._request.path, text=self._text(views, settings)), _ENDLESS, paths=paths)
+
+    def _text(self, views: Sequence[LookAt], settings: Settings, *remarks: str) -> str:
+        number = self._numbers[settings.leds]
+        rows = None if number == len(self._order) else self._order[:number]
+        ids = None if rows is None else sorted(self._job.cell.leds.ids[rows].tolist())
+        return self._request.text.with_views(views, settings.exposures_us, ids, remarks)
+
+    def _with_paths(self, settings: Settings, view_s: float) -> Suggestion:
+        """The suggestion of these settings, with views to which there are paths, within the budget."""
+        information = self._information(settings.exposures_us, "what views tell, of the chosen exposure")
+        allowed = list(range(len(self._candidates)))
+        most, budget = self._most_views(settings)[0], self._request.budget
+        for number in range(1, _ROUNDS + 1):
+            self._say("paths to the views", number, _ROUNDS)
+            choice = self._choose(information, settings.leds, most, allowed)
+            views = [self._candidates[number].view for number in choice.views]
+            if not views:
+                break
+            job, report = self._checked(views, settings, paths=True)
+            cut_off = {view.name for view in report.views if view.joints_deg is None}
+            if not cut_off and report.refusals:
+                raise PreflightRefused(report.refusals)
+            if cut_off:
+                allowed = [place for place in allowed if self._candidates[place].view.name not in cut_off]
+            elif report.duration_s > budget.seconds or report.dose_lux_h > (budget.lux_h or math.inf):
+                most = len(views) - 1
+            else:
+                return self._suggestion(settings, choice, job, report)
+        raise PreflightRefused([f"no plan within the budget was found in {_ROUNDS} rounds: {view_s:.0f} s a view"])
+
+    def _suggestion(
+        self, settings: Settings, choice: ViewChoice, job: Job, report: Report
+    ) -> Suggestion:
+        self._say("samples that are drawn, and their fits", 0, len(self._materials))
+        seen = [self._candidates[view].seen for view in choice.views]
+        led_rows = self._order[: self._fitted_numbers[settings.leds]]
+        expected = {}
+        for number, (name, material) in enumerate(self._materials.items(), start=1):
+            expected[name] = rehearse(
+                self._surface, seen, material, settings.exposures_us, led_rows, self._request.scan_noise_um
+            )
+            self._say("samples that are drawn, and their fits", number, len(self._materials))
+        views = [self._candidates[view].view for view in choice.views]
+        counts = np.sum([of_view.pixels > 0.0 for of_view in seen], axis=0)
+        suggestion = Suggestion(
+            "", report, tuple(views), settings.exposures_us, self._numbers[settings.leds], self._surface, counts,
+            expected, job,
+        )  # fmt: skip
+        remarks = ["Suggested by `coupole plan suggest`.", *_promises(suggestion.medians())]
+        return replace(suggestion, text=self._text(views, settings, *remarks))
+
+
+def _promises(medians: dict[str, dict[str, float | None]]) -> list[str]:
+    """A line for each supposed material."""
+    lines = []
+    for name, figures in medians.items():
+        if (normal_deg := figures["normal_deg"]) is None:
+            continue
+        shares = (f"{key} {figures[f'{key}_percent']:.2g} %" for key in ("kd", "ks", "alpha"))
+        lines.append(
+            f"Expected if {name}, median standard uncertainty: normal {normal_deg:.2g} degrees, {', '.join(shares)}."
+        )
+    return lines
+
+
+def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float | None:
+    """Weighted median of the known values."""
+    is_known = np.isfinite(values)
+    if not is_known.any():
+        return None
+    order = np.argsort(values[is_known])
+    cumulative = np.cumsum(weights[is_known][order])
+    return float(values[is_known][order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])

@@ -1,0 +1,185 @@
+"""The signal that a cell gives of parts of an object's surface, and its noise, by the records in force.
+
+Power of each LED from the record `led-power`, noise from the record `response`, shadows of the object, the arm and
+the tool by `coupole.motion.occlusion`. What is not in it: light from surface to surface, glare, and errors of the
+mesh and of the records beside the LEDs' own power.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.calibration.light.frames import channels_of
+from coupole.calibration.light.irradiance import irradiance_per_flux
+from coupole.calibration.record import Record
+from coupole.errors import InputError
+from coupole.geometry import apply, inverse
+from coupole.motion.occlusion import REACHED, Occlusion, Occlusions, Sight, sight_of
+from coupole.motion.patches import Patches
+from coupole.plan.rig import Sensor
+from coupole.preflight.framing import depth_of_field_mm
+from coupole.preflight.job import Job
+from coupole.reflectance.extraction.measured_run import Powers, emission_of, read_powers, u_signal_of
+from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT
+
+Floats = NDArray[np.float64]
+
+LEAST_COSINE = 0.1
+"""Least cosine between view and normal: what the extraction uses."""
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """Variance of a pixel at a signal of s DN above black, by channel: in_dark + gain s."""
+
+    in_dark_dn2: Floats
+    """[channels]"""
+    gain_dn: Floats
+    """[channels] DN per electron."""
+    least_dn: float
+    """Signal above black below which a mean is not used."""
+    most_dn: float
+    """Signal above black at which a pixel is not used."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """An object's surface in a cell, in n parts, each with one of the mesh's triangles."""
+
+    points_mm: Floats
+    """[n, 3] support frame."""
+    normals: Floats
+    """[n, 3] unit."""
+    triangle_areas_mm2: Floats
+    """[n] of the triangle of each part."""
+    triangles: Floats
+    """[n] number of triangles of each part."""
+    leds_mm: Floats
+    """[leds, 3] support frame, in the order of the dome's table."""
+    signal_per_f: Floats
+    """[n, leds, channels] DN/s above black of a reflectance of 1/sr; cosine of incidence included."""
+    u_own: Floats
+    """[leds] relative standard uncertainty of an LED's own power."""
+    u_shared: float
+    """Relative standard uncertainty of what all LEDs share."""
+    u_led_mm: float
+    """Standard uncertainty of each coordinate of an LED's centre."""
+    noise: CameraNoise
+    channel_share: Floats
+    """[channels] share of the pixels that have this colour."""
+
+
+@dataclass(frozen=True)
+class SeenParts:
+    """Parts of the surface as one view has them."""
+
+    camera_mm: Floats
+    """[3] support frame."""
+    pixels: Floats
+    """[n] pixels of a triangle, all channels; 0 where the view does not see the part."""
+    is_lit: NDArray[np.bool_]
+    """[n, leds]"""
+
+
+class SupposedCell:
+    """A job's cell, asked for what views would see. Raises InputError if a record that it takes is not named."""
+
+    def __init__(self, job: Job) -> None:
+        self._job, self.rig = job, job.cell.rig
+        records = {item.record.kind: item for item in job.calibrations or ()}
+        if missing := [kind for kind in ("led-power", "response", "leds") if kind not in records]:
+            raise InputError(
+                f"expected calibration records of the kinds led-power, response and leds, and none is of the kind "
+                f"{missing[0]}: name the cell's records with --calibrations, or under `calibrations:` of the rig"
+            )
+        self._power_path, self._power = records["led-power"].path, records["led-power"].record
+        self._response, self._leds = records["response"].record, records["leds"].record
+        self._u_signal = u_signal_of({kind: item.path for kind, item in records.items()})
+
+    @cached_property
+    def occlusions(self) -> Occlusions:
+        return self._job.motion.occlusions
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The parts, and the light that reaches them where nothing shades them."""
+        patches, leds = self.occlusions.patches, self._job.cell.leds
+        support_from_base = inverse(self.rig.support.base_from_support.matrix())
+        leds_mm = apply(support_from_base, leds.positions_mm)
+        axes = leds.normals @ support_from_base[:3, :3].T
+        channels, channel_share = _channels(self.rig.sensor)
+        powers: Powers = read_powers(self._power_path, channels).of(leds.ids)
+        per_flux = np.stack(
+            [
+                irradiance_per_flux(point, normal, leds_mm, axes, emission=emission_of(self._power))
+                for point, normal in zip(patches.points_mm, patches.normals, strict=True)
+            ]
+        )
+        triangles, areas_mm2 = _triangles_of_parts(patches, self._job.shape.corners_mm)
+        return Surface(
+            patches.points_mm,
+            patches.normals,
+            areas_mm2,
+            triangles,
+            leds_mm,
+            per_flux[:, :, None] * np.nan_to_num(powers.power)[None],
+            np.nan_to_num(powers.u_own.mean(axis=1)),
+            float(np.nanmean(np.hypot(powers.u_shared, self._u_signal))),
+            self._leds.value("led_centre_median_u_mm"),
+            _camera_noise(self.rig.sensor, self._response, channels),
+            channel_share,
+        )
+
+    def seen_by(self, joints_deg: Floats, support_from_camera: Floats) -> SeenParts:
+        """The parts that a view sees with the arm in this posture."""
+        occlusion: Occlusion = self.occlusions.at(joints_deg)
+        sight = sight_of(self.rig, support_from_camera)
+        pixels = np.where(occlusion.is_seen, self._pixels(sight), 0.0)
+        return SeenParts(support_from_camera[:3, 3], pixels, occlusion.codes == REACHED)
+
+    def _pixels(self, sight: Sight) -> Floats:
+        """[n] pixels that a triangle of each part covers; 0 where it is out of focus, or seen too obliquely."""
+        ways = sight.support_from_camera[:3, 3] - self.surface.points_mm
+        distance_mm = np.linalg.norm(ways, axis=1)
+        depth_mm = -ways @ sight.support_from_camera[:3, 2]
+        cosine = np.sum(ways * self.surface.normals, axis=1) / distance_mm
+        near_mm, far_mm = depth_of_field_mm(self.rig.lens, self.rig.sensor.pixel_pitch_um)
+        is_used = (cosine > LEAST_COSINE) & (depth_mm >= near_mm) & (depth_mm <= far_mm)
+        scale = sight.focal_px**2 * distance_mm / np.maximum(depth_mm, 1.0) ** 3
+        pixels: Floats = np.where(is_used, self.surface.triangle_areas_mm2 * cosine * scale, 0.0)
+        return pixels
+
+
+def _triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, Floats]:
+    """[n] number of triangles of each part, where one that lies in several counts in each by its share, and their
+    mean area, mm^2."""
+    across = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    areas_mm2 = 0.5 * np.linalg.norm(across, axis=1)
+    share = 1.0 / np.bincount(patches.piece_triangle, minlength=len(corners_mm))[patches.piece_triangle]
+    count = len(patches.points_mm)
+    triangles = np.bincount(patches.piece_patch, share, count)
+    sums_mm2 = np.bincount(patches.piece_patch, share * areas_mm2[patches.piece_triangle], count)
+    return triangles, sums_mm2 / triangles
+
+
+def _channels(sensor: Sensor) -> tuple[Sequence[str], Floats]:
+    """Names of the channels, as records have them, and the share of the pixels that each has."""
+    channels = channels_of(sensor.bayer_pattern)
+    shares = {"R": 0.25, "G": 0.5, "B": 0.25}
+    return channels, np.array([shares[channel] for channel in channels] if len(channels) > 1 else [1.0])
+
+
+def _camera_noise(sensor: Sensor, response: Record, channels: Sequence[str]) -> CameraNoise:
+    range_dn = sensor.white_dn - sensor.black_dn
+    left_out_dn = RANGE_LEFT_OUT * range_dn
+    return CameraNoise(
+        np.array([response.value(f"dark_variance_dn2.{channel}") for channel in channels]),
+        np.array([response.value(f"gain_dn_per_e.{channel}") for channel in channels]),
+        left_out_dn,
+        range_dn - left_out_dn,
+    )

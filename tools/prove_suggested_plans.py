@@ -1,0 +1,98 @@
+"""Proves what `coupole plan suggest` promises, by runs of the suggested plans in the simulated cell.
+
+    python tools/prove_suggested_plans.py [--cases N] [--budget TIME] [--keep FOLDER]
+
+Three meshes, each of one of the supposed materials: a plan is suggested, acquired, and its reflectance is fitted, by
+the commands that a user has. The medians of the uncertainties that the result states are compared with the promised
+ones. The rendered highlights have Fresnel's term, LEDs and arm stand where they do, and not where the records say.
+Exits with 1 unless each ratio is within a fifth of 1; not with `--smallest`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import trimesh
+from rich.console import Console
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from coupole.reflectance.suggestion.supposed_materials import SUPPOSED  # noqa: E402
+from smallest import add_smallest  # noqa: E402
+
+CASES = (("relief", "objects/relief.ply", "glossy"), ("plaque", "objects/plaque.ply", "metal"),
+         ("bust", "restorations/bust.ply", "matt"))  # fmt: skip
+MOST_OFF = 0.2
+CONFIGS = ROOT / "configs"
+FIGURES = ("normal_deg", "kd_percent", "ks_percent", "alpha_percent")
+
+
+def write_cell(folder: Path, mesh: str, material: str) -> None:
+    """The simulated cell with an object of one material, and the object's mesh without colours."""
+    supposed, pi = SUPPOSED[material], 3.141592653589793
+    colour, f0 = [round(supposed.kd * pi, 4)] * 3, [supposed.ks] * 3
+    settings = f"    material: {{diffuse: {colour}, f0: {f0}, roughness: {supposed.alpha}}}\n"
+    text = (CONFIGS / "rigs" / "sim.yaml").read_text()
+    text = text.replace("../domes", str(CONFIGS / "domes")).replace("../../runs", str(folder / "runs"))
+    place = text.index("    white_at_us:")
+    (folder / "rig.yaml").write_text(text[:place] + settings + text[place:])
+    whole = trimesh.load(CONFIGS / mesh, process=False)
+    trimesh.Trimesh(whole.vertices, whole.faces, process=False).export(folder / "object.ply")
+
+
+def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Run a command there; its JSON."""
+    command = [sys.executable, "-m", "coupole.commands.cli", *arguments, "--json"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{' '.join(arguments)} ended with {done.returncode}: {done.stderr[-2000:] or done.stdout[-2000:]}")
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
+
+
+def rehearse(folder: Path, mesh: str, material: str, budget: str, *options: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Promised and stated figures of one case."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_cell(folder, mesh, material)
+    promised = coupole(
+        folder, "plan", "suggest", "object.ply", "--rig", "rig.yaml", "--calibrations", str(CONFIGS / "calibrations"),
+        "--material", material, "--budget", budget, *options,
+    )  # fmt: skip
+    run = coupole(folder, "acquire", "object.yaml")["run"]
+    stated = coupole(folder, "reflectance", run, "--out", "result")
+    return promised, stated["material_uncertainty"]["ggx_normal"]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--cases", type=int, default=len(CASES), help="so many of the cases")
+    parser.add_argument("--budget", default="1min", help="of each plan")
+    parser.add_argument("--views", type=int, default=24, help="views of each plan, at most")
+    parser.add_argument("--keep", type=Path, help="folder for plans, runs and results; otherwise they are removed")
+    add_smallest(parser, cases=1, budget="20s", views=2)
+    options = parser.parse_args()
+    table, is_off = Table("object", "material", "views, LEDs", "seen", *FIGURES, box=None), False
+    with tempfile.TemporaryDirectory(prefix="coupole-suggested-") as folder:
+        for name, mesh, material in CASES[: options.cases]:
+            of_case = (options.keep or Path(folder)) / name
+            promised, stated = rehearse(of_case, mesh, material, options.budget, "--views", str(options.views))
+            pairs = [(promised["expected"][material][key], stated[key]) for key in FIGURES]
+            ratios = [told / found for told, found in pairs]
+            is_off |= any(abs(ratio - 1.0) > MOST_OFF for ratio in ratios)
+            cells = [f"{told:.3g} / {found:.3g} = {ratio:.2f}" for (told, found), ratio in zip(pairs, ratios, strict=True)]
+            size = f"{len(promised['views'])}, {promised['leds']}"
+            table.add_row(name, material, size, f"{promised['known_share']:.0%}", *cells)
+    Console(soft_wrap=True, width=200).print(table, "promised / stated by the result", sep="\n")
+    return int(is_off and not options.smallest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

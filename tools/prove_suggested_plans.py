@@ -2,10 +2,10 @@
 
     python tools/prove_suggested_plans.py [--cases N] [--budget TIME] [--keep FOLDER]
 
-Three meshes, each of one of the supposed materials: a plan is suggested, acquired, and its reflectance is fitted, by
-the commands that a user has. The medians of the uncertainties that the result states are compared with the promised
-ones. The rendered highlights have Fresnel's term, LEDs and arm stand where they do, and not where the records say.
-Exits with 1 unless each ratio is within a fifth of 1; not with `--smallest`.
+Three meshes, each of one of the supposed materials: a plan is suggested, acquired, and its reflectance is fitted,
+by the commands that a user has. The medians of the uncertainties that the result states are compared with the
+promised ones. The rendered highlights have Fresnel's term, LEDs and arm stand where they do, not where the records
+say. Exits with 1 unless each ratio is within a fifth of 1; not with `--smallest`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ FIGURES = ("normal_deg", "kd_percent", "ks_percent", "alpha_percent")
 
 def write_cell(folder: Path, mesh: str, material: str) -> None:
     """The simulated cell with an object of one material, and the object's mesh without colours."""
-    supposed, pi = SUPPOSED[material], 3.141592653589793
-    colour, f0 = [round(supposed.kd * pi, 4)] * 3, [supposed.ks] * 3
-    settings = f"    material: {{diffuse: {colour}, f0: {f0}, roughness: {supposed.alpha}}}\n"
+    material_values, pi = SUPPOSED[material], 3.141592653589793
+    colour, f0 = [round(material_values.kd * pi, 4)] * 3, [material_values.ks] * 3
+    settings = f"    material: {{diffuse: {colour}, f0: {f0}, roughness: {material_values.alpha}}}\n"
     text = (CONFIGS / "rigs" / "sim.yaml").read_text()
     text = text.replace("../domes", str(CONFIGS / "domes")).replace("../../runs", str(folder / "runs"))
     place = text.index("    white_at_us:")
@@ -51,24 +51,28 @@ def write_cell(folder: Path, mesh: str, material: str) -> None:
 def coupole(folder: Path, *arguments: str) -> dict[str, Any]:
     """Run a command there; its JSON."""
     command = [sys.executable, "-m", "coupole.commands.cli", *arguments, "--json"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    if done.returncode:
-        sys.exit(f"{' '.join(arguments)} ended with {done.returncode}: {done.stderr[-2000:] or done.stdout[-2000:]}")
-    document: dict[str, Any] = json.loads(done.stdout)
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if process.returncode:
+        words = process.stderr[-2000:] or process.stdout[-2000:]
+        sys.exit(f"{' '.join(arguments)} ended with {process.returncode}: {words}")
+    document: dict[str, Any] = json.loads(process.stdout)
     return document
 
 
-def rehearse(folder: Path, mesh: str, material: str, budget: str, *options: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def rehearse(
+    folder: Path, mesh: str, material: str, budget: str, *options: str
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Promised and stated figures of one case."""
     folder.mkdir(parents=True, exist_ok=True)
     write_cell(folder, mesh, material)
-    promised = coupole(
-        folder, "plan", "suggest", "object.ply", "--rig", "rig.yaml", "--calibrations", str(CONFIGS / "calibrations"),
+    promised_figures = coupole(
+        folder, "plan", "suggest", "object.ply", "--rig", "rig.yaml", "--calibrations",
+        str(CONFIGS / "calibrations"),
         "--material", material, "--budget", budget, *options,
     )  # fmt: skip
     run = coupole(folder, "acquire", "object.yaml")["run"]
-    stated = coupole(folder, "reflectance", run, "--out", "result")
-    return promised, stated["material_uncertainty"]["ggx_normal"]
+    result_figures = coupole(folder, "reflectance", run, "--out", "result")
+    return promised_figures, result_figures["material_uncertainty"]["ggx_normal"]
 
 
 def main() -> int:
@@ -83,13 +87,18 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="coupole-suggested-") as folder:
         for name, mesh, material in CASES[: options.cases]:
             of_case = (options.keep or Path(folder)) / name
-            promised, stated = rehearse(of_case, mesh, material, options.budget, "--views", str(options.views))
-            pairs = [(promised["expected"][material][key], stated[key]) for key in FIGURES]
-            ratios = [told / found for told, found in pairs]
+            promised_figures, stated_figures = rehearse(
+                of_case, mesh, material, options.budget, "--views", str(options.views)
+            )
+            pairs = [(promised_figures["expected"][material][key], stated_figures[key]) for key in FIGURES]
+            ratios = [promise / result for promise, result in pairs]
             is_off |= any(abs(ratio - 1.0) > MOST_OFF for ratio in ratios)
-            cells = [f"{told:.3g} / {found:.3g} = {ratio:.2f}" for (told, found), ratio in zip(pairs, ratios, strict=True)]
-            size = f"{len(promised['views'])}, {promised['leds']}"
-            table.add_row(name, material, size, f"{promised['known_share']:.0%}", *cells)
+            cells = [
+                f"{promise:.3g} / {result:.3g} = {ratio:.2f}"
+                for (promise, result), ratio in zip(pairs, ratios, strict=True)
+            ]
+            size = f"{len(promised_figures['views'])}, {promised_figures['leds']}"
+            table.add_row(name, material, size, f"{promised_figures['known_share']:.0%}", *cells)
     Console(soft_wrap=True, width=200).print(table, "promised / stated by the result", sep="\n")
     return int(is_off and not options.smallest)
 

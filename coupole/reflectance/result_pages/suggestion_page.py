@@ -13,6 +13,7 @@ from coupole.pages.maps import shaded_map
 from coupole.pages.page_parts import Code, Map, Page, Section, Table
 from coupole.pages.page_rendering import write_page
 from coupole.reflectance.suggestion.plan_suggestion import Suggestion
+from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG
 
 Floats = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def write(path: Path, name: str, suggestion: Suggestion) -> None:
 
 
 def sentences(suggestion: Suggestion) -> list[str]:
-    """What was chosen, what it promises, and what it costs."""
+    """Say what was chosen, what it promises, and what it costs."""
     report = suggestion.report
     views = f"{len(suggestion.views)} view{'s' if len(suggestion.views) > 1 else ''}"
     exposures = ", ".join(f"{exposure_us / 1000:g}" for exposure_us in suggestion.exposures_us)
@@ -47,16 +48,22 @@ def sentences(suggestion: Suggestion) -> list[str]:
 
 
 def _page(name: str, suggestion: Suggestion) -> Page:
-    chosen, known, *expected = (f"{line[0].upper()}{line[1:]}." for line in sentences(suggestion))
+    choice_line, share_line, *material_lines = (f"{line[0].upper()}{line[1:]}." for line in sentences(suggestion))
     return Page(
         title=f"{name}: a plan of {len(suggestion.views)} views, before anything is measured",
         pictures=[_map_of_normals(suggestion, name, *side) for name, side in _SIDES.items()],
-        summary=chosen,
-        quality=expected[0] if expected else known,
+        summary=choice_line,
+        quality=material_lines[0] if material_lines else share_line,
         next_step=["Look at it and change what you want, then ", Code(f"coupole check {name}.yaml"), "."],
         remark="Expected, not measured.",
         sections=[
-            Section("known", "What to expect", words=[known], tables=[_expected(suggestion)], notes=_LIMITS),
+            Section(
+                "known",
+                "What to expect",
+                words=[share_line],
+                tables=[_expectation_table(suggestion)],
+                notes=_LIMITS,
+            ),
             Section("views", "Views, the one that tells most first", tables=[_views(suggestion)]),
             Section("warnings", "Preflight's warnings", items=suggestion.report.warnings),
         ],
@@ -71,16 +78,14 @@ _LIMITS = (
 )
 
 
-def _expected(suggestion: Suggestion) -> Table:
+def _expectation_table(suggestion: Suggestion) -> Table:
     rows = []
-    for name, uncertainty in suggestion.expected.items():
+    for name, uncertainty in suggestion.uncertainties.items():
         for words, share in (("half of the triangles", 0.5), ("19 of 20", _HIGH_QUANTILE)):
-            values = {key: _quantile(values, suggestion, share) for key, values in vars(uncertainty).items()}
+            values = {key: _quantile(values, suggestion, share) for key, values in uncertainty.items()}
             percents = (_percent(values[f"{key}_percent"]) for key in _KEYS)
             rows.append((name, words, f"{values['normal_deg']:.2g}", *percents))
-    return Table(
-        "Standard uncertainty, not more than", ("if", "for", "normal, degrees", *_KEYS), rows
-    )
+    return Table("Standard uncertainty, not more than", ("if", "for", "normal, degrees", *_KEYS), rows)
 
 
 def _percent(value: float) -> str:
@@ -108,7 +113,7 @@ def _views(suggestion: Suggestion) -> Table:
 def _map_of_normals(suggestion: Suggestion, title: str, azimuth_deg: float, elevation_deg: float) -> Map:
     """The object in a parallel projection, with the expected uncertainty of its normals for the material of which
     they are known least."""
-    per_part = np.max([uncertainty.normal_deg for uncertainty in suggestion.expected.values()], axis=0)
+    per_part = np.max([uncertainty[NORMAL_DEG] for uncertainty in suggestion.uncertainties.values()], axis=0)
     corners_mm, mesh = suggestion.job.shape.corners_mm, suggestion.job.motion.occlusions.mesh
     to_eye = direction(azimuth_deg, elevation_deg)
     right = np.cross([0.0, 0.0, 1.0], to_eye)
@@ -121,9 +126,7 @@ def _map_of_normals(suggestion: Suggestion, title: str, azimuth_deg: float, elev
     reach_mm = 2.0 * float(np.linalg.norm(points_mm - middle_mm, axis=1).max())
     x = (np.arange(_WIDTH_PX) - 0.5 * (_WIDTH_PX - 1)) * pixel_mm
     y = (0.5 * (_HEIGHT_PX - 1) - np.arange(_HEIGHT_PX)) * pixel_mm
-    starts_mm = (
-        middle_mm + reach_mm * to_eye + x[None, :, None] * right + y[:, None, None] * up
-    ).reshape(-1, 3)
+    starts_mm = (middle_mm + reach_mm * to_eye + x[None, :, None] * right + y[:, None, None] * up).reshape(-1, 3)
     ways = np.tile(-to_eye, (len(starts_mm), 1)).astype(np.float32)
     hit = np.asarray(mesh.run(starts_mm.astype(np.float32), ways, query="INTERSECT"))
     depth_mm = np.asarray(mesh.run(starts_mm.astype(np.float32), ways, query="DISTANCE"), np.float64)

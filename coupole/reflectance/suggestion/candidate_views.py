@@ -1,4 +1,4 @@
-"""Views from which a suggestion is chosen: directions round targets on the object, as far as the arm gets there."""
+"""Views from which a suggestion is chosen: directions round targets on the object that the arm can take."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ class Candidate:
     """A view that may be taken, and what it would see."""
 
     view: LookAt
-    seen: SeenParts
+    seen_parts: SeenParts
 
 
 def candidates_of(job: Job, cell: SupposedCell, say: Callable[[str, int, int], None]) -> list[Candidate]:
     """All views that the arm can take without contact and that see something in focus; none if there is no such
     view."""
-    wanted = list(_directions(cell.surface, cell.rig))
-    found = []
-    for number, view in enumerate(wanted, start=1):
-        say("views that the arm can take", number, len(wanted))
+    wanted_views = list(_directions(cell.surface, cell.rig))
+    candidates = []
+    for number, view in enumerate(wanted_views, start=1):
+        say("views that the arm can take", number, len(wanted_views))
         pose = expand_view(view)[0]
         postures, why_not = postures_of(pose, cell.rig, job.motion.bodies)
         if why_not or pose.support_from_camera is None:
             continue
-        seen = cell.seen_by(postures[0], pose.support_from_camera)
-        if (seen.pixels > 0.0).any():
-            found.append(Candidate(view, seen))
-    return found
+        seen_parts = cell.seen_by(postures[0], pose.support_from_camera)
+        if (seen_parts.pixels > 0.0).any():
+            candidates.append(Candidate(view, seen_parts))
+    return candidates
 
 
 def field_mm(rig: Rig) -> float:
@@ -80,18 +80,18 @@ def _directions(surface: Surface, rig: Rig) -> Iterator[LookAt]:
 
 
 def _targets(surface: Surface, reach_mm: float) -> list[tuple[list[float], Floats | None]]:
-    """Points to look at, and the normal there; one in the middle, without a normal, if a view shows all from it."""
+    """Points to look at, and the normal there; one in the middle, without a normal, if views of it show all."""
     points_mm = surface.points_mm
     middle_mm = (points_mm.min(axis=0) + points_mm.max(axis=0)) / 2.0
     if np.linalg.norm(points_mm - middle_mm, axis=1).max() <= reach_mm:
-        return [(_rounded(middle_mm), None)]
-    targets = []
+        return [(_round_to_tenths(middle_mm), None)]
+    targets: list[tuple[list[float], Floats | None]] = []
     for part, distance_mm in farthest_first(points_mm, int(np.argmax(points_mm[:, 2]))):
         if distance_mm <= reach_mm or len(targets) == _MOST_TARGETS:
             break
-        targets.append((_rounded(points_mm[part]), surface.normals[part]))
+        targets.append((_round_to_tenths(points_mm[part]), surface.normals[part]))
     return targets
 
 
-def _rounded(point_mm: Floats) -> list[float]:
+def _round_to_tenths(point_mm: Floats) -> list[float]:
     return [round(float(value), 1) + 0.0 for value in point_mm]

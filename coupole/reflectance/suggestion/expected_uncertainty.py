@@ -1,9 +1,9 @@
 """Uncertainty that a fit of a material will have, before anything is measured.
 
-The fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). Both are sums over samples, so each
-view adds its own to them. Here the derivatives are those of a supposed material, and M has what is known beforehand:
-the frames' noise, each LED's own power, and the priors. What the model will miss, light from surface to surface and
-shadows' edges are not in it, so that the true uncertainty is larger where these matter.
+The fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). Both are sums over samples, so
+each view adds its own to them. Here the derivatives are those of a supposed material, and M has what is known
+beforehand: the frames' noise, each LED's own power, and the priors. It serves to compare views; what a plan
+promises is `rehearsal`'s.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Information:
-    """What samples tell of the materials of n parts, for several numbers of LEDs; a sum over views."""
+    """Sums of what samples tell of the materials of n parts, for several numbers of LEDs; a sum over views."""
 
     bread: Floats
     """[numbers, n, 5, 5] the scores' derivatives."""
@@ -37,8 +37,8 @@ class Information:
     samples: Floats
     """[numbers, n]"""
 
-    def __add__(self, other: Information) -> Information:
-        return Information(self.bread + other.bread, self.meat + other.meat, self.samples + other.samples)
+    def __add__(self, more: Information) -> Information:
+        return Information(self.bread + more.bread, self.meat + more.meat, self.samples + more.samples)
 
     def at(self, number: int) -> Information:
         """Return the same of one number of LEDs."""
@@ -72,8 +72,8 @@ def prior_information(surface: Surface, noise_um: float) -> Information:
     """Return what is known of each part before any sample: the mesh's normal, and usual materials."""
     stiffness = prior_stiffness(surface.triangle_areas_mm2, noise_um)
     bread = np.zeros((1, len(stiffness), UNKNOWNS, UNKNOWNS))
-    for place, known in ((2, LEAST_KNOWN), (3, USUAL / SPREAD_KS**2), (4, USUAL)):
-        bread[..., place, place] = known
+    for place, precision in ((2, LEAST_KNOWN), (3, USUAL / SPREAD_KS**2), (4, USUAL)):
+        bread[..., place, place] = precision
     for tilt in range(2):
         bread[..., tilt, tilt] = stiffness
     return Information(bread, bread.copy(), np.zeros(bread.shape[:2]))
@@ -88,7 +88,8 @@ def covariance_of(information: Information) -> Floats:
 
 @numba.njit(cache=True, nogil=True)
 def _fill(  # type: ignore[no-untyped-def]
-    points_mm, normals, camera_mm, pixels, leds_mm, signal_per_f, is_lit, u_own, noise, range_dn, material, times_s,
+    points_mm, normals, camera_mm, pixels, leds_mm, signal_per_f, is_lit, u_own, noise, range_dn, material,
+    times_s,
     led_rows, numbers, bread, meat, samples,
 ):  # fmt: skip
     kd, ks, alpha = material
@@ -128,9 +129,9 @@ def _fill(  # type: ignore[no-untyped-def]
             samples[number, part] += 1.0
             for i in range(UNKNOWNS):
                 for j in range(UNKNOWNS):
-                    squared = row[i] * row[j] / scale2
-                    bread[number, part, i, j] += squared
-                    meat[number, part, i, j] += by_noise * squared
+                    product = row[i] * row[j] / scale2
+                    bread[number, part, i, j] += product
+                    meat[number, part, i, j] += by_noise * product
         for later in range(1, len(numbers)):
             samples[later, part] += samples[later - 1, part]
             bread[later, part] += bread[later - 1, part]
@@ -151,12 +152,12 @@ def relative_variance(f, signal_per_f, pixels, noise, range_dn, times_s):  # typ
     """Relative variance by noise of a channel's sample, from all exposures in which it is neither too dark nor
     saturated; infinite where it is so in all. `noise` is the pixels' variance in the dark, their gain, and the
     channel's share of them."""
-    known = 0.0
+    precision = 0.0
     for exposure in range(len(times_s)):
         signal_dn = signal_per_f * f * times_s[exposure]
         if range_dn[0] < signal_dn < range_dn[1]:
-            known += pixels * noise[2] * signal_dn * signal_dn / (noise[0] + noise[1] * signal_dn)
-    return 1.0 / known if known > 0.0 else np.inf
+            precision += pixels * noise[2] * signal_dn * signal_dn / (noise[0] + noise[1] * signal_dn)
+    return 1.0 / precision if precision > 0.0 else np.inf
 
 
 def signal_quantile(
@@ -172,8 +173,8 @@ def signal_quantile(
         )  # fmt: skip
         values = surface.signal_per_f.max(axis=2) * f_cosine
         signals.append(values[np.isfinite(values)])
-    joined = np.concatenate(signals) if signals else np.zeros(0)
-    return float(np.quantile(joined, quantile)) if len(joined) else math.nan
+    all_signals = np.concatenate(signals) if signals else np.zeros(0)
+    return float(np.quantile(all_signals, quantile)) if len(all_signals) else math.nan
 
 
 @numba.njit(cache=True, nogil=True)

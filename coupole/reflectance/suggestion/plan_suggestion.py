@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from coupole.errors import InputError, PreflightRefused
 from coupole.geometry import farthest_first
 from coupole.plan.plan import LookAt
-from coupole.preflight.checking import StorageFacts, calibration_refusals, check_job
+from coupole.preflight.checking import calibration_refusals, check_job
 from coupole.preflight.job import Job, read_job
-from coupole.preflight.preflight import Report
+from coupole.preflight.preflight import Report, StorageFacts
 from coupole.reflectance.run_job import HELD_OUT_EVERY
 from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
 from coupole.reflectance.suggestion.expected_uncertainty import (
@@ -34,7 +34,7 @@ from coupole.reflectance.suggestion.expected_uncertainty import (
     signal_quantile,
 )
 from coupole.reflectance.suggestion.plan_text import PlanText
-from coupole.reflectance.suggestion.rehearsal import ExpectedUncertainty, rehearse
+from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG, ExpectedUncertainty, rehearse
 from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial, supposed_materials
 from coupole.reflectance.suggestion.supposed_signal import SupposedCell, Surface
 from coupole.reflectance.suggestion.view_choice import ViewChoice, choose_views
@@ -58,7 +58,7 @@ _SAME = 0.02
 
 @dataclass(frozen=True)
 class Budget:
-    """What a plan may cost."""
+    """The most that a plan may cost."""
 
     seconds: float
     lux_h: float | None = None
@@ -67,12 +67,12 @@ class Budget:
 
 @dataclass(frozen=True)
 class SuggestionRequest:
-    """What is asked for."""
+    """A request for a plan."""
 
     text: PlanText
     """Names of the files, as the plan will have them."""
     path: Path
-    """Where the plan will be written; its relative paths begin there."""
+    """The file that the plan will be; its relative paths begin there."""
     material: str
     """One of `supposed_materials.SUPPOSED`, or `unknown`."""
     budget: Budget
@@ -81,7 +81,7 @@ class SuggestionRequest:
 
 
 class Settings(NamedTuple):
-    """What a plan may have beside its views."""
+    """The rest of a plan, beside its views."""
 
     exposures_us: tuple[int, ...]
     leds: int
@@ -97,29 +97,27 @@ class Suggestion:
     report: Report
     """Preflight's, with paths."""
     views: tuple[LookAt, ...]
-    """In the order of their worth."""
+    """The views, the one that tells most first."""
     exposures_us: tuple[int, ...]
     leds: int
     surface: Surface
-    views_of_part: NDArray[np.int64]
-    """[n] number of views that see each part of the surface."""
-    expected: dict[str, ExpectedUncertainty]
-    """By name of the supposed material."""
+    uncertainties: dict[str, ExpectedUncertainty]
+    """The figures of each supposed material, by its name."""
     job: Job
 
     @property
     def known_share(self) -> float:
         """Share of the mesh's triangles that get a material, for the material that fewest get it of."""
         weights = self.surface.triangles
-        shares = [weights[np.isfinite(u.normal_deg)].sum() / weights.sum() for u in self.expected.values()]
+        shares = [weights[np.isfinite(u[NORMAL_DEG])].sum() / weights.sum() for u in self.uncertainties.values()]
         return float(min(shares))
 
     def medians(self) -> dict[str, dict[str, float | None]]:
         """Median standard uncertainties of the triangles that get a material, by supposed material; None without
         any."""
         return {
-            name: {key: _median(values, self.surface.triangles) for key, values in vars(uncertainty).items()}
-            for name, uncertainty in self.expected.items()
+            name: {key: _median(values, self.surface.triangles) for key, values in uncertainty.items()}
+            for name, uncertainty in self.uncertainties.items()
         }
 
     def figures(self) -> dict[str, Any]:
@@ -138,10 +136,12 @@ class Suggestion:
         }
 
 
-def suggest_plan(request: SuggestionRequest, say: Said = lambda step, done, of: None) -> Suggestion:
+def suggest_plan(request: SuggestionRequest, say: Said = lambda step, count, total: None) -> Suggestion:
     """Raises InputError if no view is possible, or a record is missing; PreflightRefused if the budget allows not
     even one view, or the cell's records are not valid."""
-    first = LookAt(kind="look_at", name="first", target_mm=(0, 0, 0), distance_mm=300, azimuth_deg=0, elevation_deg=80)
+    first = LookAt(
+        kind="look_at", name="first", target_mm=(0, 0, 0), distance_mm=300, azimuth_deg=0, elevation_deg=80
+    )
     job = read_job(request.path, text=request.text.with_views([first], (1000,), None))
     if refusals := calibration_refusals(job):
         raise PreflightRefused(refusals)
@@ -174,24 +174,29 @@ class _Trial:
         self._exposures = self._exposures_to_try()
 
     def best(self) -> Suggestion:
-        """The best plan, checked."""
+        """The best plan that has paths and is within the budget."""
         choices = self._choices()
-        if not choices:
-            raise PreflightRefused(
-                [f"the budget of {self._request.budget.seconds / 60:.3g} min allows not one view with "
-                 f"{self._numbers[0]} LEDs"]
-            )  # fmt: skip
-        most_value = max(choice.value for choice, _ in choices.values())
-        good = {settings: cost for settings, (choice, cost) in choices.items() if choice.value > most_value - _SAME}
-        settings = min(good, key=lambda one: good[one] * len(choices[one][0].views))
-        return self._with_paths(settings, good[settings])
+        most_value = max((choice.value for choice, _ in choices.values()), default=0.0)
+
+        def rank(settings: Settings) -> tuple[float, float]:
+            choice, view_s = choices[settings]
+            behind = most_value - choice.value
+            return (behind if behind > _SAME else 0.0), view_s * len(choice.views)
+
+        for settings in sorted(choices, key=rank)[:_ROUNDS]:
+            if suggestion := self._with_paths(settings):
+                return suggestion
+        budget = self._request.budget
+        light = "" if budget.lux_h is None else f" and {budget.lux_h:g} lux h"
+        refusal = f"the budget of {budget.seconds / 60:.3g} min{light} allows not one view that the arm reaches"
+        raise PreflightRefused([f"{refusal}, even with {self._numbers[0]} LEDs"])
 
     def _exposures_to_try(self) -> list[tuple[int, ...]]:
         """Short, long, and both; for several materials the short one of the brightest, the long of the darkest."""
         noise, limits = self._surface.noise, self._job.cell.rig.led_limits.on_us
-        seen = [candidate.seen for candidate in self._candidates]
+        parts_of_views = [candidate.seen_parts for candidate in self._candidates]
         brightest = [
-            signal_quantile(self._surface, seen, material, 1.0 - _SATURATED_SHARE)
+            signal_quantile(self._surface, parts_of_views, material, 1.0 - _SATURATED_SHARE)
             for material in self._materials.values()
         ]
         longest_us = min(limits[1], 2_000_000)
@@ -208,7 +213,9 @@ class _Trial:
         """Choice and time of a view, for all settings of which one view is within the budget."""
         choices = {}
         for count, exposures_us in enumerate(self._exposures, start=1):
-            information = self._information(exposures_us, f"what views tell, exposure {count} of {len(self._exposures)}")
+            information = self._information(
+                exposures_us, f"what views tell, exposure {count} of {len(self._exposures)}"
+            )
             for leds in range(len(self._numbers)):
                 settings = Settings(exposures_us, leds)
                 most, view_s = self._most_views(settings)
@@ -223,7 +230,7 @@ class _Trial:
         def tell(pair: tuple[Candidate, SupposedMaterial]) -> Information:
             candidate, material = pair
             return information_of(
-                self._surface, candidate.seen, material, exposures_us, self._order, self._fitted_numbers
+                self._surface, candidate.seen_parts, material, exposures_us, self._order, self._fitted_numbers
             )
 
         parts = []
@@ -235,23 +242,23 @@ class _Trial:
         return [parts[first : first + count] for first in range(0, len(parts), count)]
 
     def _choose(
-        self, information: list[list[Information]], leds: int, most: int, allowed: Sequence[int]
+        self, information: list[list[Information]], leds: int, most: int, allowed_candidates: Sequence[int]
     ) -> ViewChoice:
-        some = [[of_material.at(leds) for of_material in information[number]] for number in allowed]
+        some = [[of_material.at(leds) for of_material in information[number]] for number in allowed_candidates]
         choice = choose_views(some, self._priors, self._surface.triangles, most)
-        return replace(choice, views=tuple(allowed[number] for number in choice.views))
+        return replace(choice, views=tuple(allowed_candidates[number] for number in choice.views))
 
     def _most_views(self, settings: Settings) -> tuple[int, float]:
         """Number of views that the budget allows, and the time of one, by preflight without paths."""
         budget = self._request.budget
-        some = [candidate.view for candidate in self._candidates[: _TRIAL_VIEWS]]
-        _, report = self._checked(some, settings, paths=False)
+        some = [candidate.view for candidate in self._candidates[:_TRIAL_VIEWS]]
+        _, report = self._check_views(some, settings, paths=False)
         view_s, view_lux_h = report.duration_s / len(some), report.dose_lux_h / len(some)
         by_time = int(budget.seconds / view_s)
         by_light = budget.views if budget.lux_h is None else int(budget.lux_h / max(view_lux_h, 1e-9))
         return min(by_time, by_light, budget.views), view_s
 
-    def _checked(self, views: Sequence[LookAt], settings: Settings, *, paths: bool) -> tuple[Job, Report]:
+    def _check_views(self, views: Sequence[LookAt], settings: Settings, *, paths: bool) -> tuple[Job, Report]:
         return check_job(read_job(self._request.path, text=self._text(views, settings)), _ENDLESS, paths=paths)
 
     def _text(self, views: Sequence[LookAt], settings: Settings, *remarks: str) -> str:
@@ -260,46 +267,51 @@ class _Trial:
         ids = None if rows is None else sorted(self._job.cell.leds.ids[rows].tolist())
         return self._request.text.with_views(views, settings.exposures_us, ids, remarks)
 
-    def _with_paths(self, settings: Settings, view_s: float) -> Suggestion:
-        """The suggestion of these settings, with views to which there are paths, within the budget."""
+    def _with_paths(self, settings: Settings) -> Suggestion | None:
+        """The suggestion of these settings, with views to which there are paths; None if none fits the budget.
+        Raises PreflightRefused for what no other choice mends."""
         information = self._information(settings.exposures_us, "what views tell, of the chosen exposure")
-        allowed = list(range(len(self._candidates)))
+        allowed_candidates = list(range(len(self._candidates)))
         most, budget = self._most_views(settings)[0], self._request.budget
         for number in range(1, _ROUNDS + 1):
             self._say("paths to the views", number, _ROUNDS)
-            choice = self._choose(information, settings.leds, most, allowed)
+            choice = self._choose(information, settings.leds, most, allowed_candidates)
             views = [self._candidates[number].view for number in choice.views]
             if not views:
-                break
-            job, report = self._checked(views, settings, paths=True)
+                return None
+            job, report = self._check_views(views, settings, paths=True)
             cut_off = {view.name for view in report.views if view.joints_deg is None}
             if not cut_off and report.refusals:
                 raise PreflightRefused(report.refusals)
             if cut_off:
-                allowed = [place for place in allowed if self._candidates[place].view.name not in cut_off]
+                allowed_candidates = [
+                    place for place in allowed_candidates if self._candidates[place].view.name not in cut_off
+                ]
             elif report.duration_s > budget.seconds or report.dose_lux_h > (budget.lux_h or math.inf):
                 most = len(views) - 1
             else:
                 return self._suggestion(settings, choice, job, report)
-        raise PreflightRefused([f"no plan within the budget was found in {_ROUNDS} rounds: {view_s:.0f} s a view"])
+        return None
 
-    def _suggestion(
-        self, settings: Settings, choice: ViewChoice, job: Job, report: Report
-    ) -> Suggestion:
+    def _suggestion(self, settings: Settings, choice: ViewChoice, job: Job, report: Report) -> Suggestion:
         self._say("samples that are drawn, and their fits", 0, len(self._materials))
-        seen = [self._candidates[view].seen for view in choice.views]
+        parts_of_views = [self._candidates[view].seen_parts for view in choice.views]
         led_rows = self._order[: self._fitted_numbers[settings.leds]]
-        expected = {}
+        uncertainties = {}
         for number, (name, material) in enumerate(self._materials.items(), start=1):
-            expected[name] = rehearse(
-                self._surface, seen, material, settings.exposures_us, led_rows, self._request.scan_noise_um
+            uncertainties[name] = rehearse(
+                self._surface,
+                parts_of_views,
+                material,
+                settings.exposures_us,
+                led_rows,
+                self._request.scan_noise_um,
             )
             self._say("samples that are drawn, and their fits", number, len(self._materials))
         views = [self._candidates[view].view for view in choice.views]
-        counts = np.sum([of_view.pixels > 0.0 for of_view in seen], axis=0)
         suggestion = Suggestion(
-            "", report, tuple(views), settings.exposures_us, self._numbers[settings.leds], self._surface, counts,
-            expected, job,
+            "", report, tuple(views), settings.exposures_us, self._numbers[settings.leds], self._surface,
+            uncertainties, job,
         )  # fmt: skip
         remarks = ["Suggested by `coupole plan suggest`.", *_promises(suggestion.medians())]
         return replace(suggestion, text=self._text(views, settings, *remarks))
@@ -313,7 +325,8 @@ def _promises(medians: dict[str, dict[str, float | None]]) -> list[str]:
             continue
         shares = (f"{key} {figures[f'{key}_percent']:.2g} %" for key in ("kd", "ks", "alpha"))
         lines.append(
-            f"Expected if {name}, median standard uncertainty: normal {normal_deg:.2g} degrees, {', '.join(shares)}."
+            f"Expected if {name}, median standard uncertainty: normal {normal_deg:.2g} degrees, "
+            f"{', '.join(shares)}."
         )
     return lines
 

@@ -14,7 +14,7 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class PlanText:
-    """What a suggested plan has, whatever its views are. Paths are relative to the plan."""
+    """The part of a suggested plan that is there whatever its views are. Paths are relative to the plan."""
 
     name: str
     rig: str
@@ -24,7 +24,7 @@ class PlanText:
     calibrations: tuple[str, ...] = ()
     """Records; none: those of the rig."""
     translation_mm: tuple[float, float, float] | None = None
-    """Of the mesh's frame on the support."""
+    """Place of the mesh's frame on the support."""
 
     def with_views(
         self,
@@ -37,18 +37,18 @@ class PlanText:
         lines = [f"# {line}" for remark in remarks for line in wrap(remark, _WIDTH)]
         lines += [
             "schema_version: 1",
-            f"name: {_quoted(self.name)}",
-            f"rig: {_quoted(self.rig)}",
+            f"name: {_quote(self.name)}",
+            f"rig: {_quote(self.rig)}",
             "object:",
-            f"  id: {_quoted(self.object_id)}",
-            f"  mesh: {_quoted(self.mesh)}",
+            f"  id: {_quote(self.object_id)}",
+            f"  mesh: {_quote(self.mesh)}",
             f"  mesh_unit: {self.mesh_unit}",
         ]
         if self.translation_mm is not None:
             numbers = ", ".join(f"{value:.3f}" for value in self.translation_mm)
             lines.append(f"  support_from_object: {{translation_mm: [{numbers}], abc_deg: [0, 0, 0]}}")
         if self.calibrations:
-            lines += ["calibrations:", *(f"  - {_quoted(path)}" for path in self.calibrations)]
+            lines += ["calibrations:", *(f"  - {_quote(path)}" for path in self.calibrations)]
         lines += ["views:", *map(_line, views)]
         lines += _lights(led_ids)
         if len(exposures_us) == 1:
@@ -74,6 +74,6 @@ def _lights(led_ids: Sequence[int] | None) -> list[str]:
     return ["lights:", "  kind: ids", "  ids: [", *(f"    {line}" for line in numbers), "  ]"]
 
 
-def _quoted(text: str) -> str:
-    """As YAML has any text: JSON's strings are YAML's."""
+def _quote(text: str) -> str:
+    """Write any text as YAML has it: JSON's strings are YAML's."""
     return text if text.replace("-", "").replace("_", "").isalnum() and text[0].isalpha() else json.dumps(text)

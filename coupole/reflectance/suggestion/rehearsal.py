@@ -8,7 +8,6 @@ misfit included. Light from surface to surface, shadows' edges, and errors of po
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -27,16 +26,11 @@ _MOST_VALUES = 20_000_000
 """Samples that are drawn, of all channels, at most; beyond it fewer parts stand for the surface."""
 
 
-@dataclass(frozen=True)
-class ExpectedUncertainty:
-    """Standard uncertainties of n parts, as the report of a result calls them; NaN where too few samples are
-    expected for a material, and of parts that were not drawn."""
-
-    normal_deg: Floats
-    kd_percent: Floats
-    """With what all LEDs share; so is `ks_percent`."""
-    ks_percent: Floats
-    alpha_percent: Floats
+NORMAL_DEG = "normal_deg"
+ExpectedUncertainty = dict[str, Floats]
+"""Standard uncertainties [n] of parts by the names that the report of a result has: `normal_deg`, `kd_percent`,
+`ks_percent`, `alpha_percent`, kd and ks with what all LEDs share. NaN where too few samples are expected for a
+material, and of parts that were not drawn."""
 
 
 def rehearse(
@@ -63,9 +57,8 @@ def rehearse(
     variances[:, 2:4] += surface.u_shared**2
     deviations = np.full((count, variances.shape[1]), np.nan)
     deviations[rows] = np.sqrt(variances)
-    return ExpectedUncertainty(
-        np.degrees(np.hypot(deviations[:, 0], deviations[:, 1])), *(100.0 * deviations[:, 2 + n] for n in range(3))
-    )
+    percents = {f"{name}_percent": 100.0 * deviations[:, 2 + n] for n, name in enumerate(("kd", "ks", "alpha"))}
+    return {NORMAL_DEG: np.degrees(np.hypot(deviations[:, 0], deviations[:, 1])), **percents}
 
 
 def _drawn_samples(
@@ -80,19 +73,20 @@ def _drawn_samples(
     """Samples of some of the parts; LEDs stand elsewhere, and are as bright otherwise, than the records say."""
     leds_mm, channels = surface.leds_mm[led_rows], len(surface.channel_share)
     true_leds_mm = leds_mm + surface.u_led_mm * random.standard_normal(leds_mm.shape)
-    own = 1.0 + surface.u_own[led_rows] * random.standard_normal(len(led_rows))
+    own_power = 1.0 + surface.u_own[led_rows] * random.standard_normal(len(led_rows))
     values = np.full((len(rows), len(views), len(led_rows), channels), np.nan, np.float32)
     noise = np.stack([surface.noise.in_dark_dn2, surface.noise.gain_dn, surface.channel_share], axis=1)
     for number, view in enumerate(views):
         f_cosine, variance = np.full((2, len(rows), len(led_rows), channels), np.nan)
         _fill(
-            surface.points_mm[rows], surface.normals[rows], view.camera_mm, view.pixels[rows], leds_mm, true_leds_mm,
+            surface.points_mm[rows], surface.normals[rows], view.camera_mm, view.pixels[rows], leds_mm,
+            true_leds_mm,
             surface.signal_per_f[rows][:, led_rows], view.is_lit[rows][:, led_rows], noise,
             (surface.noise.least_dn, surface.noise.most_dn), (material.kd, material.ks, material.alpha),
             np.array(exposures_us, float) * 1e-6, f_cosine, variance,
         )  # fmt: skip
         noisy = 1.0 + np.sqrt(variance) * random.standard_normal(variance.shape)
-        values[:, number] = f_cosine * noisy * own[None, :, None]
+        values[:, number] = f_cosine * noisy * own_power[None, :, None]
     return TriangleSamples(
         values.reshape(len(rows), -1, channels),
         np.tile(leds_mm, (len(views), 1)),
@@ -109,7 +103,7 @@ def _fill(  # type: ignore[no-untyped-def]
     points_mm, normals, camera_mm, pixels, leds_mm, true_leds_mm, signal_per_f, is_lit, noise, range_dn, material,
     times_s, f_cosine, variance,
 ):  # fmt: skip
-    """Fill f times the cosine of incidence, [n, leds, channels] in 1/sr, and the relative variance of its noise."""
+    """Fill f times the cosine of incidence, [n, leds, channels] in 1/sr, and its noise's relative variance."""
     kd, ks, alpha = material
     light, true_light, view, half = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for part in range(len(points_mm)):
@@ -133,7 +127,9 @@ def _fill(  # type: ignore[no-untyped-def]
             fresnel = ks + (1.0 - ks) * (1.0 - vh) ** 5
             f = kd + fresnel * lobe(nl, nv, nh, alpha)[0]
             for channel in range(len(noise)):
-                u2 = relative_variance(f, signal_per_f[part, led, channel], pixels[part], noise[channel], range_dn, times_s)
+                u2 = relative_variance(
+                    f, signal_per_f[part, led, channel], pixels[part], noise[channel], range_dn, times_s
+                )
                 if u2 < np.inf:
                     f_cosine[part, led, channel] = f * nl
                     variance[part, led, channel] = u2

@@ -162,7 +162,7 @@ def _triangles_of_parts(patches: Patches, corners_mm: Floats) -> tuple[Floats, F
     areas_mm2 = 0.5 * np.linalg.norm(across, axis=1)
     share = 1.0 / np.bincount(patches.piece_triangle, minlength=len(corners_mm))[patches.piece_triangle]
     count = len(patches.points_mm)
-    triangles = np.bincount(patches.piece_patch, share, count)
+    triangles: Floats = np.bincount(patches.piece_patch, share, count).astype(np.float64)
     sums_mm2 = np.bincount(patches.piece_patch, share * areas_mm2[patches.piece_triangle], count)
     return triangles, sums_mm2 / triangles
 

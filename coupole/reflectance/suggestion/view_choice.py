@@ -39,21 +39,23 @@ def choose_views(
 ) -> ViewChoice:
     """Choose at most `most` of the candidates; each has its information for each supposed material, of one number
     of LEDs. `weights` [n] are those of the parts."""
-    so_far, chosen = list(priors), list[int]()
+    so_far, chosen_views = list(priors), list[int]()
     value = begin = _value(so_far, weights)
-    while len(chosen) < min(most, len(candidates)):
+    while len(chosen_views) < min(most, len(candidates)):
         trials = {
-            number: _value([known + of_view for known, of_view in zip(so_far, candidate, strict=True)], weights)
+            number: _value(
+                [of_material + of_view for of_material, of_view in zip(so_far, candidate, strict=True)], weights
+            )
             for number, candidate in enumerate(candidates)
-            if number not in chosen
+            if number not in chosen_views
         }
         best = max(trials, key=lambda number: trials[number])
         if trials[best] - value < ENOUGH:
             break
-        chosen.append(best)
+        chosen_views.append(best)
         value = trials[best]
-        so_far = [known + of_view for known, of_view in zip(so_far, candidates[best], strict=True)]
-    return ViewChoice(tuple(chosen), value - begin)
+        so_far = [of_material + of_view for of_material, of_view in zip(so_far, candidates[best], strict=True)]
+    return ViewChoice(tuple(chosen_views), value - begin)
 
 
 def _value(materials: Sequence[Information], weights: Floats) -> float:

@@ -25,6 +25,7 @@ from sim.devices.camera_body import Exposed, Surroundings
 from sim.devices.ledbox_firmware import LedBoxFirmware
 from sim.devices.refusals import untold
 from sim.devices.text_box import TextBox
+from sim.optics.disturbances import Disturber
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
 from sim.world import faults as script
@@ -51,7 +52,7 @@ class World:
         self.lighting = Lighting()
         self._exposures = ExposureLog(self.lighting, settings.exposures_remembered)
         self._photographer = Photographer(config.scene, config.rendered_camera, settings)
-        self._flashes = Flashes(settings.leds)
+        self._flashes, self._disturber = Flashes(settings.leds), Disturber()
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
@@ -108,6 +109,7 @@ class World:
                 pose=self.robot.true_base_from_flange,
                 render=self._photographer.render,
                 arm=self._in_the_light,
+                disturbance=self._disturber.at,
                 on_exposed=self._exposures.note,
             ),
         )
@@ -139,7 +141,7 @@ class World:
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box switches an LED on; it is lit with its present flux."""
-        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led)) * self._disturber.flux(led, t_on_ns)
         self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
@@ -185,6 +187,16 @@ class World:
                 self.box.stick_led(fault.led)
             case script.FlickeringLed():
                 self._flashes.unsteady[fault.led] = fault.rms
+            case (
+                script.DimLed()
+                | script.Warming()
+                | script.RoomLamp()
+                | script.Bump()
+                | script.Smudge()
+                | script.ExposureStep()
+                | script.Hand()
+            ):
+                self._disturber.happen(fault, self.reactor.now_ns)
             case script.EmergencyStop():
                 self.robot.estop()
             case script.EnablingSwitch():

@@ -1,0 +1,98 @@
+"""Reduces a frame to a grid of means, fast enough for the thread that stores it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.devices import FrameFormat
+
+_COLUMNS = 128
+"""Bins across a frame, at most: with 32 pixels in a bin of the full camera, 0.2 mm are an eighth of one."""
+_ROWS_READ = 8
+"""Rows that are read of each bin, at most, in pairs spread over it: the bus is the bottleneck."""
+
+
+@dataclass(frozen=True)
+class FrameLook:
+    """What is kept of a frame."""
+
+    mean_dn: NDArray[np.float32]
+    """[rows, columns] mean of a bin's pixels above black, all colours together."""
+    clipped: NDArray[np.bool_]
+    """[rows, columns] True where a pixel of the bin is at the top of its range."""
+
+
+@dataclass(frozen=True)
+class LookGrid:
+    """Bins of frames of one format: whole Bayer cells, at most 128 across."""
+
+    frame_format: FrameFormat
+
+    @property
+    def bin_px(self) -> int:
+        """Side of a bin."""
+        return max(2, 2 * math.ceil(self.frame_format.width_px / _COLUMNS / 2))
+
+    @property
+    def _pair_step(self) -> int:
+        """Each of so many pairs of rows is read."""
+        return max(1, self.bin_px // _ROWS_READ)
+
+    @property
+    def rows_in_bin(self) -> int:
+        """Rows of a bin that are read."""
+        return 2 * len(range(0, self.bin_px // 2, self._pair_step))
+
+    @property
+    def pixels_in_bin(self) -> int:
+        return self.rows_in_bin * self.bin_px
+
+    def look(self, pixels: NDArray[np.uint16]) -> FrameLook:
+        """The look of a frame [H, W]. Bins that are not whole are left out."""
+        rows, columns = (side // self.bin_px for side in pixels.shape)
+        mean_dn = np.empty((rows, columns), np.float32)
+        clipped = np.empty((rows, columns), np.bool_)
+        frame_format = self.frame_format
+        white_dn = np.uint16(frame_format.white_dn)
+        _bin_means(pixels, mean_dn, clipped, self.bin_px, self._pair_step, white_dn, frame_format.black_dn)
+        return FrameLook(mean_dn, clipped)
+
+
+def compile_now() -> None:
+    """Compile before the first frame is due, for buffers that may be written to and for those that may not."""
+    pixels = np.zeros((2, 2), np.uint16)
+    grid = LookGrid(FrameFormat(2, 2, 12, "MONO", 0, 4095))
+    grid.look(pixels)
+    pixels.flags.writeable = False
+    grid.look(pixels)
+
+
+@numba.njit(cache=True, nogil=True)
+def _bin_means(pixels, mean_dn, clipped, bin_px, pair_step, white_dn, black_dn):  # type: ignore[no-untyped-def]
+    rows, columns = mean_dn.shape
+    sums = np.empty(columns, np.int64)
+    tops = np.empty(columns, np.uint16)
+    for row in range(rows):
+        sums[:] = 0
+        tops[:] = 0
+        read = 0
+        for pair in range(0, bin_px // 2, pair_step):
+            for line in range(2):
+                values = pixels[row * bin_px + 2 * pair + line]
+                read += bin_px
+                for column in range(columns):
+                    total = np.uint32(0)
+                    top = np.uint16(0)
+                    for k in range(column * bin_px, (column + 1) * bin_px):
+                        total += values[k]
+                        top = max(top, values[k])
+                    sums[column] += total
+                    tops[column] = max(tops[column], top)
+        for column in range(columns):
+            mean_dn[row, column] = sums[column] / read - black_dn
+            clipped[row, column] = tops[column] >= white_dn

@@ -239,7 +239,8 @@ def judged(
 
 def _names_led(found: Found, words: str) -> bool:
     """True if a finding is of the LED that these words begin with."""
-    return {f"LED {getattr(label.light, 'id', None)}" for label in found.labels} == {words.split(",", maxsplit=1)[0]}
+    named = {f"LED {getattr(label.light, 'id', None)}" for label in found.labels}
+    return named == {words.partition(",")[0]}
 
 
 def main() -> int:

@@ -71,6 +71,15 @@ def test_what_a_hand_has_spoilt_is_taken_again(cell: CellFolder) -> None:
     cells.assert_each_shot_proven_once(cell.run_folder)
 
 
+def test_under_a_lamp_all_is_taken_again_as_often_as_the_plan_says_then_kept_and_marked(cell: CellFolder) -> None:
+    cell.plan_data["reshoot_limit"] = 1
+    ended = _watched(cell, {"retake": True}, FAULTS["ambient light"])
+    assert ended.code == 0, ended
+    assert [found["kind"] for found in _found(cell)] == ["ambient light"]  # then the end is as the begin
+    assert ended.document["reshot"] == 54
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
 def test_without_a_word_in_the_plan_a_lamp_is_found_by_the_dark_frames(cell: CellFolder) -> None:
     cell.faults(FAULTS["ambient light"])
     assert cell.acquire().code == 0

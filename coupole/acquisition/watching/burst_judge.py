@@ -82,8 +82,11 @@ class BurstJudge:
         for later in (before, after):
             found = ambient_light(reference_dn, count, later, self.noise, self.limits, exposure_us)
             if found:
-                concerned = tuple(frame.label for frame in frames if frame.label.is_shot)
-                return replace(found, labels=concerned)
+                spoilt = [
+                    *(frame.label for frame in frames if frame.label.is_shot),
+                    *(dark.label for dark in later),
+                ]
+                return replace(found, labels=tuple(spoilt))
         return None
 
     # -- neighbouring lights ------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ proven is ever overwritten. What is spoilt is then left unproven, and the sequen
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -140,6 +141,7 @@ class WatchedRecorder:
         are left unproven, to be taken again, empty if none are."""
         frames = self._frames_of(burst)
         findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
+        findings = [self._with_unseen_shots(burst, found) for found in findings]
         new_labels = {label for label in burst.labels if label}
         findings = [found for found in findings if self._is_news(found) and new_labels & set(found.labels)]
         for found in findings:
@@ -163,6 +165,13 @@ class WatchedRecorder:
         again = set(labels)
         self._timeline = [label for label in self._timeline if label not in again] + labels
         return [SeenFrame(label, self._seen[label]) for label in self._timeline if label in self._seen]
+
+    def _with_unseen_shots(self, burst: Burst, found: Found) -> Found:
+        """The same with the shots of the burst, if only its dark frames were looked at."""
+        if self._watch.frames == "all":
+            return found
+        shots = (label for label in burst.labels if label and label.is_shot)
+        return replace(found, labels=tuple(dict.fromkeys([*found.labels, *shots])))
 
     def _is_news(self, found: Found) -> bool:
         """An LED that is known to be wrong is not named in each view again."""

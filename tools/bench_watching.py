@@ -50,12 +50,12 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         job = read_job(write_demo_plan(root, Path(folder), watch=True, lights=lights))
     labels = [label for label in job.schedule.bursts[0][0].labels if label]
     looks = [grid.look(frame) for frame in frames]
-    seen = [SeenFrame(label, looks[place % BUFFERS]) for place, label in enumerate(labels)]
+    seen_frames = [SeenFrame(label, looks[place % BUFFERS]) for place, label in enumerate(labels)]
     start = time.perf_counter()
-    judge_of(job, grid, job.schedule.views[0], FirstFrames()).judge(seen, 8000)
-    judge_ms = 1e3 * (time.perf_counter() - start) / len(seen)
+    judge_of(job, grid, job.schedule.views[0], FirstFrames()).judge(seen_frames, 8000)
+    judge_ms = 1e3 * (time.perf_counter() - start) / len(seen_frames)
     yield {
-        "name": f"judging_a_burst_of_{len(seen)}_per_frame",
+        "name": f"judging_a_burst_of_{len(seen_frames)}_per_frame",
         "value": judge_ms,
         "unit": "ms",
         "peer": period,

@@ -60,9 +60,9 @@ class Scene:
     grid: LookGrid
     poses: list[NDArray[np.float64]]
     leds: LedModel
-    taken: int = 0
+    frame_number: int = 0
 
-    def seen(
+    def looks(
         self, pose: int, disturber: Disturber, unsteady: dict[int, float], faults: dict[int, list[Any]]
     ) -> list[SeenFrame]:
         """Looks of a burst from a pose, with faults that happen at steps of its table."""
@@ -80,9 +80,11 @@ class Scene:
             lit = (
                 {} if led == NO_LED else {led: exposure_s * flashes.flux(led, 25.0) * disturber.flux(led, now_ns)}
             )
-            number, self.taken = self.taken, self.taken + 1
-            exposed = Exposed(lit, [], exposure_s, 1.0, number, self.poses[pose], disturbance=disturber.at(now_ns))
-            self.photographer.render(pixels, exposed)
+            number, self.frame_number = self.frame_number, self.frame_number + 1
+            exposure = Exposed(
+                lit, [], exposure_s, 1.0, number, self.poses[pose], disturbance=disturber.at(now_ns)
+            )
+            self.photographer.render(pixels, exposure)
             assert label is not None
             frames.append(SeenFrame(label, self.grid.look(pixels)))
         return frames
@@ -135,7 +137,7 @@ def _lit(burst: Burst) -> NDArray[np.int64]:
     return np.flatnonzero(burst.table["led"] != NO_LED)
 
 
-def _signed(random: np.random.Generator, low: float, high: float) -> float:
+def _either_way(random: np.random.Generator, low: float, high: float) -> float:
     return float(random.choice([-1.0, 1.0]) * random.uniform(low, high))
 
 
@@ -164,17 +166,17 @@ def drift(random: np.random.Generator, burst: Burst) -> Drawn:
     """A drift of all LEDs that begins in the first half and reaches 2 to 10 % at the end."""
     begin = _moment(random, burst, 0.0, 0.5)
     rest_s = float(burst.table["period_us"][begin:].sum()) * 1e-6
-    reached = _signed(random, 0.02, 0.10)
-    return {begin: [script.Warming(kind="warming", per_s=reached / rest_s)]}, {}, f"{reached:+.1%}"
+    reached_share = _either_way(random, 0.02, 0.10)
+    return {begin: [script.Warming(kind="warming", per_s=reached_share / rest_s)]}, {}, f"{reached_share:+.1%}"
 
 
 def bump(random: np.random.Generator, burst: Burst) -> Drawn:
     """The object, or the camera, displaced by 0.2 mm along the support or across the line of sight."""
     angle = random.uniform(0.0, 2.0 * np.pi)
     mm = (float(0.2 * np.cos(angle)), float(0.2 * np.sin(angle)), 0.0)
-    what = str(random.choice(["object", "camera"]))
-    fault = script.Bump.model_validate({"kind": "bump", "what": what, "mm": mm})
-    return {_moment(random, burst, 0.05, 0.93): [fault]}, {}, f"{what} 0.2 mm"
+    moved_thing = str(random.choice(["object", "camera"]))
+    fault = script.Bump.model_validate({"kind": "bump", "what": moved_thing, "mm": mm})
+    return {_moment(random, burst, 0.05, 0.93): [fault]}, {}, f"{moved_thing} 0.2 mm"
 
 
 def smudge(random: np.random.Generator, burst: Burst) -> Drawn:
@@ -192,7 +194,7 @@ def smudge(random: np.random.Generator, burst: Burst) -> Drawn:
 
 def exposure_step(random: np.random.Generator, burst: Burst) -> Drawn:
     """All values above black by 2 to 20 %."""
-    factor = 1.0 + _signed(random, 0.02, 0.20)
+    factor = 1.0 + _either_way(random, 0.02, 0.20)
     fault = script.ExposureStep(kind="exposure_step", factor=factor)
     return {_moment(random, burst, 0.05, 0.93): [fault]}, {}, f"x {factor:.2f}"
 
@@ -227,20 +229,20 @@ KINDS: Sequence[tuple[str, Draw]] = (
 # -- the proof --------------------------------------------------------------------------------------------
 
 
-def judged(
+def judge_view(
     cell: Scene, random: np.random.Generator, pose: int, draw: Draw | None
 ) -> tuple[list[Found], str, BurstJudge]:
     """Findings of one view with a fault, or without."""
     faults, unsteady, words = draw(random, cell.burst) if draw else ({}, {}, "")
     judge = judge_of(cell.job, cell.grid, cell.job.schedule.views[0], FirstFrames())
-    frames = cell.seen(pose, Disturber(), unsteady, faults)
+    frames = cell.looks(pose, Disturber(), unsteady, faults)
     return judge.judge(frames, cell.burst.timing.exposure_us), words, judge
 
 
 def _names_led(found: Found, words: str) -> bool:
     """True if a finding is of the LED that these words begin with."""
-    named = {f"LED {getattr(label.light, 'id', None)}" for label in found.labels}
-    return named == {words.partition(",")[0]}
+    named_leds = {f"LED {getattr(label.light, 'id', None)}" for label in found.labels}
+    return named_leds == {words.partition(",")[0]}
 
 
 def main() -> int:
@@ -259,14 +261,14 @@ def main() -> int:
         alarms = 0
         for number in range(options.clean):
             random = np.random.default_rng([options.seed, 1, number])
-            findings, _, _ = judged(cell, random, number * VIEWS // max(1, options.clean), None)
+            findings, _, _ = judge_view(cell, random, number * VIEWS // max(1, options.clean), None)
             alarms += bool(findings)
             for finding in findings:
                 print(f"  false alarm in clean view {number}: {finding.kind}: {finding.words}")
         for number in range(options.faults):
             random = np.random.default_rng([options.seed, 2, number])
             kind, draw = KINDS[number % len(KINDS)]
-            findings, words, _ = judged(cell, random, number * VIEWS // options.faults, draw)
+            findings, words, _ = judge_view(cell, random, number * VIEWS // options.faults, draw)
             names = [finding.kind for finding in findings]
             is_found = kind in names[:1] and (kind != "LED" or _names_led(findings[0], words))
             verdict = "found" if is_found else "named " + names[0] if names else "missed"

@@ -162,20 +162,23 @@ def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> 
     if not sentinels:
         return in_order
     between = range(every, len(lit) - every // 2, every)
-    wanted = [(0, list(sentinels)), *((place, [sentinels[k % len(sentinels)]]) for k, place in enumerate(between))]
-    wanted.append((len(lit), list(sentinels)))
-    numbers = iter(reversed(range(sum(len(leds) for _, leds in wanted))))
-    for wanted_place, leds in reversed(wanted):
-        own = [place for place, led in enumerate(lit) if led.id in leds]
-        place = _cool_place(wanted_place, own, len(lit))
+    wanted_places = [
+        (0, list(sentinels)),
+        *((place, [sentinels[k % len(sentinels)]]) for k, place in enumerate(between)),
+    ]
+    wanted_places.append((len(lit), list(sentinels)))
+    numbers = iter(reversed(range(sum(len(leds) for _, leds in wanted_places))))
+    for wanted_place, leds in reversed(wanted_places):
+        own_places = [place for place, led in enumerate(lit) if led.id in leds]
+        place = _cool_place(wanted_place, own_places, len(lit))
         in_order[place:place] = [Sentinel(led, next(numbers)) for led in reversed(leds)][::-1]
     return in_order
 
 
-def _cool_place(wanted: int, own: Sequence[int], count: int) -> int:
+def _cool_place(wanted_places: int, own_places: Sequence[int], count: int) -> int:
     """The place among so many LEDs nearest to the wanted one that keeps the distance from these places."""
-    places = (p for p in range(count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own))
-    return min(places, key=lambda p: (abs(p - wanted), p), default=wanted)
+    places = (p for p in range(count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own_places))
+    return min(places, key=lambda p: (abs(p - wanted_places), p), default=wanted_places)
 
 
 def _burst(

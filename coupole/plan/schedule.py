@@ -195,7 +195,7 @@ def build_schedule(
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
-            lit = _watched(lit_in_bursts(lights, leds, base_from_support), plan, leds)
+            lit = _with_sentinels(lit_in_bursts(lights, leds, base_from_support), plan, leds)
             bursts_of[lights] = [
                 burst
                 for repeat in range(2 if is_auto else plan.repeats)
@@ -228,10 +228,10 @@ def build_schedule(
     return _with_open_lights(schedule, plan) if plan.chooses_lights else schedule
 
 
-def _watched(
+def _with_sentinels(
     lit: Sequence[Sequence[Led] | Panel], plan: Plan, leds: LedTable
 ) -> list[Sequence[Led | Sentinel] | Panel]:
-    """What each burst of one exposure lights, with sentinels if the plan has them."""
+    """Lights of each burst of one exposure, with sentinels if the plan has them."""
     sentinels = sentinels_among(lit, leds) if plan.takes_sentinels else ()
     return [
         lights if isinstance(lights, Panel) else with_sentinels(lights, sentinels, plan.watching.every)

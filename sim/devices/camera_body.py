@@ -124,7 +124,7 @@ class Surroundings:
     arm: Callable[[], Capsules] = lambda: NONE
     """Parts of the arm that block light at present."""
     disturbance: Callable[[int], Disturbance] = lambda _: CALM
-    """What disturbs an exposure that begins at a world time, ns."""
+    """Disturbance of an exposure that begins at a world time, ns."""
     on_exposed: Callable[[int, int, int, int, int], None] = lambda *_: None
     """Told of each exposure that has ended: number, frame id, timestamp ns, world times ns of start and end."""
 

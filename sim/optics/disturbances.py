@@ -60,12 +60,12 @@ class Disturbance:
         """True if something lies in the way of the light."""
         return bool(self.smudges or self.things)
 
-    def covered(self, mean_e: Electrons) -> Electrons:
+    def cover_up(self, mean_e: Electrons) -> Electrons:
         """Mean electrons [h, w] behind what lies in the way."""
         level = np.float32(mean_e.mean())
         for smudge in self.smudges:
-            taken = np.float32(1.0 - smudge.share) * np.exp(-0.5 * (2.0 * smudge.radius_share(mean_e.shape)) ** 2)
-            mean_e = mean_e * (1.0 - taken) + np.float32(_VEIL) * taken * level
+            loss = np.float32(1.0 - smudge.share) * np.exp(-0.5 * (2.0 * smudge.radius_share(mean_e.shape)) ** 2)
+            mean_e = mean_e * (1.0 - loss) + np.float32(_VEIL) * loss * level
         for thing in self.things:
             cover = np.clip((1.0 - thing.radius_share(mean_e.shape)) / np.float32(_SOFT) + 0.5, 0.0, 1.0)
             mean_e = mean_e * (1.0 - cover) + cover * np.float32(thing.share) * level
@@ -116,7 +116,7 @@ class Disturber:
                 self._dim[fault.led] = 1.0 - fault.loss
 
     def at(self, now_ns: int) -> Disturbance:
-        """What disturbs an exposure at that time."""
+        """Return what disturbs an exposure at that time."""
         things = []
         for since_ns, hand in self._hands:
             age_s = (now_ns - since_ns) * 1e-9

@@ -144,8 +144,8 @@ class Photographer:
         displacement = np.eye(4)
         displacement[:3, 3] = self._object_mm = moved_mm
         base_from_displaced = self._base_from_support @ displacement
-        placed = [(surface, base_from_displaced @ pose) for surface, pose in self._object]
-        self._scene = build_scene([*self._around, *placed, *self._things])
+        object_surfaces = [(surface, base_from_displaced @ pose) for surface, pose in self._object]
+        self._scene = build_scene([*self._around, *object_surfaces, *self._things])
         self._viewer = Viewer(self._scene, self._lens, self._camera.samples_per_side, self._shading)
         self._obstacles = Obstacles(self._scene.corners_mm)
         self._shadows = Shadows(self._obstacles, self._lamp_places_mm, _SHADOW_BYTES)
@@ -194,7 +194,7 @@ class Photographer:
             mean_e = self._blurred_electrons(look, sharp)
             if glows is not None:
                 mean_e += glows
-            mean_e = disturbance.covered(mean_e)
+            mean_e = disturbance.cover_up(mean_e)
             expose_electrons(out, mean_e, **sensor_arguments)
         else:
             expose(

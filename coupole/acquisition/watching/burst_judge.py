@@ -61,7 +61,7 @@ class BurstJudge:
     first: FirstFrames
 
     def judge(self, frames: Sequence[SeenFrame], exposure_us: int) -> list[Found]:
-        """What was found in the frames of one burst, in the order of time; the most telling first."""
+        """Findings in the frames of one burst, which are in the order of time; the most telling first."""
         if ambient := self._ambient(frames, exposure_us):
             return [ambient]
         lit = [frame for frame in frames if isinstance(frame.label.light, Led | Sentinel)]
@@ -80,13 +80,13 @@ class BurstJudge:
             return None
         reference_dn, count = self.first.darks.setdefault(exposure_us, (dark_level(before), len(before)))
         for later in (before, after):
-            found = ambient_light(reference_dn, count, later, self.noise, self.limits, exposure_us)
-            if found:
+            finding = ambient_light(reference_dn, count, later, self.noise, self.limits, exposure_us)
+            if finding:
                 spoilt = [
                     *(frame.label for frame in frames if frame.label.is_shot),
                     *(dark.label for dark in later),
                 ]
-                return replace(found, labels=tuple(spoilt))
+                return replace(finding, labels=tuple(spoilt))
         return None
 
     # -- neighbouring lights ------------------------------------------------------------------------------
@@ -132,9 +132,9 @@ class BurstJudge:
         if len(changes) < SENTINELS:
             return None
         series = _Series(lit, known_places, changes, first)
-        for look_for in (self._thing, self._moved, self._smudge, self._of_light):
-            if found := look_for(series):
-                return found
+        for look_for in (self._thing, self._displacement, self._smudge, self._of_light):
+            if finding := look_for(series):
+                return finding
         return None
 
     def _places(self, series: _Series) -> _Places:
@@ -159,18 +159,18 @@ class BurstJudge:
         limit = np.maximum(self.limits.least_share, self.limits.sigmas * change.tile_sigmas)
         worst = np.unravel_index(int(np.argmax(np.abs(change.tile_shares) / limit)), limit.shape)
         figure = float(change.tile_shares[worst])
-        return series.found(kind, begin, end, abs(figure), float(limit[worst]), OF_THE_LIGHT, words(figure))
+        return series.finding(kind, begin, end, abs(figure), float(limit[worst]), OF_THE_LIGHT, words(figure))
 
     def _thing(self, series: _Series) -> Found | None:
         """A change in places that is too strong for a smudge, or that goes away."""
         places = self._places(series)
-        passing = places.is_over & (places.is_strong | ~places.stays)
-        if not passing.any():
+        is_passing = places.is_over & (places.is_strong | ~places.stays)
+        if not is_passing.any():
             return None
-        begin = end = int(np.argmax(passing))
-        while end + 1 < len(passing) and places.is_over[end + 1]:
+        begin = end = int(np.argmax(is_passing))
+        while end + 1 < len(is_passing) and places.is_over[end + 1]:
             end += 1
-        count = f"{end - begin + 1} of {len(passing)} sentinels"
+        count = f"{end - begin + 1} of {len(is_passing)} sentinels"
         return self._place_found(
             "thing in the field", series, begin, end, lambda _: f"something lay in the field, for {count}"
         )
@@ -190,18 +190,18 @@ class BurstJudge:
             ),
         )
 
-    def _moved(self, series: _Series) -> Found | None:
+    def _displacement(self, series: _Series) -> Found | None:
         """The object or the camera: the sentinels' pictures are displaced, and stay so."""
         shifts_mm = np.array([np.linalg.norm(change.shift_bins) for change in series.changes]) * self.mm_per_bin
         sigmas_mm = np.array([change.shift_sigma_bins for change in series.changes]) * self.mm_per_bin
         limits_mm = np.maximum(self.limits.least_mm, self.limits.sigmas * sigmas_mm)
-        explained = np.array([change.by_shift > change.by_places for change in series.changes])
-        since = _lasting((shifts_mm > limits_mm) & explained)
+        is_displacement = np.array([change.by_shift > change.by_places for change in series.changes])
+        since = _lasting((shifts_mm > limits_mm) & is_displacement)
         if since is None or len(shifts_mm) - since < SENTINELS:
             return None
         figure, limit = float(np.median(shifts_mm[since:])), float(np.median(limits_mm[since:]))
         words = f"the picture is displaced by {figure:.2f} mm on the object: it was moved, or the camera"
-        return series.found("moved", since, None, figure, limit, "mm", words)
+        return series.finding("moved", since, None, figure, limit, "mm", words)
 
     def _of_light(self, series: _Series) -> Found | None:
         """A change of brightness: of one LED alone, of all in one step, or a drift of all."""
@@ -222,13 +222,13 @@ class BurstJudge:
             led = int(changed_leds[0])
             labels = tuple(f.label for f in series.lit if f.label.is_shot and _led_of(f.label) == led)
             words = f"{Led(led)} changed by {share} from flash to flash, the other sentinels did not"
-            found = series.found("LED", largest, None, abs(figure), limit, OF_THE_LIGHT, words)
-            return replace(found, labels=labels)
+            finding = series.finding("LED", largest, None, abs(figure), limit, OF_THE_LIGHT, words)
+            return replace(finding, labels=labels)
         if _is_step(np.array(series.places, float), gains):
             words = f"all light changed by {share} in one step: gain or exposure of the camera"
-            return series.found("exposure step", since, None, abs(figure), limit, OF_THE_LIGHT, words)
+            return series.finding("exposure step", since, None, abs(figure), limit, OF_THE_LIGHT, words)
         words = f"all light has drifted by {share}: LEDs, reference or camera warm up"
-        return series.found("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
+        return series.finding("drift", since, None, abs(figure), limit, OF_THE_LIGHT, words)
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ class _Series:
     changes: Sequence[Change]
     first: Mapping[int, FrameLook]
 
-    def found(
+    def finding(
         self, kind: Kind, begin: int, end: int | None, figure: float, limit: float, unit: str, words: str
     ) -> Found:
         """A finding that shows in the sentinels from `begin` to `end` (None: the last): it concerns all shots from

@@ -15,10 +15,12 @@ _FULL_SHARE = 0.1
 """Least difference, as a share of the bright places, at which the colour of the third part is full."""
 
 
-def finding_picture(found: Found) -> bytes:
+def finding_picture(finding: Found) -> bytes:
     """PNG of three looks beside each other: the one before, the one after, and their difference, where red is more
     light and blue is less."""
-    before, after = (np.maximum(np.nan_to_num(look.astype(float)), 0.0) for look in (found.before, found.after))
+    before, after = (
+        np.maximum(np.nan_to_num(look.astype(float)), 0.0) for look in (finding.before, finding.after)
+    )
     bright_dn = max(float(np.quantile(before, 0.99)), float(np.quantile(after, 0.99)), 1.0)
     difference = after - before
     full_dn = max(float(np.quantile(np.abs(difference), 0.99)), _FULL_SHARE * bright_dn)

@@ -39,7 +39,7 @@ class Found:
     limit: float
     unit: str
     words: str
-    """What was seen, in a sentence."""
+    """Description of the change, in a sentence."""
     before: NDArray[np.float32]
     """[rows, columns] look to compare with, DN."""
     after: NDArray[np.float32]

@@ -19,11 +19,11 @@ _ROWS_READ = 4
 
 @dataclass(frozen=True)
 class FrameLook:
-    """What is kept of a frame."""
+    """The part of a frame that is kept."""
 
     mean_dn: NDArray[np.float32]
     """[rows, columns] mean of a bin's pixels above black, all colours together."""
-    clipped: NDArray[np.bool_]
+    is_clipped: NDArray[np.bool_]
     """[rows, columns] True where a pixel of the bin is at the top of its range."""
 
 
@@ -56,11 +56,11 @@ class LookGrid:
         """The look of a frame [H, W]. Bins that are not whole are left out."""
         rows, columns = (side // self.bin_px for side in pixels.shape)
         mean_dn = np.empty((rows, columns), np.float32)
-        clipped = np.empty((rows, columns), np.bool_)
+        is_clipped = np.empty((rows, columns), np.bool_)
         frame_format = self.frame_format
         white_dn = np.uint16(frame_format.white_dn)
-        _bin_means(pixels, mean_dn, clipped, self.bin_px, self._pair_step, white_dn, frame_format.black_dn)
-        return FrameLook(mean_dn, clipped)
+        _bin_means(pixels, mean_dn, is_clipped, self.bin_px, self._pair_step, white_dn, frame_format.black_dn)
+        return FrameLook(mean_dn, is_clipped)
 
 
 def compile_now() -> None:
@@ -73,7 +73,7 @@ def compile_now() -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _bin_means(pixels, mean_dn, clipped, bin_px, pair_step, white_dn, black_dn):  # type: ignore[no-untyped-def]
+def _bin_means(pixels, mean_dn, is_clipped, bin_px, pair_step, white_dn, black_dn):  # type: ignore[no-untyped-def]
     """Whole rows are added up before bins are, so that the loop over pixels is a vector's."""
     rows, columns = mean_dn.shape
     width = columns * bin_px
@@ -82,19 +82,19 @@ def _bin_means(pixels, mean_dn, clipped, bin_px, pair_step, white_dn, black_dn):
     for row in range(rows):
         sums[:] = 0
         tops[:] = 0
-        read = 0
+        pixel_count = 0
         for pair in range(0, bin_px // 2, pair_step):
             for line in range(2):
                 values = pixels[row * bin_px + 2 * pair + line]
-                read += bin_px
+                pixel_count += bin_px
                 for k in range(width):
                     sums[k] += np.uint32(values[k])
                     tops[k] = values[k] if values[k] > tops[k] else tops[k]
         for column in range(columns):
             total = 0.0
-            is_clipped = False
+            has_top = False
             for k in range(column * bin_px, (column + 1) * bin_px):
                 total += sums[k]
-                is_clipped |= tops[k] >= white_dn
-            mean_dn[row, column] = total / read - black_dn
-            clipped[row, column] = is_clipped
+                has_top |= tops[k] >= white_dn
+            mean_dn[row, column] = total / pixel_count - black_dn
+            is_clipped[row, column] = has_top

@@ -34,9 +34,9 @@ def foretelling(directions: Floats) -> Floats | None:
         reach = away[len(away) // 2]
         across = np.linalg.svd(direction[None])[2][1:]  # two axes of the plane across the direction
         columns = np.column_stack([np.ones(len(near)), (directions[near] - direction) @ across.T / reach])
-        weighted = columns * np.exp(-0.5 * (away / reach) ** 2)[:, None]
-        normal = weighted.T @ columns + np.diag([0.0, _RIDGE, _RIDGE]) * weighted[:, 0].sum()
-        weights[row, near] = np.linalg.solve(normal, weighted.T)[0]
+        weighted_columns = columns * np.exp(-0.5 * (away / reach) ** 2)[:, None]
+        normal = weighted_columns.T @ columns + np.diag([0.0, _RIDGE, _RIDGE]) * weighted_columns[:, 0].sum()
+        weights[row, near] = np.linalg.solve(normal, weighted_columns.T)[0]
     return weights
 
 

@@ -141,20 +141,20 @@ class WatchedRecorder:
         are left unproven, to be taken again, empty if none are."""
         frames = self._frames_of(burst)
         findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
-        findings = [self._with_unseen_shots(burst, found) for found in findings]
+        findings = [self._with_unseen_shots(burst, finding) for finding in findings]
         new_labels = {label for label in burst.labels if label}
-        findings = [found for found in findings if self._is_news(found) and new_labels & set(found.labels)]
-        for found in findings:
-            self._note(burst, found)
+        findings = [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
+        for finding in findings:
+            self._note(burst, finding)
         spoilt: set[ShotLabel] = set()
         if may_retake and self._watch.retake:
-            spoilt = {label for found in findings if found.kind in TAKEN_AGAIN for label in found.labels}
+            spoilt = {label for finding in findings if finding.kind in TAKEN_AGAIN for label in finding.labels}
         spoilt &= {shot.label for shot in self._held}
         self._prove_held(spoilt)
-        if self._watch.pause and any(found.kind in FOR_A_PERSON for found in findings):
+        if self._watch.pause and any(finding.kind in FOR_A_PERSON for finding in findings):
             self._observer.note("paused by what was found: mend it, then go on")
             self._control.pause.set()
-        return "; ".join(found.words for found in findings if found.kind in TAKEN_AGAIN) if spoilt else ""
+        return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
 
     def _frames_of(self, burst: Burst) -> list[SeenFrame]:
         """Frames of the burst, and of the attempts before, in the order of time."""
@@ -166,47 +166,49 @@ class WatchedRecorder:
         self._timeline = [label for label in self._timeline if label not in again] + labels
         return [SeenFrame(label, self._seen[label]) for label in self._timeline if label in self._seen]
 
-    def _with_unseen_shots(self, burst: Burst, found: Found) -> Found:
+    def _with_unseen_shots(self, burst: Burst, finding: Found) -> Found:
         """The same with the shots of the burst, if only its dark frames were looked at."""
         if self._watch.frames == "all":
-            return found
+            return finding
         shots = (label for label in burst.labels if label and label.is_shot)
-        return replace(found, labels=tuple(dict.fromkeys([*found.labels, *shots])))
+        return replace(finding, labels=tuple(dict.fromkeys([*finding.labels, *shots])))
 
-    def _is_news(self, found: Found) -> bool:
+    def _is_news(self, finding: Found) -> bool:
         """An LED that is known to be wrong is not named in each view again."""
-        if found.kind != "LED":
+        if finding.kind != "LED":
             return True
-        leds = {label.light.id for label in found.labels if isinstance(label.light, Led)}
+        leds = {label.light.id for label in finding.labels if isinstance(label.light, Led)}
         is_news = not leds <= self._known_leds
         self._known_leds |= leds
         return is_news
 
-    def _note(self, burst: Burst, found: Found) -> None:
-        shots = tuple(ShotId(burst.view, label) for label in found.labels)
+    def _note(self, burst: Burst, finding: Found) -> None:
+        shots = tuple(ShotId(burst.view, label) for label in finding.labels)
         picture = ""
         if self._pictures < _MOST_PICTURES:
             self._pictures += 1
-            name = f"{burst.view}-e{burst.exposure_index}-r{burst.repeat}-{found.kind.replace(' ', '-')}.png"
-            picture = self.keep_picture(name, finding_picture(found))
-        self._observer.note(f"{burst.view}: {found.kind}: {found.words}" + (f" ({picture})" if picture else ""))
+            name = f"{burst.view}-e{burst.exposure_index}-r{burst.repeat}-{finding.kind.replace(' ', '-')}.png"
+            picture = self.keep_picture(name, finding_picture(finding))
+        self._observer.note(
+            f"{burst.view}: {finding.kind}: {finding.words}" + (f" ({picture})" if picture else "")
+        )
         self._recorder.note(
             FindingNoted(
-                kind=found.kind,
+                kind=finding.kind,
                 view=burst.view,
                 shots=shots,
-                figure=round(found.figure, 6),
-                limit=round(found.limit, 6),
-                unit=found.unit,
-                message=found.words,
+                figure=round(finding.figure, 6),
+                limit=round(finding.limit, 6),
+                unit=finding.unit,
+                message=finding.words,
                 picture=picture,
             )
         )
 
     def _prove_held(self, spoilt: set[ShotLabel]) -> None:
         """Prove the frames that waited, but free those that are spoilt."""
-        held, self._held = self._held, {}
-        for shot, (slot, fields) in held.items():
+        held_frames, self._held = self._held, {}
+        for shot, (slot, fields) in held_frames.items():
             if shot.label in spoilt:
                 self._seen.pop(shot.label, None)
                 self._recorder.free(slot)

@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, assert_never
 
@@ -25,7 +26,7 @@ from sim.devices.camera_body import Exposed, Surroundings
 from sim.devices.ledbox_firmware import LedBoxFirmware
 from sim.devices.refusals import untold
 from sim.devices.text_box import TextBox
-from sim.optics.disturbances import Disturber
+from sim.optics.disturbances import OF_EACH_KIND, Disturber, Disturbing
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
 from sim.world import faults as script
@@ -75,6 +76,7 @@ class World:
         self._control.setblocking(False)
         self.reactor.add_reader(self._control, self._accept)
         self._faults_at_edge: dict[int, list[script.Fault]] = {}
+        self._settings_faults = settings.faults
         for fault in settings.faults:
             self._schedule(fault)
         self._warm_up(config.camera)
@@ -118,7 +120,10 @@ class World:
         """Compile the renderer and fill its caches, before the first frame is due."""
         led = int(self._photographer.leds.ids[0])
         lit = Exposed({led: 1e-3}, [1], 1e-3, 1.0, 0, self.robot.true_base_from_flange())
-        self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
+        pixels = np.zeros((camera.height_px, camera.width_px), np.uint16)
+        self._photographer.render(pixels, lit)
+        if any(isinstance(fault, Disturbing) for fault in self._settings_faults):
+            self._photographer.render(pixels, replace(lit, disturbance=OF_EACH_KIND))
 
     # -- the cables ---------------------------------------------------------------------------------------
 

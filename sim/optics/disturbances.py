@@ -74,7 +74,7 @@ class Disturbance:
 
 CALM = Disturbance()
 OF_EACH_KIND = Disturbance(lamp_lux=1.0, smudges=(Spot(0.5, 0.5, 0.1, 0.9),))
-"""What renders by code that calm pictures may not need: to be compiled before the first frame is due."""
+"""Disturbance whose code calm pictures may not need: it is to be compiled before the first frame is due."""
 Disturbing = (
     script.RoomLamp
     | script.Warming

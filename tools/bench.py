@@ -270,6 +270,14 @@ def bench_urushi(options: Asked) -> None:
         line(**figure)
 
 
+def bench_watching(options: Asked) -> None:
+    """The look at a full-size frame and the judging of a burst, against a frame's time at 100 frames/s."""
+    from bench_watching import figures
+
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
+        line(**figure)
+
+
 BENCHES: dict[str, Callable[[Asked], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
@@ -286,6 +294,7 @@ BENCHES: dict[str, Callable[[Asked], None]] = {
     "urushi": bench_urushi,
     "workers": bench_workers,
     "console": bench_console,
+    "watching": bench_watching,
 }
 
 

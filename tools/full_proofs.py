@@ -97,6 +97,11 @@ PROOFS = (
         "LEDs chosen in the run, beside spread and random ones, on seven rendered objects",
         "tools/prove_adaptive_lights.py",
     ),
+    Proof(
+        "watching",
+        "50 faults in a measurement found within the view and named, 200 clean views without alarm",
+        "tools/prove_watching.py",
+    ),
     Proof("exports", "pixels lit anew from each export are the result's", "tools/prove_exports.py"),
     Proof("brackets", "intervals of merged photographs hold for random cameras", "tools/prove_brackets.py"),
     Proof(

@@ -17,6 +17,8 @@ from coupole.geometry import Transform
 from coupole.plan.choices import FrameSample
 from coupole.plan.shot_id import ShotId
 from coupole.storage import journal, run_dose
+from coupole.storage.disk_errors import disk_error
+from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.frame_file_creation import Collections, create
 from coupole.storage.journal import FRAME_LINE, Journal, append_lines
 from coupole.storage.journal_events import Event, FrameProven
@@ -25,6 +27,8 @@ from coupole.storage.view_reader import View, read_view, refuse_lost
 from coupole.storage.view_writer import ViewWriter
 
 COMMIT_EVERY_S = 0.5
+PICTURES = "watch"
+"""Folder of a run with pictures of what was found while it was acquired."""
 SPARE_SLOTS = 32
 """Additional slots for surplus frames, until their burst has been evaluated."""
 _SLOWEST_SYNC_BYTES_S, _SLOWEST_ALLOCATION_BYTES_S = 5e6, 50e6
@@ -79,6 +83,11 @@ class Recorder(Protocol):
 
     def note(self, event: Event) -> None:
         """Note an event for the journal."""
+        ...
+
+    def keep_picture(self, name: str, content: bytes) -> str:
+        """Keep the PNG file of a finding; returns its path in the run, empty where there is no run. Raises
+        StorageError."""
         ...
 
     def commit(self, *, now: bool) -> None:
@@ -212,6 +221,22 @@ class RunRecorder:
 
     def note(self, event: Event) -> None:
         self._journal.write(event)
+
+    def keep_picture(self, name: str, content: bytes) -> str:
+        folder = self._run.folder / PICTURES
+        stem, suffix = name.rsplit(".", 1)
+        path = folder / name
+        with under_way(DISK, str(path)):
+            number = 1
+            while path.exists():
+                number += 1
+                path = folder / f"{stem}-{number}.{suffix}"
+            try:
+                make_folder(folder)
+                write_synced(path, content)
+            except OSError as error:
+                raise disk_error(path, error) from error
+        return str(path.relative_to(self._run.folder))
 
     def commit(self, *, now: bool) -> None:
         """A disk may take seconds to sync, so this is done in another thread unless it must be `now`, and a

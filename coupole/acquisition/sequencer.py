@@ -22,6 +22,7 @@ from coupole.acquisition.observer import Control, Held, Observer, Unwatched
 from coupole.acquisition.opened_cell import OpenedCell
 from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.verdict import NOTHING_TO_MATCH, Verdict
+from coupole.acquisition.watching.watched_run import WatchedRecorder
 from coupole.devices import FrameFormat
 from coupole.errors import DeviceError, UnprovenError
 from coupole.motion.itinerary import Visit
@@ -60,8 +61,9 @@ class Sequencer:
         can_stand: bool = True,
     ) -> None:
         """`can_stand`: a person can let the session go on after a hold; else a hold ends it."""
-        self._job, self._cell, self._recorder = job, cell, recorder
+        self._job, self._cell = job, cell
         self._observer, self._control = observer or Unwatched(), control or Control()
+        self._recorder = recorder = WatchedRecorder(recorder, job, self._observer, self._control)
         self._dose = DoseMeter(job, cell, recorder)
         self._bursts = BurstsOfViews(job, recorder)
         self._ahead_s = 0.0
@@ -247,11 +249,12 @@ class Sequencer:
                 if not self._arm.was_held(error) or self._control.stop.is_set():
                     raise
                 verdict = Verdict(NOTHING_TO_MATCH, [])  # what was cut short is no attempt
+            spoilt = self._recorder.judge(todo, may_retake=attempt <= self._job.plan.reshoot_limit)
             proven_shots = self._recorder.proven()
             missing_shots = [shot for shot in todo.shots if shot and shot not in proven_shots]
             if not missing_shots:
                 return
-            self._note_gap(burst, verdict, missing_shots)
+            self._note_gap(burst, verdict.because(spoilt), missing_shots)
             self.outcome.bad |= set(verdict.dead)
             todo = burst.only({shot.label for shot in missing_shots})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,10 @@ class Verdict:
     match: Match
     dead: list[ShotId]
     """Shots whose LED drew no current."""
+
+    def because(self, reason: str) -> Verdict:
+        """The same with another reason why frames are not proven, if there is one."""
+        return replace(self, match=replace(self.match, reason=reason)) if reason else self
 
 
 _NONE = np.zeros(0, np.int64)

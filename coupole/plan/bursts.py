@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
+from typing import assert_never
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coupole.devices import NO_LED, STEP_DTYPE, Step
 from coupole.plan.marks import MARKS_AT_ENDS, Marks, with_marks
-from coupole.plan.shot_id import Dark, Led, Light, Panel, PanelMark, ShotId, ShotLabel
+from coupole.plan.shot_id import Dark, Led, Light, Panel, PanelMark, Sentinel, ShotId, ShotLabel
 
 EXPOSURE_MARGIN_US = 200
 """On-time of an LED after the exposure's nominal end, because the camera's exposure may start late."""
@@ -23,6 +24,8 @@ PERIOD_MARGIN_US, PERIOD_MARGIN_PPM = 10, 200
 them."""
 LED_GAP_US = 100
 """Least dark time between two lights."""
+_COOLS_FOR = 3
+"""Steps between a sentinel and another shot of its LED: in them it rests for twice the time of a flash."""
 SOFTWARE_LATENCY_US = 60_000
 """Additional on-time of an LED with software trigger: the host's round trip to the camera."""
 
@@ -137,7 +140,7 @@ def burst_timing(
 
 
 def bursts_of_exposure(
-    lights: Sequence[Sequence[Led] | Panel],
+    lights: Sequence[Sequence[Led | Sentinel] | Panel],
     timing: BurstTiming,
     exposure_index: int,
     repeat: int,
@@ -152,8 +155,34 @@ def bursts_of_exposure(
         yield _burst(lit, own_darks, timing, exposure_index, repeat, marks=marks)
 
 
+def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> list[Led | Sentinel]:
+    """LEDs with `sentinels` among them: all at the begin and at the end, and one after the other in between, after
+    each `every` LEDs. They keep a distance from their LEDs' own shots, in which these cool."""
+    in_order: list[Led | Sentinel] = list(lit)
+    if not sentinels:
+        return in_order
+    between = range(every, len(lit) - every // 2, every)
+    wanted_places = [
+        (0, list(sentinels)),
+        *((place, [sentinels[k % len(sentinels)]]) for k, place in enumerate(between)),
+    ]
+    wanted_places.append((len(lit), list(sentinels)))
+    numbers = iter(reversed(range(sum(len(leds) for _, leds in wanted_places))))
+    for wanted_place, leds in reversed(wanted_places):
+        own_places = [place for place, led in enumerate(lit) if led.id in leds]
+        place = _cool_place(wanted_place, own_places, len(lit))
+        in_order[place:place] = [Sentinel(led, next(numbers)) for led in reversed(leds)][::-1]
+    return in_order
+
+
+def _cool_place(wanted_places: int, own_places: Sequence[int], count: int) -> int:
+    """The place among so many LEDs nearest to the wanted one that keeps the distance from these places."""
+    places = (p for p in range(count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own_places))
+    return min(places, key=lambda p: (abs(p - wanted_places), p), default=wanted_places)
+
+
 def _burst(
-    lit: Sequence[Led] | Panel,
+    lit: Sequence[Led | Sentinel] | Panel,
     darks: int,
     timing: BurstTiming,
     exposure_index: int,
@@ -169,11 +198,22 @@ def _burst(
     mark_lights: list[Light] = [PanelMark(panel, k) if panel else Dark(k) for k in range(mark_count)]
     dark = _dark_step(timing, sends_edge=hardware)
     steps = np.repeat(dark, len(lights))
-    steps["led"] = [light.id if isinstance(light, Led) else NO_LED for light in lights]
+    steps["led"] = [_led_of(light) for light in lights]
     own_labels = [ShotLabel(light, exposure_index, repeat) for light in lights]
     mark_labels = [ShotLabel(light, exposure_index, repeat) for light in mark_lights]
     table, labels = with_marks(marks, steps, own_labels, mark_labels, dark)
     return Burst("", exposure_index, repeat, panel, hardware, marks, timing, table, tuple(labels))
+
+
+def _led_of(light: Light) -> int:
+    """Id of the LED that is lit, or NO_LED."""
+    match light:
+        case Led(id=led) | Sentinel(led=led):
+            return led
+        case Panel() | PanelMark() | Dark():
+            return NO_LED
+        case _:
+            assert_never(light)
 
 
 def _darks(first: int, count: int) -> list[Dark]:

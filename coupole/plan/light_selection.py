@@ -24,6 +24,7 @@ from coupole.plan.plan_lights import (
     Panels,
 )
 from coupole.plan.shot_id import Led, Panel
+from coupole.plan.watch import SENTINELS
 
 
 def leds_of_plan(plan: Plan, leds: LedTable, base_from_support: Transform) -> NDArray[np.int64]:
@@ -74,6 +75,8 @@ def lit_in_bursts(lights: Lights, leds: LedTable, base_from_support: Transform) 
             assert_never(lights)
 
 
+FEWEST_WATCHED = 12
+"""LEDs of a view, at least, for sentinels among them."""
 FEWEST_FIRST_LIGHTS, FIRST_SHARE = 6, 8
 
 
@@ -82,6 +85,19 @@ def first_lights(ids: NDArray[np.int64], leds: LedTable, most: int) -> NDArray[n
     them, nor fewer than six."""
     count = min(len(ids), most, max(FEWEST_FIRST_LIGHTS, len(ids) // FIRST_SHARE))
     return ids[spread_rows(leds.positions_mm[leds.rows(ids)], count)] if len(ids) else ids
+
+
+def sentinels_among(lit: Sequence[Sequence[Led] | Panel], leds: LedTable) -> tuple[int, ...]:
+    """Ids of the LEDs that a view's sentinels are, spread over the middle half of those `lit` by their height: low
+    ones graze, and the highest are alike. None where too few are lit to place them between."""
+    ids = np.array([led.id for lights in lit if not isinstance(lights, Panel) for led in lights], np.int64)
+    if len(ids) < FEWEST_WATCHED:
+        return ()
+    heights_mm = leds.positions_mm[leds.rows(ids)] @ leds.normals.mean(axis=0)
+    order = np.argsort(heights_mm, kind="stable")
+    middle = np.sort(ids[order[len(ids) // 4 : len(ids) - len(ids) // 4]])
+    rows = spread_rows(leds.positions_mm[leds.rows(middle)], SENTINELS)
+    return tuple(middle[rows].tolist())
 
 
 def spread_rows(positions_mm: NDArray[np.float64], count: int) -> NDArray[np.int64]:

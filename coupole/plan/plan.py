@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from coupole.plan.base_model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.exposures import AutoExposure, Exposures, FixedExposure
 from coupole.plan.plan_lights import AdaptiveLights, Lights, NoLights, Panels
+from coupole.plan.watch import DARKS_ONLY, EVERYTHING, NOTHING, Watch
 
 
 class LookAt(Model):
@@ -132,6 +133,8 @@ class Plan(Model):
     """The camera is triggered by the LED box, or by the host, light by light."""
     reshoot_limit: Annotated[int, Field(ge=0, le=20)] = 3
     """Number of times that frames which are not proven are taken again, at most."""
+    watch: bool | Watch = DARKS_ONLY
+    """Watching of the run: `true`, `false`, or what of it. Without it dark frames are looked at."""
     licence: Words | None = None
     """Terms under which the run's data may be used; None: the rig's. For the run's README.txt."""
     contact: Words | None = None
@@ -142,6 +145,25 @@ class Plan(Model):
         lights = [view.lights or self.lights for view in self.views]
         if any(isinstance(selection, NoLights) for selection in lights) and self.darks_per_view == 0:
             raise ValueError("lights, or at least one dark frame per view: a view would shoot nothing")
+        return self
+
+    @property
+    def watching(self) -> Watch:
+        """The way in which the run is watched."""
+        return {True: EVERYTHING, False: NOTHING}[self.watch] if isinstance(self.watch, bool) else self.watch
+
+    @property
+    def takes_sentinels(self) -> bool:
+        """True if LEDs are lit again and again to tell what changes."""
+        return self.watching.frames == "all"
+
+    @model_validator(mode="after")
+    def _no_sentinels_of_choices(self) -> Plan:
+        if self.takes_sentinels and (self.chooses_lights or isinstance(self.exposure, AutoExposure)):
+            raise ValueError(
+                "`watch: {frames: darks}` where lights or exposures are chosen in the run: "
+                "sentinels stand in bursts that the plan says"
+            )
         return self
 
     @property

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 from coupole.plan.arm_description import ArmDescription
 from coupole.plan.base_model import Degrees, FilePath, Length, Model, Name, Pose, Vector, Words
 from coupole.plan.registry import WORLD, current_name
+from coupole.plan.watch import WatchLimits
 
 DriverName = Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"), AfterValidator(current_name)]
 """`package.module:Class`; names of version 0.1 are understood."""
@@ -315,6 +316,8 @@ class Rig(Model):
     """Volumes that the arm must not enter."""
     led_limits: LedLimits = LedLimits()
     """Limits of LEDs and boards: for how long LEDs may be lit."""
+    watch: WatchLimits = WatchLimits()
+    """Figures of camera and LEDs from which the limits of a watched run follow."""
     motion: Motion = Motion()
     """Motion of the arm between views."""
     storage: Storage

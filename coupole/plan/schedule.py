@@ -7,15 +7,16 @@ from dataclasses import dataclass, field, replace
 from typing import assert_never
 
 from coupole.geometry import Transform, look_at
-from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure
+from coupole.plan.bursts import FASTEST, Burst, Pace, burst_timing, bursts_of_exposure, with_sentinels
 from coupole.plan.choices import Choice, OpenView, bound_of, bound_of_lights, has_enough
 from coupole.plan.exposures import AutoExposure
 from coupole.plan.led_table import LedTable
-from coupole.plan.light_selection import first_lights, lit_in_bursts
+from coupole.plan.light_selection import first_lights, lit_in_bursts, sentinels_among
 from coupole.plan.marks import MARKS, Marks
 from coupole.plan.plan import Grid, Joints, LookAt, Plan, View
 from coupole.plan.plan_lights import AdaptiveLights, Lights
-from coupole.plan.shot_id import MAX_CHARACTERS, Led, PanelMark, ShotId, ShotLabel
+from coupole.plan.shot_id import MAX_CHARACTERS, Led, Panel, PanelMark, Sentinel, ShotId, ShotLabel
+from coupole.plan.watch import SENTINELS
 
 MOST_VIEWS, MOST_FRAMES = 2000, 5_000_000
 """Largest numbers of views and frames of one plan, as many as fit into memory."""
@@ -194,7 +195,7 @@ def build_schedule(
     for view in plan.views:
         lights = view.lights or plan.lights
         if lights not in bursts_of:
-            lit = lit_in_bursts(lights, leds, base_from_support)
+            lit = _with_sentinels(lit_in_bursts(lights, leds, base_from_support), plan, leds)
             bursts_of[lights] = [
                 burst
                 for repeat in range(2 if is_auto else plan.repeats)
@@ -225,6 +226,17 @@ def build_schedule(
     if isinstance(plan.exposure, AutoExposure):
         return _with_open_exposures(schedule, plan.exposure, leds)
     return _with_open_lights(schedule, plan) if plan.chooses_lights else schedule
+
+
+def _with_sentinels(
+    lit: Sequence[Sequence[Led] | Panel], plan: Plan, leds: LedTable
+) -> list[Sequence[Led | Sentinel] | Panel]:
+    """Lights of each burst of one exposure, with sentinels if the plan has them."""
+    sentinels = sentinels_among(lit, leds) if plan.takes_sentinels else ()
+    return [
+        lights if isinstance(lights, Panel) else with_sentinels(lights, sentinels, plan.watching.every)
+        for lights in lit
+    ]
 
 
 def _with_open_lights(schedule: Schedule, plan: Plan) -> Schedule:
@@ -274,7 +286,11 @@ def names_too_long(plan: Plan, leds: LedTable) -> list[tuple[tuple[str | int, ..
     longest_light = max(int(leds.ids.max()), 9999)
     longest = ShotLabel(Led(longest_light), len(plan.exposure.exposures_us) - 1, plan.repeats - 1)
     mark = ShotLabel(PanelMark(4, MARKS - 1), longest.exposure, longest.repeat)
-    room = MAX_CHARACTERS - 1 - max(len(str(longest)), len(str(mark)))
+    labels = [longest, mark]
+    if plan.takes_sentinels:
+        last = Sentinel(longest_light, len(leds.ids) // plan.watching.every + 2 * SENTINELS)
+        labels.append(ShotLabel(last, longest.exposure, longest.repeat))
+    room = MAX_CHARACTERS - 1 - max(len(str(label)) for label in labels)
     return [
         (("views", number, "name"), f"{name}: a view's name may have {room} characters here, found {len(name)}")
         for number, view in enumerate(plan.views)

@@ -6,6 +6,7 @@
     top/led0417/e1/r2       the same light, second exposure, third time (the first repeat is not written)
     top/panel2/e0           flat panel 2
     top/dark3/e0            a dark frame or dark mark
+    top/led0417-watch3/e0   LED 417 as a sentinel, for the fourth time: it tells what changes, and is no shot
     top/panel2-mark4/e0     a mark of a panel's burst: the panel shines there too, so it is not dark
 """
 
@@ -18,7 +19,7 @@ from typing import TypeAlias
 MAX_CHARACTERS = 80
 """Greatest length of a shot id: the width of its field in the frame table."""
 _LABEL = re.compile(
-    r"(?:led(?P<led>\d{4,5})|panel(?P<panel>\d)(?:-mark(?P<mark>\d+))?|dark(?P<dark>\d+))"
+    r"(?:led(?P<led>\d{4,5})(?:-watch(?P<watch>\d+))?|panel(?P<panel>\d)(?:-mark(?P<mark>\d+))?|dark(?P<dark>\d+))"
     r"/e(?P<exposure>\d+)(?:/r(?P<repeat>[1-9]\d*))?"
 )
 
@@ -31,6 +32,17 @@ class Led:
 
     def __str__(self) -> str:
         return f"led{self.id:04d}"
+
+
+@dataclass(frozen=True, slots=True)
+class Sentinel:
+    """One LED is lit to tell what has changed since it was lit before; the frame is not a shot of the plan."""
+
+    led: int
+    number: int
+
+    def __str__(self) -> str:
+        return f"{Led(self.led)}-watch{self.number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +76,7 @@ class Dark:
         return f"dark{self.number}"
 
 
-Light: TypeAlias = Led | Panel | PanelMark | Dark
+Light: TypeAlias = Led | Sentinel | Panel | PanelMark | Dark
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +93,7 @@ class ShotLabel:
 
     @property
     def is_shot(self) -> bool:
-        """True for a frame under a light that was asked for; False for dark frames and marks."""
+        """True for a frame under a light that was asked for; False for dark frames, marks and sentinels."""
         return isinstance(self.light, Led | Panel)
 
     @property
@@ -116,7 +128,7 @@ class ShotId:
 
     @property
     def is_shot(self) -> bool:
-        """True for a frame under a light that was asked for; False for dark frames and marks."""
+        """True for a frame under a light that was asked for; False for dark frames, marks and sentinels."""
         return self.label.is_shot
 
     @property
@@ -133,6 +145,8 @@ class ShotId:
 
 
 def _light(match: re.Match[str]) -> Light:
+    if match["watch"] is not None:
+        return Sentinel(int(match["led"]), int(match["watch"]))
     if match["led"] is not None:
         return Led(int(match["led"]))
     if match["dark"] is not None:

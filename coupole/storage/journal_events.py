@@ -219,6 +219,29 @@ class ReshootBegun(JournalEvent):
     """Shots that are taken again."""
 
 
+class FindingNoted(JournalEvent):
+    """Something changed in a burst that should not; the shots are marked by this line, and may be taken again."""
+
+    event: Literal["finding"] = "finding"
+    kind: str
+    """Name of what was found: `ambient light`, `LED`, `drift`, `moved`, `smudge`, `exposure step` or
+    `thing in the field`."""
+    view: str
+    """Name of the view."""
+    shots: tuple[Shot, ...]
+    """Shots that it concerns."""
+    figure: float
+    """Size of the change."""
+    limit: float
+    """Limit that the figure is beyond, from the rig's figures of noise."""
+    unit: str
+    """Unit of both."""
+    message: str
+    """Description of what was seen, in a sentence."""
+    picture: InnerPath | Literal[""] = ""
+    """A PNG file with the light before, after, and their difference, relative to the run's folder."""
+
+
 class FaultNoted(JournalEvent):
     """Something failed."""
 
@@ -298,6 +321,7 @@ Event: TypeAlias = (
     | BurstEnded
     | GapFound
     | ReshootBegun
+    | FindingNoted
     | FaultNoted
     | InputsChanged
     | Paused

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, assert_never
 
 from coupole.errors import CoupoleError
+from coupole.plan.shot_id import Sentinel
 from coupole.storage import journal, run_dose
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import (
@@ -21,6 +22,7 @@ from coupole.storage.journal_events import (
     Continued,
     Event,
     FaultNoted,
+    FindingNoted,
     FrameProven,
     GapFound,
     InputsChanged,
@@ -83,6 +85,8 @@ class Status:
     reshot: int = 0
     faults: list[str] = field(default_factory=list)
     """Failures of the run. That somebody stopped the run is none."""
+    findings: list[str] = field(default_factory=list)
+    """Findings of watching the measurement: view, name, what was seen, and the picture's path in the run."""
     sessions: list[Session] = field(default_factory=list)
     views: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Proven and expected frames of each view; where they are chosen in the run, expected as far as chosen."""
@@ -137,7 +141,7 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
             proven.add(event.shot)
         _note_event(status, event)
     status.proven = sum(shot.is_shot for shot in proven)
-    status.darks_proven = len(proven) - status.proven
+    status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
     proven_per_view = Counter(shot.view for shot in proven)
     status.open_views = run.open_views()
     status.views = {
@@ -194,6 +198,9 @@ def _note_event(found: Status, event: Event) -> None:
             found.reason = event.message
             if event.kind != _STOPPED_IN_0_1:
                 found.faults.append(event.message)
+        case FindingNoted():
+            picture = f" ({event.picture})" if event.picture else ""
+            found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
         case BurstEnded():
             session.light_s += event.on_s
         case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():

@@ -17,6 +17,7 @@ from coupole.storage.journal_events import (
     BurstsChosen,
     Event,
     FaultNoted,
+    FindingNoted,
     GapFound,
     SessionStopped,
 )
@@ -147,6 +148,10 @@ def troubles(events: Iterable[Event], views: Iterable[SampledView], run_status: 
     for event in events:
         if isinstance(event, FaultNoted) and event.kind != _STOPPED_IN_0_1:
             lines.append([Moment(event.t), " ", Verdict(event.message, "bad")])
+        elif isinstance(event, FindingNoted):
+            figure = f"{event.figure:.3g} {event.unit}, the limit is {event.limit:.3g}"
+            words = f" view {event.view}: {event.kind}: {event.message}; {len(event.shots)} shots ({figure}) "
+            lines.append([Moment(event.t), words, Link(event.picture) if event.picture else ""])
         elif isinstance(event, GapFound):
             why = f"{event.missing} missing, {event.lost_in_transfer} lost in transfer, {event.surplus} surplus"
             dead = f"; LEDs without current: {', '.join(map(str, event.dead_leds))}" if event.dead_leds else ""

@@ -221,6 +221,8 @@ def show_status(console: Console, status: Status) -> None:
     console.print(f"  light on the object: {status.dose_lux_h:.3f} lux.h")
     for view, (proven, total) in status.views.items():
         console.print(f"  {view}: {proven} of {total} frames")
+    for finding in status.findings:
+        console.print("  [yellow]found:[/]", Text(finding))
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from coupole.geometry import Transform
 from sim.devices.arm_bodies import NONE, Capsules
+from sim.optics.disturbances import CALM, Disturbance
 from sim.optics.sensor_model import SensorModel
 from sim.world.lighting import Lighting
 from sim.world.reactor import Reactor
@@ -39,6 +40,7 @@ class Exposed:
     base_from_flange: Transform
     arm_mm: Capsules = field(default_factory=lambda: NONE)
     """Parts of arm and tool that block light, in the base frame."""
+    disturbance: Disturbance = CALM
 
 
 _RENDER_PATIENCE_S = 30.0
@@ -121,6 +123,8 @@ class Surroundings:
     render: Render
     arm: Callable[[], Capsules] = lambda: NONE
     """Parts of the arm that block light at present."""
+    disturbance: Callable[[int], Disturbance] = lambda _: CALM
+    """Disturbance of an exposure that begins at a world time, ns."""
     on_exposed: Callable[[int, int, int, int, int], None] = lambda *_: None
     """Told of each exposure that has ended: number, frame id, timestamp ns, world times ns of start and end."""
 
@@ -155,7 +159,7 @@ class CameraBody:
         self._reactor, self._settings, self._wire = reactor, settings, wire
         self._lighting, self._pose = surroundings.lighting, surroundings.pose
         self._render, self._arm = surroundings.render, surroundings.arm
-        self._on_exposed = surroundings.on_exposed
+        self._on_exposed, self._disturbance = surroundings.on_exposed, surroundings.disturbance
         self.readout_ns = round(surroundings.readout_us * 1e3)
         self.gap_ns = round(surroundings.exposure_gap_us * 1e3)
         self._random = random.Random(settings.seed)
@@ -277,6 +281,7 @@ class CameraBody:
             number,
             self._pose(),
             self._arm(),
+            self._disturbance(start_ns),
         )
         working = self._workers.submit(self._work, shot, exposure)
         self._reactor.at(shot.deliver_ns, lambda: self._wait_for(working, session))

@@ -18,6 +18,7 @@ from sim.devices.camera_body import Exposed
 from sim.objects.plan_object import surface_of
 from sim.optics import panels
 from sim.optics.blur import defocus_blur_px, through
+from sim.optics.disturbances import Millimetres
 from sim.optics.dome import as_built
 from sim.optics.glow import Glow, glow
 from sim.optics.led_light import channel_factors
@@ -85,15 +86,12 @@ class Photographer:
 
     def __init__(self, scene: SceneConfig, camera: CameraConfig, settings: Settings) -> None:
         base_from_support = np.array(scene.base_from_support)
-        surfaces = [(support_disk(scene.support_diameter_mm), base_from_support)]
-        surfaces += [
-            (surface_of(mesh, settings), base_from_support @ np.array(mesh.support_from_object))
-            for mesh in scene.objects
-        ]
-        surfaces += placed_surfaces(settings.things, base_from_support, settings.strangers.target)
+        self._base_from_support = base_from_support
+        self._object = [(surface_of(mesh, settings), np.array(mesh.support_from_object)) for mesh in scene.objects]
+        self._around = [(support_disk(scene.support_diameter_mm), base_from_support)]
+        self._things = placed_surfaces(settings.things, base_from_support, settings.strangers.target)
         self._strangers = settings.strangers
         self._up = base_from_support[:3, 2]
-        self._scene = build_scene(surfaces)
         self._emission = scene.emission
         table = read_leds(scene.leds)
         self.leds: Leds = as_built(table, settings.dome)
@@ -123,7 +121,6 @@ class Photographer:
         self._sight = sight(self._lens)
         self._falloff = self._relative_illuminance()
         self._shading = settings.shading
-        self._viewer = Viewer(self._scene, self._lens, camera.samples_per_side, self._shading)
         self.sensor = camera.true_sensor(settings.seed)
         self.flange_from_camera: Transform = np.array(camera.flange_from_camera)
         self.reference_lux = _reference_lux(_emitters(table), base_from_support)
@@ -136,13 +133,25 @@ class Photographer:
         pieces = [piece for panel, unevenness in self._panels for piece in panels.pieces(panel, unevenness)]
         self._pieces = pieces
         places_mm = np.array([*self.leds.positions_mm, *(piece.centre_mm for piece in pieces)])
-        self._obstacles = Obstacles(self._scene.corners_mm)
-        self._shadows = Shadows(self._obstacles, places_mm, _SHADOW_BYTES)
-        self._look: Look | None = None
-        self._interreflection = config = settings.light_between_surfaces
-        self._exchange = None if config is None else exchange(self._scene, self._obstacles, config.rays)
+        self._lamp_places_mm = places_mm
+        self._interreflection = settings.light_between_surfaces
+        self._place_object((0.0, 0.0, 0.0))
         self._colour: dict[int, NDArray[np.float32]] = {}
         self._warm_up(base_from_support)
+
+    def _place_object(self, moved_mm: Millimetres) -> None:
+        """Build the scene with the plan's object displaced in the support frame."""
+        displacement = np.eye(4)
+        displacement[:3, 3] = self._object_mm = moved_mm
+        base_from_displaced = self._base_from_support @ displacement
+        object_surfaces = [(surface, base_from_displaced @ pose) for surface, pose in self._object]
+        self._scene = build_scene([*self._around, *object_surfaces, *self._things])
+        self._viewer = Viewer(self._scene, self._lens, self._camera.samples_per_side, self._shading)
+        self._obstacles = Obstacles(self._scene.corners_mm)
+        self._shadows = Shadows(self._obstacles, self._lamp_places_mm, _SHADOW_BYTES)
+        self._look: Look | None = None
+        config = self._interreflection
+        self._exchange = None if config is None else exchange(self._scene, self._obstacles, config.rays)
 
     def _warm_up(self, base_from_support: Transform) -> None:
         """Compile by rendering the support from above under one LED, before the first frame is due."""
@@ -164,22 +173,28 @@ class Photographer:
 
     def render(self, out: NDArray[np.uint16], exposure: Exposed) -> None:
         """Fill `out` [h, w] with the frame of one exposure, DN."""
-        look = self._look_from(exposure.base_from_flange, exposure.arm_mm)
+        disturbance = exposure.disturbance
+        if disturbance.object_mm != self._object_mm:
+            self._place_object(disturbance.object_mm)
+        base_from_flange = exposure.base_from_flange.copy()
+        base_from_flange[:3, 3] += disturbance.camera_mm
+        look = self._look_from(base_from_flange, exposure.arm_mm)
         radiance, seconds = self._lit(look, exposure)
         sensor_arguments: dict[str, Any] = {
             "model": self.sensor,
             "frame": exposure.number,
             "exposure_s": exposure.exposure_s,
-            "gain": exposure.gain * self._strangers.sensor.gain(exposure.number),
+            "gain": exposure.gain * disturbance.gain * self._strangers.sensor.gain(exposure.number),
             "temperature_c": self._camera.sensor_temperature_c,
         }
         glows = self._glows(look, exposure)
         scale = self._electrons * seconds
-        if self._camera.blur or self._strangers.lens.coma_px:
+        if self._camera.blur or self._strangers.lens.coma_px or disturbance.covers:
             sharp = electrons(look.view.site, radiance, self._falloff, electrons_per_radiance=scale)
             mean_e = self._blurred_electrons(look, sharp)
             if glows is not None:
                 mean_e += glows
+            mean_e = disturbance.cover_up(mean_e)
             expose_electrons(out, mean_e, **sensor_arguments)
         else:
             expose(
@@ -215,6 +230,8 @@ class Photographer:
         """Radiance of the sites, and its duration in seconds."""
         lights = [(self._led(look, led), lit_s) for led, lit_s in exposure.seconds_of_led.items()]
         lights += [(self._panel(look, panel), exposure.exposure_s) for panel in exposure.panels]
+        if lamp_lux := exposure.disturbance.lamp_lux:
+            lights.append((panel_radiance(look.view, self._scene.materials, lamp_lux), exposure.exposure_s))
         if len(lights) == 1:
             return lights[0]
         count = len(look.view.points_mm)

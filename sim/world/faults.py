@@ -17,6 +17,8 @@ class _Model(BaseModel):
 
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Seconds = Annotated[float, Field(ge=0, le=1e6)]
+Offset = Annotated[float, Field(ge=-1000, le=1000)]
+Place = Annotated[float, Field(ge=-1, le=2)]
 
 
 class When(BaseModel):
@@ -111,6 +113,64 @@ class FlickeringLed(_Model):
     rms: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
+class DimLed(When):
+    """An LED that has aged, or whose contact has become worse: it loses `loss` of its flux for good."""
+
+    kind: Literal["dim_led"]
+    led: Count
+    loss: Annotated[float, Field(gt=0, lt=1)] = 0.3
+
+
+class Warming(When):
+    """All LEDs change together, by `per_s` of their flux each second, as on boards that warm up."""
+
+    kind: Literal["warming"]
+    per_s: Annotated[float, Field(ge=-1, le=1)] = -0.01
+
+
+class RoomLamp(When):
+    """A lamp in the room is switched on (0: off): `lux` on everything that the camera sees."""
+
+    kind: Literal["room_lamp"]
+    lux: Annotated[float, Field(ge=0, le=1e6)] = 20.0
+
+
+class Bump(When):
+    """The plan's object (in the support frame), or the camera (in the base frame), is displaced by `mm`."""
+
+    kind: Literal["bump"]
+    what: Literal["object", "camera"] = "object"
+    mm: tuple[Offset, Offset, Offset] = (0.2, 0.0, 0.0)
+
+
+class Smudge(When):
+    """A fingerprint or dust on the lens. Place and radius are shares of the picture's width, from its top left."""
+
+    kind: Literal["smudge"]
+    at: tuple[Place, Place] = (0.5, 0.4)
+    radius: Annotated[float, Field(gt=0, le=1)] = 0.15
+    transmission: Annotated[float, Field(ge=0, lt=1)] = 0.93
+
+
+class ExposureStep(When):
+    """The camera's gain or exposure changes by itself: all values above black by `factor`."""
+
+    kind: Literal["exposure_step"]
+    factor: Annotated[float, Field(gt=0, le=100)] = 1.1
+
+
+class Hand(When):
+    """A hand or a cloth between camera and object, for `seconds`; it sways by `sway` of the picture's width."""
+
+    kind: Literal["hand"]
+    seconds: Annotated[float, Field(gt=0, le=1e6)] = 0.3
+    at: tuple[Place, Place] = (0.3, 0.4)
+    radius: Annotated[float, Field(gt=0, le=1)] = 0.15
+    brightness: Annotated[float, Field(ge=0, le=100)] = 0.8
+    """Its brightness over the mean of the picture behind it."""
+    sway: Annotated[float, Field(ge=0, le=1)] = 0.03
+
+
 class EmergencyStop(When):
     """The robot's emergency stop is pressed."""
 
@@ -158,6 +218,13 @@ Fault = Annotated[
     | DeadLed
     | StuckLed
     | FlickeringLed
+    | DimLed
+    | Warming
+    | RoomLamp
+    | Bump
+    | Smudge
+    | ExposureStep
+    | Hand
     | EmergencyStop
     | EnablingSwitch
     | LateRsi

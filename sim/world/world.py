@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, assert_never
 
@@ -25,6 +26,7 @@ from sim.devices.camera_body import Exposed, Surroundings
 from sim.devices.ledbox_firmware import LedBoxFirmware
 from sim.devices.refusals import untold
 from sim.devices.text_box import TextBox
+from sim.optics.disturbances import OF_EACH_KIND, Disturber, Disturbing
 from sim.optics.led_light import Flashes
 from sim.optics.photographer import Photographer
 from sim.world import faults as script
@@ -51,7 +53,7 @@ class World:
         self.lighting = Lighting()
         self._exposures = ExposureLog(self.lighting, settings.exposures_remembered)
         self._photographer = Photographer(config.scene, config.rendered_camera, settings)
-        self._flashes = Flashes(settings.leds)
+        self._flashes, self._disturber = Flashes(settings.leds), Disturber()
         self._robot_settings, self._camera_settings = settings.robot, settings.camera
         self._ledbox_settings = settings.ledbox
         self._tool, self._arm_shadows = config.scene.tool, settings.arm_shadows
@@ -74,6 +76,7 @@ class World:
         self._control.setblocking(False)
         self.reactor.add_reader(self._control, self._accept)
         self._faults_at_edge: dict[int, list[script.Fault]] = {}
+        self._settings_faults = settings.faults
         for fault in settings.faults:
             self._schedule(fault)
         self._warm_up(config.camera)
@@ -108,6 +111,7 @@ class World:
                 pose=self.robot.true_base_from_flange,
                 render=self._photographer.render,
                 arm=self._in_the_light,
+                disturbance=self._disturber.at,
                 on_exposed=self._exposures.note,
             ),
         )
@@ -116,7 +120,10 @@ class World:
         """Compile the renderer and fill its caches, before the first frame is due."""
         led = int(self._photographer.leds.ids[0])
         lit = Exposed({led: 1e-3}, [1], 1e-3, 1.0, 0, self.robot.true_base_from_flange())
-        self._photographer.render(np.zeros((camera.height_px, camera.width_px), np.uint16), lit)
+        pixels = np.zeros((camera.height_px, camera.width_px), np.uint16)
+        self._photographer.render(pixels, lit)
+        if any(isinstance(fault, Disturbing) for fault in self._settings_faults):
+            self._photographer.render(pixels, replace(lit, disturbance=OF_EACH_KIND))
 
     # -- the cables ---------------------------------------------------------------------------------------
 
@@ -139,7 +146,7 @@ class World:
 
     def _light(self, led: int, t_on_ns: int, t_off_ns: int) -> None:
         """The box switches an LED on; it is lit with its present flux."""
-        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led))
+        flux = self._flashes.flux(led, self.box.temperature_of_led_c(led)) * self._disturber.flux(led, t_on_ns)
         self.lighting.light(led, t_on_ns, t_off_ns, flux)
 
     def _edge_counted(self, number: int) -> None:
@@ -185,6 +192,16 @@ class World:
                 self.box.stick_led(fault.led)
             case script.FlickeringLed():
                 self._flashes.unsteady[fault.led] = fault.rms
+            case (
+                script.DimLed()
+                | script.Warming()
+                | script.RoomLamp()
+                | script.Bump()
+                | script.Smudge()
+                | script.ExposureStep()
+                | script.Hand()
+            ):
+                self._disturber.happen(fault, self.reactor.now_ns)
             case script.EmergencyStop():
                 self.robot.estop()
             case script.EnablingSwitch():

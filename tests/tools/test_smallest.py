@@ -55,6 +55,7 @@ BENCHED = {
     "urushi": True,
     "workers": True,
     "console": True,
+    "watching": True,
 }
 """Benches, and whether they are run at full scale only."""
 
@@ -75,6 +76,7 @@ RUNS = (
     Run("prove_clusters.py --smallest", r"1000 clusters for \d+ triangles: .*ratio \d", full=True),
     Run("prove_exports.py --smallest", r"`bird` \| \d", full=True),
     Run("prove_finishes.py --smallest", r"peaks up to 60 degrees .*: off by up to \d", full=True),
+    Run("prove_watching.py --smallest", r"\d of 8 faults found and named; \d false alarms in 2", full=True),
     Run(f"prove_identification.py {PIGMENTS} --smallest", r"\(its class|its class left out: \d", True, PIGMENTS),
     Run("prove_layers.py --smallest", r"photons, another ground: 95 % intervals hold \d", full=True),
     Run("prove_materials.py --smallest", r"diffuse, white \| (0\.99|1\.00)\d\d \|", full=True),

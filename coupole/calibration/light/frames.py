@@ -18,7 +18,7 @@ from coupole.calibration.calibrated_arm import CalibratedArm, corrected_poses
 from coupole.calibration.rotations import Floats
 from coupole.calibration.sources import About, about_of, frames_sha256
 from coupole.errors import InputError, StorageError
-from coupole.plan.shot_id import Led, PanelMark, ShotId
+from coupole.plan.shot_id import Led, PanelMark, Sentinel, ShotId
 from coupole.storage.durable import sha256
 from coupole.storage.journal_events import FrameProven
 from coupole.storage.run import Run
@@ -155,11 +155,11 @@ def temperatures_of(frames: Sequence[LightFrame]) -> tuple[float, float] | None:
 
 
 def _by_view(run: Run) -> dict[Path, list[FrameProven]]:
-    """Proven frames by their view's file, without marks: these are dark, but light may still glow when they
-    end."""
+    """Proven frames by their view's file, without marks, which are dark, but light may still glow when they
+    end, and without sentinels."""
     frames_of: dict[Path, list[FrameProven]] = {}
     for shot, frame in run.proven().items():
-        if not isinstance(shot.light, PanelMark):
+        if not isinstance(shot.light, PanelMark | Sentinel):
             frames_of.setdefault(run.view_path(shot.view), []).append(frame)
     return frames_of
 

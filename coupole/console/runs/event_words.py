@@ -12,6 +12,7 @@ from coupole.storage.journal_events import (
     Continued,
     Event,
     FaultNoted,
+    FindingNoted,
     FrameProven,
     GapFound,
     InputsChanged,
@@ -56,6 +57,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return f"{event.view}: {len(event.shots)} frames are not proven{why}{dead}"
         case ReshootBegun():
             return f"{event.view}: {len(event.shots)} shots are taken again"
+        case FindingNoted():
+            return f"{event.view}: {event.kind}: {event.message}; {len(event.shots)} shots are concerned"
         case FaultNoted():
             return f"fault: {event.message}"
         case InputsChanged():

@@ -1,0 +1,216 @@
+"""A run that is watched: a recorder that looks at the frames it passes on, and judges them burst by burst.
+
+Where shots may be taken again, frames are proven when their burst has been judged, not before: nothing that is
+proven is ever overwritten. What is spoilt is then left unproven, and the sequencer takes it again as any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from coupole.acquisition.observer import Control, Observer
+from coupole.acquisition.recorder import Recorder
+from coupole.acquisition.watching.burst_judge import BurstJudge, FirstFrames, LightTable
+from coupole.acquisition.watching.camera_noise import CameraNoise
+from coupole.acquisition.watching.finding_picture import finding_picture
+from coupole.acquisition.watching.findings import FOR_A_PERSON, TAKEN_AGAIN, Found, SeenFrame
+from coupole.acquisition.watching.frame_look import FrameLook, LookGrid, compile_now
+from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.geometry import Transform, apply
+from coupole.plan.bursts import Burst
+from coupole.plan.choices import FrameSample
+from coupole.plan.schedule import ViewPose
+from coupole.plan.shot_id import Led, ShotId, ShotLabel
+from coupole.preflight.job import Job
+from coupole.storage.frame_file_creation import Collections
+from coupole.storage.journal_events import Event, FindingNoted
+
+_MOST_PICTURES = 200
+"""Pictures of one session, at most: what is found in each burst of a long run looks alike."""
+
+
+def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> BurstJudge:
+    """The judge of a view's bursts, by the figures of the job's rig."""
+    rig, leds = job.cell.rig, job.cell.leds
+    target_mm = apply(rig.support.base_from_support.matrix(), view.target_mm or (0.0, 0.0, 0.0))
+    offsets = leds.positions_mm - target_mm
+    directions = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    light = leds.illuminance_lux(target_mm[None], emission=rig.dome.emission)[0]
+    ids = leds.ids.tolist()
+    table = LightTable(dict(zip(ids, directions, strict=True)), dict(zip(ids, light.tolist(), strict=True)))
+    lens = rig.lens
+    magnification = lens.focal_length_mm / (lens.focus_distance_mm - lens.focal_length_mm)
+    mm_per_bin = grid.bin_px * rig.sensor.pixel_pitch_um * 1e-3 / magnification
+    noise = CameraNoise.of(rig.watch, grid, job.plan.gain_db)
+    return BurstJudge(rig.watch, noise, mm_per_bin, table, first)
+
+
+class WatchedRecorder:
+    """A `coupole.acquisition.recorder.Recorder` before another one, which it watches the frames of."""
+
+    def __init__(self, recorder: Recorder, job: Job, observer: Observer, control: Control) -> None:
+        self._recorder, self._job, self._observer, self._control = recorder, job, observer, control
+        self._watch = job.plan.watching
+        self._views = {view.name: view for view in job.schedule.views}
+        self._first = FirstFrames()
+        self._grid: LookGrid | None = None
+        self._judge: BurstJudge | None = None
+        self._looks: dict[int, FrameLook] = {}
+        """Looks of stored frames, by slot."""
+        self._seen: dict[ShotLabel, FrameLook] = {}
+        """Looks of the burst's proven frames."""
+        self._timeline: list[ShotLabel] = []
+        """Labels of the burst under way, in the order of time; what was taken again stands at its last place."""
+        self._held: dict[ShotId, tuple[int, Mapping[str, int]]] = {}
+        """Frames that are proven as soon as their burst is judged: slot and fields."""
+        self._known_leds: set[int] = set()
+        """LEDs that a finding has named already."""
+        self._pictures = 0
+        self.name = recorder.name
+        if self._watch.frames != "none":
+            compile_now()
+
+    # -- what a recorder does -----------------------------------------------------------------------------
+
+    def light_before_lux_h(self) -> tuple[float, ...]:
+        return self._recorder.light_before_lux_h()
+
+    def proven(self) -> set[ShotId]:
+        return self._recorder.proven()
+
+    def begin_view(
+        self,
+        view: str,
+        frames: int,
+        frame_format: FrameFormat,
+        arm: ArmState,
+        base_from_camera: Transform,
+        collections: Collections,
+    ) -> None:
+        self._recorder.begin_view(view, frames, frame_format, arm, base_from_camera, collections)
+        self._first.begin_view()
+        self._grid = LookGrid(frame_format)
+        self._judge = judge_of(self._job, self._grid, self._views[view], self._first)
+
+    def store(self, frame: Frame, exposure_us: int) -> int:
+        slot = self._recorder.store(frame, exposure_us)
+        if self._grid is not None and frame.rendered and self._watch.frames != "none":
+            self._looks[slot] = self._grid.look(frame.pixels)
+        return slot
+
+    def sample_frames(self, *, is_wanted: bool) -> None:
+        self._recorder.sample_frames(is_wanted=is_wanted)
+
+    def sample(self, shot: ShotId) -> FrameSample:
+        return self._recorder.sample(shot)
+
+    def prove(self, slot: int, shot: ShotId, fields: Mapping[str, int]) -> None:
+        look = self._looks.pop(slot, None)
+        if look is not None and (self._watch.frames == "all" or shot.is_dark):
+            self._seen[shot.label] = look
+        if self._watch.retake:
+            self._held[shot] = slot, fields
+        else:
+            self._recorder.prove(slot, shot, fields)
+
+    def free(self, slot: int) -> None:
+        self._looks.pop(slot, None)
+        self._recorder.free(slot)
+
+    def note(self, event: Event) -> None:
+        self._recorder.note(event)
+
+    def commit(self, *, now: bool) -> None:
+        self._recorder.commit(now=now)
+
+    def end_view(self) -> None:
+        self._prove_held(set())
+        self._looks.clear()
+        self._recorder.end_view()
+
+    def keep_picture(self, name: str, content: bytes) -> str:
+        return self._recorder.keep_picture(name, content)
+
+    # -- watching -----------------------------------------------------------------------------------------
+
+    def judge(self, burst: Burst, *, may_retake: bool) -> str:
+        """Judge a burst that was fired, and prove its frames. What was found is noted and said; returns why shots
+        are left unproven, to be taken again, empty if none are."""
+        frames = self._frames_of(burst)
+        findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
+        findings = [self._with_unseen_shots(burst, finding) for finding in findings]
+        new_labels = {label for label in burst.labels if label}
+        findings = [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
+        for finding in findings:
+            self._note(burst, finding)
+        spoilt: set[ShotLabel] = set()
+        if may_retake and self._watch.retake:
+            spoilt = {label for finding in findings if finding.kind in TAKEN_AGAIN for label in finding.labels}
+        spoilt &= {shot.label for shot in self._held}
+        self._prove_held(spoilt)
+        if self._watch.pause and any(finding.kind in FOR_A_PERSON for finding in findings):
+            self._observer.note("paused by what was found: mend it, then go on")
+            self._control.pause.set()
+        return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
+
+    def _frames_of(self, burst: Burst) -> list[SeenFrame]:
+        """Frames of the burst, and of the attempts before, in the order of time."""
+        labels = [label for label in burst.labels if label]
+        if not set(labels) <= set(self._timeline):
+            self._timeline = []
+            self._seen = {label: look for label, look in self._seen.items() if label in set(labels)}
+        again = set(labels)
+        self._timeline = [label for label in self._timeline if label not in again] + labels
+        return [SeenFrame(label, self._seen[label]) for label in self._timeline if label in self._seen]
+
+    def _with_unseen_shots(self, burst: Burst, finding: Found) -> Found:
+        """The same with the shots of the burst, if only its dark frames were looked at."""
+        if self._watch.frames == "all":
+            return finding
+        shots = (label for label in burst.labels if label and label.is_shot)
+        return replace(finding, labels=tuple(dict.fromkeys([*finding.labels, *shots])))
+
+    def _is_news(self, finding: Found) -> bool:
+        """An LED that is known to be wrong is not named in each view again."""
+        if finding.kind != "LED":
+            return True
+        leds = {label.light.id for label in finding.labels if isinstance(label.light, Led)}
+        is_news = not leds <= self._known_leds
+        self._known_leds |= leds
+        return is_news
+
+    def _note(self, burst: Burst, finding: Found) -> None:
+        shots = tuple(ShotId(burst.view, label) for label in finding.labels)
+        picture = ""
+        if self._pictures < _MOST_PICTURES:
+            self._pictures += 1
+            name = f"{burst.view}-e{burst.exposure_index}-r{burst.repeat}-{finding.kind.replace(' ', '-')}.png"
+            picture = self.keep_picture(name, finding_picture(finding))
+        self._observer.note(
+            f"{burst.view}: {finding.kind}: {finding.words}" + (f" ({picture})" if picture else "")
+        )
+        self._recorder.note(
+            FindingNoted(
+                kind=finding.kind,
+                view=burst.view,
+                shots=shots,
+                figure=round(finding.figure, 6),
+                limit=round(finding.limit, 6),
+                unit=finding.unit,
+                message=finding.words,
+                picture=picture,
+            )
+        )
+
+    def _prove_held(self, spoilt: set[ShotLabel]) -> None:
+        """Prove the frames that waited, but free those that are spoilt."""
+        held_frames, self._held = self._held, {}
+        for shot, (slot, fields) in held_frames.items():
+            if shot.label in spoilt:
+                self._seen.pop(shot.label, None)
+                self._recorder.free(slot)
+            else:
+                self._recorder.prove(slot, shot, fields)

@@ -1,0 +1,99 @@
+"""Runs that are watched: what happens in the simulated cell is found, named, marked, and taken again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cells
+import pytest
+from cells import CellFolder
+
+from coupole.preflight.job import read_job
+
+EVERY = {"kind": "every", "every": 20}
+
+
+def _watched(cell: CellFolder, watch: object, *faults: dict[str, Any]) -> cells.Ended:
+    cell.world_settings["camera"] = {"samples_per_side": 3}
+    cell.write(watch=watch, lights=EVERY)
+    cell.faults(*faults)
+    return cell.acquire()
+
+
+def _found(cell: CellFolder) -> list[dict[str, Any]]:
+    return cells.events(cell.run_folder, "finding")
+
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "ambient light": {"kind": "room_lamp", "lux": 10, "at_edge": 40},
+    "LED": {"kind": "dim_led", "led": 0, "loss": 0.1, "at_edge": 40},
+    "drift": {"kind": "warming", "per_s": -0.1, "at_edge": 10},
+    "moved": {"kind": "bump", "what": "object", "mm": [0.2, 0.0, 0.0], "at_edge": 40},
+    "smudge": {"kind": "smudge", "transmission": 0.85, "radius": 0.2, "at_edge": 40},
+    "exposure step": {"kind": "exposure_step", "factor": 1.05, "at_edge": 40},
+    "thing in the field": {"kind": "hand", "seconds": 0.3, "at_edge": 20},
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_fault_is_found_and_named_and_has_a_picture(cell: CellFolder, kind: str) -> None:
+    cell.write(watch=True, lights=EVERY)
+    sentinels = [str(label) for label in read_job(cell.plan).schedule.labels[0] if "watch" in str(label)]
+    fault = FAULTS[kind] | ({"led": int(sentinels[0][3:7])} if kind == "LED" else {})
+    ended = _watched(cell, True, fault)
+    assert ended.code == 0, ended
+    (found,) = _found(cell)
+    assert found["kind"] == kind
+    assert found["figure"] > found["limit"]
+    assert found["shots"]
+    assert (cell.run_folder / found["picture"]).read_bytes().startswith(b"\x89PNG")
+    status = cells.here("status", cell.run_folder, "--json")
+    assert len(status.document["findings"]) == 1
+    status = cells.here("status", cell.run_folder)
+    assert kind in status.err
+
+
+def test_a_clean_run_with_sentinels_has_no_finding_and_all_its_frames(cell: CellFolder) -> None:
+    ended = _watched(cell, True)
+    assert ended.code == 0
+    assert _found(cell) == []
+    assert ended.document["shots"] == ended.document["proven"] == 54
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def test_what_a_hand_has_spoilt_is_taken_again(cell: CellFolder) -> None:
+    ended = _watched(cell, {"retake": True}, FAULTS["thing in the field"])
+    assert ended.code == 0, ended
+    (found,) = _found(cell)
+    (again,) = cells.events(cell.run_folder, "reshoot")
+    assert set(again["shots"]) == set(found["shots"])
+    assert ended.document["reshot"] == len(found["shots"])
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def test_under_a_lamp_all_is_taken_again_as_often_as_the_plan_says_then_kept_and_marked(cell: CellFolder) -> None:
+    cell.plan_data["reshoot_limit"] = 1
+    ended = _watched(cell, {"retake": True}, FAULTS["ambient light"])
+    assert ended.code == 0, ended
+    assert [found["kind"] for found in _found(cell)] == 2 * ["ambient light"]
+    assert ended.document["reshot"] == 54
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def test_without_a_word_in_the_plan_a_lamp_is_found_by_the_dark_frames(cell: CellFolder) -> None:
+    cell.faults(FAULTS["ambient light"])
+    assert cell.acquire().code == 0
+    assert [found["kind"] for found in _found(cell)] == ["ambient light"]
+
+
+def test_a_run_that_is_not_watched_finds_nothing(cell: CellFolder) -> None:
+    assert _watched(cell, False, FAULTS["ambient light"]).code == 0
+    assert _found(cell) == []
+
+
+def test_sentinels_are_refused_where_lights_are_chosen(cell: CellFolder) -> None:
+    lights = {"kind": "adaptive", "until": {"lights": 32}}
+    cell.write(watch=True, lights=lights)
+    ended = cells.here("check", cell.plan)
+    assert ended.code == 2
+    assert "watch: {frames: darks}" in ended.err

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -53,7 +53,13 @@ from coupole.preflight.checking import calibration_refusals, check_job, prefligh
 from coupole.preflight.job import Job, with_choices, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults, faults_of
-from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
+from coupole.storage.journal_events import (
+    FaultNoted,
+    ProcessingAsked,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+)
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import copied_s
 from coupole.storage.view_reader import refuse_lost
@@ -61,6 +67,9 @@ from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
+
+if TYPE_CHECKING:
+    from coupole.acquisition.processing_beside import ProcessingBeside
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
@@ -78,10 +87,12 @@ def acquire_plan(
     confirm: bool,
     figures: dict[str, Any],
     with_mesh: bool = False,
+    beside: ProcessingBeside | None = None,
 ) -> None:
     """Run a plan into a run folder; `figures` is filled with the figures of `--json`, also when this raises.
 
-    A mesh of more than 100 MB is copied into the folder only `with_mesh`.
+    A mesh of more than 100 MB is copied into the folder only `with_mesh`. `beside` processes the run's views while
+    it is acquired.
     """
     with contextlib.ExitStack() as stack:
         run = Run(resume) if resume else None
@@ -101,6 +112,7 @@ def acquire_plan(
             figures=figures,
             exit_stack=stack,
             with_mesh=with_mesh,
+            beside=beside,
         )
 
 
@@ -114,6 +126,7 @@ def _acquire_into(
     figures: dict[str, Any],
     exit_stack: contextlib.ExitStack,
     with_mesh: bool,
+    beside: ProcessingBeside | None,
 ) -> None:
     is_resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
@@ -123,10 +136,14 @@ def _acquire_into(
         allocated_bytes=run.allocated_bytes() if run else 0,
         proven=run.proven() if run else (),
     )
+    if beside is not None:
+        preflight.refusals += beside.refusals()
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
     if run is not None and not preflight.frames and not run.open_views():
-        dose_lux_h = close_complete(run, console)
+        dose_lux_h = close_complete(run, console, beside.result_of(run.folder) if beside else None)
+        if beside is not None:
+            beside.follow(run.folder)
         outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
         figures.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
         _say_outcome(console, run, outcome, "done")
@@ -156,6 +173,9 @@ def _acquire_into(
             event = event_class(simulated=cell.is_simulated, room_c=room_c, acknowledged=acknowledgement)
             fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
             recorder.note(event.model_copy(update=fields))
+            if beside is not None:
+                recorder.note(ProcessingAsked(result=str(beside.result_of(run.folder))))
+                beside.follow(run.folder)
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}

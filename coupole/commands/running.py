@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +24,9 @@ from coupole.errors import CoupoleError
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.acquisition.processing_beside import ProcessingBeside
     from coupole.plan.cell import Cell
     from coupole.preflight.job import Job
 
@@ -42,6 +47,18 @@ def acquire(
     with_mesh: Annotated[
         bool, typer.Option("--with-mesh", help="Copy the mesh into the run even if it has more than 100 MB.")
     ] = False,
+    reflectance: Annotated[
+        bool,
+        typer.Option(
+            "--reflectance",
+            help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the result "
+            "that `coupole reflectance RUN` makes. A resumed run goes on with it by itself.",
+        ),
+    ] = False,
+    result: Annotated[
+        Path | None,
+        typer.Option("--result", help="Folder of that result; by default the run's, with -reflectance behind."),
+    ] = None,
     as_json: JsonOption = False,
     begun_by_console: Annotated[bool, typer.Option("--begun-by-console", hidden=True)] = False,
 ) -> None:
@@ -58,6 +75,8 @@ def acquire(
 
     if dry_run and (resume or output):
         raise typer.BadParameter("a dry run stores nothing: --dry-run excludes --resume and --output")
+    if dry_run and (reflectance or result):
+        raise typer.BadParameter("a dry run stores nothing: --dry-run excludes --reflectance and --result")
     if resume and output:
         raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
     console = make_console(quiet=as_json and not begun_by_console)
@@ -76,14 +95,43 @@ def acquire(
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
-            acquire_plan(
-                job, console, parent=output, resume=resume, confirm=not yes, figures=summary, with_mesh=with_mesh
-            )
+            with _beside(job, console, resume, result, asked=reflectance) as beside:
+                acquire_plan(
+                    job,
+                    console,
+                    parent=output,
+                    resume=resume,
+                    confirm=not yes,
+                    figures=summary,
+                    with_mesh=with_mesh,
+                    beside=beside,
+                )
+                if beside is not None:
+                    beside.wait()
+                    summary["reflectance"] = beside.figures()
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise
     if as_json:
         print(json.dumps(summary))
+
+
+@contextmanager
+def _beside(
+    job: Job, console: Console, resume: Path | None, result: Path | None, *, asked: bool
+) -> Iterator[ProcessingBeside | None]:
+    """The processing beside an acquisition, if it is asked for, or the run that is resumed has asked for it."""
+    from coupole.storage.run import Run
+
+    if resume is not None:
+        result = result or Run(resume).asked_result
+    if not (asked or result):
+        yield None
+        return
+    from coupole.acquisition.processing_beside import ProcessingBeside
+
+    with ProcessingBeside(job.document.path, job.cell.document.path, result, console) as beside:
+        yield beside
 
 
 def devices(

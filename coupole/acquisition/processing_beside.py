@@ -1,8 +1,8 @@
 """The acquisition's end of the processing beside it: begins its process, hears of its progress, ends it.
 
 The process has the lowest priority and reads the run's folder alone (`coupole.reflectance.beside`). Here a thread
-waits for its lines, of which there is at most about one a second; the sequencer knows nothing of it. Whatever becomes
-of the process, the acquisition goes on, and says so.
+waits for its lines, of which there is about one a second at most; the sequencer knows nothing of it. Whatever
+becomes of the process, the acquisition goes on, and says so.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _READY_WITHIN_S = 120.0
 """Longer than its imports take on a busy machine."""
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process that neither tells anything nor computes for so long, when all frames are there, hangs."""
-_LOOK_EVERY_S = 0.5
+_LOOK_EVERY_S, _ENDS_WITHIN_S = 0.5, 5.0
 Say = Callable[[str, int, int], None]
 
 
@@ -52,6 +52,8 @@ class ProcessingBeside:
         self._told = threading.Event()
         self._has_ended = threading.Event()
         self._is_ending = False
+        self._why = ""
+        """Reason that is known here why the result is not whole."""
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", _PROGRAM, str(os.getpid())],
@@ -62,7 +64,8 @@ class ProcessingBeside:
         )
         result_text = None if self._result is None else str(self._result)
         self._ask({"plan": str(plan.absolute()), "rig": str(rig.absolute()), "result": result_text})
-        threading.Thread(target=self._listen, name="processing beside", daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, name="processing beside", daemon=True)
+        self._listener.start()
 
     def __enter__(self) -> ProcessingBeside:
         return self
@@ -70,10 +73,16 @@ class ProcessingBeside:
     def __exit__(self, *_: object) -> None:
         """End the process, if it has not ended: what it did is kept."""
         if self._end() and self._run is not None:
+            self._why = "ended with the run, which is not complete"
             self._console.print(
-                f"reflectance: ended with the run; the samples of {self._views_text} are kept for when it is resumed",
+                f"reflectance: ended with the run; the samples of {self._views_text} are kept until it is resumed",
                 markup=False,
             )
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        self._listener.join(_ENDS_WITHIN_S)
+        self._errors.close()
 
     # -- before anything moves --------------------------------------------------------------------------------
 
@@ -85,7 +94,7 @@ class ProcessingBeside:
             return [f"--reflectance: its process ended: {self._last_words}"]
         return self._reasons
 
-    # -- while the run is acquired ------------------------------------------------------------------------------
+    # -- while the run is acquired ----------------------------------------------------------------------------
 
     def result_of(self, run: Path) -> Path:
         """The folder of the result of a run."""
@@ -97,7 +106,7 @@ class ProcessingBeside:
         self._console.print(f"reflectance {self._result}", markup=False)
         self._ask({"run": str(run), "result": str(self._result)})
 
-    # -- after the last frame -------------------------------------------------------------------------------------
+    # -- after the last frame ---------------------------------------------------------------------------------
 
     def wait(self) -> None:
         """Wait for the result, after all frames are there and no device is open. A signal ends the wait and the
@@ -109,12 +118,11 @@ class ProcessingBeside:
                 self._wait_for_end(say)
         except (KeyboardInterrupt, SignalReceived):
             self._end()
-            self._say_unfinished("stopped while it was made")
-            return
+            self._why = "stopped while it was made"
         if self._is_whole:
             self._console.print(f"  result  {self._result}", markup=False)
         else:
-            self._say_unfinished(self._progress.why or self._last_words)
+            self._say_unfinished()
 
     def figures(self) -> dict[str, Any]:
         """Content of `reflectance` in `--json`."""
@@ -124,11 +132,11 @@ class ProcessingBeside:
             "result": str(self._result),
             "is_whole": self._is_whole,
             "views": self._progress.views_done,
-            "why": "" if self._is_whole else self._progress.why or self._last_words,
+            "why": "" if self._is_whole else self._reason,
             **self._times,
         }
 
-    # -- helpers -----------------------------------------------------------------------------------------------------
+    # -- helpers ----------------------------------------------------------------------------------------------
 
     def _wait_for_end(self, say: Say) -> None:
         heard_s, cpu_s = time.monotonic(), self._cpu_s()
@@ -148,7 +156,7 @@ class ProcessingBeside:
 
     def _give_up(self, why: str) -> None:
         self._end()
-        self._progress = self._progress.model_copy(update={"why": why})
+        self._why = why
 
     def _cpu_s(self) -> float:
         """Time that the process has computed; 0 where that cannot be told."""
@@ -165,11 +173,15 @@ class ProcessingBeside:
     def _views_text(self) -> str:
         return f"{self._progress.views_done} of {self._progress.views} views"
 
-    def _say_unfinished(self, why: str) -> None:
+    @property
+    def _reason(self) -> str:
+        return self._why or self._progress.why or self._last_words
+
+    def _say_unfinished(self) -> None:
         assert self._run is not None
         assert self._result is not None
         alarm(
-            f"  the frames are complete; their result is not: {why}\n"
+            f"  the frames are complete; their result is not: {self._reason}\n"
             f"  goes on from what is there ({self._views_text}): {go_on_command(self._run, self._result)}"
         )
 
@@ -182,9 +194,10 @@ class ProcessingBeside:
     def _listen(self) -> None:
         """Hear all lines, until the process has ended; for a thread of its own."""
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            with contextlib.suppress(InputError, ValueError):
-                self._hear(json_of(line, _PROGRAM))
+        with self._process.stdout as lines:
+            for line in lines:
+                with contextlib.suppress(InputError, ValueError):
+                    self._hear(json_of(line, _PROGRAM))
         self._process.wait()
         self._has_answered.set()
         self._has_ended.set()
@@ -205,14 +218,16 @@ class ProcessingBeside:
 
     def _tell_of_failure(self) -> None:
         alarm(
-            f"reflectance: {self._progress.why or self._last_words}. The acquisition is not concerned; the samples of "
-            f"{self._views_text} are kept"
+            f"reflectance failed: {self._reason}. The acquisition goes on without it; "
+            f"the samples of {self._views_text} are kept"
         )
 
     @property
     def _last_words(self) -> str:
         """Why the process ended, as far as it can be told."""
         code = self._process.returncode
+        if self._errors.closed:
+            return "its process ended"
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")
         self._errors.seek(0)
@@ -225,5 +240,5 @@ class ProcessingBeside:
             return False
         self._is_ending = True
         self._process.kill()  # every file of a result is whole or not there
-        self._has_ended.wait(_LOOK_EVERY_S)
+        self._has_ended.wait(_ENDS_WITHIN_S)
         return True

@@ -175,6 +175,7 @@ def _acquire_into(
             recorder.note(event.model_copy(update=fields))
             if beside is not None:
                 recorder.note(ProcessingAsked(result=str(beside.result_of(run.folder))))
+                recorder.commit(now=True)
                 beside.follow(run.folder)
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h

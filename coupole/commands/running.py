@@ -51,8 +51,8 @@ def acquire(
         bool,
         typer.Option(
             "--reflectance",
-            help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the result "
-            "that `coupole reflectance RUN` makes. A resumed run goes on with it by itself.",
+            help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the "
+            "result that `coupole reflectance RUN` makes. A resumed run goes on with it by itself.",
         ),
     ] = False,
     result: Annotated[
@@ -87,15 +87,20 @@ def acquire(
             from coupole.console.command_line.following import acquire_by_console
 
             paths = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
+            paths["result"] = result
             request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
             acquire_by_console(
-                console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, summary=summary
+                console_cell,
+                console,
+                {**request, "with_mesh": with_mesh, "reflectance": reflectance or result is not None},
+                confirm=not yes,
+                summary=summary,
             )
         elif dry_run:
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
-            with _beside(job, console, resume, result, asked=reflectance) as beside:
+            with _beside(job, console, resume, result, summary, asked=reflectance) as beside:
                 acquire_plan(
                     job,
                     console,
@@ -108,7 +113,6 @@ def acquire(
                 )
                 if beside is not None:
                     beside.wait()
-                    summary["reflectance"] = beside.figures()
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise
@@ -118,9 +122,16 @@ def acquire(
 
 @contextmanager
 def _beside(
-    job: Job, console: Console, resume: Path | None, result: Path | None, *, asked: bool
+    job: Job,
+    console: Console,
+    resume: Path | None,
+    result: Path | None,
+    summary: dict[str, Any],
+    *,
+    asked: bool,
 ) -> Iterator[ProcessingBeside | None]:
-    """The processing beside an acquisition, if it is asked for, or the run that is resumed has asked for it."""
+    """The processing beside an acquisition, if it is asked for, or the run that is resumed has asked for it; what
+    became of it is in `summary` afterwards."""
     from coupole.storage.run import Run
 
     if resume is not None:
@@ -130,8 +141,13 @@ def _beside(
         return
     from coupole.acquisition.processing_beside import ProcessingBeside
 
-    with ProcessingBeside(job.document.path, job.cell.document.path, result, console) as beside:
-        yield beside
+    beside = ProcessingBeside(job.document.path, job.cell.document.path, result, console)
+    try:
+        with beside:
+            yield beside
+    finally:
+        if figures := beside.figures():
+            summary["reflectance"] = figures
 
 
 def devices(

@@ -1,8 +1,8 @@
 """Samples of views that were taken beside an acquisition, before anybody knew what else the run would hold.
 
-A result is begun with the frames of all its views (`result_folder.begin`). What was taken before that is noted view
-by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what agrees is
-used, and the rest is taken again.
+A result is begun with the frames of all its views (`result_folder.begin`). What was taken before that is noted
+view by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what agrees
+is used, and the rest is taken again.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def frames_basis(frames: LightFrames, view: str) -> str:
 
 
 def note_view(out: Path, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
-    """Note, before the samples of a view are taken, what they depend on. Raises InputError if others were taken with
-    other settings, OSError."""
+    """Note, before the samples of a view are taken, what they depend on. Raises InputError if others were taken
+    with other settings, OSError."""
     notes = _read(out)
     decisive = _decisive(settings)
     if notes is None:
@@ -70,9 +70,9 @@ def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
 
 
 def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]) -> None:
-    """Keep of what was taken beside an acquisition what holds for the complete run; `bases` are those of its views,
-    by the names of their files. Raises InputError if the samples are of other input, or a process is at work on
-    them."""
+    """Keep of what was taken beside an acquisition what holds for the complete run; `bases` are those of its
+    views, by the names of their files. Raises InputError if the samples are of other input, or a process is at
+    work on them."""
     if not (out / FOLDER).is_dir():
         return
     refuse_held(out)

@@ -38,7 +38,7 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
 
 
 def _has_other_content(out: Path) -> bool:
-    """Tell whether a folder holds anything that no killed writer, and no processing beside an acquisition, left."""
+    """Tell whether a folder holds anything that neither a killed writer nor processing beside a run has left."""
     if not out.exists() or (out / processing.FOLDER).is_dir():
         return False
     return any(content.suffix != ".part" for content in out.iterdir())

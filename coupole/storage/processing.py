@@ -110,7 +110,8 @@ def go_on_command(run: Path, result: Path) -> str:
 
 
 def tell(result: Path, progress: Progress) -> None:
-    """Write the progress, for `processing_of`. Not synced: it must cost the acquisition nothing. Raises OSError."""
+    """Write the progress, for `processing_of`. Not synced: it must cost the acquisition nothing. Raises
+    OSError."""
     path = result / _PROGRESS
     part = path.with_suffix(".json.part")
     part.write_text(progress.model_dump_json() + "\n", encoding="utf-8")

@@ -32,8 +32,8 @@ _CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field")
 
 
 def reasons_against(plan: Path, rig: Path | None, result: Path | None) -> list[str]:
-    """List why `coupole reflectance RUN` could not make a result of this plan's run, with the place in the plan and
-    the remedy; `result` is the folder, if one is named."""
+    """List why `coupole reflectance RUN` could not make a result of this plan's run, with the place in the plan
+    and the remedy; `result` is the folder, if one is named."""
     try:
         files = read_plan(plan, rig)
         return [*_of_folder(result), *_of_mesh(files), *_of_records(files)]
@@ -42,7 +42,12 @@ def reasons_against(plan: Path, rig: Path | None, result: Path | None) -> list[s
 
 
 def _of_folder(result: Path | None) -> Iterator[str]:
-    if result is None or not result.exists():
+    if result is None:
+        return
+    if not result.exists():
+        existing = next(parent for parent in result.parents if parent.exists())
+        if not existing.is_dir():
+            yield f"--result {result}: expected a folder that can be made; {existing} is a file"
         return
     begun = (result / SETTINGS).exists() or (result / processing.FOLDER).is_dir()
     if not result.is_dir() or (not begun and any(result.iterdir())):

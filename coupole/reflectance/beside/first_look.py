@@ -1,7 +1,7 @@
 """A first look at a view while its run goes on: normals and diffuse colour by a quick fit to some of its samples.
 
-It is no part of the result: one view alone, few triangles and LEDs, and light that came by way of other surfaces is
-still in the samples.
+It is no part of the result: one view alone, few triangles and LEDs, and light that came by way of other surfaces
+is still in the samples.
 """
 
 from __future__ import annotations

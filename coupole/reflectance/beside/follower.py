@@ -1,5 +1,5 @@
-"""Follows a run by its journal: takes the samples of each view as soon as it is complete, and makes the result after
-the last."""
+"""Follows a run by its journal: takes the samples of each view as soon as it is complete, and makes the result
+after the last."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Say = Callable[[dict[str, Any]], object]
 
 
 def process_run(folder: Path, result: Path, say: Say) -> bool:
-    """Process a run into its result, while it is acquired and after it; True if the result is whole. `say` is given
-    the progress, and `times` at the end. What fails is told, and what is there stays."""
+    """Process a run into its result, while it is acquired and after it; True if the result is whole. `say` is
+    given the progress, and `times` at the end. What fails is told, and what is there stays."""
     teller = _Teller(result, say)
     try:
         with held(result):
@@ -41,7 +41,7 @@ def process_run(folder: Path, result: Path, say: Say) -> bool:
 
 
 class _Teller:
-    """Tells the progress in the result's folder and to whoever began the process, seldom enough to cost nothing."""
+    """Tells the progress in the result's folder and to whoever began the process, seldom enough."""
 
     def __init__(self, result: Path, say: Say) -> None:
         self._result, self.say = result, say
@@ -126,10 +126,10 @@ class _Follower:
         self._teller.step("extracting", detail=view)
         extract_beside(self._run.folder, view, self._result, self._teller.part)
         self._taken.add(view)
-        self._teller.step("waiting", views_done=len(self._taken))
         if not self._is_done:
             with contextlib.suppress(OSError):  # a picture alone
                 write_normals(self._result, view, self._result / PICTURE)
+        self._teller.step("waiting", views_done=len(self._taken))
         return True
 
     def _seconds_since_last_frame(self) -> float | None:

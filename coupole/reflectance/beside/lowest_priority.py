@@ -19,21 +19,25 @@ _PR_SET_PDEATHSIG = 1
 def yield_to_all_others() -> None:
     """Take processors and disk only while nobody else wants them, and be the first to die when memory is short.
     Threads that begin later inherit it. Each of the four is done where the system has it."""
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, 19)
     if sys.platform != "linux":
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, 19)
         return
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    if (number := _IOPRIO_SET.get(platform.machine())) is not None:
-        ctypes.CDLL(None).syscall(number, _IOPRIO_WHO_PROCESS, 0, _IDLE_CLASS)
+    for task in Path("/proc/self/task").iterdir():  # libraries may have begun threads
+        thread = int(task.name)
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, 19)
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(thread, os.SCHED_IDLE, os.sched_param(0))
+        if (number := _IOPRIO_SET.get(platform.machine())) is not None:
+            ctypes.CDLL(None).syscall(number, _IOPRIO_WHO_PROCESS, thread, _IDLE_CLASS)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
 def end_with(parent: int) -> None:
-    """End by SIGKILL when the thread ends that has begun this process, also while this is stopped (prctl(2)). Where
-    the system has no such thing, the end of its input tells."""
+    """End by SIGKILL when the thread ends that has begun this process, also while this is stopped (prctl(2)).
+    Where the system has no such thing, the end of its input tells."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it has died before

@@ -1,8 +1,8 @@
 """The process beside an acquisition: `python -m coupole.reflectance.beside.process PARENT`.
 
-It is told by lines of JSON on its input: first plan, rig and result, to which it answers with the `reasons` against
-a result; then the run's folder and the result's. From then on it follows the run's journal, and tells its progress
-in lines on its output. It ends with its input: whoever has begun it has died, or wants no more.
+It is told by lines of JSON on its input: first plan, rig and result, to which it answers with the `reasons`
+against a result; then the run's folder and the result's. From then on it follows the run's journal, and tells its
+progress in lines on its output. It ends with its input: whoever has begun it has died, or wants no more.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from coupole.reflectance.beside.lowest_priority import end_with, yield_to_all_ot
 def main() -> None:
     """Run to the end of the result, or of the input."""
     end_with(int(sys.argv[1]))
-    yield_to_all_others()  # before libraries make threads
     for number in (signal.SIGINT, signal.SIGHUP):  # Ctrl-C is for the acquisition, which ends this
         signal.signal(number, signal.SIG_IGN)
-    _say({"reasons": _reasons(_asked())})
+    _say({"reasons": _reasons(_asked())})  # before anything moves or shines, and for this somebody waits
+    yield_to_all_others()
     asked = _asked()
     threading.Thread(target=_end_with_input, name="end with input", daemon=True).start()
 

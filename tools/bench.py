@@ -136,6 +136,17 @@ def bench_store(options: Asked) -> None:
         line(**figure)
 
 
+# -- live -------------------------------------------------------------------------------------------------
+
+
+def bench_live(options: Asked) -> None:
+    """Whole runs of full-size frames with processing beside them, against the same runs without it."""
+    from bench_live import figures
+
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
+        line(**figure)
+
+
 # -- matching ---------------------------------------------------------------------------------------------
 
 
@@ -274,6 +285,7 @@ BENCHES: dict[str, Callable[[Asked], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
     "store": bench_store,
+    "live": bench_live,
     "matching": bench_matching,
     "rsi": bench_rsi,
     "collisions": bench_collisions,

@@ -88,8 +88,8 @@ def bench_sequencing(options: Asked) -> None:
     duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.run_description import about_run, metadata_of_views
     from coupole.acquisition.sequencer import Sequencer
-    from coupole.acquisition.session import about_run, metadata_of_views
     from coupole.devices import NO_LED
     from coupole.preflight.job import read_job
     from coupole.storage.run import Run

@@ -48,12 +48,12 @@ class LiveRun:
     frames_per_s: float
     """Median of the views after the first, from first to last proven frame of each."""
     frames: int
-    lost: int
+    lost_count: int
     """Frames that did not arrive, or shots that were taken again."""
     move_s: float
     """Longest time from a view's last frame to the next one's first."""
-    said: dict[str, Any]
-    """What the command says of the result; empty without."""
+    result_figures: dict[str, Any]
+    """Figures of `--json` that tell of the result; empty without."""
 
 
 def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict[str, Any]]:
@@ -68,8 +68,8 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
     common = {
         "frames": sum(run.frames for run in beside_runs),
         "frame_px": [size.width_px, size.height_px],
-        "lost": sum(run.lost for run in beside_runs),
-        "peer_lost": sum(run.lost for run in alone_runs),
+        "lost": sum(run.lost_count for run in beside_runs),
+        "peer_lost": sum(run.lost_count for run in alone_runs),
     }
     yield {
         "name": "live_beside",
@@ -80,8 +80,8 @@ def figures(root: Path, rounds: int, *, smallest: bool = False) -> Iterator[dict
         "peer_value": round(alone, 2),
         **common,
     }
-    samples_s = statistics.median(run.said["samples_after_last_frame_s"] for run in beside_runs)
-    result_s = statistics.median(run.said["result_after_last_frame_s"] for run in beside_runs)
+    samples_s = statistics.median(run.result_figures["samples_after_last_frame_s"] for run in beside_runs)
+    result_s = statistics.median(run.result_figures["result_after_last_frame_s"] for run in beside_runs)
     move_s = statistics.median(run.move_s for run in beside_runs)
     yield {
         "name": "samples_after_last_frame",
@@ -108,17 +108,17 @@ def _live_run(root: Path, size: Size, *options: str) -> LiveRun:
             "--json",
             *options,
         ]
-        ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if ended.returncode:
-            raise RuntimeError(ended.stderr)
-        document = json.loads(ended.stdout)
-        said = document.get("reflectance", {})
-        if options and not said["is_whole"]:
-            raise RuntimeError(said["why"])
-        return _figures_of(Path(document["run"]), document, said)
+        completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        if completed.returncode:
+            raise RuntimeError(completed.stderr)
+        document = json.loads(completed.stdout)
+        result_figures = document.get("reflectance", {})
+        if options and not result_figures["is_whole"]:
+            raise RuntimeError(result_figures["why"])
+        return _figures_of(Path(document["run"]), document, result_figures)
 
 
-def _figures_of(run: Path, document: dict[str, Any], said: dict[str, Any]) -> LiveRun:
+def _figures_of(run: Path, document: dict[str, Any], result_figures: dict[str, Any]) -> LiveRun:
     events = [json.loads(line) for line in (run / "journal.jsonl").read_text(encoding="utf-8").splitlines()]
     times_of_view: dict[str, list[datetime]] = {}
     for event in events:
@@ -128,8 +128,8 @@ def _figures_of(run: Path, document: dict[str, Any], said: dict[str, Any]) -> Li
     views = list(times_of_view.values())
     rates = [(len(times) - 1) / (times[-1] - times[0]).total_seconds() for times in views[1:]]
     moves_s = [(after[0] - before[-1]).total_seconds() for before, after in pairwise(views)]
-    lost = document["reshot"] + sum(event["lost_in_transfer"] for event in events if event["event"] == "gap")
-    return LiveRun(statistics.median(rates), document["frames"], lost, max(moves_s), said)
+    lost_count = document["reshot"] + sum(event["lost_in_transfer"] for event in events if event["event"] == "gap")
+    return LiveRun(statistics.median(rates), document["frames"], lost_count, max(moves_s), result_figures)
 
 
 def _write_cell(root: Path, folder: Path, size: Size) -> None:

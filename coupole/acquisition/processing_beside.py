@@ -146,7 +146,7 @@ class ProcessingBeside:
                 self._told.clear()
                 heard_s, cpu_s = time.monotonic(), self._cpu_s()
                 if progress.of:
-                    say(progress.detail, progress.done, progress.of)
+                    say(progress.detail, progress.done_count, progress.of)
             if is_stopped(self._process.pid):
                 self._give_up(f"its process {self._process.pid} is stopped (SIGSTOP), and was ended")
             elif time.monotonic() - heard_s > _SILENT_S:
@@ -224,7 +224,7 @@ class ProcessingBeside:
 
     @property
     def _last_words(self) -> str:
-        """Why the process ended, as far as it can be told."""
+        """Reason why the process ended, as far as it can be told."""
         code = self._process.returncode
         if self._errors.closed:
             return "its process ended"

@@ -31,7 +31,7 @@ _DECIDE = ("records", "mesh", "refined", "emission", "simulated", "channels")
 
 @dataclass(frozen=True)
 class ViewBasis:
-    """What a view's samples depend on, beside mesh and records."""
+    """Frames and LEDs that a view's samples depend on, beside mesh and records."""
 
     frames: str
     """Hash of the frames of the view and of those before it, whose dark frames count too."""
@@ -48,7 +48,7 @@ def frames_basis(frames: LightFrames, view: str) -> str:
 def note_view(out: Path, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
     """Note, before the samples of a view are taken, what they depend on. Raises InputError if others were taken
     with other settings, OSError."""
-    notes = _read(out)
+    notes = _read_notes(out)
     decisive = _decisive(settings)
     if notes is None:
         notes = {"settings": decisive, "views": {}}
@@ -62,10 +62,12 @@ def note_view(out: Path, settings: Mapping[str, Any], file_name: str, basis: Vie
 
 def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
     """Tell whether the samples of a view are there, and agree with its frames as they are now."""
-    notes = _read(out)
-    noted = None if notes is None else notes["views"].get(file_name)
+    notes = _read_notes(out)
+    view_notes = None if notes is None else notes["views"].get(file_name)
     return (
-        noted is not None and noted["frames"] == basis.frames and (out / "samples" / f"{file_name}.json").exists()
+        view_notes is not None
+        and view_notes["frames"] == basis.frames
+        and (out / "samples" / f"{file_name}.json").exists()
     )
 
 
@@ -78,17 +80,17 @@ def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]
     refuse_held(out)
     if (out / SETTINGS).exists():
         return
-    notes = _read(out)
+    notes = _read_notes(out)
     if notes is not None and notes["settings"] != _decisive(settings):
         raise InputError(_of_others(out))
-    noted_views = {} if notes is None else notes["views"]
+    known_views = {} if notes is None else notes["views"]
     for path in (out / "samples").glob("*.h5"):
-        noted, basis = noted_views.get(path.stem), bases.get(path.stem)
+        view_notes, basis = known_views.get(path.stem), bases.get(path.stem)
         picture = out / FRAMES / path.name
-        if noted is None or basis is None or noted["frames"] != basis.frames:
+        if view_notes is None or basis is None or view_notes["frames"] != basis.frames:
             for stale in (path.with_suffix(".json"), path, picture):  # the first says that the others are whole
                 stale.unlink(missing_ok=True)
-        elif tuple(noted["left_out"]) != basis.left_out:
+        elif tuple(view_notes["left_out"]) != basis.left_out:
             picture.unlink(missing_ok=True)
 
 
@@ -107,7 +109,7 @@ def _of_others(out: Path) -> str:
     return f"{out} holds samples of other input, settings or version: name another folder, or remove it"
 
 
-def _read(out: Path) -> dict[str, Any] | None:
+def _read_notes(out: Path) -> dict[str, Any] | None:
     """None if nothing was noted."""
     path = out / _NOTES
     try:

@@ -276,10 +276,10 @@ def _extract_one(
     """Write the files of a view's samples and frames for the check; what the report says of them."""
     measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
     view = next(view for view in measured_run.views if view.name == task.view)
-    told = task.path.with_suffix(".json")
+    summary_path = task.path.with_suffix(".json")
     summary: dict[str, Any] = (
-        read_json(told, allow_nan=True)
-        if told.exists()  # of samples whose pictures for the check alone are missing
+        read_json(summary_path, allow_nan=True)
+        if summary_path.exists()  # of samples whose pictures for the check alone are missing
         else extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
     )
     complete(task.frames_path, partial(write_frames, radiometry, view, task.path, task.left_out, threads))

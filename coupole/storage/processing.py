@@ -52,7 +52,7 @@ class Progress(BaseModel):
     """Views of the plan."""
     detail: str = ""
     """Name of the step within the step, such as a fit."""
-    done: Annotated[int, Field(ge=0)] = 0
+    done_count: Annotated[int, Field(ge=0)] = 0
     """Parts of `detail` that are done."""
     of: Annotated[int, Field(ge=0)] = 0
     """Parts of `detail`."""
@@ -135,7 +135,7 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
         return Processing(
             place, "ended", *counts, why="its process ended before the result was whole", remedy=remedy
         )
-    share = f" {progress.done} of {progress.of}" if progress.of else ""
+    share = f" {progress.done_count} of {progress.of}" if progress.of else ""
     pid = holder_of(result / _LOCK)
     still = f"its process {pid} is stopped; `kill -CONT {pid}` lets it go on" if pid and is_stopped(pid) else ""
     return Processing(place, progress.step, *counts, detail=f"{progress.detail}{share}", why=still)
@@ -150,7 +150,7 @@ def _read_progress(result: Path) -> Progress:
 
 
 @contextmanager
-def held(result: Path) -> Iterator[None]:
+def hold_result(result: Path) -> Iterator[None]:
     """Keep a result for this process: its folder is made, and locked while the context lasts. Raises InputError if
     another process has it, OSError."""
     (result / FOLDER).mkdir(parents=True, exist_ok=True)

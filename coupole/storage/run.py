@@ -172,8 +172,8 @@ class Run:
     def asked_result(self) -> Path | None:
         """The folder of the result that is made beside the acquisition, as the newest session says; None if none
         is."""
-        asked = [e for e in journal.read_events(self.journal_path) if isinstance(e, ProcessingAsked)]
-        return Path(asked[-1].result) if asked else None
+        events = [e for e in journal.read_events(self.journal_path) if isinstance(e, ProcessingAsked)]
+        return Path(events[-1].result) if events else None
 
     def lock(self) -> int:
         """Lock the run for this process. Raises InputError if another process acquires into it."""

@@ -1,5 +1,5 @@
-"""What a result lacks that shall be made beside an acquisition: known from plan, rig and records before anything
-moves."""
+"""Reasons against a result that shall be made beside an acquisition: known from plan, rig and records before
+anything moves."""
 
 from __future__ import annotations
 
@@ -49,16 +49,16 @@ def _of_folder(result: Path | None) -> Iterator[str]:
         if not existing.is_dir():
             yield f"--result {result}: expected a folder that can be made; {existing} is a file"
         return
-    begun = (result / SETTINGS).exists() or (result / processing.FOLDER).is_dir()
-    if not result.is_dir() or (not begun and any(result.iterdir())):
+    is_begun = (result / SETTINGS).exists() or (result / processing.FOLDER).is_dir()
+    if not result.is_dir() or (not is_begun and any(result.iterdir())):
         yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
 
 
 def _of_mesh(files: PlanFiles) -> Iterator[str]:
     if files.mesh_path is None:
         key = ("object",) if files.plan.object else ()
-        what = "expected the object's mesh (`object: {id: ..., mesh: FILE}`), which --reflectance needs"
-        yield str(files.document.problem(key, what))
+        message = "expected the object's mesh (`object: {id: ..., mesh: FILE}`), which --reflectance needs"
+        yield str(files.document.problem(key, message))
         return
     read_mesh(files.mesh_path)
 
@@ -66,13 +66,13 @@ def _of_mesh(files: PlanFiles) -> Iterator[str]:
 def _of_records(files: PlanFiles) -> Iterator[str]:
     by_kind = records_by_kind(files.record_paths or ())
     if missing := [kind for kind in NEEDED if kind not in by_kind]:
-        what = (
+        message = (
             f"expected calibration records of the kinds {', '.join(NEEDED)}, which --reflectance needs; no "
             f"{', no '.join(missing)} is named. `coupole calibrate all --rig RIG` makes them"
         )
         in_plan = files.plan.calibrations is not None
         document, key = (files.document, ("calibrations",)) if in_plan else (files.cell.document, ())
-        yield str(document.problem(key, what))
+        yield str(document.problem(key, message))
         return
     for check in (_check_camera, _check_leds):
         try:
@@ -113,12 +113,12 @@ def _check_leds(files: PlanFiles, by_kind: dict[str, Path]) -> None:
     """Raise InputError if the plan lights no single LEDs, or some that the record does not have."""
     base_from_support = files.cell.rig.support.base_from_support.matrix()
     rows = leds_of_plan(files.plan, files.cell.leds, base_from_support)
-    planned = set(map(int, files.cell.leds.ids[rows]))
-    if not planned:
-        what = "expected single LEDs, which --reflectance needs; the plan lights none"
-        raise InputError([files.document.problem(("lights",), what)])
-    known = set(map(int, calibrated_positions(by_kind["leds"]).ids))
-    if unknown := sorted(planned - known):
+    planned_leds = set(map(int, files.cell.leds.ids[rows]))
+    if not planned_leds:
+        message = "expected single LEDs, which --reflectance needs; the plan lights none"
+        raise InputError([files.document.problem(("lights",), message)])
+    known_leds = set(map(int, calibrated_positions(by_kind["leds"]).ids))
+    if unknown := sorted(planned_leds - known_leds):
         raise InputError(
             f"{by_kind['leds']}: does not have LED {unknown[0]}, which the plan lights; calibrate anew"
         )

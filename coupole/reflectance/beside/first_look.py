@@ -36,16 +36,16 @@ def write_normals(result: Path, view: str, path: Path) -> None:
     places = places[::step, ::step]
     nearest = cKDTree(samples.centres_mm).query(centres_mm)[1]
     kd = np.repeat(materials.kd, 3, axis=1)[:, :3] if materials.kd.shape[1] == 1 else materials.kd
-    left = _picture(places, nearest, 0.5 + 0.5 * materials.normals)
-    right = _picture(places, nearest, _for_the_eye(kd))
+    normals_picture = _picture(places, nearest, 0.5 + 0.5 * materials.normals)
+    colour_picture = _picture(places, nearest, _for_the_eye(kd))
     part = path.with_suffix(".png.part")
-    part.write_bytes(picture_png(np.hstack([left, right])))
+    part.write_bytes(picture_png(np.hstack([normals_picture, colour_picture])))
     part.replace(path)
 
 
 def _for_the_eye(kd: NDArray[np.float64]) -> NDArray[np.float64]:
-    known = kd[np.isfinite(kd)]
-    white = max(float(np.quantile(known, 0.99)), 1e-12) if len(known) else 1.0
+    finite_kd = kd[np.isfinite(kd)]
+    white = max(float(np.quantile(finite_kd, 0.99)), 1e-12) if len(finite_kd) else 1.0
     shares: NDArray[np.float64] = np.clip(kd / white, 0.0, 1.0) ** (1.0 / GAMMA)
     return shares
 
@@ -55,7 +55,7 @@ def _picture(
 ) -> NDArray[np.uint8]:
     """[h, w, 3] of what pixels see, by the rows of `colours` that are nearest to their triangles."""
     picture = np.zeros((*places.shape, 3), np.uint8)
-    seen = places >= 0
-    shares = np.nan_to_num(colours[nearest[places[seen]]])
-    picture[seen] = np.rint(255.0 * np.clip(shares, 0.0, 1.0)).astype(np.uint8)
+    seen_mask = places >= 0
+    shares = np.nan_to_num(colours[nearest[places[seen_mask]]])
+    picture[seen_mask] = np.rint(255.0 * np.clip(shares, 0.0, 1.0)).astype(np.uint8)
     return picture

@@ -16,7 +16,7 @@ from coupole.reflectance.result_pages import run_reflectance_page
 from coupole.reflectance.run_job import RunRequest, extract_beside, reflectance_of
 from coupole.storage.journal import Follower
 from coupole.storage.journal_events import FrameProven, SessionStopped, ViewBegun, ViewSealed
-from coupole.storage.processing import PICTURE, Progress, Step, held, tell
+from coupole.storage.processing import PICTURE, Progress, Step, hold_result, tell
 from coupole.storage.run import Run
 
 _LOOK_EVERY_S = 0.2
@@ -29,7 +29,7 @@ def process_run(folder: Path, result: Path, say: Say) -> bool:
     given the progress, and `times` at the end. What fails is told, and what is there stays."""
     teller = _Teller(result, say)
     try:
-        with held(result):
+        with hold_result(result):
             _Follower(Run(folder), result, teller).to_the_end()
     except (CoupoleError, OSError, MemoryError) as error:
         teller.fail(str(error) if isinstance(error, CoupoleError) else reason(error))
@@ -58,12 +58,12 @@ class _Teller:
 
     def step(self, step: Step, **changes: Any) -> None:
         """Tell that another step begins."""
-        self.tell(**{"step": step, "detail": "", "done": 0, "of": 0} | changes)
+        self.tell(**{"step": step, "detail": "", "done_count": 0, "of": 0} | changes)
 
-    def part(self, detail: str, done: int, of: int) -> None:
+    def part(self, detail: str, done_count: int, of: int) -> None:
         """Tell how much of a part of the step is done, if nothing was told for a moment."""
         if detail != self._progress.detail or time.monotonic() - self._told_s > _TELL_EVERY_S:
-            self.tell(detail=detail, done=done, of=of)
+            self.tell(detail=detail, done_count=done_count, of=of)
 
     def fail(self, why: str) -> None:
         self.step("failed", why=why)

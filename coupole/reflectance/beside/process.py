@@ -23,19 +23,19 @@ def main() -> None:
     end_with(int(sys.argv[1]))
     for number in (signal.SIGINT, signal.SIGHUP):  # Ctrl-C is for the acquisition, which ends this
         signal.signal(number, signal.SIG_IGN)
-    _say({"reasons": _reasons(_asked())})  # before anything moves or shines, and for this somebody waits
+    _say({"reasons": _reasons(_next_request())})  # before anything moves or shines, and for this somebody waits
     yield_to_all_others()
-    asked = _asked()
+    request = _next_request()
     threading.Thread(target=_end_with_input, name="end with input", daemon=True).start()
 
     from coupole.reflectance.beside.follower import process_run
 
-    succeeded = process_run(Path(asked["run"]), Path(asked["result"]), _say)
+    is_whole = process_run(Path(request["run"]), Path(request["result"]), _say)
     sys.stdout.flush()
-    os._exit(0 if succeeded else 1)  # no thread is waited for
+    os._exit(0 if is_whole else 1)  # no thread is waited for
 
 
-def _reasons(asked: dict[str, Any]) -> list[str]:
+def _reasons(request: dict[str, Any]) -> list[str]:
     """Reasons against a result; among them a library that is missing, with its extra's name by whoever asked."""
     try:
         from coupole.reflectance.beside import follower
@@ -43,16 +43,16 @@ def _reasons(asked: dict[str, Any]) -> list[str]:
     except ImportError as error:
         return [f"--reflectance: needs {error.name or error}, which is not installed: pip install 'coupole[all]'"]
     assert follower is not None  # imported now: nothing is missing later
-    rig, result = (None if asked[key] is None else Path(asked[key]) for key in ("rig", "result"))
-    return reasons_against(Path(asked["plan"]), rig, result)
+    rig, result = (None if request[key] is None else Path(request[key]) for key in ("rig", "result"))
+    return reasons_against(Path(request["plan"]), rig, result)
 
 
-def _asked() -> dict[str, Any]:
+def _next_request() -> dict[str, Any]:
     line = sys.stdin.readline()
     if not line:
         os._exit(1)
-    asked: dict[str, Any] = json.loads(line)
-    return asked
+    request: dict[str, Any] = json.loads(line)
+    return request
 
 
 def _say(document: dict[str, Any]) -> None:

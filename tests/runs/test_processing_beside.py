@@ -3,6 +3,7 @@ process that makes it, and never at the cost of the run."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -40,7 +41,20 @@ def begun(cell: CellFolder, *options: str | Path) -> tuple[subprocess.Popen[str]
     """An acquisition with processing beside it, and the number of that process, once its journal has begun."""
     process = cell.start_acquire("--reflectance", *options)
     cells.wait_until(lambda: cells.events(cell.run_folder, "processing"), "the session's first lines")
-    return process, beside(process.pid)
+    worker = beside(process.pid)
+    cells.wait_until(lambda: os.sched_getscheduler(worker) == os.SCHED_IDLE, "the lowest priority")
+    assert os.getpriority(os.PRIO_PROCESS, worker) == 19
+    hurry(worker)
+    return process, worker
+
+
+def hurry(pid: int) -> None:
+    """Give a process a share again: on a busy machine one of the lowest priority starves for longer than tests
+    wait."""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # ended, or not ours to raise
+            os.sched_setscheduler(int(task.name), os.SCHED_OTHER, os.sched_param(0))
+            os.setpriority(os.PRIO_PROCESS, int(task.name), 0)
 
 
 def beside(pid: int) -> int:
@@ -110,8 +124,6 @@ def frames_alone_count(ended: cells.Ended) -> dict[str, Any]:
 def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)
-    cells.wait_until(lambda: os.sched_getscheduler(worker) == os.SCHED_IDLE, "the lowest priority")
-    assert os.getpriority(os.PRIO_PROCESS, worker) == 19
     cells.wait_until(lambda: status(cell.run_folder).get("views_done"), "samples of a view")
     picture = cells.wait_until(
         lambda: (result_of(cell) / "beside/normals.png").exists() or not is_beside(worker), "a first look"

@@ -133,8 +133,9 @@ def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
         pixels = np.asarray(Image.open(result_of(cell) / "beside/normals.png"))
         assert np.count_nonzero(pixels.any(axis=2)) > 1000
         refused = cells.here("reflectance", cell.run_folder, "--out", result_of(cell))
-        assert refused.code == 2
-        assert f"process {worker}" in refused.err
+        if is_beside(worker):  # it has not ended meanwhile
+            assert refused.code == 2
+            assert f"process {worker}" in refused.err
     said = frames_alone_count(cells.finish(process))
     assert said["is_whole"]
     assert said["views"] == 3

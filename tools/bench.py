@@ -88,8 +88,8 @@ def bench_sequencing(options: Asked) -> None:
     duration; on the world's clock and on the machine's."""
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.run_description import about_run, metadata_of_views
     from coupole.acquisition.sequencer import Sequencer
-    from coupole.acquisition.session import about_run, metadata_of_views
     from coupole.devices import NO_LED
     from coupole.preflight.job import read_job
     from coupole.storage.run import Run
@@ -131,6 +131,17 @@ def bench_sequencing(options: Asked) -> None:
 def bench_store(options: Asked) -> None:
     """Full-size frames to disk: the view writer and others, and the whole data path of a run."""
     from bench_store import figures
+
+    for figure in figures(ROOT, options.rounds, smallest=options.smallest):
+        line(**figure)
+
+
+# -- live -------------------------------------------------------------------------------------------------
+
+
+def bench_live(options: Asked) -> None:
+    """Whole runs of full-size frames with processing beside them, against the same runs without it."""
+    from bench_live import figures
 
     for figure in figures(ROOT, options.rounds, smallest=options.smallest):
         line(**figure)
@@ -282,6 +293,7 @@ BENCHES: dict[str, Callable[[Asked], None]] = {
     "check": bench_check,
     "sequencing": bench_sequencing,
     "store": bench_store,
+    "live": bench_live,
     "matching": bench_matching,
     "rsi": bench_rsi,
     "collisions": bench_collisions,

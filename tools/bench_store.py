@@ -278,8 +278,8 @@ def _burst(root: Path, folder: Path, size: Size) -> Burst:
     from coupole.acquisition.observer import Unwatched
     from coupole.acquisition.opened_cell import open_cell
     from coupole.acquisition.recorder import RunRecorder
+    from coupole.acquisition.run_description import about_run, metadata_of_views
     from coupole.acquisition.sequencer import Sequencer
-    from coupole.acquisition.session import about_run, metadata_of_views
     from coupole.preflight.job import read_job
     from coupole.storage.run import Run
     from coupole.viewing.progress import Progress

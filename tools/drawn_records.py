@@ -85,6 +85,17 @@ def draw_records(folder: Path, seed: int | None, scale: Scale | None = None) -> 
     return records
 
 
+def write_camera_record(folder: Path) -> None:
+    """Write a camera record that says of the lens what the drawn hand-eye record in a folder says."""
+    hand_eye = read_record(folder / "hand-eye.yaml")
+    values = {parameter.name: parameter.value for parameter in hand_eye.parameters}
+    content = _content(read_record(SHIPPED / "camera.yaml"))
+    for parameter in content["parameters"]:
+        parameter["value"] = values[parameter["name"]]
+    content["validity"]["size_px"] = hand_eye.validity.size_px
+    write_record(folder / "camera.yaml", _seal_record(content))
+
+
 def true_powers() -> Floats:
     """[leds] of the simulated cell, DN s^-1 m^2 sr: alike in all channels."""
     table, cell = true_leds(), read_cell(RIG)

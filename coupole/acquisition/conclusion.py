@@ -11,7 +11,7 @@ from coupole.acquisition.signals import SignalReceived
 from coupole.bounded import DISK, hangs, left_behind, on_disk, run_bounded, under_way
 from coupole.errors import StorageError
 from coupole.storage import journal, manifest, run_dose
-from coupole.storage.journal_events import SessionResumed, SessionStopped, TextUnread
+from coupole.storage.journal_events import ProcessingAsked, SessionResumed, SessionStopped, TextUnread
 from coupole.storage.run import Run
 from coupole.viewing import report
 from coupole.viewing.terminal import alarm, bytes_text
@@ -29,10 +29,7 @@ def open_for_session(run: Run) -> None:
 
 def complete_views(run: Run) -> list[str]:
     """Files of the views whose frames are all proven, relative to the run: nothing writes into them any more."""
-    proven = run.proven()
-    incomplete_views = {shot.view for shot in run.expected_shots() if shot not in proven}
-    incomplete_views |= set(run.open_views())
-    files = (run.view_path(view) for view in run.about["views"] if view not in incomplete_views)
+    files = map(run.view_path, run.complete_views())
     return [str(path.relative_to(run.folder)) for path in files if path.is_file()]
 
 
@@ -48,13 +45,15 @@ def renew_report(run: Run) -> Path:
     return path
 
 
-def close_complete(run: Run, console: Console) -> float:
+def close_complete(run: Run, console: Console, result: Path | None = None) -> float:
     """A session of a run whose frames are all there, perhaps killed before it could say so: no device is opened.
-    Returns the light of the run in lux hours."""
+    `result` is the folder of the result that is asked for beside it. Returns the light of the run in lux hours."""
     console.print("all frames are there; no device is opened")
     open_for_session(run)
     writer = journal.Journal(run.journal_path)
     writer.write(SessionResumed(simulated=run.is_simulated))
+    if result is not None:
+        writer.write(ProcessingAsked(result=str(result)))
     writer.write(SessionStopped(outcome="done"))
     writer.commit()
     writer.close()

@@ -1,11 +1,16 @@
-"""Description of the cell in every view's file, so that it can be used without rig and plan: LEDs and lens."""
+"""Description of a run: what run.json says, and the cell in every view's file, so that it can be used without rig
+and plan."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from coupole.acquisition.opened_cell import OpenedCell
+from coupole.acquisition.verdict import PROOF_BY
 from coupole.plan.rig import Rig
+from coupole.plan.schedule import Schedule
 from coupole.preflight.job import Job
 from coupole.storage.frame_file_creation import Collections, Quantity
 
@@ -67,4 +72,60 @@ def _nominal(rig: Rig) -> dict[str, Quantity]:
     return {
         **_pinhole({"fx": f_px, "fy": f_px, "cx": centre_px[0], "cy": centre_px[1]}),
         "source": Quantity("nominal, from the rig: no calibration of the camera was in force"),
+    }
+
+
+def camera_name(cell: OpenedCell) -> str:
+    """The camera's name in calibration records."""
+    return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
+
+
+def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
+    """The contents of run.json in addition to the inputs."""
+    return {
+        "simulated": cell.is_simulated,
+        "proof": _proof(job),
+        "licence": job.plan.licence or job.cell.rig.licence,
+        "contact": job.plan.contact or job.cell.rig.contact,
+        "object": job.plan.object.id if job.plan.object else None,
+        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
+        "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
+        "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
+        "views": [view.name for view in job.schedule.views],
+        "labels": [] if job.schedule.is_open else _labels(job.schedule),
+        "chosen_in_the_run": job.schedule.is_open,
+        "hidden_leds": job.hidden_leds,
+        "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
+    }
+
+
+def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
+    """One list if all views have the same frames; otherwise one for each view, by its name."""
+    if len(set(schedule.labels)) == 1:
+        return list(map(str, schedule.labels[0]))
+    return {
+        view.name: list(map(str, labels)) for view, labels in zip(schedule.views, schedule.labels, strict=True)
+    }
+
+
+def _proof(job: Job) -> str:
+    """The kind of proof of the run's frames."""
+    return PROOF_BY[job.schedule.planned_bursts()[0][0].marks]
+
+
+def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
+    """Attributes of every view's file."""
+    rig = job.cell.rig
+    return {
+        "program_name": "coupole",
+        "sample": job.plan.object.id if job.plan.object else "none",
+        "simulated": cell.is_simulated,
+        "proof": _proof(job),
+        "pixel_pitch_um": cell.sensor.pixel_pitch_um,
+        "focal_length_mm": rig.lens.focal_length_mm,
+        "f_number": rig.lens.f_number,
+        "focus_distance_mm": rig.lens.focus_distance_mm,
+        "base_from_support": rig.support.base_from_support.matrix(),
+        "camera": camera_name(cell),
+        "gain_db": job.plan.gain_db,
     }

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -29,7 +29,7 @@ from coupole.acquisition.operator import (
 )
 from coupole.acquisition.recorder import RunRecorder
 from coupole.acquisition.run_control import RunControl
-from coupole.acquisition.run_description import described_cell
+from coupole.acquisition.run_description import about_run, camera_name, described_cell, metadata_of_views
 from coupole.acquisition.sequencer import Sequencer
 from coupole.acquisition.session_failure import (
     note_failure,
@@ -38,7 +38,6 @@ from coupole.acquisition.session_failure import (
     statistics,
 )
 from coupole.acquisition.signals import obeyed_by
-from coupole.acquisition.verdict import PROOF_BY
 from coupole.bounded import left_behind, on_disk, run_bounded
 from coupole.errors import (
     Interrupted,
@@ -47,13 +46,18 @@ from coupole.errors import (
     unsafe_end,
 )
 from coupole.plan.rig_devices import trusted_by_name
-from coupole.plan.schedule import Schedule
 from coupole.plan.shot_id import ShotId
 from coupole.preflight.checking import calibration_refusals, check_job, preflight_of
 from coupole.preflight.job import Job, with_choices, without_hidden
 from coupole.preflight.preflight import StorageFacts
 from coupole.storage.arm_faults import ArmFaults, faults_of
-from coupole.storage.journal_events import FaultNoted, SessionResumed, SessionStarted, SessionStopped
+from coupole.storage.journal_events import (
+    FaultNoted,
+    ProcessingAsked,
+    SessionResumed,
+    SessionStarted,
+    SessionStopped,
+)
 from coupole.storage.run import Run
 from coupole.storage.run_inputs import copied_s
 from coupole.storage.view_reader import refuse_lost
@@ -61,6 +65,9 @@ from coupole.viewing.keys import key_actions
 from coupole.viewing.preflight_table import show_preflight
 from coupole.viewing.progress import Outcome
 from coupole.viewing.terminal import RunObserver, alarm, show_dry_run
+
+if TYPE_CHECKING:
+    from coupole.acquisition.processing_beside import ProcessingBeside
 
 _ASKED_BOARDS = 12
 """Number of boards, spread over the dome, whose temperature is read."""
@@ -78,10 +85,12 @@ def acquire_plan(
     confirm: bool,
     figures: dict[str, Any],
     with_mesh: bool = False,
+    beside: ProcessingBeside | None = None,
 ) -> None:
     """Run a plan into a run folder; `figures` is filled with the figures of `--json`, also when this raises.
 
-    A mesh of more than 100 MB is copied into the folder only `with_mesh`.
+    A mesh of more than 100 MB is copied into the folder only `with_mesh`. `beside` processes the run's views while
+    it is acquired.
     """
     with contextlib.ExitStack() as stack:
         run = Run(resume) if resume else None
@@ -101,6 +110,7 @@ def acquire_plan(
             figures=figures,
             exit_stack=stack,
             with_mesh=with_mesh,
+            beside=beside,
         )
 
 
@@ -114,6 +124,7 @@ def _acquire_into(
     figures: dict[str, Any],
     exit_stack: contextlib.ExitStack,
     with_mesh: bool,
+    beside: ProcessingBeside | None,
 ) -> None:
     is_resumed = run is not None
     folder = (run.folder if run else parent or job.cell.storage_folder).resolve()
@@ -123,13 +134,12 @@ def _acquire_into(
         allocated_bytes=run.allocated_bytes() if run else 0,
         proven=run.proven() if run else (),
     )
+    if beside is not None:
+        preflight.refusals += beside.refusals()
     show_preflight(console, preflight, name=job.plan.name, rig=job.cell.rig.name)
     refuse(preflight)
     if run is not None and not preflight.frames and not run.open_views():
-        dose_lux_h = close_complete(run, console)
-        outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
-        figures.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
-        _say_outcome(console, run, outcome, "done")
+        _close_complete(run, job, console, beside, figures)
         return
     faults_of(job.cell).refuse(job.cell.document.path)
     ask_to_begin(job.cell, confirm=confirm)
@@ -156,12 +166,33 @@ def _acquire_into(
             event = event_class(simulated=cell.is_simulated, room_c=room_c, acknowledged=acknowledgement)
             fields = {"dose_budget_lux_h": preflight.dose_budget_lux_h, "trusted": trusted_by_name(job.cell.rig)}
             recorder.note(event.model_copy(update=fields))
+            if beside is not None:
+                _begin_processing(run, recorder, beside)
             tell_changes(job.cell.files, recorder, console)
             after_lux_h = preflight.dose_before_lux_h + preflight.dose_lux_h
             light = {job.plan.object.id: after_lux_h} if job.plan.object else {}
             _acquire(job, cell, run, recorder, console, faults, light, figures=figures)
         finally:
             recorder.close()
+
+
+def _close_complete(
+    run: Run, job: Job, console: Console, beside: ProcessingBeside | None, figures: dict[str, Any]
+) -> None:
+    """The session of a run whose frames are all there; what is missing may be its result."""
+    dose_lux_h = close_complete(run, console, beside.result_of(run.folder) if beside else None)
+    if beside is not None:
+        beside.follow(run.folder)
+    outcome = Outcome(job.schedule.shots, job.schedule.shots, dose_lux_h=dose_lux_h)
+    figures.update({**_figures(run, job, outcome, run.proven()), "unsafe": []})
+    _say_outcome(console, run, outcome, "done")
+
+
+def _begin_processing(run: Run, recorder: RunRecorder, beside: ProcessingBeside) -> None:
+    """Process the run's views from now on; a resumed run knows of it by its journal."""
+    recorder.note(ProcessingAsked(result=str(beside.result_of(run.folder))))
+    recorder.commit(now=True)
+    beside.follow(run.folder)
 
 
 def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
@@ -173,65 +204,9 @@ def _refuse_other_calibrations(job: Job, cell: OpenedCell) -> float | None:
     some = boards[np.unique(np.linspace(0, len(boards) - 1, _ASKED_BOARDS).astype(int))]
     temperatures_c = [c for board in some if (c := cell.ledbox.board_temperature_c(int(board))) is not None]
     room_c = min(temperatures_c, default=None)
-    if reasons := calibration_refusals(job, camera=_camera_name(cell), temperature_c=room_c):
+    if reasons := calibration_refusals(job, camera=camera_name(cell), temperature_c=room_c):
         raise PreflightRefused(reasons)
     return room_c
-
-
-def _camera_name(cell: OpenedCell) -> str:
-    """The camera's name in calibration records."""
-    return " ".join((cell.identities["camera"].model, cell.identities["camera"].serial))
-
-
-def about_run(job: Job, cell: OpenedCell) -> dict[str, Any]:
-    """The contents of run.json in addition to the inputs."""
-    return {
-        "simulated": cell.is_simulated,
-        "proof": _proof(job),
-        "licence": job.plan.licence or job.cell.rig.licence,
-        "contact": job.plan.contact or job.cell.rig.contact,
-        "object": job.plan.object.id if job.plan.object else None,
-        "calibrations": {item.record.kind: item.record.sha256 for item in job.calibrations or ()} or "none",
-        "devices": {kind: vars(identity) for kind, identity in cell.identities.items()},
-        "scaling": cell.world_endpoints["camera"]["scaling"] if cell.world_endpoints else None,
-        "views": [view.name for view in job.schedule.views],
-        "labels": [] if job.schedule.is_open else _labels(job.schedule),
-        "chosen_in_the_run": job.schedule.is_open,
-        "hidden_leds": job.hidden_leds,
-        "expected": {"shots": job.schedule.shots, "frames": job.schedule.frames},
-    }
-
-
-def _labels(schedule: Schedule) -> list[str] | dict[str, list[str]]:
-    """One list if all views have the same frames; otherwise one for each view, by its name."""
-    if len(set(schedule.labels)) == 1:
-        return list(map(str, schedule.labels[0]))
-    return {
-        view.name: list(map(str, labels)) for view, labels in zip(schedule.views, schedule.labels, strict=True)
-    }
-
-
-def _proof(job: Job) -> str:
-    """The kind of proof of the run's frames."""
-    return PROOF_BY[job.schedule.planned_bursts()[0][0].marks]
-
-
-def metadata_of_views(job: Job, cell: OpenedCell) -> dict[str, Any]:
-    """Attributes of every view's file."""
-    rig = job.cell.rig
-    return {
-        "program_name": "coupole",
-        "sample": job.plan.object.id if job.plan.object else "none",
-        "simulated": cell.is_simulated,
-        "proof": _proof(job),
-        "pixel_pitch_um": cell.sensor.pixel_pitch_um,
-        "focal_length_mm": rig.lens.focal_length_mm,
-        "f_number": rig.lens.f_number,
-        "focus_distance_mm": rig.lens.focus_distance_mm,
-        "base_from_support": rig.support.base_from_support.matrix(),
-        "camera": _camera_name(cell),
-        "gain_db": job.plan.gain_db,
-    }
 
 
 def _acquire(

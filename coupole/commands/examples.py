@@ -17,7 +17,7 @@ EXAMPLES: dict[str, tuple[str, str]] = {
     "view": ("view first.yaml --show", "view first.yaml --out drawn --no-paths"),
     "simulate": ("simulate first.yaml --frames 12", "simulate first.yaml --frames 3 --width 400 --out frames"),
     "meter": ("meter first.yaml", "meter first.yaml --snr 50 --write metered.yaml"),
-    "acquire": ("acquire first.yaml --dry-run --speed 20", "acquire --resume RUN"),
+    "acquire": ("acquire first.yaml --reflectance", "acquire --resume RUN"),
     "demo": ("demo --open", "demo my-demo --short"),
     # cell
     "devices": ("devices --rig sim", "devices --rig my-cell.yaml --json"),

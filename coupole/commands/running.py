@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,8 +25,24 @@ from coupole.errors import CoupoleError
 from coupole.plan.shipped_files import SIMULATED_CELL, file_of
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coupole.acquisition.processing_beside import ProcessingBeside
     from coupole.plan.cell import Cell
     from coupole.preflight.job import Job
+
+ReflectanceOption = Annotated[
+    bool,
+    typer.Option(
+        "--reflectance",
+        help="Take samples of each view as soon as it is complete, beside the acquisition, and end with the "
+        "result that `coupole reflectance RUN` makes. A resumed run goes on with it by itself.",
+    ),
+]
+ResultOption = Annotated[
+    Path | None,
+    typer.Option("--result", help="Folder of that result; by default the run's, with -reflectance behind."),
+]
 
 
 def acquire(
@@ -42,6 +61,8 @@ def acquire(
     with_mesh: Annotated[
         bool, typer.Option("--with-mesh", help="Copy the mesh into the run even if it has more than 100 MB.")
     ] = False,
+    reflectance: ReflectanceOption = False,
+    result: ResultOption = None,
     as_json: JsonOption = False,
     begun_by_console: Annotated[bool, typer.Option("--begun-by-console", hidden=True)] = False,
 ) -> None:
@@ -56,10 +77,7 @@ def acquire(
     from coupole.preflight.job import read_job
     from coupole.viewing.terminal import make_console
 
-    if dry_run and (resume or output):
-        raise typer.BadParameter("a dry run stores nothing: --dry-run excludes --resume and --output")
-    if resume and output:
-        raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
+    _refuse_exclusive(resume, output, dry_run=dry_run, asks_result=reflectance or result is not None)
     console = make_console(quiet=as_json and not begun_by_console)
     summary: dict[str, Any] = {}
     try:
@@ -67,23 +85,63 @@ def acquire(
         if console_cell is not None:
             from coupole.console.command_line.following import acquire_by_console
 
-            paths = {"plan": plan or (plan_of(resume) if rig else None), "output": output, "resume": resume}
+            plan = plan or (plan_of(resume) if rig else None)
+            paths = {"plan": plan, "output": output, "resume": resume, "result": result}
             request = {key: str(path.resolve()) for key, path in paths.items() if path is not None}
-            acquire_by_console(
-                console_cell, console, {**request, "with_mesh": with_mesh}, confirm=not yes, summary=summary
-            )
+            flags = {"with_mesh": with_mesh, "reflectance": reflectance or result is not None}
+            acquire_by_console(console_cell, console, {**request, **flags}, confirm=not yes, summary=summary)
         elif dry_run:
             rehearse(read_job(plan or plan_of(resume), rig), console, speed=speed, figures=summary)
         else:
             job = read_job(plan or plan_of(resume), rig)
-            acquire_plan(
-                job, console, parent=output, resume=resume, confirm=not yes, figures=summary, with_mesh=with_mesh
-            )
+            begin = partial(acquire_plan, job, console, parent=output, resume=resume, with_mesh=with_mesh)
+            with _beside(job, console, resume, result, summary, is_asked=reflectance) as beside:
+                begin(confirm=not yes, figures=summary, beside=beside)
     except CoupoleError as error:
         fail(error, as_json=as_json, figures=summary)
         raise
     if as_json:
         print(json.dumps(summary))
+
+
+def _refuse_exclusive(resume: Path | None, output: Path | None, *, dry_run: bool, asks_result: bool) -> None:
+    if dry_run and (resume or output or asks_result):
+        raise typer.BadParameter(
+            "a dry run stores nothing: --dry-run excludes --resume, --output, --reflectance and --result"
+        )
+    if resume and output:
+        raise typer.BadParameter("a resumed run keeps its folder: --resume excludes --output")
+
+
+@contextmanager
+def _beside(
+    job: Job,
+    console: Console,
+    resume: Path | None,
+    result: Path | None,
+    summary: dict[str, Any],
+    *,
+    is_asked: bool,
+) -> Iterator[ProcessingBeside | None]:
+    """The processing beside an acquisition, if it is asked for, or the run that is resumed has asked for it; what
+    became of it is in `summary` afterwards."""
+    from coupole.storage.run import Run
+
+    if resume is not None:
+        result = result or Run(resume).asked_result
+    if not (is_asked or result):
+        yield None
+        return
+    from coupole.acquisition.processing_beside import ProcessingBeside
+
+    beside = ProcessingBeside(job.document.path, job.cell.document.path, result, console)
+    try:
+        with beside:
+            yield beside
+            beside.wait()
+    finally:
+        if figures := beside.figures():
+            summary["reflectance"] = figures
 
 
 def devices(

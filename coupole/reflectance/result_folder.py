@@ -12,6 +12,7 @@ from uuid import uuid4
 
 from coupole.errors import InputError, reason
 from coupole.intake.plain_data import read_json
+from coupole.storage import processing
 from coupole.storage.durable import make_folder, sync_folder
 
 SETTINGS = "settings.json"
@@ -26,7 +27,7 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
             raise InputError(
                 f"{out} holds the result of other input, settings or version: name another folder with --out"
             )
-    elif out.exists() and any(content.suffix != ".part" for content in out.iterdir()):
+    elif _has_other_content(out):
         raise InputError(f"{out} is not empty, and holds no result: name another folder with --out")
     else:
         make_folder(out)
@@ -34,6 +35,13 @@ def begin(out: Path, settings: dict[str, Any]) -> None:
     clear_remains(out)
     for name in ("samples", "fits"):
         make_folder(out / name)
+
+
+def _has_other_content(out: Path) -> bool:
+    """Tell whether a folder holds anything that neither a killed writer nor processing beside a run has left."""
+    if not out.exists() or (out / processing.FOLDER).is_dir():
+        return False
+    return any(content.suffix != ".part" for content in out.iterdir())
 
 
 def read_settings(out: Path) -> dict[str, Any]:

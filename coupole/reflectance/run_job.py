@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -16,9 +16,12 @@ from typing import Any
 from uuid import uuid4
 
 from coupole.errors import InputError
+from coupole.intake.plain_data import read_json
+from coupole.plan.shot_id import Led
 from coupole.reflectance.alignment.colmap_model import read_model
 from coupole.reflectance.alignment.colmap_poses import read_poses
 from coupole.reflectance.alignment.refined_geometry import ABOUT, read_refined, what_was_refined
+from coupole.reflectance.begun_beside import ViewBasis, adopt, clear_beside, frames_basis, is_taken, note_view
 from coupole.reflectance.block_work import Said, Workshop, silent, workshop
 from coupole.reflectance.extraction.extraction import Geometry, extract_view, geometry_of
 from coupole.reflectance.extraction.frames_for_check import write_frames
@@ -37,6 +40,7 @@ from coupole.reflectance.run_result import FRAMES, OBJECT, RunResult
 from coupole.reflectance.run_result_files import write_object
 from coupole.storage.disk_errors import disk_error
 from coupole.storage.durable import sha256, write_synced
+from coupole.storage.run import Run
 from coupole.storage.run_json import RUN_JSON
 
 HELD_OUT_EVERY, HELD_OUT_FIRST = 12, 4
@@ -95,7 +99,9 @@ def reflectance_of(
     begun_s = time.monotonic()
     extract_runs(request, out, scheduler=scheduler, say=say)
     fit_result(out, request.memory_bytes, scheduler=scheduler, say=say)
-    return check_result(out, request.memory_bytes, begun_s=begun_s, say=say)
+    about = check_result(out, request.memory_bytes, begun_s=begun_s, say=say)
+    clear_beside(out)
+    return about
 
 
 def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None, say: Said = silent) -> None:
@@ -104,9 +110,10 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
     measured_runs = read_runs(request, token)
     try:
         with workshop(scheduler) as shop:
-            begin(out, settings_of(request, token, measured_runs))
-            first = measured_runs[0]
-            complete(out / OBJECT, lambda path: write_object(path, first.corners_mm, first.base_from_support))
+            settings = settings_of(request, token, measured_runs)
+            adopt(out, settings, _bases(measured_runs, settings["left_out"]))
+            begin(out, settings)
+            complete(out / OBJECT, partial(_write_object, measured_runs[0]))
             shop.refuse_blind(out.resolve(), SETTINGS)
             _extract(request, token, measured_runs, out.resolve(), shop, say)
         settings = read_settings(out)
@@ -117,6 +124,54 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
         raise disk_error(out, error) from error
     finally:
         forget()
+
+
+def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> None:
+    """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. What is
+    there already, and agrees with the view's frames, stays. Raises as `reflectance_of`."""
+    request, token = RunRequest((run,)), uuid4().hex
+    try:
+        (measured_run,) = read_runs(request, token)
+        view = next((view for view in measured_run.views if view.name == view_name), None)
+        if view is None:  # dark frames or panels alone
+            return
+        left_out = tuple(held_out_leds(_expected_leds(measured_run.run)))
+        basis = ViewBasis(frames_basis(measured_run.frames, view_name), left_out)
+        file_name = view_file_name([measured_run], measured_run, view)
+        if is_taken(out, file_name, basis):
+            return
+        path = out / "samples" / f"{file_name}.h5"
+        path.with_suffix(".json").unlink(missing_ok=True)
+        note_view(out, settings_of(request, token, [measured_run]), file_name, basis)
+        complete(out / OBJECT, partial(_write_object, measured_run))
+        summary = _extract_one(token, request.sources, None, say, _View(run.resolve(), view_name, path, left_out))
+        write_synced(path.with_suffix(".json"), json.dumps(summary))
+    except OSError as error:
+        raise disk_error(out, error) from error
+    finally:
+        forget()
+
+
+def _write_object(measured_run: MeasuredRun, path: Path) -> None:
+    write_object(path, measured_run.corners_mm, measured_run.base_from_support)
+
+
+def _expected_leds(run: Run) -> set[int]:
+    """LEDs of all views; where they are chosen in the run, of those that were chosen so far."""
+    return {shot.light.id for shot in run.expected_shots() if isinstance(shot.light, Led)}
+
+
+def held_out_leds(leds: Collection[int]) -> list[int]:
+    """LEDs that are kept for the check, if none are named."""
+    return sorted(leds)[HELD_OUT_FIRST::HELD_OUT_EVERY]
+
+
+def _bases(measured_runs: Sequence[MeasuredRun], left_out: Sequence[int]) -> dict[str, ViewBasis]:
+    return {
+        view_file_name(measured_runs, m, view): ViewBasis(frames_basis(m.frames, view.name), tuple(left_out))
+        for m in measured_runs
+        for view in m.views
+    }
 
 
 def read_runs(request: RunRequest, token: str) -> list[MeasuredRun]:
@@ -132,7 +187,7 @@ def settings_of(request: RunRequest, token: str, measured_runs: Sequence[Measure
     """Return what a result of a request is begun with."""
     frames = [frame for m in measured_runs for view in m.views for frame in view.frames]
     leds = sorted({frame.led for frame in frames if frame.led is not None})
-    left_out = list(request.left_out) or leds[HELD_OUT_FIRST::HELD_OUT_EVERY]
+    left_out = list(request.left_out) or held_out_leds(leds)
     if wrong := sorted(set(left_out) - set(leds)):
         raise InputError(f"--leave-out: no frame under LED {wrong[0]} in these runs")
     return {
@@ -168,6 +223,15 @@ class _View:
     path: Path
     left_out: tuple[int, ...]
 
+    @property
+    def frames_path(self) -> Path:
+        """File of the pictures for the check."""
+        return self.path.parents[1] / FRAMES / self.path.name
+
+    @property
+    def is_whole(self) -> bool:
+        return self.path.with_suffix(".json").exists() and self.frames_path.exists()
+
 
 def _extract(
     request: RunRequest, token: str, measured_runs: Sequence[MeasuredRun], out: Path, shop: Workshop, say: Said
@@ -184,7 +248,7 @@ def _extract(
         for run, measured_run in zip(request.runs, measured_runs, strict=True)
         for view in measured_run.views
     ]
-    remaining_views = [run_view for run_view in remaining_views if not run_view.path.with_suffix(".json").exists()]
+    remaining_views = [run_view for run_view in remaining_views if not run_view.is_whole]
     sources = request.sources
     for run_view in remaining_views:
         shop.refuse_blind(run_view.run, RUN_JSON)
@@ -212,9 +276,13 @@ def _extract_one(
     """Write the files of a view's samples and frames for the check; what the report says of them."""
     measured_run, geometry, radiometry = prepare_run(token, task.run, sources)
     view = next(view for view in measured_run.views if view.name == task.view)
-    summary = extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
-    frames = task.path.parents[1] / FRAMES / task.path.name
-    complete(frames, partial(write_frames, radiometry, view, task.path, task.left_out, threads))
+    summary_path = task.path.with_suffix(".json")
+    summary: dict[str, Any] = (
+        read_json(summary_path, allow_nan=True)
+        if summary_path.exists()  # of samples whose pictures for the check alone are missing
+        else extract_view(measured_run, geometry, radiometry, view, task.path, say, threads=threads)
+    )
+    complete(task.frames_path, partial(write_frames, radiometry, view, task.path, task.left_out, threads))
     return summary
 
 

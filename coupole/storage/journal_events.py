@@ -86,6 +86,14 @@ class SessionResumed(JournalEvent):
     """Permissions that a person gives by name in the rig, in words."""
 
 
+class ProcessingAsked(JournalEvent):
+    """The session shall end with a result: views are processed beside the acquisition, in a process of its own."""
+
+    event: Literal["processing"] = "processing"
+    result: str
+    """Folder of the result, a whole path."""
+
+
 class ViewBegun(JournalEvent):
     """The arm is about to move to a view."""
 
@@ -312,6 +320,7 @@ Event: TypeAlias = (
     JournalBegun
     | SessionStarted
     | SessionResumed
+    | ProcessingAsked
     | ViewBegun
     | MoveBegun
     | ArmSettled

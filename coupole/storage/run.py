@@ -37,6 +37,7 @@ from coupole.storage.journal_events import (
     JOURNAL_VERSION,
     BurstsChosen,
     FrameProven,
+    ProcessingAsked,
 )
 from coupole.storage.line_file import utc_now
 from coupole.storage.run_inputs import Inputs, changes_since, keep
@@ -157,6 +158,22 @@ class Run:
         return {
             event.shot: event for event in journal.read_events(self.journal_path) if isinstance(event, FrameProven)
         }
+
+    def complete_views(self) -> list[str]:
+        """Views whose frames are all proven and on the disk, and of which no more are chosen, in the plan's order:
+        nothing writes into their files any more."""
+        proven = self.proven()
+        incomplete_views = {shot.view for shot in self.expected_shots() if shot not in proven}
+        incomplete_views |= set(self.open_views())
+        begun_views = {shot.view for shot in proven}
+        return [v for v in self.about["views"] if v not in incomplete_views and v in begun_views]
+
+    @property
+    def asked_result(self) -> Path | None:
+        """The folder of the result that is made beside the acquisition, as the newest session says; None if none
+        is."""
+        events = [e for e in journal.read_events(self.journal_path) if isinstance(e, ProcessingAsked)]
+        return Path(events[-1].result) if events else None
 
     def lock(self) -> int:
         """Lock the run for this process. Raises InputError if another process acquires into it."""

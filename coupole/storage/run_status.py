@@ -29,6 +29,7 @@ from coupole.storage.journal_events import (
     JournalBegun,
     MoveBegun,
     Paused,
+    ProcessingAsked,
     ReshootBegun,
     SessionResumed,
     SessionStarted,
@@ -37,6 +38,7 @@ from coupole.storage.journal_events import (
     ViewBegun,
     ViewSealed,
 )
+from coupole.storage.processing import Processing, processing_of
 from coupole.storage.run import Run
 from coupole.storage.run_json import RUN_JSON
 from coupole.storage.stopped_process import is_stopped
@@ -104,6 +106,8 @@ class Status:
     """The command line that takes what is left; empty if nothing is, or while the run is in use."""
     before_that: str = ""
     """The command line by which a person first confirms a fault of the arm; empty if none stands."""
+    processing: Processing | None = None
+    """Processing beside the acquisition; None if it was not asked for."""
 
     @property
     def missing(self) -> int:
@@ -123,7 +127,9 @@ class Status:
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""
         sessions = [{**vars(session), "duration_s": round(session.duration_s, 3)} for session in self.sessions]
-        return {**vars(self), "sessions": sessions, "missing": self.missing, "frames_left": self.frames_left}
+        processing = None if self.processing is None else self.processing.figures()
+        left = {"missing": self.missing, "frames_left": self.frames_left}
+        return {**vars(self), "sessions": sessions, "processing": processing, **left}
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
@@ -136,9 +142,12 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
     proven = set()
     events = list(journal.read_events(run.journal_path))
     status.dose_lux_h = run_dose.highest_lux_h(events)
+    result = ""
     for event in events:
         if isinstance(event, FrameProven):
             proven.add(event.shot)
+        elif isinstance(event, ProcessingAsked):
+            result = event.result
         _note_event(status, event)
     status.proven = sum(shot.is_shot for shot in proven)
     status.darks_proven = sum(not shot.is_shot and not isinstance(shot.light, Sentinel) for shot in proven)
@@ -158,6 +167,9 @@ def status(run: Run, *, in_use: bool | None = None) -> Status:
         status.go_on = run.go_on_command
         if status.faults:
             status.before_that = _confirmation(run)
+    if result:
+        frames_left = bool(status.frames_left or status.open_views)
+        status.processing = processing_of(run.folder, Path(result), frames_left=frames_left, in_use=in_use)
     return status
 
 
@@ -203,7 +215,7 @@ def _note_event(found: Status, event: Event) -> None:
             found.findings.append(f"{event.view}: {event.kind}: {event.message}{picture}")
         case BurstEnded():
             session.light_s += event.on_s
-        case JournalBegun() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
+        case JournalBegun() | ProcessingAsked() | ViewBegun() | MoveBegun() | ArmSettled() | FrameProven():
             pass
         case BurstsChosen() | BurstBegun() | GapFound() | ViewSealed() | InputsChanged() | TextUnread():
             pass

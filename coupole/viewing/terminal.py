@@ -223,6 +223,12 @@ def show_status(console: Console, status: Status) -> None:
         console.print(f"  {view}: {proven} of {total} frames")
     for finding in status.findings:
         console.print("  [yellow]found:[/]", Text(finding))
+    if status.processing is not None:
+        console.print("  reflectance:", Text(status.processing.words), soft_wrap=True)
+        if status.processing.remedy:
+            console.print(
+                f"  goes on from what is there: {status.processing.remedy}", markup=False, soft_wrap=True
+            )
     for fault in status.faults:
         console.print("  [red]fault:[/]", Text(fault))
     if status.go_on:

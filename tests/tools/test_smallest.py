@@ -43,6 +43,7 @@ BENCHED = {
     "check": True,
     "sequencing": True,
     "store": True,
+    "live": True,
     "matching": False,
     "rsi": False,
     "collisions": True,

@@ -83,6 +83,17 @@ class LightFrames:
     def dark(self) -> tuple[LightFrame, ...]:
         return tuple(frame for frame in self.frames if not frame.shot.is_shot)
 
+    def until(self, view: str) -> LightFrames:
+        """The frames of a view and of those that were begun before it, with the files of these."""
+        views = list(dict.fromkeys(frame.view for frame in self.frames))
+        kept_views = set(views[: views.index(view) + 1])
+        files = {f"/views/{name}.h5" for name in kept_views} | {"/run.json"}
+        return replace(
+            self,
+            frames=tuple(frame for frame in self.frames if frame.view in kept_views),
+            inputs=tuple((name, digest) for name, digest in self.inputs if name[name.index("/") :] in files),
+        )
+
     @cached_property
     def size_px(self) -> tuple[int, int]:
         """Width and height."""

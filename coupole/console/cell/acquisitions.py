@@ -189,7 +189,9 @@ class Acquisitions:
         plan = [entry.plan, "--rig", self._rig] if entry.plan else []
         resume = ["--resume", entry.resume] if entry.resume else []
         output = ["--output", entry.output] if entry.output else []
-        return [*plan, *resume, *output, *(["--with-mesh"] if entry.with_mesh else [])]
+        result = ["--result", entry.result] if entry.result else []
+        flags = {"--with-mesh": entry.with_mesh, "--reflectance": entry.reflectance}
+        return [*plan, *resume, *output, *result, *(flag for flag, is_set in flags.items() if is_set)]
 
     def _look_after(self, entry: Entry) -> None:
         if self.state is not None and self.state["pid"] == entry.pid and not entry.run:

@@ -55,8 +55,9 @@ class Entering:
             if request.now:
                 raise InputError("`now`: a hold does not begin")
             return self._queue.add(by, before=request.before, hold=request.hold)
-        if not by_command_line and (request.output or request.with_mesh or (request.plan and request.resume)):
-            raise InputError("`output`, `with_mesh` and `plan` with `resume` are for the command line")
+        for_command_line = request.output or request.with_mesh or request.result
+        if not by_command_line and (for_command_line or (request.plan and request.resume)):
+            raise InputError("`output`, `with_mesh`, `result` and `plan` with `resume` are for the command line")
         run = self._run(request.resume, anywhere=by_command_line) if request.resume else None
         plan = self._plan(request.plan, anywhere=by_command_line) if request.plan else None
         fields: dict[str, Any] = {
@@ -64,6 +65,8 @@ class Entering:
             "resume": str(run.folder) if run else "",
             "output": str(Path(request.output).resolve()) if request.output else "",
             "with_mesh": request.with_mesh,
+            "reflectance": request.reflectance,
+            "result": str(Path(request.result).resolve()) if request.result else "",
         }
         if request.now:
             return self._acquisitions.begin_at_once(by, **fields)

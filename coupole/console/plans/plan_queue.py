@@ -61,6 +61,10 @@ class Entry(BaseModel):
     """Folder for the run, if not the rig's."""
     with_mesh: bool = False
     """Copy the mesh into the run even if it is large."""
+    reflectance: bool = False
+    """Process the views beside the acquisition, and end with the result."""
+    result: str = ""
+    """Folder of that result, if not the run's with `-reflectance` behind."""
     needs: Needs | None = None
     """None for a hold, and for what began at once."""
     by: str

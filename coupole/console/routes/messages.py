@@ -51,6 +51,11 @@ class NewEntry(Asked):
     """Folder for the run, if not the rig's; for the command line."""
     with_mesh: bool = False
     """Copy the mesh into the run even if it is large; for the command line."""
+    reflectance: bool = False
+    """Process the views beside the acquisition, and end with the result; a resumed run that was begun so does it
+    anyway."""
+    result: Text = ""
+    """Folder of that result, if not the run's with `-reflectance` behind; for the command line."""
 
 
 class Move(Asked):

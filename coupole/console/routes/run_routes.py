@@ -17,6 +17,7 @@ from coupole.console.runs.run_files import RunRow
 from coupole.console.runs.run_results import look_page
 from coupole.console.service_parts import Service
 from coupole.errors import InputError
+from coupole.storage.processing import PICTURE
 
 _STILL = (
     "sandbox allow-popups; default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; "
@@ -46,6 +47,14 @@ def add_run_routes(app: FastAPI, service: Service) -> None:
         """A proven shot as JPEG, developed for the eye; with `saturation` clipped pixels are red."""
         jpeg = service.runs.picture(run, shot, width, saturation=saturation)
         return Response(jpeg, media_type="image/jpeg", headers={"Cache-Control": "private, max-age=3600"})
+
+    @app.get("/api/v1/runs/{run}/first-look", response_class=FileResponse)
+    def first_look(run: Text) -> FileResponse:
+        """Normals and diffuse colour of the view that was processed last, as PNG, while the run goes on."""
+        result = service.runs.run(run).asked_result
+        if result is None:
+            raise InputError(f"{run}: is not processed beside its acquisition")
+        return _file(result / PICTURE, "image/png", _STILL)
 
     @app.get("/api/v1/runs/{run}/report", response_class=FileResponse)
     def report_page(run: Text) -> FileResponse:

@@ -19,6 +19,7 @@ from coupole.storage.journal_events import (
     JournalBegun,
     MoveBegun,
     Paused,
+    ProcessingAsked,
     ReshootBegun,
     SessionResumed,
     SessionStarted,
@@ -39,6 +40,8 @@ def words_of(event: Event) -> str:  # noqa: PLR0912  a case for each event
             return "; ".join(("began: the devices are open", *event.trusted))
         case SessionResumed():
             return "; ".join(("resumed: the devices are open", *event.trusted))
+        case ProcessingAsked():
+            return f"views are processed beside it, into {event.result}"
         case ViewBegun():
             hidden_words = f"; {len(event.hidden_leds)} LEDs are hidden from it" if event.hidden_leds else ""
             return f"view {event.view}{hidden_words}"

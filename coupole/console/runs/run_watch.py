@@ -6,12 +6,14 @@ import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from coupole.console.runs.event_words import words_of
 from coupole.console.runs.run_files import RunFiles
 from coupole.plan.shot_id import Led
 from coupole.storage.journal import Follower
-from coupole.storage.journal_events import BurstEnded, BurstsChosen, FrameProven, ReshootBegun
+from coupole.storage.journal_events import BurstEnded, BurstsChosen, FrameProven, ProcessingAsked, ReshootBegun
+from coupole.storage.processing import Processing, processing_of
 from coupole.storage.run import Run
 
 _NO_OFTENER_S = 0.4
@@ -31,6 +33,8 @@ class Watched:
     hottest_board_c: float | None
     events: tuple[tuple[str, str], ...]
     """Time (UTC) and words, the newest first."""
+    processing: Processing | None
+    """Processing beside the run; None if it was not asked for."""
 
 
 @dataclass
@@ -42,6 +46,8 @@ class _Followed:
     newest: FrameProven | None = None
     reshot: int = 0
     hottest_board_c: float | None = None
+    result: str = ""
+    """Folder of the result that is made beside it."""
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS_KEPT))
 
     def read_news(self) -> None:
@@ -53,6 +59,8 @@ class _Followed:
                         self.newest = event
                 case ReshootBegun():
                     self.reshot += len(event.shots)
+                case ProcessingAsked():
+                    self.result = event.result
                 case BurstsChosen():
                     self.expected_counts[event.view] += sum(len(list(burst.labels())) for burst in event.bursts)
                 case BurstEnded():
@@ -90,6 +98,12 @@ class RunWatch:
 
 
 def _watched_run(followed_run: _Followed) -> Watched:
+    run = followed_run.run
+    processing = (
+        processing_of(run.folder, Path(followed_run.result), frames_left=True, in_use=True)
+        if followed_run.result
+        else None
+    )
     return Watched(
         run=followed_run.run.folder.name,
         views=tuple(
@@ -99,4 +113,5 @@ def _watched_run(followed_run: _Followed) -> Watched:
         reshot=followed_run.reshot,
         hottest_board_c=followed_run.hottest_board_c,
         events=tuple(followed_run.events),
+        processing=processing,
     )

@@ -139,6 +139,7 @@ class _Page:
             "light on the object": f"{status.dose_lux_h:.3f} lux h",
             "size": bytes_text(row.bytes) + (", archived" if row.archived else ""),
             "verified": f"{moment(row.verified)} UTC" if row.verified else "not since it last changed",
+            **({"reflectance": status.processing.words} if status.processing else {}),
             **({"why it ended": status.reason} if status.reason and status.state != "done" else {}),
         }
 

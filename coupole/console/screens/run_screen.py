@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
+from urllib.parse import quote
 
 from nicegui import ui
 
@@ -48,6 +49,11 @@ class _Screen:
                 self._picture = ui.html("", sanitize=False).style("width:100%")
                 self._histogram = ui.html("", sanitize=False).style("width:100%")
                 self._exposure = ui.html("", sanitize=False).style("width:100%")
+                with ui.column().style("width:100%") as self._first_look_box:
+                    ui.label("First look at the view processed last: normals, diffuse colour").classes("hint")
+                    self._first_look = ui.html("", sanitize=False).style("width:100%")
+                self._first_look_box.set_visibility(False)
+                self._first_look_of = ("", 0)
             with ui.column().classes("gap"):
                 with panel("Progress"):
                     self._facts = ui.html("", sanitize=False).style("width:100%")
@@ -119,6 +125,7 @@ class _Screen:
             self._events.set_content(f'<p class="bad">{html.escape(str(error))}</p>')
 
     def _show(self, now: StateNow, run_progress: Watched) -> None:
+        processing = run_progress.processing
         hot = "-" if run_progress.hottest_board_c is None else f"{run_progress.hottest_board_c:.1f} C"
         self._facts.set_content(
             facts_html(
@@ -129,13 +136,26 @@ class _Screen:
                     "light on the object": f"{now.dose:.3f} lux h in this run",
                     "taken again": f"{run_progress.reshot} shots",
                     "hottest LED board": hot,
+                    **({} if processing is None else {"reflectance": processing.words}),
                 }
             )
         )
+        self._show_first_look(run_progress)
         self._views.set_content(_bars(run_progress, now.view))
         self._events.set_content(
             table_html(("UTC", "what"), [(t[11:19], words) for t, words in run_progress.events[:40]])
         )
+
+    def _show_first_look(self, run_progress: Watched) -> None:
+        """The newest view's normals, anew when there are more."""
+        processing = run_progress.processing
+        views = 0 if processing is None else processing.views_done
+        self._first_look_box.set_visibility(views > 0)
+        if views and (run_progress.run, views) != self._first_look_of:
+            self._first_look_of = run_progress.run, views
+            address = f"/api/v1/runs/{quote(run_progress.run)}/first-look?views={views}"
+            words = "normals (left) and diffuse colour of the view that was processed last"
+            self._first_look.set_content(f'<img class="frame-picture" src="{address}" alt="{words}">')
 
     def _show_frame(self, name: str, frame: Frame) -> None:
         address = picture_address(name, frame.shot, 1280, saturation=True)

@@ -169,7 +169,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     mesh_path = mesh or files.mesh_path
     if mesh_path is None or files.plan.object is None:
         raise InputError(f"{folder}: its plan names no mesh of the object; name it with --mesh")
-    by_kind = _by_kind(records or files.record_paths or ())
+    by_kind = records_by_kind(records or files.record_paths or ())
     if missing := [kind for kind in NEEDED if kind not in by_kind]:
         raise InputError(f"{folder}: no calibration record of the kind {', '.join(missing)} is named; {_HOW}")
     frames = open_light_frames([folder])
@@ -177,7 +177,7 @@ def read_measured_run(folder: Path, mesh: Path | None = None, records: Sequence[
     prior = read_posed_camera(hand_eye, by_kind.get("camera"), frames.about, frames.size_px)
     base_from_support = files.cell.rig.support.base_from_support.matrix()
     power_record = read_earlier(by_kind["led-power"], "led-power", frames.about, frames.size_px)
-    _refuse_other_gain(by_kind["led-power"], power_record, frames)
+    refuse_other_gain(by_kind["led-power"], power_record, frames.gain_db)
     refuse_read_otherwise(by_kind["led-power"], power_record, by_kind)
     lens, leds = files.cell.rig.lens, calibrated_positions(by_kind["leds"])
     shape = read_mesh(mesh_path)
@@ -257,11 +257,12 @@ def refuse_different(measured_runs: Sequence[MeasuredRun]) -> None:
 # -- helpers --------------------------------------------------------------------------------------------------
 
 
-def _refuse_other_gain(path: Path, record: Record, frames: LightFrames) -> None:
-    gain_db = record.fixed.get("gain_db", 0.0)
-    if abs(gain_db - frames.gain_db) > SAME_GAIN_DB:
+def refuse_other_gain(path: Path, record: Record, gain_db: float) -> None:
+    """Raise InputError for a record of powers that was made at another gain than that of the frames."""
+    record_db = record.fixed.get("gain_db", 0.0)
+    if abs(record_db - gain_db) > SAME_GAIN_DB:
         raise InputError(
-            f"{path}: holds for a gain of {gain_db:g} dB; the run has {frames.gain_db:g} dB. Name one of that gain"
+            f"{path}: holds for a gain of {record_db:g} dB; the run has {gain_db:g} dB. Name one of that gain"
         )
 
 
@@ -292,7 +293,7 @@ def u_signal_of(records: Mapping[str, Path]) -> float:
     return math.sqrt(square)
 
 
-def _by_kind(paths: Sequence[Path]) -> dict[str, Path]:
+def records_by_kind(paths: Sequence[Path]) -> dict[str, Path]:
     """Records by their kind, those that are not used left out. Raises InputError for two of a kind."""
     path_of_kind: dict[str, Path] = {}
     for path in paths:

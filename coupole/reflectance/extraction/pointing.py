@@ -107,11 +107,12 @@ class Pointing:
 
 def pointings(prior: CameraPrior, base_from_camera: Floats, middle_mm: Floats) -> tuple[Pointing, ...]:
     """Return the pointings of the views of an object from poses [v, 4, 4], by a camera's records and what no
-    record states."""
-    whole, lens = camera_covariance(prior, base_from_camera, STATED), len(prior.free)
+    record states: each view alone, so that no last bit depends on how many there are."""
     view_pointings = []
     for view in range(len(base_from_camera)):
-        indices = [*range(lens), *range(lens + 6 * view, lens + 6 * view + 6)]
-        covariance = block_diag(whole[np.ix_(indices, indices)], STATED.mesh_covariance)
+        alone, sensitivity = slice(view, view + 1), prior.axis_sensitivity
+        view_prior = replace(prior, axis_sensitivity=None if sensitivity is None else sensitivity[alone])
+        camera = camera_covariance(view_prior, base_from_camera[alone], STATED)
+        covariance = block_diag(camera, STATED.mesh_covariance)
         view_pointings.append(Pointing(prior.free, covariance, middle_mm))
     return tuple(view_pointings)

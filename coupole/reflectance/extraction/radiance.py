@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numba
@@ -10,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.calibration.earlier import read_earlier
-from coupole.calibration.light.frames import LightFrame, channel_mask
+from coupole.calibration.light.frames import LightFrame, LightFrames, channel_mask
 from coupole.calibration.light.records import dark_signal, linearise, map_beside
 from coupole.reflectance.extraction.measured_run import MeasuredRun
 from coupole.reflectance.extraction.seen_surface import SeenSurface
@@ -26,7 +28,7 @@ class Radiometry:
         frames, records = measured_run.frames, measured_run.records
         width, height = frames.size_px
         self.white_dn, self.black_dn = frames.white_dn, frames.black_dn
-        self.dark: Callable[[LightFrame], NDArray[np.float32]] = dark_signal(frames, records.get("dark"))
+        self._dark_of_view = lru_cache(maxsize=2)(partial(_dark_in_view, frames, records.get("dark")))
         self.channel = np.zeros((height, width), np.int8)
         """[h, w] number of a pixel's channel."""
         for number, channel in enumerate(measured_run.channels):
@@ -37,6 +39,12 @@ class Radiometry:
         if "flat-field" in records:
             self.flat, u_pixel = _flat_field(measured_run)
             self.u_pixel = np.full(self.channels, u_pixel)
+
+    def dark(self, frame: LightFrame) -> NDArray[np.float32]:
+        """[h, w] DN that a frame has without light, by the record, or by the dark frames of its view and of those
+        before it. Later views have no say: a view's samples are the same whether they are taken as soon as it is
+        complete or when the run has ended."""
+        return self._dark_of_view(frame.view)(frame)
 
 
 class PixelLists(NamedTuple):
@@ -100,6 +108,12 @@ class SignalReader:
         self.darks = np.empty((len(alike), len(self.lists.places)), np.float32)
         for number, frame in enumerate(alike.values()):
             np.take(self._radiometry.dark(frame).ravel(), self.lists.places, out=self.darks[number], mode="clip")
+
+
+def _dark_in_view(
+    frames: LightFrames, record: Path | None, view: str
+) -> Callable[[LightFrame], NDArray[np.float32]]:
+    return dark_signal(frames.until(view), record)
 
 
 def _response(measured_run: MeasuredRun) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,244 @@
+"""The acquisition's end of the processing beside it: begins its process, hears of its progress, ends it.
+
+The process has the lowest priority and reads the run's folder alone (`coupole.reflectance.beside`). Here a thread
+waits for its lines, of which there is about one a second at most; the sequencer knows nothing of it. Whatever
+becomes of the process, the acquisition goes on, and says so.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from coupole.acquisition.signals import SignalReceived
+from coupole.errors import InputError
+from coupole.intake.plain_data import json_of
+from coupole.storage.processing import Progress, default_result, go_on_command
+from coupole.storage.stopped_process import is_stopped
+from coupole.viewing.terminal import alarm, step_bars
+
+_PROGRAM = "coupole.reflectance.beside.process"
+_READY_WITHIN_S = 120.0
+"""Longer than its imports take on a busy machine."""
+_SILENT_S, _LEAST_CPU_S = 120.0, 1.0
+"""A process that neither tells anything nor computes for so long, when all frames are there, hangs."""
+_LOOK_EVERY_S, _ENDS_WITHIN_S = 0.5, 5.0
+Say = Callable[[str, int, int], None]
+
+
+class ProcessingBeside:
+    """One run's processing, in a process of its own."""
+
+    def __init__(self, plan: Path, rig: Path, result: Path | None, console: Console) -> None:
+        """Begin the process, which checks whether plan and rig can have a result; `result` is its folder, None for
+        one beside the run's."""
+        self._console, self._result = console, None if result is None else result.absolute()
+        self._run: Path | None = None
+        self._progress = Progress()
+        self._times: dict[str, float | None] = {}
+        self._reasons: list[str] | None = None
+        self._has_answered = threading.Event()
+        self._told = threading.Event()
+        self._has_ended = threading.Event()
+        self._is_ending = False
+        self._why = ""
+        """Reason that is known here why the result is not whole."""
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", _PROGRAM, str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            process_group=0,  # Ctrl-C and Ctrl-Z at the terminal are for the acquisition
+        )
+        result_text = None if self._result is None else str(self._result)
+        self._ask({"plan": str(plan.absolute()), "rig": str(rig.absolute()), "result": result_text})
+        self._listener = threading.Thread(target=self._listen, name="processing beside", daemon=True)
+        self._listener.start()
+
+    def __enter__(self) -> ProcessingBeside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process, if it has not ended: what it did is kept."""
+        if self._end() and self._run is not None:
+            self._why = "ended with the run, which is not complete"
+            self._console.print(
+                f"reflectance: ended with the run; the samples of {self._views_text} are kept until it is resumed",
+                markup=False,
+            )
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        self._listener.join(_ENDS_WITHIN_S)
+        self._errors.close()
+
+    # -- before anything moves --------------------------------------------------------------------------------
+
+    def refusals(self) -> list[str]:
+        """List why no result could be made; to be asked before anything moves."""
+        if not self._has_answered.wait(_READY_WITHIN_S):
+            return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
+        if self._reasons is None:
+            return [f"--reflectance: its process ended: {self._last_words}"]
+        return self._reasons
+
+    # -- while the run is acquired ----------------------------------------------------------------------------
+
+    def result_of(self, run: Path) -> Path:
+        """The folder of the result of a run."""
+        return self._result or default_result(run)
+
+    def follow(self, run: Path) -> None:
+        """Process this run from now on."""
+        self._run, self._result = run, self.result_of(run)
+        self._console.print(f"reflectance {self._result}", markup=False)
+        self._ask({"run": str(run), "result": str(self._result)})
+
+    # -- after the last frame ---------------------------------------------------------------------------------
+
+    def wait(self) -> None:
+        """Wait for the result, after all frames are there and no device is open. A signal ends the wait and the
+        process; the frames are what the run's exit code tells of."""
+        if self._run is None:
+            return
+        try:
+            with step_bars(self._console) as say:
+                self._wait_for_end(say)
+        except (KeyboardInterrupt, SignalReceived):
+            self._end()
+            self._why = "stopped while it was made"
+        if self._is_whole:
+            self._console.print(f"  result  {self._result}", markup=False)
+        else:
+            self._say_unfinished()
+
+    def figures(self) -> dict[str, Any]:
+        """Content of `reflectance` in `--json`."""
+        if self._run is None:
+            return {}
+        return {
+            "result": str(self._result),
+            "is_whole": self._is_whole,
+            "views": self._progress.views_done,
+            "why": "" if self._is_whole else self._reason,
+            **self._times,
+        }
+
+    # -- helpers ----------------------------------------------------------------------------------------------
+
+    def _wait_for_end(self, say: Say) -> None:
+        heard_s, cpu_s = time.monotonic(), self._cpu_s()
+        while not self._has_ended.wait(_LOOK_EVERY_S):
+            progress = self._progress
+            if self._told.is_set():
+                self._told.clear()
+                heard_s, cpu_s = time.monotonic(), self._cpu_s()
+                if progress.of:
+                    say(progress.detail, progress.done_count, progress.of)
+            if is_stopped(self._process.pid):
+                self._give_up(f"its process {self._process.pid} is stopped (SIGSTOP), and was ended")
+            elif time.monotonic() - heard_s > _SILENT_S:
+                if self._cpu_s() - cpu_s < _LEAST_CPU_S:
+                    self._give_up(f"its process did nothing for {_SILENT_S:g} s, and was ended")
+                heard_s, cpu_s = time.monotonic(), self._cpu_s()
+
+    def _give_up(self, why: str) -> None:
+        self._end()
+        self._why = why
+
+    def _cpu_s(self) -> float:
+        """Time that the process has computed; 0 where that cannot be told."""
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            words = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+        return 0.0
+
+    @property
+    def _is_whole(self) -> bool:
+        return self._has_ended.is_set() and self._process.returncode == 0
+
+    @property
+    def _views_text(self) -> str:
+        return f"{self._progress.views_done} of {self._progress.views} views"
+
+    @property
+    def _reason(self) -> str:
+        return self._why or self._progress.why or self._last_words
+
+    def _say_unfinished(self) -> None:
+        assert self._run is not None
+        assert self._result is not None
+        alarm(
+            f"  the frames are complete; their result is not: {self._reason}\n"
+            f"  goes on from what is there ({self._views_text}): {go_on_command(self._run, self._result)}"
+        )
+
+    def _ask(self, document: dict[str, Any]) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it has ended, as its listener tells
+            self._process.stdin.write(json.dumps(document).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def _listen(self) -> None:
+        """Hear all lines, until the process has ended; for a thread of its own."""
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for line in lines:
+                with contextlib.suppress(InputError, ValueError):
+                    self._hear(json_of(line, _PROGRAM))
+        self._process.wait()
+        self._has_answered.set()
+        self._has_ended.set()
+        if self._process.returncode and self._run is not None and not self._is_ending:
+            self._tell_of_failure()
+
+    def _hear(self, document: Any) -> None:
+        if "reasons" in document:
+            self._reasons = list(map(str, document["reasons"]))
+            self._has_answered.set()
+        elif "times" in document:
+            self._times = document["times"]
+        elif "progress" in document:
+            before, self._progress = self._progress, Progress.model_validate(document["progress"])
+            self._told.set()
+            if self._progress.views_done != before.views_done:
+                self._console.print(f"reflectance: samples of {self._views_text} are there", markup=False)
+
+    def _tell_of_failure(self) -> None:
+        alarm(
+            f"reflectance failed: {self._reason}. The acquisition goes on without it; "
+            f"the samples of {self._views_text} are kept"
+        )
+
+    @property
+    def _last_words(self) -> str:
+        """Reason why the process ended, as far as it can be told."""
+        code = self._process.returncode
+        if self._errors.closed:
+            return "its process ended"
+        if code is not None and code < 0:
+            return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "its process ended without a word"
+
+    def _end(self) -> bool:
+        """End the process; False if it had ended."""
+        if self._has_ended.is_set():
+            return False
+        self._is_ending = True
+        self._process.kill()  # every file of a result is whole or not there
+        self._has_ended.wait(_ENDS_WITHIN_S)
+        return True

@@ -1,0 +1,123 @@
+"""Samples of views that were taken beside an acquisition, before anybody knew what else the run would hold.
+
+A result is begun with the frames of all its views (`result_folder.begin`). What was taken before that is noted
+view by view: the frames that it depends on, and the LEDs kept for the check. When the run is complete, what agrees
+is used, and the rest is taken again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import coupole
+from coupole.calibration.light.frames import LightFrames
+from coupole.errors import InputError
+from coupole.intake.plain_data import read_json
+from coupole.reflectance.result_folder import SETTINGS
+from coupole.reflectance.run_result import FRAMES
+from coupole.storage.durable import make_folder, write_synced
+from coupole.storage.processing import FOLDER, refuse_held
+
+_NOTES = f"{FOLDER}/samples.json"
+_DECIDE = ("records", "mesh", "refined", "emission", "simulated", "channels")
+"""Settings of a result that its samples depend on."""
+
+
+@dataclass(frozen=True)
+class ViewBasis:
+    """Frames and LEDs that a view's samples depend on, beside mesh and records."""
+
+    frames: str
+    """Hash of the frames of the view and of those before it, whose dark frames count too."""
+    left_out: tuple[int, ...]
+    """LEDs kept for the check, whose pictures are written with the samples."""
+
+
+def frames_basis(frames: LightFrames, view: str) -> str:
+    """Hash of the frames that the samples of a view depend on."""
+    lines = [f"{name} {digest}" for name, digest in frames.until(view).inputs if "/views/" in name]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def note_view(out: Path, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
+    """Note, before the samples of a view are taken, what they depend on. Raises InputError if others were taken
+    with other settings, OSError."""
+    notes = _read_notes(out)
+    decisive = _decisive(settings)
+    if notes is None:
+        notes = {"settings": decisive, "views": {}}
+    elif notes["settings"] != decisive:
+        raise InputError(_of_others(out))
+    notes["views"][file_name] = {"frames": basis.frames, "left_out": list(basis.left_out)}
+    for name in ("samples", FOLDER):
+        make_folder(out / name)
+    write_synced(out / _NOTES, json.dumps(notes) + "\n")
+
+
+def is_taken(out: Path, file_name: str, basis: ViewBasis) -> bool:
+    """Tell whether the samples of a view are there, and agree with its frames as they are now."""
+    notes = _read_notes(out)
+    view_notes = None if notes is None else notes["views"].get(file_name)
+    return (
+        view_notes is not None
+        and view_notes["frames"] == basis.frames
+        and (out / "samples" / f"{file_name}.json").exists()
+    )
+
+
+def adopt(out: Path, settings: Mapping[str, Any], bases: Mapping[str, ViewBasis]) -> None:
+    """Keep of what was taken beside an acquisition what holds for the complete run; `bases` are those of its
+    views, by the names of their files. Raises InputError if the samples are of other input, or a process is at
+    work on them."""
+    if not (out / FOLDER).is_dir():
+        return
+    refuse_held(out)
+    if (out / SETTINGS).exists():
+        return
+    notes = _read_notes(out)
+    if notes is not None and notes["settings"] != _decisive(settings):
+        raise InputError(_of_others(out))
+    known_views = {} if notes is None else notes["views"]
+    for path in (out / "samples").glob("*.h5"):
+        view_notes, basis = known_views.get(path.stem), bases.get(path.stem)
+        picture = out / FRAMES / path.name
+        if view_notes is None or basis is None or view_notes["frames"] != basis.frames:
+            for stale in (path.with_suffix(".json"), path, picture):  # the first says that the others are whole
+                stale.unlink(missing_ok=True)
+        elif tuple(view_notes["left_out"]) != basis.left_out:
+            picture.unlink(missing_ok=True)
+
+
+def clear_beside(out: Path) -> None:
+    """Remove what only the making of a result wants, when that is whole."""
+    shutil.rmtree(out / FOLDER, ignore_errors=True)
+
+
+def _decisive(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {"software": coupole.__version__, "poses": settings.get("poses")} | {
+        name: settings[name] for name in _DECIDE
+    }
+
+
+def _of_others(out: Path) -> str:
+    return f"{out} holds samples of other input, settings or version: name another folder, or remove it"
+
+
+def _read_notes(out: Path) -> dict[str, Any] | None:
+    """None if nothing was noted."""
+    path = out / _NOTES
+    try:
+        notes = read_json(path)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if not isinstance(notes, dict) or not {"settings", "views"} <= notes.keys():
+        raise InputError(f"{path}: expected notes on samples; was it changed? Remove {out}, then begin anew")
+    return notes

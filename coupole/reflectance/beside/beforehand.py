@@ -1,0 +1,124 @@
+"""Reasons against a result that shall be made beside an acquisition: known from plan, rig and records before
+anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from coupole.calibration.calibrated_arm import has_axis_zeros
+from coupole.calibration.earlier import read_earlier, refuse_read_otherwise
+from coupole.calibration.light.frames import channels_of
+from coupole.calibration.light.led_power_tile import calibrated_positions
+from coupole.calibration.posed_camera import read_posed_camera
+from coupole.calibration.record import Kind
+from coupole.calibration.sources import About
+from coupole.errors import CoupoleError, InputError
+from coupole.plan.light_selection import leds_of_plan
+from coupole.plan.reading import PlanFiles, read_plan
+from coupole.plan.rig_devices import described_arm, in_world
+from coupole.reflectance.extraction.measured_run import (
+    NEEDED,
+    read_powers,
+    records_by_kind,
+    refuse_other_gain,
+)
+from coupole.reflectance.result_folder import SETTINGS
+from coupole.scan.mesh_files import read_mesh
+from coupole.storage import processing
+
+_CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field")
+
+
+def reasons_against(plan: Path, rig: Path | None, result: Path | None) -> list[str]:
+    """List why `coupole reflectance RUN` could not make a result of this plan's run, with the place in the plan
+    and the remedy; `result` is the folder, if one is named."""
+    try:
+        files = read_plan(plan, rig)
+        return [*_of_folder(result), *_of_mesh(files), *_of_records(files)]
+    except CoupoleError as error:
+        return [f"--reflectance: {error}"]
+
+
+def _of_folder(result: Path | None) -> Iterator[str]:
+    if result is None:
+        return
+    if not result.exists():
+        existing = next(parent for parent in result.parents if parent.exists())
+        if not existing.is_dir():
+            yield f"--result {result}: expected a folder that can be made; {existing} is a file"
+        return
+    is_begun = (result / SETTINGS).exists() or (result / processing.FOLDER).is_dir()
+    if not result.is_dir() or (not is_begun and any(result.iterdir())):
+        yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
+
+
+def _of_mesh(files: PlanFiles) -> Iterator[str]:
+    if files.mesh_path is None:
+        key = ("object",) if files.plan.object else ()
+        message = "expected the object's mesh (`object: {id: ..., mesh: FILE}`), which --reflectance needs"
+        yield str(files.document.problem(key, message))
+        return
+    read_mesh(files.mesh_path)
+
+
+def _of_records(files: PlanFiles) -> Iterator[str]:
+    by_kind = records_by_kind(files.record_paths or ())
+    if missing := [kind for kind in NEEDED if kind not in by_kind]:
+        message = (
+            f"expected calibration records of the kinds {', '.join(NEEDED)}, which --reflectance needs; no "
+            f"{', no '.join(missing)} is named. `coupole calibrate all --rig RIG` makes them"
+        )
+        in_plan = files.plan.calibrations is not None
+        document, key = (files.document, ("calibrations",)) if in_plan else (files.cell.document, ())
+        yield str(document.problem(key, message))
+        return
+    for check in (_check_camera, _check_leds):
+        try:
+            check(files, by_kind)
+        except InputError as error:
+            yield f"--reflectance: {error}"
+
+
+def _check_camera(files: PlanFiles, by_kind: dict[str, Path]) -> None:
+    """Raise InputError for records that do not hold for the rig's camera as it is set."""
+    rig = files.cell.rig
+    about, size_px = _about(files), (rig.sensor.width_px, rig.sensor.height_px)
+    read_posed_camera(by_kind["hand-eye"], by_kind.get("camera"), about, size_px)
+    if has_axis_zeros(by_kind["hand-eye"]) and described_arm(rig) is None:
+        raise InputError(f"{by_kind['hand-eye']}: has zeros of axes, but the rig describes no arm")
+    for kind in _CHECKED:
+        if kind in by_kind:
+            read_earlier(by_kind[kind], kind, about, size_px)
+    powers = read_earlier(by_kind["led-power"], "led-power", about, size_px)
+    refuse_other_gain(by_kind["led-power"], powers, files.plan.gain_db)
+    refuse_read_otherwise(by_kind["led-power"], powers, by_kind)
+    read_powers(by_kind["led-power"], channels_of(rig.sensor.bayer_pattern))
+
+
+def _about(files: PlanFiles) -> About:
+    """Describe the camera as the rig has it; which one it is, is known when it is open."""
+    rig, lens = files.cell.rig, files.cell.rig.lens
+    return About(
+        is_simulated=in_world(rig, dry_run=False),
+        focal_length_mm=lens.focal_length_mm,
+        focus_distance_mm=lens.focus_distance_mm,
+        f_number=lens.f_number,
+        begun=datetime.now(UTC),
+    )
+
+
+def _check_leds(files: PlanFiles, by_kind: dict[str, Path]) -> None:
+    """Raise InputError if the plan lights no single LEDs, or some that the record does not have."""
+    base_from_support = files.cell.rig.support.base_from_support.matrix()
+    rows = leds_of_plan(files.plan, files.cell.leds, base_from_support)
+    planned_leds = set(map(int, files.cell.leds.ids[rows]))
+    if not planned_leds:
+        message = "expected single LEDs, which --reflectance needs; the plan lights none"
+        raise InputError([files.document.problem(("lights",), message)])
+    known_leds = set(map(int, calibrated_positions(by_kind["leds"]).ids))
+    if unknown := sorted(planned_leds - known_leds):
+        raise InputError(
+            f"{by_kind['leds']}: does not have LED {unknown[0]}, which the plan lights; calibrate anew"
+        )

@@ -1,0 +1,71 @@
+"""The process beside an acquisition: `python -m coupole.reflectance.beside.process PARENT`.
+
+It is told by lines of JSON on its input: first plan, rig and result, to which it answers with the `reasons`
+against a result; then the run's folder and the result's. From then on it follows the run's journal, and tells its
+progress in lines on its output. It ends with its input: whoever has begun it has died, or wants no more.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from coupole.reflectance.beside.lowest_priority import end_with, yield_to_all_others
+
+
+def main() -> None:
+    """Run to the end of the result, or of the input."""
+    end_with(int(sys.argv[1]))
+    for number in (signal.SIGINT, signal.SIGHUP):  # Ctrl-C is for the acquisition, which ends this
+        signal.signal(number, signal.SIG_IGN)
+    _say({"reasons": _reasons(_next_request())})  # before anything moves or shines, and for this somebody waits
+    yield_to_all_others()
+    request = _next_request()
+    threading.Thread(target=_end_with_input, name="end with input", daemon=True).start()
+
+    from coupole.reflectance.beside.follower import process_run
+
+    is_whole = process_run(Path(request["run"]), Path(request["result"]), _say)
+    sys.stdout.flush()
+    os._exit(0 if is_whole else 1)  # no thread is waited for
+
+
+def _reasons(request: dict[str, Any]) -> list[str]:
+    """Reasons against a result; among them a library that is missing, with its extra's name by whoever asked."""
+    try:
+        from coupole.reflectance.beside import follower
+        from coupole.reflectance.beside.beforehand import reasons_against
+    except ImportError as error:
+        return [f"--reflectance: needs {error.name or error}, which is not installed: pip install 'coupole[all]'"]
+    assert follower is not None  # imported now: nothing is missing later
+    rig, result = (None if request[key] is None else Path(request[key]) for key in ("rig", "result"))
+    return reasons_against(Path(request["plan"]), rig, result)
+
+
+def _next_request() -> dict[str, Any]:
+    line = sys.stdin.readline()
+    if not line:
+        os._exit(1)
+    request: dict[str, Any] = json.loads(line)
+    return request
+
+
+def _say(document: dict[str, Any]) -> None:
+    try:
+        print(json.dumps(document), flush=True)
+    except OSError:  # nobody listens any more
+        os._exit(1)
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

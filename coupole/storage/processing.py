@@ -1,0 +1,193 @@
+"""Progress of the processing that runs beside an acquisition, kept in the folder of its result.
+
+::
+
+    RESULT/beside/          only until the result is whole
+      samples.json          frames that the samples of each view were taken from; synced
+      progress.json         progress, for people: written again and again, never synced
+      lock                  locked by the process at work
+      normals.png           normals of the newest view, by a quick fit
+
+The run's journal names the result's folder (`ProcessingAsked`); nothing else connects the two processes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from coupole.errors import InputError
+from coupole.intake.plain_data import read_json
+from coupole.storage.stopped_process import holder_of, is_stopped
+
+FOLDER = "beside"
+RESULT = "result.json"
+"""File of a result that is whole."""
+PICTURE = f"{FOLDER}/normals.png"
+_LOCK, _PROGRESS = f"{FOLDER}/lock", f"{FOLDER}/progress.json"
+_SUFFIX = "-reflectance"
+Step = Literal["waiting", "extracting", "fitting", "failed"]
+_own_results: set[Path] = set()
+"""Results that this process has locked."""
+
+
+class Progress(BaseModel):
+    """Progress as the process tells it."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+
+    step: Step = "waiting"
+    views_done: Annotated[int, Field(ge=0)] = 0
+    """Views whose samples are there."""
+    views: Annotated[int, Field(ge=0)] = 0
+    """Views of the plan."""
+    detail: str = ""
+    """Name of the step within the step, such as a fit."""
+    done_count: Annotated[int, Field(ge=0)] = 0
+    """Parts of `detail` that are done."""
+    of: Annotated[int, Field(ge=0)] = 0
+    """Parts of `detail`."""
+    why: str = ""
+    """Reason of a failure."""
+
+
+@dataclass(frozen=True)
+class Processing:
+    """State of the processing of a run."""
+
+    result: str
+    """Folder of the result."""
+    state: Literal["waiting", "extracting", "fitting", "done", "failed", "ended"]
+    """`waiting` for a complete view, `extracting` samples of one, `fitting` after the last; `done`; `failed`, or
+    `ended` before the result was whole."""
+    views_done: int = 0
+    """Views whose samples are there."""
+    views: int = 0
+    """Views of the plan."""
+    detail: str = ""
+    """Fit or other step under way, with its share that is done."""
+    why: str = ""
+    """Reason why it failed or ended, or stands still."""
+    remedy: str = ""
+    """The command line that goes on from what is there; empty while nothing is wrong."""
+
+    def figures(self) -> dict[str, Any]:
+        """Content of `processing` in `--json`."""
+        return asdict(self)
+
+    @property
+    def words(self) -> str:
+        """Say in a few words how far it is."""
+        views = f"{self.views_done} of {self.views} views extracted"
+        match self.state:
+            case "done":
+                return f"done: {self.result}"
+            case "failed" | "ended":
+                return f"{self.state}, {views}: {self.why}"
+            case _:
+                detail = f", {self.detail}" if self.detail else ""
+                still = f" ({self.why})" if self.why else ""
+                return f"{self.state}, {views}{detail}{still}"
+
+
+def default_result(run: Path) -> Path:
+    """The folder of a run's result, if none was named: beside the run's own."""
+    return run.with_name(run.name + _SUFFIX)
+
+
+def go_on_command(run: Path, result: Path) -> str:
+    """The command line that makes a result of a complete run, from what is there of it."""
+    return f"coupole reflectance {shlex.quote(str(run))} --out {shlex.quote(str(result))}"
+
+
+def tell(result: Path, progress: Progress) -> None:
+    """Write the progress, for `processing_of`. Not synced: it must cost the acquisition nothing. Raises
+    OSError."""
+    path = result / _PROGRESS
+    part = path.with_suffix(".json.part")
+    part.write_text(progress.model_dump_json() + "\n", encoding="utf-8")
+    part.replace(path)
+
+
+def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -> Processing:
+    """State of the processing of a run into a result. `frames_left`: the run is not complete; `in_use`: a process
+    acquires into it."""
+    progress = _read_progress(result)
+    place = str(result)
+    if (result / RESULT).is_file() and not frames_left:
+        return Processing(place, "done", progress.views_done, progress.views)
+    counts = progress.views_done, progress.views
+    remedy = "" if frames_left else go_on_command(run, result)
+    if progress.step == "failed":
+        return Processing(place, "failed", *counts, why=progress.why, remedy=remedy)
+    if not _is_held(result / _LOCK):
+        if in_use and not counts[1]:
+            return Processing(place, "waiting")
+        return Processing(
+            place, "ended", *counts, why="its process ended before the result was whole", remedy=remedy
+        )
+    share = f" {progress.done_count} of {progress.of}" if progress.of else ""
+    pid = holder_of(result / _LOCK)
+    still = f"its process {pid} is stopped; `kill -CONT {pid}` lets it go on" if pid and is_stopped(pid) else ""
+    return Processing(place, progress.step, *counts, detail=f"{progress.detail}{share}", why=still)
+
+
+def _read_progress(result: Path) -> Progress:
+    """Nothing, where nothing was told yet, or what is there is none."""
+    try:
+        return Progress.model_validate(read_json(result / _PROGRESS))
+    except (OSError, InputError, ValidationError):
+        return Progress()
+
+
+@contextmanager
+def hold_result(result: Path) -> Iterator[None]:
+    """Keep a result for this process: its folder is made, and locked while the context lasts. Raises InputError if
+    another process has it, OSError."""
+    (result / FOLDER).mkdir(parents=True, exist_ok=True)
+    fd = os.open(result / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(_at_work(result)) from error
+        _own_results.add(result.resolve())
+        yield
+    finally:
+        _own_results.discard(result.resolve())
+        os.close(fd)
+
+
+def refuse_held(result: Path) -> None:
+    """Raise InputError if another process is at work on a result, beside an acquisition."""
+    if result.resolve() not in _own_results and _is_held(result / _LOCK):
+        raise InputError(_at_work(result))
+
+
+def _at_work(result: Path) -> str:
+    pid = holder_of(result / _LOCK)
+    return (
+        f"{result}: {f'process {pid}' if pid else 'another process'} makes this result beside its acquisition; "
+        "`coupole status RUN` tells how far it is. Wait until it has ended, or name another folder with --out"
+    )
+
+
+def _is_held(lock: Path) -> bool:
+    with contextlib.suppress(OSError):
+        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+        finally:
+            os.close(fd)
+    return False

@@ -1,0 +1,248 @@
+"""`coupole acquire --reflectance`: the result that `coupole reflectance` makes afterwards, whatever happens to the
+process that makes it, and never at the cost of the run."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import cells
+import numpy as np
+import pytest
+from cells import CellFolder
+from PIL import Image
+from relief_cells import RECORDS, SIDE, shipped_cell
+
+KINDS = ("camera", "flat-field", "hand-eye", "led-power", "leds", "response")
+LOW = {**cells.LOW, "elevation_deg": 55}
+OF_ITS_MAKING = {"seconds", "peak_memory_bytes"}
+pytestmark = pytest.mark.timeout(900)  # it has the lowest priority: a busy machine makes it wait
+
+
+def cell_of_three_views(folder: Path, **plan: Any) -> CellFolder:
+    cell = shipped_cell(folder)
+    cell.write(
+        views=[cells.TOP, SIDE, LOW],
+        lights={"kind": "every", "every": 24},
+        calibrations=[str(RECORDS / f"{kind}.yaml") for kind in KINDS],
+        **plan,
+    )
+    return cell
+
+
+def begun(cell: CellFolder, *options: str | Path) -> tuple[subprocess.Popen[str], int]:
+    """An acquisition with processing beside it, and the number of that process, once its journal has begun."""
+    process = cell.start_acquire("--reflectance", *options)
+    cells.wait_until(lambda: cells.events(cell.run_folder, "processing"), "the session's first lines")
+    worker = beside(process.pid)
+    cells.wait_until(lambda: os.sched_getscheduler(worker) == os.SCHED_IDLE, "the lowest priority")
+    assert os.getpriority(os.PRIO_PROCESS, worker) == 19
+    hurry(worker)
+    return process, worker
+
+
+def hurry(pid: int) -> None:
+    """Give a process a share again: on a busy machine one of the lowest priority starves for longer than tests
+    wait."""
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # ended, or not ours to raise
+            os.sched_setscheduler(int(task.name), os.SCHED_OTHER, os.sched_param(0))
+            os.setpriority(os.PRIO_PROCESS, int(task.name), 0)
+
+
+def beside(pid: int) -> int:
+    """The process beside that an acquisition has begun."""
+    found = cells.wait_until(lambda: [child for child in cells.children(pid) if is_beside(child)], "its process")
+    assert len(found) == 1
+    return int(found[0])
+
+
+def is_beside(pid: int) -> bool:
+    try:
+        return b"coupole.reflectance.beside.process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def result_of(cell: CellFolder) -> Path:
+    return cell.run_folder.with_name(f"{cell.run_folder.name}-reflectance")
+
+
+def has_samples(cell: CellFolder) -> bool:
+    """Of any view."""
+    return any((result_of(cell) / "samples").glob("*.json"))
+
+
+def files(folder: Path) -> dict[str, Path]:
+    return {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+
+
+def same_result(one: Path, other: Path) -> None:
+    """To the bit; `result.json`, which the report shows, tells how long it took and what memory."""
+    mine, others = files(one), files(other)
+    assert mine.keys() == others.keys()
+    assert {"samples/low.h5", "samples/frames/top.h5", "fits/ggx_normal.h5", "fits/sh/side.h5"} < mine.keys()
+    for name in mine.keys() - {"result.json", "report.html"}:
+        assert mine[name].read_bytes() == others[name].read_bytes(), name
+    told = [json.loads(result["result.json"].read_text()) for result in (mine, others)]
+    for about in told:
+        for key in OF_ITS_MAKING:
+            del about[key]
+    assert told[0] == told[1]
+
+
+def made_afterwards(cell: CellFolder, folder: Path) -> Path:
+    ended = cells.here("reflectance", cell.run_folder, "--out", folder, "--json")
+    assert ended.code == 0, ended.err
+    return folder
+
+
+def status(run: Path) -> dict[str, Any]:
+    ended = cells.here("status", run, "--json")
+    assert ended.code == 0, ended.err
+    document: dict[str, Any] = ended.document["processing"] or {}  # none before the session's first line
+    return document
+
+
+def frames_alone_count(ended: cells.Ended) -> dict[str, Any]:
+    """The exit code is that of the frames, and all are there; what is said of the result."""
+    assert ended.code == 0, ended.err
+    assert ended.document["missing"] == 0
+    assert ended.document["proven"] == 3 * 45
+    document = ended.document["reflectance"]
+    assert isinstance(document, dict)
+    return document
+
+
+def test_the_result_is_the_one_that_is_made_afterwards(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(lambda: status(cell.run_folder).get("views_done"), "samples of a view")
+    picture = cells.wait_until(
+        lambda: (result_of(cell) / "beside/normals.png").exists() or not is_beside(worker), "a first look"
+    )
+    assert picture
+    if is_beside(worker):
+        pixels = np.asarray(Image.open(result_of(cell) / "beside/normals.png"))
+        assert np.count_nonzero(pixels.any(axis=2)) > 1000
+        refused = cells.here("reflectance", cell.run_folder, "--out", result_of(cell))
+        if is_beside(worker):  # it has not ended meanwhile
+            assert refused.code == 2
+            assert f"process {worker}" in refused.err
+    said = frames_alone_count(cells.finish(process))
+    assert said["is_whole"]
+    assert said["views"] == 3
+    assert 0 < said["samples_after_last_frame_s"] < said["result_after_last_frame_s"]
+    assert status(cell.run_folder)["state"] == "done"
+    same_result(result_of(cell), made_afterwards(cell, tmp_path / "afterwards"))
+    assert cells.here("verify", cell.run_folder).code == 0
+
+
+def test_a_run_ends_as_it_would_when_the_processing_is_killed_and_what_is_there_is_used(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(lambda: has_samples(cell), "samples of a view")
+    os.kill(worker, signal.SIGKILL)
+    ended = cells.finish(process)
+    said = frames_alone_count(ended)
+    assert not said["is_whole"]
+    assert "killed by signal 9" in said["why"]
+    assert "The acquisition goes on without it" in ended.err
+    told = status(cell.run_folder)
+    assert told["state"] == "ended"
+    assert told["remedy"] == f"coupole reflectance {cell.run_folder} --out {result_of(cell)}"
+    assert told["remedy"] in ended.err
+    kept = {path.name: path.stat().st_mtime_ns for path in (result_of(cell) / "samples").glob("*.json")}
+    again = cells.here(*told["remedy"].split()[1:])
+    assert again.code == 0, again.err
+    for name, mtime_ns in kept.items():
+        assert (result_of(cell) / "samples" / name).stat().st_mtime_ns == mtime_ns
+    same_result(result_of(cell), made_afterwards(cell, tmp_path / "afterwards"))
+
+
+def test_a_run_does_not_wait_for_a_processing_that_is_stopped(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    os.kill(worker, signal.SIGSTOP)
+    said = frames_alone_count(cells.finish(process))
+    assert not said["is_whole"]
+    assert "is stopped (SIGSTOP)" in said["why"]
+    assert not cells.alive(worker)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_run_that_is_killed_leaves_no_process(tmp_path: Path, *, stopped: bool) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    if stopped:
+        os.kill(worker, signal.SIGSTOP)
+    process.kill()
+    cells.finish(process)
+    end_s = time.monotonic() + 5.0
+    while is_beside(worker) and time.monotonic() < end_s:
+        time.sleep(0.02)
+    assert not is_beside(worker)
+    assert status(cell.run_folder)["state"] == "ended"
+    assert status(cell.run_folder)["remedy"] == ""  # the run goes on first, and the processing with it
+
+
+def test_a_resumed_run_goes_on_with_what_was_asked(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    process, worker = begun(cell)
+    cells.wait_until(lambda: has_samples(cell), "samples of a view")
+    process.send_signal(signal.SIGINT)
+    ended = cells.finish(process)
+    if ended.code == 0:
+        pytest.skip("all frames were there before the run was stopped")
+    assert ended.code == 130, ended.err
+    assert not is_beside(worker)
+    assert ended.document["reflectance"]["why"] == "ended with the run, which is not complete"
+    kept = {path.name: path.stat().st_mtime_ns for path in (result_of(cell) / "samples").glob("*.json")}
+    resumed = cells.here("acquire", "--resume", cell.run_folder, "--yes", "--json")
+    assert frames_alone_count(resumed)["is_whole"]
+    for name, mtime_ns in kept.items():
+        assert (result_of(cell) / "samples" / name).stat().st_mtime_ns == mtime_ns
+    same_result(result_of(cell), made_afterwards(cell, tmp_path / "afterwards"))
+    shutil.rmtree(result_of(cell))
+    assert status(cell.run_folder)["state"] == "ended"
+    whole = cells.here("acquire", "--resume", cell.run_folder, "--yes", "--json")
+    assert whole.document["reflectance"]["is_whole"], whole.err
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ({"calibrations": "none"}, "expected calibration records of the kinds hand-eye, leds, led-power"),
+        ({"object": {"id": "nobody"}}, "expected the object's mesh"),
+        ({"gain_db": 6.0}, "holds for a gain of"),
+        ({"lights": {"kind": "panels", "panels": [1]}}, "expected single LEDs"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_anything_moves(
+    tmp_path: Path, plan: dict[str, Any], words: str
+) -> None:
+    cell = cell_of_three_views(tmp_path)
+    cell.write(**plan)
+    ended = cell.acquire("--reflectance")
+    assert ended.code == 3, ended.err
+    assert words in ended.err
+    assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+
+
+def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("dear all")
+    ended = cell.acquire("--reflectance", "--result", tmp_path / "mine")
+    assert ended.code == 3, ended.err
+    assert "found other content" in ended.err
+    assert (tmp_path / "mine/letter.txt").exists()
+    refused = cells.here("acquire", cell.plan, "--reflectance", "--dry-run")
+    assert refused.code == 2

@@ -226,10 +226,10 @@ class ProcessingBeside:
     def _last_words(self) -> str:
         """Reason why the process ended, as far as it can be told."""
         code = self._process.returncode
-        if self._errors.closed:
-            return "its process ended"
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")
+        if self._errors.closed:
+            return "its process ended"
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "its process ended without a word"

@@ -36,6 +36,7 @@ HARMLESS: Mapping[str, str] = {
     "controllers": "where faults and commissioning are kept",
     "calibrations": "records carry limits and a checksum of their own, and move neither arm nor lamps",
     "white_response": "advice about exposures",
+    "watch": "limits of what is told of frames",
     "lens.f_number": "how bright pictures are",
     "sensor.bit_depth": "how pixels are coded",
     "sensor.bayer_pattern": "how pixels are coded",

@@ -35,7 +35,7 @@ from coupole.preflight.commissioned_rig import HARMLESS, steps_of
 __all__ = ["real"]
 EXPECTED_HARMLESS = {
     *("schema_version", "arm.schema_version", "name", "arm.name", "licence", "contact"),
-    *("storage", "ledger", "controllers", "calibrations", "white_response", "world"),
+    *("storage", "ledger", "controllers", "calibrations", "white_response", "world", "watch"),
     *("lens.f_number", "sensor.bit_depth", "sensor.bayer_pattern", "sensor.black_dn"),
     *("motion.home_joints_deg", "motion.park_joints_deg"),
     *("ledbox.twin", "camera.twin", "robot.twin"),

@@ -92,7 +92,7 @@ class WatchedRecorder:
     ) -> None:
         self._recorder.begin_view(view, frames, frame_format, arm, base_from_camera, collections)
         self._first.begin_view()
-        self._grid = LookGrid(frame_format)
+        self._grid = LookGrid(frame_format, is_sparse=self._watch.frames == "darks")
         self._judge = judge_of(self._job, self._grid, self._views[view], self._first)
 
     def store(self, frame: Frame, exposure_us: int) -> int:

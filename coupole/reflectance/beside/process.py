@@ -15,6 +15,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+from coupole.intake.plain_data import json_of
 from coupole.reflectance.beside.lowest_priority import end_with, yield_to_all_others
 
 
@@ -51,7 +52,7 @@ def _next_request() -> dict[str, Any]:
     line = sys.stdin.readline()
     if not line:
         os._exit(1)
-    request: dict[str, Any] = json.loads(line)
+    request: dict[str, Any] = json_of(line, "the request")
     return request
 
 

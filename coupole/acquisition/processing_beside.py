@@ -40,9 +40,11 @@ Say = Callable[[str, int, int], None]
 class ProcessingBeside:
     """One run's processing, in a process of its own."""
 
-    def __init__(self, plan: Path, rig: Path, result: Path | None, console: Console) -> None:
+    def __init__(
+        self, plan: Path, rig: Path, result: Path | None, console: Console, *, resumed_run: Path | None = None
+    ) -> None:
         """Begin the process, which checks whether plan and rig can have a result; `result` is its folder, None for
-        one beside the run's."""
+        one beside the run's, in which only a resumed run may find anything: its own."""
         self._console, self._result = console, None if result is None else result.absolute()
         self._run: Path | None = None
         self._progress = Progress()
@@ -63,7 +65,10 @@ class ProcessingBeside:
             process_group=0,  # Ctrl-C and Ctrl-Z at the terminal are for the acquisition
         )
         result_text = None if self._result is None else str(self._result)
-        self._ask({"plan": str(plan.absolute()), "rig": str(rig.absolute()), "result": result_text})
+        run_text = None if resumed_run is None else str(resumed_run.resolve())
+        self._ask(
+            {"plan": str(plan.absolute()), "rig": str(rig.absolute()), "result": result_text, "run": run_text}
+        )
         self._listener = threading.Thread(target=self._listen, name="processing beside", daemon=True)
         self._listener.start()
 

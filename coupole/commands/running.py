@@ -134,7 +134,7 @@ def _beside(
         return
     from coupole.acquisition.processing_beside import ProcessingBeside
 
-    beside = ProcessingBeside(job.document.path, job.cell.document.path, result, console)
+    beside = ProcessingBeside(job.document.path, job.cell.document.path, result, console, resumed_run=resume)
     try:
         with beside:
             yield beside

@@ -14,10 +14,10 @@ from coupole.pages import palettes
 from coupole.pages.page_parts import Map, Picture
 
 WIDTH_PX = 480
-"""Largest width of a map; wider ones are pixel_values by every second pixel, or fewer."""
+"""Largest width of a map; wider ones are shown by every second pixel, or fewer."""
 GAMMA = 2.2
 BRIGHTEST = 0.999
-"""Quantile of a picture that is pixel_values as white."""
+"""Quantile of a picture that is shown as white."""
 
 
 def value_map(
@@ -71,8 +71,8 @@ def colour_map(
     unit: str = "",
     gamma: float = 1.0,
 ) -> Map:
-    """A map of three values [h, w, 3], pixel_values as red, green and blue. Where one is NaN there is no "
-    "colour."""
+    """A map of three values [h, w, 3], shown as red, green and blue. Where one is NaN there is
+    no colour."""
     from PIL import Image
 
     pixel_values = _some_pixels(values)

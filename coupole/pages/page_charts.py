@@ -1,5 +1,5 @@
-"""Curves over the wavelength with their bands of uncertainty, patches of colour, bars of limits: drawings of a "
-"page."""
+"""Curves over the wavelength with their bands of uncertainty, patches of colour, bars of limits: drawings of a
+page."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
+from itertools import count
 from typing import assert_never
 
 import numpy as np
@@ -158,27 +159,27 @@ def bursts_of_exposure(
 def with_sentinels(lit: Sequence[Led], sentinels: Sequence[int], every: int) -> list[Led | Sentinel]:
     """LEDs with `sentinels` among them: all at the begin and at the end, and one after the other in between, after
     each `every` LEDs. They keep a distance from their LEDs' own shots, in which these cool."""
-    in_order: list[Led | Sentinel] = list(lit)
     if not sentinels:
-        return in_order
+        return list(lit)
     between = range(every, len(lit) - every // 2, every)
-    wanted_places = [
-        (0, list(sentinels)),
-        *((place, [sentinels[k % len(sentinels)]]) for k, place in enumerate(between)),
-    ]
-    wanted_places.append((len(lit), list(sentinels)))
-    numbers = iter(reversed(range(sum(len(leds) for _, leds in wanted_places))))
-    for wanted_place, leds in reversed(wanted_places):
+    groups = [(place, [sentinels[k % len(sentinels)]]) for k, place in enumerate(between)]
+    groups = [(0, list(sentinels)), *groups, (len(lit), list(sentinels))]
+    leds_before: dict[int, list[int]] = {}
+    for wanted_place, leds in groups:
         own_places = [place for place, led in enumerate(lit) if led.id in leds]
-        place = _cool_place(wanted_place, own_places, len(lit))
-        in_order[place:place] = [Sentinel(led, next(numbers)) for led in reversed(leds)][::-1]
+        leds_before.setdefault(_cool_place(wanted_place, own_places, len(lit)), []).extend(leds)
+    numbers = count()
+    in_order: list[Led | Sentinel] = []
+    for place in range(len(lit) + 1):
+        in_order += [Sentinel(led, next(numbers)) for led in leds_before.get(place, ())]
+        in_order += lit[place : place + 1]
     return in_order
 
 
-def _cool_place(wanted_places: int, own_places: Sequence[int], count: int) -> int:
+def _cool_place(wanted_place: int, own_places: Sequence[int], led_count: int) -> int:
     """The place among so many LEDs nearest to the wanted one that keeps the distance from these places."""
-    places = (p for p in range(count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own_places))
-    return min(places, key=lambda p: (abs(p - wanted_places), p), default=wanted_places)
+    cool = (p for p in range(led_count + 1) if not any(-_COOLS_FOR <= at - p < _COOLS_FOR for at in own_places))
+    return min(cool, key=lambda p: (abs(p - wanted_place), p), default=wanted_place)
 
 
 def _burst(

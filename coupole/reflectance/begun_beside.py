@@ -19,7 +19,7 @@ import coupole
 from coupole.calibration.light.frames import LightFrames
 from coupole.errors import InputError
 from coupole.intake.plain_data import read_json
-from coupole.reflectance.result_folder import SETTINGS
+from coupole.reflectance.result_folder import SETTINGS, read_settings
 from coupole.reflectance.run_result import FRAMES
 from coupole.storage.durable import make_folder, write_synced
 from coupole.storage.processing import FOLDER, refuse_held
@@ -45,14 +45,23 @@ def frames_basis(frames: LightFrames, view: str) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def note_view(out: Path, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
-    """Note, before the samples of a view are taken, what they depend on. Raises InputError if others were taken
-    with other settings, OSError."""
+def is_of_run(out: Path, run: str) -> bool:
+    """Tell whether what a folder holds of a result is of this run, by its name, and of no other. Raises InputError
+    for a folder whose files cannot be read."""
+    if (out / SETTINGS).exists():
+        return list(read_settings(out)["runs"]) == [run]
+    notes = _read_notes(out)
+    return (out / FOLDER).is_dir() if notes is None else notes["run"] == run
+
+
+def note_view(out: Path, run: str, settings: Mapping[str, Any], file_name: str, basis: ViewBasis) -> None:
+    """Note, before the samples of a view of a run are taken, what they depend on. Raises InputError if others were
+    taken of another run or with other settings, OSError."""
     notes = _read_notes(out)
     decisive = _decisive(settings)
     if notes is None:
-        notes = {"settings": decisive, "views": {}}
-    elif notes["settings"] != decisive:
+        notes = {"run": run, "settings": decisive, "views": {}}
+    elif (notes["run"], notes["settings"]) != (run, decisive):
         raise InputError(_of_others(out))
     notes["views"][file_name] = {"frames": basis.frames, "left_out": list(basis.left_out)}
     for name in ("samples", FOLDER):
@@ -118,6 +127,6 @@ def _read_notes(out: Path) -> dict[str, Any] | None:
         return None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not isinstance(notes, dict) or not {"settings", "views"} <= notes.keys():
+    if not isinstance(notes, dict) or not {"run", "settings", "views"} <= notes.keys():
         raise InputError(f"{path}: expected notes on samples; was it changed? Remove {out}, then begin anew")
     return notes

@@ -128,7 +128,10 @@ def extract_runs(request: RunRequest, out: Path, *, scheduler: str | None = None
 
 def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> None:
     """The samples of a complete view of a run that is still acquired, with the run's own mesh and records. What is
-    there already, and agrees with the view's frames, stays. Raises as `reflectance_of`."""
+    there already, and agrees with the view's frames, stays; so does a result that was begun with all frames of its
+    runs. Raises as `reflectance_of`."""
+    if (out / SETTINGS).exists():
+        return
     request, token = RunRequest((run,)), uuid4().hex
     try:
         (measured_run,) = read_runs(request, token)
@@ -142,7 +145,7 @@ def extract_beside(run: Path, view_name: str, out: Path, say: Said = silent) -> 
             return
         path = out / "samples" / f"{file_name}.h5"
         path.with_suffix(".json").unlink(missing_ok=True)
-        note_view(out, settings_of(request, token, [measured_run]), file_name, basis)
+        note_view(out, run.name, settings_of(request, token, [measured_run]), file_name, basis)
         complete(out / OBJECT, partial(_write_object, measured_run))
         summary = _extract_one(token, request.sources, None, say, _View(run.resolve(), view_name, path, left_out))
         write_synced(path.with_suffix(".json"), json.dumps(summary))

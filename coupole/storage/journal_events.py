@@ -233,7 +233,7 @@ class FindingNoted(JournalEvent):
     event: Literal["finding"] = "finding"
     kind: str
     """Name of what was found: `ambient light`, `LED`, `drift`, `moved`, `smudge`, `exposure step` or
-    `thing in the field`."""
+    `thing in the field`; `not watched` if the watching itself has failed, and has ended."""
     view: str
     """Name of the view."""
     shots: tuple[Shot, ...]

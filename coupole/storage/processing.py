@@ -123,7 +123,7 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
     acquires into it."""
     progress = _read_progress(result)
     place = str(result)
-    if (result / RESULT).is_file() and not frames_left:
+    if not frames_left and _is_whole(run, result):
         return Processing(place, "done", progress.views_done, progress.views)
     counts = progress.views_done, progress.views
     remedy = "" if frames_left else go_on_command(run, result)
@@ -139,6 +139,14 @@ def processing_of(run: Path, result: Path, *, frames_left: bool, in_use: bool) -
     pid = holder_of(result / _LOCK)
     still = f"its process {pid} is stopped; `kill -CONT {pid}` lets it go on" if pid and is_stopped(pid) else ""
     return Processing(place, progress.step, *counts, detail=f"{progress.detail}{share}", why=still)
+
+
+def _is_whole(run: Path, result: Path) -> bool:
+    """Tell whether a folder has the whole result of this run, and of no other."""
+    with contextlib.suppress(OSError, InputError):
+        about = read_json(result / RESULT, allow_nan=True)
+        return isinstance(about, dict) and list(about.get("runs", ())) == [run.name]
+    return False
 
 
 def _read_progress(result: Path) -> Progress:

@@ -1,5 +1,5 @@
-"""`report.html` and `maps.ply` of a comparison: where shape and colour changed_picture, by how much, and how "
-"surely."""
+"""`report.html` and `maps.ply` of a comparison: where shape and colour changed, by how much, and how
+surely."""
 
 from __future__ import annotations
 

@@ -35,8 +35,8 @@ from coupole.pages.page_rendering import render, write_page
 HOSTILE = """<script>alert("x")</script>' onload='x' & {{ 7 * 7 }}"""
 BY_HAND = re.compile(r"<(html|head|body|h[1-6]|table|tr|td|th|figure|svg|dl|section|p|ul|li|img)\b[^>]*>")
 ELSEWHERE = ("coupole/console/", "coupole/exchange/", "coupole/viewing/live", "coupole/viewing/view_page.py")
-"""Screens of the console, pages to relight and to paint, the live image and the plan in 3D: programs, no "
-"reports."""
+"""Screens of the console, pages to relight and to paint, the live image and the plan in 3D: programs, no
+reports."""
 
 
 class Outline(HTMLParser):

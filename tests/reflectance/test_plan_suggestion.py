@@ -14,8 +14,9 @@ from places import REPO
 from coupole.commands.suggest_plan import seconds_of
 from coupole.errors import InputError
 from coupole.preflight.job import read_job
-from coupole.reflectance.suggestion.expected_uncertainty import Information, relative_variance
+from coupole.reflectance.suggestion.supposed_signal import CameraNoise
 from coupole.reflectance.suggestion.view_choice import choose_views
+from coupole.reflectance.suggestion.view_information import Information, ViewInformation
 
 RELIEF, RECORDS = REPO / "configs/objects/relief.ply", REPO / "configs/calibrations"
 BUDGET_S, DOSE_LUX_H = 40.0, 0.6
@@ -121,26 +122,29 @@ def test_what_is_no_time(text: str) -> None:
 def test_noise_of_a_mean_is_that_of_counted_electrons() -> None:
     """8 pixels of which half have the channel, 900 electrons each, no read noise: 1 over the electrons."""
     gain_dn, electrons = 0.5, 900.0
-    signal_dn = gain_dn * electrons
-    noise = np.array([0.0, gain_dn, 0.5])
-    u2 = relative_variance(1.0, signal_dn / 0.01, 8.0, noise, (10.0, 4000.0), np.array([0.01]))
-    assert u2 == pytest.approx(1.0 / (4 * electrons))
-    both = relative_variance(1.0, signal_dn / 0.01, 8.0, noise, (10.0, 4000.0), np.array([0.01, 0.02]))
-    assert both == pytest.approx(1.0 / (4 * electrons * 3.0))
-    assert math.isinf(relative_variance(1.0, 5.0 / 0.01, 8.0, noise, (10.0, 4000.0), np.array([0.01])))
-    assert math.isinf(relative_variance(1.0, 5000.0 / 0.01, 8.0, noise, (10.0, 4000.0), np.array([0.01])))
+    noise = CameraNoise(np.zeros(1), np.array([gain_dn]), 10.0, 4000.0, np.array([0.5]))
+
+    def variance(signal_dn: float, *exposures_us: int) -> float:
+        return float(noise.relative_variances(np.array([signal_dn / 0.01]), np.float64(8.0), exposures_us)[0])
+
+    assert variance(gain_dn * electrons, 10_000) == pytest.approx(1.0 / (4 * electrons))
+    assert variance(gain_dn * electrons, 10_000, 20_000) == pytest.approx(1.0 / (4 * electrons * 3.0))
+    assert math.isinf(variance(5.0, 10_000))
+    assert math.isinf(variance(5000.0, 10_000))
 
 
-def told(known: list[float]) -> Information:
-    """What a view tells that knows each part so well, with noise as the weights have it."""
-    bread = np.array(known)[None, :, None, None] * np.eye(5)
-    return Information(bread, bread, np.full((1, len(known)), 30.0))
+def told(known: list[float]) -> ViewInformation:
+    """What a view tells that knows each part that it sees so well, with noise as the weights have it."""
+    parts = np.flatnonzero(known)
+    bread = np.array(known)[parts][None, :, None, None] * np.eye(5)
+    return ViewInformation(parts, bread, bread)
 
 
 def test_the_view_that_shows_the_rest_comes_second() -> None:
-    prior = told([1.0, 1.0])
+    prior = Information(np.tile(np.eye(5), (2, 1, 1)), np.tile(np.eye(5), (2, 1, 1)))
     views = [[told([1000.0, 0.0])], [told([900.0, 0.0])], [told([0.0, 50.0])], [told([0.01, 0.01])]]
-    choice = choose_views(views, [prior], np.ones(2), 3)
+    choice = choose_views(views, 0, [prior], np.ones(2), 3)
     assert choice.views == (0, 2, 1)
     assert choice.value == pytest.approx(0.5 * 5 * 0.5 * (math.log(1901.0) + math.log(51.0)))
-    assert choose_views(views, [prior], np.ones(2), 4).views == (0, 2, 1)  # the fourth tells nothing
+    assert choose_views(views, 0, [prior], np.ones(2), 4).views == (0, 2, 1)  # the fourth tells nothing
+    np.testing.assert_array_equal(prior.bread, np.tile(np.eye(5), (2, 1, 1)))  # what was known before stays

@@ -19,8 +19,8 @@ HEAVY = {"PIL", "cv2", "embreex", "h5py", "matplotlib", "numba", "numpy", "rich"
 LATE = {"pwd", "encodings.ascii"}
 """Python's own, that tell who acquires and spell a name: nothing that a stop or a safe end waits for."""
 REPORT = {"PIL", "jinja2", "markupsafe", "encodings"}
-"""Write the report's pictures and its page, when the cell is safe; `encodings.unicode_escape` is the "
-"template's."""
+"""Write the report's pictures and its page, when the cell is safe; `encodings.unicode_escape` is the
+template's."""
 
 
 def watched(file: Path, *arguments: str | Path) -> subprocess.Popen[str]:

@@ -196,11 +196,11 @@ def test_a_run_that_is_killed_leaves_no_process(tmp_path: Path, *, stopped: bool
 def test_a_resumed_run_goes_on_with_what_was_asked(tmp_path: Path) -> None:
     cell = cell_of_three_views(tmp_path)
     process, worker = begun(cell)
+    cells.wait_until(lambda: len(cells.events(cell.run_folder, "view")) == 2, "the second view")
+    assert cells.here("pause", cell.run_folder).code == 0  # the third is not begun
     cells.wait_until(lambda: has_samples(cell), "samples of a view")
     process.send_signal(signal.SIGINT)
     ended = cells.finish(process)
-    if ended.code == 0:
-        pytest.skip("all frames were there before the run was stopped")
     assert ended.code == 130, ended.err
     assert not is_beside(worker)
     assert ended.document["reflectance"]["why"] == "ended with the run, which is not complete"
@@ -234,6 +234,26 @@ def test_what_cannot_be_made_is_refused_before_anything_moves(
     assert ended.code == 3, ended.err
     assert words in ended.err
     assert not (tmp_path / "storage").exists() or not list((tmp_path / "storage").glob("2*"))
+
+
+def test_the_result_of_another_run_is_neither_touched_nor_taken_for_this_ones(tmp_path: Path) -> None:
+    cell = cell_of_three_views(tmp_path)
+    assert cell.acquire("--reflectance", "--result", tmp_path / "first").code == 0
+    first = {name: path.read_bytes() for name, path in files(tmp_path / "first").items()}
+    refused = cell.acquire("--reflectance", "--result", tmp_path / "first")
+    assert refused.code == 3, refused.err
+    assert "expected a new folder, or that of this run's result" in refused.err
+    assert cell.acquire().code == 0
+    second = sorted((tmp_path / "storage").glob("2*/run.json"))[-1].parent
+    refused = cells.here("acquire", "--resume", second, "--result", tmp_path / "first", "--yes")
+    assert refused.code == 3, refused.err
+    journal = second / "journal.jsonl"  # as an older version, or a hand, might have left it
+    line = json.dumps(
+        {"t": "2026-01-01T00:00:00.000000Z", "event": "processing", "result": str(tmp_path / "first")}
+    )
+    journal.write_text(journal.read_text() + line + "\n")
+    assert status(second)["state"] == "ended"
+    assert {name: path.read_bytes() for name, path in files(tmp_path / "first").items()} == first
 
 
 def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:

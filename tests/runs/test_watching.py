@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cells
 import pytest
 from cells import CellFolder
+from real_cells import true_dose_lux_h
 
+from coupole.acquisition.watching import burst_judge
 from coupole.preflight.job import read_job
 
 EVERY = {"kind": "every", "every": 20}
@@ -97,3 +100,84 @@ def test_sentinels_are_refused_where_lights_are_chosen(cell: CellFolder) -> None
     ended = cells.here("check", cell.plan)
     assert ended.code == 2
     assert "watch: {frames: darks}" in ended.err
+
+
+# -- light, frames and words, whatever happens ----------------------------------------------------------------
+
+
+def _cell_of_its_own_world(folder: Path, watch: object) -> CellFolder:
+    cell = CellFolder(folder, speed=2.0)
+    cell.join()
+    cell.write(watch=watch, lights=EVERY, reshoot_limit=1)
+    return cell
+
+
+def _told_lux_h(cell: CellFolder) -> float:
+    return float(cells.here("status", cell.run_folder, "--json").document["dose_lux_h"])
+
+
+def test_sentinels_and_what_is_taken_again_are_counted_by_ledger_and_preflight(tmp_path: Path) -> None:
+    cell = _cell_of_its_own_world(tmp_path, {"retake": True})
+    planned = cells.here("check", cell.plan, "--json", "--no-paths").document
+    cell.write(watch=False)
+    unwatched = cells.here("check", cell.plan, "--json", "--no-paths").document
+    cell.write(watch={"retake": True})
+    assert planned["dose_lux_h"] > 1.1 * unwatched["dose_lux_h"]  # 54 LEDs and 8 sentinels
+    with cell.world(FAULTS["ambient light"]) as world:
+        assert cell.acquire().code == 0
+        truth = float(true_dose_lux_h(cell, world).max())
+    told = _told_lux_h(cell)
+    assert truth <= told * 1.001
+    assert told < 1.2 * truth
+    assert told > 1.7 * planned["dose_lux_h"]  # all shots were taken twice, sentinels once
+    assert cells.here("verify", cell.run_folder).code == 0
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+@pytest.mark.parametrize("proven", [0, 70])
+def test_a_killed_run_that_takes_again_goes_on_and_no_light_is_forgotten(tmp_path: Path, proven: int) -> None:
+    """Frames wait for their burst's judgement: what a kill takes with it is taken again, and its light counted."""
+    cell = _cell_of_its_own_world(tmp_path, {"retake": True})
+    cell.write(views=[cells.TOP, cells.LOW])
+    with cell.world() as world:
+        process = cell.start_acquire()
+        cells.wait_until(lambda: len(cells.events(cell.run_folder, "frame")) >= proven, "frames")
+        cells.wait_until(lambda: world.ask("light")["leds_s"], "light")
+        process.kill()
+        cells.finish(process)
+        cells.wait_until(lambda: not world.ask("state")["shining"], "the dark")
+        cell.confirm()
+        resumed = cell.acquire("--resume", cell.run_folder)
+        assert resumed.code == 0, resumed.err
+        assert float(true_dose_lux_h(cell, world).max()) <= _told_lux_h(cell) * 1.001
+    assert _found(cell) == []
+    cells.assert_each_shot_proven_once(cell.run_folder)
+    assert cells.here("verify", cell.run_folder).code == 0
+
+
+@pytest.mark.parametrize("watch", [True, {"retake": True}])
+def test_a_defect_of_the_judge_costs_no_frame_and_is_told(
+    cell: CellFolder, watch: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> list[object]:
+        raise ZeroDivisionError("of its own making")
+
+    monkeypatch.setattr(burst_judge.BurstJudge, "judge", fail)
+    ended = _watched(cell, watch, FAULTS["ambient light"])
+    assert ended.code == 0, ended.err
+    assert ended.document["proven"] == 54
+    (found,) = _found(cell)
+    assert found["kind"] == "not watched"
+    assert "ZeroDivisionError: of its own making" in found["message"]
+    assert "the run goes on" in cells.here("status", cell.run_folder).err
+    cells.assert_each_shot_proven_once(cell.run_folder)
+
+
+def test_a_picture_that_cannot_be_kept_costs_no_frame(cell: CellFolder) -> None:
+    cell.faults(FAULTS["ambient light"])
+    process = cell.start_acquire()
+    (cell.run_folder / "watch").write_text("in the way of the folder")
+    ended = cells.finish(process)
+    assert ended.code == 0, ended.err
+    (found,) = _found(cell)
+    assert (found["kind"], found["picture"]) == ("ambient light", "")

@@ -19,6 +19,9 @@ FOR_A_PERSON: tuple[Kind, ...] = ("ambient light", "moved", "smudge")
 TAKEN_AGAIN: tuple[Kind, ...] = ("ambient light", "LED", "thing in the field")
 """Findings whose shots may be good when they are taken again."""
 
+NOT_WATCHED = "not watched"
+"""Kind of the journal's line that says that watching itself has failed, and has ended."""
+
 
 @dataclass(frozen=True)
 class SeenFrame:

@@ -16,14 +16,16 @@ from coupole.acquisition.recorder import Recorder
 from coupole.acquisition.watching.burst_judge import BurstJudge, FirstFrames, LightTable
 from coupole.acquisition.watching.camera_noise import CameraNoise
 from coupole.acquisition.watching.finding_picture import finding_picture
-from coupole.acquisition.watching.findings import FOR_A_PERSON, TAKEN_AGAIN, Found, SeenFrame
+from coupole.acquisition.watching.findings import FOR_A_PERSON, NOT_WATCHED, TAKEN_AGAIN, Found, SeenFrame
 from coupole.acquisition.watching.frame_look import FrameLook, LookGrid, compile_now
 from coupole.devices import ArmState, Frame, FrameFormat
+from coupole.errors import StorageError
 from coupole.geometry import Transform, apply
 from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.schedule import ViewPose
 from coupole.plan.shot_id import Led, ShotId, ShotLabel
+from coupole.plan.watch import NOTHING
 from coupole.preflight.job import Job
 from coupole.storage.frame_file_creation import Collections
 from coupole.storage.journal_events import Event, FindingNoted
@@ -139,11 +141,11 @@ class WatchedRecorder:
     def judge(self, burst: Burst, *, may_retake: bool) -> str:
         """Judge a burst that was fired, and prove its frames. What was found is noted and said; returns why shots
         are left unproven, to be taken again, empty if none are."""
-        frames = self._frames_of(burst)
-        findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
-        findings = [self._with_unseen_shots(burst, finding) for finding in findings]
-        new_labels = {label for label in burst.labels if label}
-        findings = [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
+        try:
+            findings = self._findings_in(burst)
+        except Exception as error:  # noqa: BLE001  a defect of what only looks must not end a run
+            findings = []
+            self._go_on_unwatched(burst, error)
         for finding in findings:
             self._note(burst, finding)
         spoilt: set[ShotLabel] = set()
@@ -155,6 +157,26 @@ class WatchedRecorder:
             self._observer.note("paused by what was found: mend it, then go on")
             self._control.pause.set()
         return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
+
+    def _findings_in(self, burst: Burst) -> list[Found]:
+        """What a burst shows that was not known before."""
+        frames = self._frames_of(burst)
+        findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
+        findings = [self._with_unseen_shots(burst, finding) for finding in findings]
+        new_labels = {label for label in burst.labels if label}
+        return [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
+
+    def _go_on_unwatched(self, burst: Burst, error: Exception) -> None:
+        """Watch no more, and say so where findings are said."""
+        self._watch = NOTHING
+        shots = tuple(ShotId(burst.view, label) for label in burst.labels if label)
+        defect = f"{type(error).__name__}: {error}. This is a defect of Coupole: please report it"
+        words = f"watching has ended, the run goes on: {defect}"
+        self._tell(
+            FindingNoted(
+                kind=NOT_WATCHED, view=burst.view, shots=shots, figure=0.0, limit=0.0, unit="", message=words
+            )
+        )
 
     def _frames_of(self, burst: Burst) -> list[SeenFrame]:
         """Frames of the burst, and of the attempts before, in the order of time."""
@@ -183,27 +205,37 @@ class WatchedRecorder:
         return is_news
 
     def _note(self, burst: Burst, finding: Found) -> None:
-        shots = tuple(ShotId(burst.view, label) for label in finding.labels)
-        picture = ""
-        if self._pictures < _MOST_PICTURES:
-            self._pictures += 1
-            name = f"{burst.view}-e{burst.exposure_index}-r{burst.repeat}-{finding.kind.replace(' ', '-')}.png"
-            picture = self.keep_picture(name, finding_picture(finding))
-        self._observer.note(
-            f"{burst.view}: {finding.kind}: {finding.words}" + (f" ({picture})" if picture else "")
-        )
-        self._recorder.note(
+        self._tell(
             FindingNoted(
                 kind=finding.kind,
                 view=burst.view,
-                shots=shots,
+                shots=tuple(ShotId(burst.view, label) for label in finding.labels),
                 figure=round(finding.figure, 6),
                 limit=round(finding.limit, 6),
                 unit=finding.unit,
                 message=finding.words,
-                picture=picture,
+                picture=self._kept_picture(burst, finding),
             )
         )
+
+    def _kept_picture(self, burst: Burst, finding: Found) -> str:
+        """The path of a finding's picture in the run; empty after many, and where it cannot be written: no frame
+        depends on it."""
+        if self._pictures >= _MOST_PICTURES:
+            return ""
+        self._pictures += 1
+        name = f"{burst.view}-e{burst.exposure_index}-r{burst.repeat}-{finding.kind.replace(' ', '-')}.png"
+        try:
+            return self.keep_picture(name, finding_picture(finding))
+        except StorageError as error:
+            self._observer.note(f"{burst.view}: the picture of what was found was not kept: {error}")
+            return ""
+
+    def _tell(self, finding: FindingNoted) -> None:
+        """Say a finding, and note it for the journal."""
+        picture = f" ({finding.picture})" if finding.picture else ""
+        self._observer.note(f"{finding.view}: {finding.kind}: {finding.message}{picture}")
+        self._recorder.note(finding)
 
     def _prove_held(self, spoilt: set[ShotLabel]) -> None:
         """Prove the frames that waited, but free those that are spoilt."""

@@ -18,30 +18,29 @@ from coupole.errors import CoupoleError, InputError
 from coupole.plan.light_selection import leds_of_plan
 from coupole.plan.reading import PlanFiles, read_plan
 from coupole.plan.rig_devices import described_arm, in_world
+from coupole.reflectance.begun_beside import is_of_run
 from coupole.reflectance.extraction.measured_run import (
     NEEDED,
     read_powers,
     records_by_kind,
     refuse_other_gain,
 )
-from coupole.reflectance.result_folder import SETTINGS
 from coupole.scan.mesh_files import read_mesh
-from coupole.storage import processing
 
 _CHECKED: tuple[Kind, ...] = ("dark", "response", "flat-field")
 
 
-def reasons_against(plan: Path, rig: Path | None, result: Path | None) -> list[str]:
+def reasons_against(plan: Path, rig: Path | None, result: Path | None, run: Path | None) -> list[str]:
     """List why `coupole reflectance RUN` could not make a result of this plan's run, with the place in the plan
-    and the remedy; `result` is the folder, if one is named."""
+    and the remedy; `result` is the folder, if one is named, and `run` that of the run, if it is resumed."""
     try:
         files = read_plan(plan, rig)
-        return [*_of_folder(result), *_of_mesh(files), *_of_records(files)]
+        return [*_of_folder(result, run), *_of_mesh(files), *_of_records(files)]
     except CoupoleError as error:
         return [f"--reflectance: {error}"]
 
 
-def _of_folder(result: Path | None) -> Iterator[str]:
+def _of_folder(result: Path | None, run: Path | None) -> Iterator[str]:
     if result is None:
         return
     if not result.exists():
@@ -49,8 +48,8 @@ def _of_folder(result: Path | None) -> Iterator[str]:
         if not existing.is_dir():
             yield f"--result {result}: expected a folder that can be made; {existing} is a file"
         return
-    is_begun = (result / SETTINGS).exists() or (result / processing.FOLDER).is_dir()
-    if not result.is_dir() or (not is_begun and any(result.iterdir())):
+    is_own = run is not None and is_of_run(result, run.name)
+    if not result.is_dir() or (not is_own and any(result.iterdir())):
         yield f"--result {result}: expected a new folder, or that of this run's result; found other content"
 
 

@@ -44,8 +44,8 @@ def _reasons(request: dict[str, Any]) -> list[str]:
     except ImportError as error:
         return [f"--reflectance: needs {error.name or error}, which is not installed: pip install 'coupole[all]'"]
     assert follower is not None  # imported now: nothing is missing later
-    rig, result = (None if request[key] is None else Path(request[key]) for key in ("rig", "result"))
-    return reasons_against(Path(request["plan"]), rig, result)
+    rig, result, run = (None if request[key] is None else Path(request[key]) for key in ("rig", "result", "run"))
+    return reasons_against(Path(request["plan"]), rig, result, run)
 
 
 def _next_request() -> dict[str, Any]:

@@ -1,6 +1,5 @@
-"""Tells whether a specular lobe is determined by the samples at all: what is nearly nothing is said, and not "
-"drawn as "
-"noise."""
+"""Tells whether the samples determine a specular lobe at all: what is nearly nothing is said, and not drawn as
+noise."""
 
 from __future__ import annotations
 

@@ -27,17 +27,12 @@ from coupole.preflight.job import Job, read_job
 from coupole.preflight.preflight import Report, StorageFacts
 from coupole.reflectance.run_job import HELD_OUT_EVERY
 from coupole.reflectance.suggestion.candidate_views import Candidate, candidates_of
-from coupole.reflectance.suggestion.expected_uncertainty import (
-    Information,
-    information_of,
-    prior_information,
-    signal_quantile,
-)
 from coupole.reflectance.suggestion.plan_text import PlanText
 from coupole.reflectance.suggestion.rehearsal import NORMAL_DEG, ExpectedUncertainty, rehearse
 from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial, supposed_materials
-from coupole.reflectance.suggestion.supposed_signal import SupposedCell, Surface
+from coupole.reflectance.suggestion.supposed_signal import SupposedCell, Surface, signal_quantile
 from coupole.reflectance.suggestion.view_choice import ViewChoice, choose_views
+from coupole.reflectance.suggestion.view_information import Information, ViewInformation, information_of
 
 Said = Callable[[str, int, int], None]
 
@@ -170,8 +165,10 @@ class _Trial:
         self._numbers = [*(number for number in LED_NUMBERS if number < len(self._order)), len(self._order)]
         fitted_share = 1.0 - 1.0 / HELD_OUT_EVERY  # the others are kept for the check
         self._fitted_numbers = [round(fitted_share * number) for number in self._numbers]
-        self._priors = [prior_information(self._surface, request.scan_noise_um) for _ in self._materials]
+        self._priors = [Information.before(self._surface, request.scan_noise_um) for _ in self._materials]
         self._exposures = self._exposures_to_try()
+        self._cut_off = set[str]()
+        """Names of views to which no path was found."""
 
     def best(self) -> Suggestion:
         """The best plan that has paths and is within the budget."""
@@ -220,14 +217,14 @@ class _Trial:
                 settings = Settings(exposures_us, leds)
                 most, view_s = self._most_views(settings)
                 if most > 0:
-                    choices[settings] = self._choose(information, leds, most, range(len(self._candidates))), view_s
+                    choices[settings] = self._choose(information, leds, most), view_s
         return choices
 
-    def _information(self, exposures_us: tuple[int, ...], step: str) -> list[list[Information]]:
+    def _information(self, exposures_us: tuple[int, ...], step: str) -> list[list[ViewInformation]]:
         """[candidates][materials]"""
         pairs = list(product(self._candidates, self._materials.values()))
 
-        def tell(pair: tuple[Candidate, SupposedMaterial]) -> Information:
+        def tell(pair: tuple[Candidate, SupposedMaterial]) -> ViewInformation:
             candidate, material = pair
             return information_of(
                 self._surface, candidate.seen_parts, material, exposures_us, self._order, self._fitted_numbers
@@ -241,12 +238,11 @@ class _Trial:
         count = len(self._materials)
         return [parts[first : first + count] for first in range(0, len(parts), count)]
 
-    def _choose(
-        self, information: list[list[Information]], leds: int, most: int, allowed_candidates: Sequence[int]
-    ) -> ViewChoice:
-        some = [[of_material.at(leds) for of_material in information[number]] for number in allowed_candidates]
-        choice = choose_views(some, self._priors, self._surface.triangles, most)
-        return replace(choice, views=tuple(allowed_candidates[number] for number in choice.views))
+    def _choose(self, information: list[list[ViewInformation]], leds: int, most: int) -> ViewChoice:
+        places = [n for n, candidate in enumerate(self._candidates) if candidate.view.name not in self._cut_off]
+        some = [information[place] for place in places]
+        choice = choose_views(some, leds, self._priors, self._surface.triangles, most)
+        return replace(choice, views=tuple(places[view] for view in choice.views))
 
     def _most_views(self, settings: Settings) -> tuple[int, float]:
         """Number of views that the budget allows, and the time of one, by preflight without paths."""
@@ -271,11 +267,10 @@ class _Trial:
         """The suggestion of these settings, with views to which there are paths; None if none fits the budget.
         Raises PreflightRefused for what no other choice mends."""
         information = self._information(settings.exposures_us, "what views tell, of the chosen exposure")
-        allowed_candidates = list(range(len(self._candidates)))
-        most, budget = self._most_views(settings)[0], self._request.budget
+        most = self._most_views(settings)[0]
         for number in range(1, _ROUNDS + 1):
             self._say("paths to the views", number, _ROUNDS)
-            choice = self._choose(information, settings.leds, most, allowed_candidates)
+            choice = self._choose(information, settings.leds, most)
             views = [self._candidates[number].view for number in choice.views]
             if not views:
                 return None
@@ -284,14 +279,17 @@ class _Trial:
             if not cut_off and report.refusals:
                 raise PreflightRefused(report.refusals)
             if cut_off:
-                allowed_candidates = [
-                    place for place in allowed_candidates if self._candidates[place].view.name not in cut_off
-                ]
-            elif report.duration_s > budget.seconds or report.dose_lux_h > (budget.lux_h or math.inf):
-                most = len(views) - 1
+                self._cut_off |= cut_off
+            elif (over := self._over_budget(report)) > 1.0:
+                most = min(len(views) - 1, int(len(views) / over))
             else:
                 return self._suggestion(settings, choice, job, report)
         return None
+
+    def _over_budget(self, report: Report) -> float:
+        """Time or light of a plan over what is allowed, whichever is more."""
+        budget = self._request.budget
+        return max(report.duration_s / budget.seconds, report.dose_lux_h / (budget.lux_h or math.inf))
 
     def _suggestion(self, settings: Settings, choice: ViewChoice, job: Job, report: Report) -> Suggestion:
         self._say("samples that are drawn, and their fits", 0, len(self._materials))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +27,9 @@ from coupole.preflight.framing import depth_of_field_mm
 from coupole.preflight.job import Job
 from coupole.reflectance.extraction.measured_run import Powers, emission_of, read_powers, u_signal_of
 from coupole.reflectance.extraction.radiance import RANGE_LEFT_OUT
+from coupole.reflectance.ggx import lobe
+from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial
+from coupole.reflectance.triangle_fit import between, towards
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +49,23 @@ class CameraNoise:
     """Signal above black below which a mean is not used."""
     most_dn: float
     """Signal above black at which a pixel is not used."""
+    channel_share: Floats
+    """[channels] share of the pixels that have this colour."""
+
+    def relative_variances(self, signal_dn_per_s: Floats, pixels: Floats, exposures_us: Sequence[int]) -> Floats:
+        """[..., channels] relative variances by noise of triangles' mean signals, from all exposures in which
+        a signal is neither too dark nor saturated; infinite where it is so in all. `pixels` [...] are all that a
+        triangle has."""
+        precision = np.zeros(signal_dn_per_s.shape)
+        for exposure_us in exposures_us:
+            signal_dn = signal_dn_per_s * exposure_us * 1e-6
+            is_used = (signal_dn > self.least_dn) & (signal_dn < self.most_dn)
+            electrons_weight = signal_dn**2 / (self.in_dark_dn2 + self.gain_dn * signal_dn)
+            precision += np.where(is_used, electrons_weight, 0.0)
+        precision *= np.asarray(pixels)[..., None] * self.channel_share
+        with np.errstate(divide="ignore"):
+            variances: Floats = 1.0 / precision
+        return variances
 
 
 @dataclass(frozen=True)
@@ -70,8 +91,6 @@ class Surface:
     u_led_mm: float
     """Standard uncertainty of each coordinate of an LED's centre."""
     noise: CameraNoise
-    channel_share: Floats
-    """[channels] share of the pixels that have this colour."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +103,11 @@ class SeenParts:
     """[n] pixels of a triangle, all channels; 0 where the view does not see the part."""
     is_lit: NDArray[np.bool_]
     """[n, leds]"""
+
+    @property
+    def parts(self) -> NDArray[np.int64]:
+        """Numbers of the parts that the view sees, rising."""
+        return np.flatnonzero(self.pixels > 0.0)
 
 
 class SupposedCell:
@@ -131,8 +155,7 @@ class SupposedCell:
             np.nan_to_num(powers.u_own.mean(axis=1)),
             float(np.nanmean(np.hypot(powers.u_shared, self._u_signal))),
             self._leds.value("led_centre_median_u_mm"),
-            _camera_noise(self.rig.sensor, self._response, channels),
-            channel_share,
+            _camera_noise(self.rig.sensor, self._response, channels, channel_share),
         )
 
     def seen_by(self, joints_deg: Floats, support_from_camera: Floats) -> SeenParts:
@@ -174,7 +197,7 @@ def _channels(sensor: Sensor) -> tuple[Sequence[str], Floats]:
     return channels, np.array([shares[channel] for channel in channels] if len(channels) > 1 else [1.0])
 
 
-def _camera_noise(sensor: Sensor, response: Record, channels: Sequence[str]) -> CameraNoise:
+def _camera_noise(sensor: Sensor, response: Record, channels: Sequence[str], channel_share: Floats) -> CameraNoise:
     range_dn = sensor.white_dn - sensor.black_dn
     left_out_dn = RANGE_LEFT_OUT * range_dn
     return CameraNoise(
@@ -182,4 +205,58 @@ def _camera_noise(sensor: Sensor, response: Record, channels: Sequence[str]) -> 
         np.array([response.value(f"gain_dn_per_e.{channel}") for channel in channels]),
         left_out_dn,
         range_dn - left_out_dn,
+        channel_share,
     )
+
+
+def reflectances(
+    surface: Surface, view: SeenParts, material: SupposedMaterial, leds_mm: Floats, parts: NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """[parts, leds] reflectance, 1/sr, and cosine of incidence of some parts under LEDs at [leds, 3]; NaN where no
+    light reaches what the view sees.
+
+    The highlight grows towards grazing angles by Schlick's Fresnel term (1994), as a real one does.
+    """
+    f, cosines = np.full((2, len(parts), len(leds_mm)), np.nan)
+    _fill_reflectances(
+        surface.points_mm[parts], surface.normals[parts], view.camera_mm, view.pixels[parts], leds_mm,
+        view.is_lit[parts], (material.kd, material.ks, material.alpha), f, cosines,
+    )  # fmt: skip
+    return f, cosines
+
+
+def signal_quantile(
+    surface: Surface, views: Sequence[SeenParts], material: SupposedMaterial, quantile: float
+) -> float:
+    """Quantile of the samples' signals, DN/s in the most sensitive channel; NaN without any."""
+    per_f = surface.signal_per_f.max(axis=2)
+    signals = [np.zeros(0)]
+    for view in views:
+        parts = view.parts
+        values = per_f[parts] * reflectances(surface, view, material, surface.leds_mm, parts)[0]
+        signals.append(values[np.isfinite(values)])
+    all_signals = np.concatenate(signals)
+    return float(np.quantile(all_signals, quantile)) if len(all_signals) else np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill_reflectances(points_mm, normals, camera_mm, pixels, leds_mm, is_lit, material, f, cosines):  # type: ignore[no-untyped-def]
+    kd, ks, alpha = material
+    light, view, half = np.empty(3), np.empty(3), np.empty(3)
+    for part in range(len(points_mm)):
+        if pixels[part] <= 0.0:
+            continue
+        normal = normals[part]
+        towards(points_mm[part], camera_mm, view)
+        nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+        for led in range(len(leds_mm)):
+            towards(points_mm[part], leds_mm[led], light)
+            nl = normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
+            if nl <= 0.0 or not is_lit[part, led]:
+                continue
+            between(light, view, half)
+            nh = normal[0] * half[0] + normal[1] * half[1] + normal[2] * half[2]
+            vh = view[0] * half[0] + view[1] * half[1] + view[2] * half[2]
+            fresnel = ks + (1.0 - ks) * (1.0 - vh) ** 5
+            f[part, led] = kd + fresnel * lobe(nl, nv, nh, alpha)[0]
+            cosines[part, led] = nl

@@ -8,14 +8,13 @@ the best one (Nemhauser et al. 1978 for functions of this kind; here it is a rul
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coupole.reflectance.suggestion.expected_uncertainty import Information, covariance_of
-
-Floats = NDArray[np.float64]
+from coupole.reflectance.suggestion.view_information import Information, ViewInformation
 
 ENOUGH = 0.1
 """Gain of a further view, for the five unknowns together, below which none is added: 2 % of each."""
@@ -28,38 +27,36 @@ class ViewChoice:
     views: tuple[int, ...]
     """Numbers of the candidates."""
     value: float
-    """Mean over materials and parts, less that without any view."""
+    """Gain of all of them together, the mean over materials and parts."""
 
 
 def choose_views(
-    candidates: Sequence[Sequence[Information]],
+    candidates: Sequence[Sequence[ViewInformation]],
+    number: int,
     priors: Sequence[Information],
-    weights: Floats,
+    weights: NDArray[np.float64],
     most: int,
 ) -> ViewChoice:
-    """Choose at most `most` of the candidates; each has its information for each supposed material, of one number
-    of LEDs. `weights` [n] are those of the parts."""
-    so_far, chosen_views = list(priors), list[int]()
-    value = begin = _value(so_far, weights)
+    """Choose at most `most` of the candidates, each of which has its information for each supposed material, with
+    one `number` of their numbers of LEDs. `weights` [n] are those of the parts."""
+    so_far, shares = deepcopy(list(priors)), weights / weights.sum()
+    chosen_views, value = list[int](), 0.0
+
+    def gain_of(candidate: Sequence[ViewInformation]) -> float:
+        gains = [
+            known.gains(view, number) @ shares[view.parts] for known, view in zip(so_far, candidate, strict=True)
+        ]
+        return float(np.mean(gains))
+
     while len(chosen_views) < min(most, len(candidates)):
         trials = {
-            number: _value(
-                [of_material + of_view for of_material, of_view in zip(so_far, candidate, strict=True)], weights
-            )
-            for number, candidate in enumerate(candidates)
-            if number not in chosen_views
+            place: gain_of(candidate) for place, candidate in enumerate(candidates) if place not in chosen_views
         }
-        best = max(trials, key=lambda number: trials[number])
-        if trials[best] - value < ENOUGH:
+        best = max(trials, key=lambda place: trials[place])
+        if trials[best] < ENOUGH:
             break
         chosen_views.append(best)
-        value = trials[best]
-        so_far = [of_material + of_view for of_material, of_view in zip(so_far, candidates[best], strict=True)]
-    return ViewChoice(tuple(chosen_views), value - begin)
-
-
-def _value(materials: Sequence[Information], weights: Floats) -> float:
-    logarithms = [
-        np.linalg.slogdet(covariance_of(information)[0])[1] @ weights / weights.sum() for information in materials
-    ]
-    return -0.5 * float(np.mean(logarithms))
+        value += trials[best]
+        for known, view in zip(so_far, candidates[best], strict=True):
+            known.add(view, number)
+    return ViewChoice(tuple(chosen_views), value)

@@ -1,0 +1,133 @@
+"""What views tell of an object's materials before anything is measured, to compare views with each other.
+
+A fit's covariance is H^-1 M H^-1 (`coupole.reflectance.material_uncertainty`). Both are sums over samples, so each
+view adds its own to them. Here the derivatives are those of a supposed material, and M has what is known
+beforehand: the frames' noise, each LED's own power, and the priors. What a plan promises is `rehearsal`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from coupole.reflectance.ggx import UNKNOWNS, root_by_unknowns, tangents
+from coupole.reflectance.material_uncertainty import LEAST_KNOWN
+from coupole.reflectance.normal_fit import CAUCHY, SPREAD_KS
+from coupole.reflectance.suggestion.supposed_materials import SupposedMaterial
+from coupole.reflectance.suggestion.supposed_signal import SeenParts, Surface, reflectances
+from coupole.reflectance.triangle_fit import USUAL, between, prior_stiffness, towards
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ViewInformation:
+    """Sums over the samples of one view, for the parts that it sees and several numbers of LEDs."""
+
+    parts: NDArray[np.int64]
+    """[k] numbers of the parts, rising."""
+    bread: Floats
+    """[numbers, k, 5, 5] the scores' derivatives."""
+    meat: Floats
+    """[numbers, k, 5, 5] the scores' variance."""
+
+
+@dataclass
+class Information:
+    """Sums over the samples of all views so far, for the n parts of a surface."""
+
+    bread: Floats
+    """[n, 5, 5] the scores' derivatives."""
+    meat: Floats
+    """[n, 5, 5] the scores' variance."""
+
+    @staticmethod
+    def before(surface: Surface, noise_um: float) -> Information:
+        """Return what is known before any sample: the mesh's normals, and usual materials."""
+        stiffness = prior_stiffness(surface.triangle_areas_mm2, noise_um)
+        bread = np.zeros((len(stiffness), UNKNOWNS, UNKNOWNS))
+        for place, precision in ((2, LEAST_KNOWN), (3, USUAL / SPREAD_KS**2), (4, USUAL)):
+            bread[:, place, place] = precision
+        for tilt in range(2):
+            bread[:, tilt, tilt] = stiffness
+        return Information(bread, bread.copy())
+
+    def gains(self, view: ViewInformation, number: int) -> Floats:
+        """[k] half the logarithm by which a view, with one of its numbers of LEDs, makes the determinant of the
+        covariance of its parts smaller."""
+        bread, meat = self.bread[view.parts], self.meat[view.parts]
+        before = _log_determinants(bread, meat)
+        return 0.5 * (before - _log_determinants(bread + view.bread[number], meat + view.meat[number]))
+
+    def add(self, view: ViewInformation, number: int) -> None:
+        """Add what a view tells, with one of its numbers of LEDs."""
+        self.bread[view.parts] += view.bread[number]
+        self.meat[view.parts] += view.meat[number]
+
+
+def _log_determinants(bread: Floats, meat: Floats) -> Floats:
+    """[k] of the covariances."""
+    logarithms: Floats = np.linalg.slogdet(meat)[1] - 2.0 * np.linalg.slogdet(bread)[1]
+    return logarithms
+
+
+def information_of(
+    surface: Surface,
+    view: SeenParts,
+    material: SupposedMaterial,
+    exposures_us: Sequence[int],
+    led_rows: NDArray[np.int64],
+    numbers: Sequence[int],
+) -> ViewInformation:
+    """Return what a view tells, with the first n of `led_rows` for each n of `numbers`, which rise."""
+    parts = view.parts
+    bread, meat = np.zeros((2, len(numbers), len(parts), UNKNOWNS, UNKNOWNS))
+    f = reflectances(surface, view, material, surface.leds_mm, parts)[0]
+    signal_dn_per_s = surface.signal_per_f[parts] * f[:, :, None]
+    by_channel = surface.noise.relative_variances(signal_dn_per_s, view.pixels[parts][:, None], exposures_us)
+    channels = by_channel.shape[2]
+    variances = by_channel.sum(axis=2) / channels**2 + surface.u_own**2
+    variances[~np.isfinite(f)] = np.inf
+    _fill(
+        surface.points_mm[parts], surface.normals[parts], view.camera_mm, surface.leds_mm, variances,
+        (material.kd, material.ks, material.alpha), np.asarray(led_rows, np.int64), np.array(numbers, np.int64),
+        bread, meat,
+    )  # fmt: skip
+    return ViewInformation(parts, bread.cumsum(axis=0), meat.cumsum(axis=0))
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(  # type: ignore[no-untyped-def]
+    points_mm, normals, camera_mm, leds_mm, variances, material, led_rows, numbers, bread, meat
+):
+    """Add to `bread` and `meat` [numbers, k, 5, 5] the samples of the LEDs that each number has more than the one
+    before it; `variances` [k, leds] are relative, of the channels' mean, infinite for no sample."""
+    kd, ks, alpha = material
+    scale2 = CAUCHY * CAUCHY * kd
+    light, view, half, row = np.empty(3), np.empty(3), np.empty(3), np.empty(UNKNOWNS)
+    for part in range(len(points_mm)):
+        normal = normals[part]
+        t1, t2 = tangents(normal[0], normal[1], normal[2])
+        towards(points_mm[part], camera_mm, view)
+        nv = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+        v1 = t1[0] * view[0] + t1[1] * view[1] + t1[2] * view[2]
+        v2 = t2[0] * view[0] + t2[1] * view[1] + t2[2] * view[2]
+        first = 0
+        for number in range(len(numbers)):
+            for led in led_rows[first : numbers[number]]:
+                if not variances[part, led] < np.inf:
+                    continue
+                towards(points_mm[part], leds_mm[led], light)
+                between(light, view, half)
+                root = root_by_unknowns(normal, t1, t2, light, half, nv, v1, v2, kd, ks, alpha, row)
+                by_noise = 0.25 * root * root * variances[part, led] / scale2
+                for i in range(UNKNOWNS):
+                    for j in range(UNKNOWNS):
+                        product = row[i] * row[j] / scale2
+                        bread[number, part, i, j] += product
+                        meat[number, part, i, j] += by_noise * product
+            first = numbers[number]

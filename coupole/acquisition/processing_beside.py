@@ -31,6 +31,7 @@ from coupole.viewing.terminal import alarm, step_bars
 _PROGRAM = "coupole.reflectance.beside.process"
 _READY_WITHIN_S = 120.0
 """Longer than its imports take on a busy machine."""
+_TOLD_AFTER_S = 1.0
 _SILENT_S, _LEAST_CPU_S = 120.0, 1.0
 """A process that neither tells anything nor computes for so long, when all frames are there, hangs."""
 _LOOK_EVERY_S, _ENDS_WITHIN_S = 0.5, 5.0
@@ -93,6 +94,8 @@ class ProcessingBeside:
 
     def refusals(self) -> list[str]:
         """List why no result could be made; to be asked before anything moves."""
+        if not self._has_answered.wait(_TOLD_AFTER_S):
+            self._console.print("reflectance: plan, mesh and records are looked at ...", markup=False)
         if not self._has_answered.wait(_READY_WITHIN_S):
             return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
         if self._reasons is None:

@@ -95,7 +95,7 @@ class WatchedRecorder:
         self._recorder.begin_view(view, frames, frame_format, arm, base_from_camera, collections)
         self._first.begin_view()
         self._grid = LookGrid(frame_format, is_sparse=self._watch.frames == "darks")
-        self._judge = judge_of(self._job, self._grid, self._views[view], self._first)
+        self._judge = None
 
     def store(self, frame: Frame, exposure_us: int) -> int:
         slot = self._recorder.store(frame, exposure_us)
@@ -159,9 +159,12 @@ class WatchedRecorder:
         return "; ".join(finding.words for finding in findings if finding.kind in TAKEN_AGAIN) if spoilt else ""
 
     def _findings_in(self, burst: Burst) -> list[Found]:
-        """What a burst shows that was not known before."""
+        """Judge a burst; return what was not known before."""
         frames = self._frames_of(burst)
-        findings = self._judge.judge(frames, burst.timing.exposure_us) if self._judge and frames else []
+        if not frames or self._grid is None:
+            return []
+        self._judge = self._judge or judge_of(self._job, self._grid, self._views[burst.view], self._first)
+        findings = self._judge.judge(frames, burst.timing.exposure_us)
         findings = [self._with_unseen_shots(burst, finding) for finding in findings]
         new_labels = {label for label in burst.labels if label}
         return [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]

@@ -1,12 +1,13 @@
 """Lets each call of each device of a small run fail, stop or change once in each way, and tells what became of it.
 
-    python tools/fail_every_call.py [--cases N] [--kinds WORD ...] [--seed N] [--jobs N] [--keep FILE]
+    python tools/fail_every_call.py [--cases N] [--calls N --skip N] [--kinds WORD ...] [--seed N] [--keep FILE]
     python tools/fail_every_call.py --pairs N [--first KIND] ...
 
 Without `--cases` all of them, for hours; those that FILE holds are not done again, so days may be put together of
-several calls with the same seed. `--pairs`: so many drawn cases of two failures in one session, the second after
-the first; `--first` has the first at every call in turn. Prints how long after the event lamps were dark and the
-arm stood, by kind of failure. Exits with 1 if anything was wrong in any case.
+several calls with the same seed and `--calls`; `--skip` leaves out the first of the draw, done elsewhere.
+`--pairs`: so many drawn cases of two failures in one session, the second after the first; `--first` has the
+first at every call in turn. Prints how long after the event lamps were dark and the arm stood, by kind of failure.
+Exits with 1 if anything was wrong in any case.
 """
 
 from __future__ import annotations
@@ -88,6 +89,8 @@ def run_all(cases: list[Case], jobs: int) -> Iterator[dict[str, Any]]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--cases", type=int, help="so many, drawn at random")
+    parser.add_argument("--calls", type=int, help="of a session; counted if not given (a busy machine has more)")
+    parser.add_argument("--skip", type=int, default=0, metavar="N", help="leave out the first N of the draw")
     parser.add_argument("--kinds", nargs="+", default=[], metavar="WORD", help="kinds that begin with these words")
     parser.add_argument("--pairs", type=int, help="so many cases of two failures in one session")
     parser.add_argument("--first", help="the first of both, at every call in turn: a kind, or `drawn` by the day")
@@ -97,9 +100,9 @@ def main() -> int:
     options = parser.parse_args()
     if options.first not in (None, "drawn", *KINDS, *MEANWHILE):
         parser.error(f"--first: expected `drawn` or one of {', '.join((*KINDS, *MEANWHILE))}")
-    with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
-        calls = count_calls(Path(folder))
-    cases = choose_cases(options, len(calls))
+    calls = options.calls or counted_calls()
+    cases = choose_cases(options, calls)[options.skip :]
+    print(f"{calls} calls, {len(cases)} cases", file=sys.stderr)
     options.keep.parent.mkdir(parents=True, exist_ok=True)
     outcomes = (
         [json.loads(line) for line in options.keep.read_text().splitlines()] if options.keep.exists() else []
@@ -115,6 +118,12 @@ def main() -> int:
             file.flush()
     selection = set(cases)
     return report([line for line in outcomes if case_of(line) in selection])
+
+
+def counted_calls() -> int:
+    """Of a session without failure."""
+    with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
+        return len(count_calls(Path(folder)))
 
 
 def choose_cases(options: argparse.Namespace, calls: int) -> list[Case]:

@@ -121,7 +121,7 @@ def main() -> int:
 
 
 def counted_calls() -> int:
-    """Of a session without failure."""
+    """Count the calls of a session without failure."""
     with tempfile.TemporaryDirectory(prefix="coupole-case-") as folder:
         return len(count_calls(Path(folder)))
 

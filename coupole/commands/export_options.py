@@ -10,11 +10,11 @@ import typer
 
 from coupole.commands.common import RecordsOption
 from coupole.commands.completion import formats, materials
-from coupole.exchange.formats import FORMATS, MAP_SIZE, Source, formats_of
+from coupole.exchange.formats import FORMATS, MAPS, Source, formats_of
 
 _COLOUR, _PARTS, _ABOUT = "Colour of frames (dng, tiff)", "What is exported", "What the crate says (rocrate)"
 _OF_MATERIALS = [name for name, export_format in FORMATS.items() if "triangle" in export_format.options]
-_WITH_MAPS = [name for name, export_format in FORMATS.items() if MAP_SIZE[0] in export_format.options]
+_WITH_MAPS = [name for name, export_format in FORMATS.items() if MAPS[0] in export_format.options]
 _SHOWN = "How views are shown (relight, iiif)"
 
 ToOption = Annotated[
@@ -94,6 +94,16 @@ MapOption = Annotated[
         min=256,
         max=16384,
         show_default=False,
+        rich_help_panel=_PARTS,
+    ),
+]
+UvOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--uv",
+        metavar="MESH",
+        help="For the same: the mesh with texture coordinates of its own (.obj, .ply, .glb), in which the "
+        "maps are laid out; by default on new charts.",
         rich_help_panel=_PARTS,
     ),
 ]
@@ -205,6 +215,7 @@ class ExportOptions:
     adaptive: AdaptiveOption = None
     texel_mm: TexelOption = None
     map_px: MapOption = None
+    uv: UvOption = None
     refined: RefinedOption = None
     calibrations: RecordsOption = None
     sensor_spectra: SensorOption = None

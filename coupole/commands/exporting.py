@@ -151,6 +151,7 @@ def _export_result(request: Asked, console: Console) -> Found:
             request.number("adaptive"),
             request.number("texel-mm"),
             request.whole_number("map-px"),
+            request.path("uv"),
             say,
         )
         paths = export_result(

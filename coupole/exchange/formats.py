@@ -44,7 +44,7 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-MAP_SIZE = ("texel-mm", "map-px")
+MAPS = ("texel-mm", "map-px", "uv")
 """Options of formats with maps."""
 _RUN, _PICTURES_TOO = (Source.RUN,), (Source.RUN, Source.PICTURES)
 _OF_FRAMES = ("views", "shots", "sensor-spectra", "led-spectrum", "calibrations")
@@ -70,12 +70,10 @@ _TABLE = (
     _views("iiif", "IIIF: a manifest and tiled pictures", "base-url"),
     Format("colmap", "views with their poses, for COLMAP", Writer.POSES, _RUN, ("refined", "calibrations")),
     _result("ply", "the mesh, with each triangle's material, normal and uncertainties"),
-    _result(
-        "gltf", "a .glb for viewers and browsers, with maps of colour, normal, roughness and specular", *MAP_SIZE
-    ),
-    _result("obj", "an OBJ with maps, for modelling programs", *MAP_SIZE),
-    _result("usd", "a .usdz with maps, for USD programs and telephones", *MAP_SIZE),
-    _result("materialx", "a MaterialX document of OpenPBR, with maps and mesh", *MAP_SIZE),
+    _result("gltf", "a .glb for viewers and browsers, with maps of colour, normal, roughness and specular", *MAPS),
+    _result("obj", "an OBJ with maps, for modelling programs", *MAPS),
+    _result("usd", "a .usdz with maps, for USD programs and telephones", *MAPS),
+    _result("materialx", "a MaterialX document of OpenPBR, with maps and mesh", *MAPS),
     _result("exr", "a multi-part OpenEXR for each view: material, normal, place and uncertainties of each pixel"),
     _result("bsdf", "tables of materials in RGL's tensor format, for Mitsuba", "triangle", "adaptive"),
     _result("merl", "tables of materials as the MERL database has them", "triangle"),

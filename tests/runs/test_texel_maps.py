@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+import scipy
 import trimesh
 from checkers import gltf_messages, needs_checkers
 from lazily import lazily
@@ -19,6 +20,8 @@ from maps_in_mitsuba import ExportedMaps
 from relief_cells import Made
 from skimage.color import deltaE_ciede2000, rgb2lab
 
+from coupole.exchange.atlas.flat_surface import flatten
+from coupole.exchange.of_results.measured_surface import ExportChoice, read_surface
 from coupole.exchange.srgb import srgb
 from coupole.reflectance.fits import TEXELS
 from coupole.reflectance.new_light.light_kinds import DistantLight
@@ -38,10 +41,30 @@ def exported(made: Made, to: str, folder: Path, *options: str) -> Path:
     return folder
 
 
-def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(detailed: Made, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def model(detailed: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The object's mesh as a modelling program may have it: in metres, y up, its triangles mixed, and seen from
+    above in its texture."""
+    surface = read_surface(detailed[1])
+    random = np.random.default_rng(4)
+    faces = random.permutation(surface.triangles)
+    low, size = surface.vertices_mm.min(axis=0), np.ptp(surface.vertices_mm, axis=0)[:2].max()
+    uv = 0.02 + 0.96 * (surface.vertices_mm - low)[:, :2] / size
+    y_up = 1e-3 * surface.vertices_mm[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    mesh = trimesh.Trimesh(y_up, faces, visual=trimesh.visual.TextureVisuals(uv=uv), process=False)
+    path = tmp_path_factory.mktemp("model") / "model.ply"
+    path.write_bytes(mesh.export(file_type="ply"))
+    return path
+
+
+@pytest.mark.parametrize("has_own_charts", [False, True])
+def test_maps_look_in_another_renderer_as_the_picture_that_relight_makes(
+    detailed: Made, model: Path, tmp_path: Path, has_own_charts: bool
+) -> None:
     """Under five lights, in CIEDE2000, where both show something lit, which they do nearly everywhere; with the
-    map's green turned round, they do not."""
-    maps = ExportedMaps.read(exported(detailed, "obj", tmp_path / "obj"))
+    map's green turned round, they do not. On new charts, and on those of a model."""
+    options = ("--uv", str(model)) if has_own_charts else ()
+    maps = ExportedMaps.read(exported(detailed, "obj", tmp_path / "obj", *options))
     camera = FreeCamera(np.array([60.0, -120.0, 280.0]), np.array([30.0, 0.0, 5.0]), (240, 180), 20.0)
     scene = scene_from(RunResult(detailed[1]), replace(camera, size_px=(480, 360)), TEXELS)
 
@@ -109,6 +132,56 @@ def test_materialx_with_maps_is_valid(detailed: Made, tmp_path: Path) -> None:
     np.testing.assert_allclose(lengths, 1.0, atol=1e-5)
 
 
+def test_normals_stand_in_the_frames_of_a_mirrored_texture(detailed: Made, model: Path, tmp_path: Path) -> None:
+    """By the ways of u and v on each triangle, as they follow from its corners alone."""
+    theirs = trimesh.load(model, process=False)
+    uv = np.asarray(theirs.visual.uv) * [-1.0, 1.0] + [1.0, 0.0]
+    mirrored = trimesh.Trimesh(
+        theirs.vertices, theirs.faces, visual=trimesh.visual.TextureVisuals(uv=uv), process=False
+    )
+    (tmp_path / "mirrored.obj").write_text(mirrored.export(file_type="obj", digits=9))
+    for path, hand in ((model, 1.0), (tmp_path / "mirrored.obj", -1.0)):
+        flat = flatten(read_surface(detailed[1], TEXELS, ExportChoice(uv_mesh=path), takes_texels=True))
+        mesh, corners = flat.mesh, flat.mesh.triangles
+        assert (mesh.handedness == hand).mean() > 0.99
+        ab, ac = (mesh.places_mm[corners[:, k]] - mesh.places_mm[corners[:, 0]] for k in (1, 2))
+        ab_uv, ac_uv = (mesh.map_places[corners[:, k]] - mesh.map_places[corners[:, 0]] for k in (1, 2))
+        inverse = np.linalg.inv(np.stack([ab_uv, ac_uv], axis=1))
+        ways = np.einsum("nij,njk->nik", inverse, np.stack([ab, ac], axis=1))
+        along, up = ways[:, 0], -ways[:, 1]
+        row_of = np.full(mesh.numbers.max() + 1, -1)
+        row_of[mesh.numbers] = np.arange(len(mesh.numbers))
+        of_texel = row_of[flat.numbers]
+        outward = mesh.normals[corners[of_texel]].mean(axis=1)
+        made = sum(
+            flat.normals_in_frames[:, k, None] * (way / np.linalg.norm(way, axis=1, keepdims=True))
+            for k, way in enumerate((along[of_texel], up[of_texel], outward))
+        )
+        made /= np.linalg.norm(made, axis=1, keepdims=True)
+        off_deg = np.degrees(np.arccos(np.clip(np.einsum("kx,kx->k", made, flat.normals), -1.0, 1.0)))
+        tilt_deg = np.degrees(np.arccos(np.clip(flat.normals_in_frames[:, 2], -1.0, 1.0)))
+        assert np.median(off_deg) < 0.25 * np.median(tilt_deg)
+
+
+@needs_checkers
+def test_gltf_by_a_models_own_texture_is_valid_and_as_large_as_asked(
+    detailed: Made, model: Path, tmp_path: Path
+) -> None:
+    folder = exported(
+        detailed, "gltf", tmp_path / "gltf", "--uv", str(model), "--texel-mm", "0.25", "--fit", "ggx_normal"
+    )
+    assert gltf_messages(folder / "surface.glb") == []
+    (mesh,) = trimesh.load(folder / "surface.glb").geometry.values()
+    theirs = trimesh.load(model, process=False)
+    width_mm = 1e3 * np.ptp(np.asarray(theirs.vertices), axis=0).max()
+    flat_px = width_mm / 0.96 / 0.25  # slopes want some more
+    assert flat_px <= mesh.visual.material.normalTexture.size[0] < 1.15 * flat_px
+    tree = scipy.spatial.KDTree(np.asarray(theirs.vertices))
+    distance, number = tree.query(np.asarray(mesh.vertices))
+    assert distance.max() < 1e-6
+    np.testing.assert_allclose(mesh.visual.uv, np.asarray(theirs.visual.uv)[number], atol=1e-5)
+
+
 def width_px(folder: Path) -> int:
     return len(np.asarray(cv2.imread(str(folder / "normal.png"))))
 
@@ -128,6 +201,8 @@ def test_maps_are_as_large_as_asked(detailed: Made, tmp_path: Path) -> None:
         (("--to", "ply", "--fit", "texels"), "texels: is for formats with maps"),
         (("--to", "ply", "--map-px", "512"), "--map-px: is for --to gltf, obj, usd, materialx"),
         (("--to", "obj", "--texel-mm", "0.001"), "give --texel-mm"),
+        (("--to", "ply", "--uv", "model.obj"), "--uv: is for --to gltf, obj, usd, materialx"),
+        (("--to", "obj", "--uv", "configs/objects/relief.ply"), "has no texture coordinates"),
     ],
 )
 def test_maps_that_cannot_be_are_refused(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numba
 import numpy as np
@@ -12,10 +13,21 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull, QhullError
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.charts import Floats, Integers, chart_axes, cut_charts, neighbours_of, split_off
+from coupole.exchange.atlas.charts import (
+    Floats,
+    Integers,
+    chart_axes,
+    cut_charts,
+    double_areas,
+    neighbours_of,
+    parts_of,
+    split_off,
+)
 
 PADDING_PX = 4
 """Texels around a chart that continue it: mipmaps of three levels see nothing else."""
+_SAME_PLACE, _MOST_SHARED = 1e-6, 0.01
+"""The step in which given places are compared, and the share of the surface that may lie on others."""
 _MOST_ROUNDS = 12
 _FILL = 0.85
 """Share of a texture that rectangles may be expected to fill; the side grows if they do not fit."""
@@ -43,6 +55,11 @@ class Atlas:
         places = np.empty((len(texels), 3))
         _places(texels, self.triangle_of_texel, self.corners_px, corners_mm, places)
         return places
+
+    @cached_property
+    def handedness(self) -> Floats:
+        """[n] 1 where a triangle's outer side is up in the texture, -1 where it is mirrored."""
+        return np.where(_double_areas_in_map(self.corners_px) > 0.0, -1.0, 1.0)
 
     def barycentric(self, texels: NDArray[np.int64]) -> Floats:
         """[k, 3] weights of the corners of the triangles that texels [k] show, counted row by row."""
@@ -74,6 +91,64 @@ def lay_out(
         chart = split_off(neighbours, chart, is_expelled)
     is_inside = triangle_of_texel >= 0
     return Atlas(side_px, texel_mm, chart, corners_px, _pad(triangle_of_texel), is_inside)
+
+
+def lay_out_by(
+    places: Floats,
+    corners_mm: Floats,
+    triangles: NDArray[np.integer],
+    texel_mm: float,
+    most_side_px: int,
+    *,
+    may_be_coarser: bool = False,
+) -> Atlas:
+    """The same, where the corners' places [n, 3, 2] in the texture are given: 0 to 1, rightwards and downwards.
+    Half of the surface has texels smaller than `texel_mm`.
+
+    Raises InputError if the texture would be wider, or if triangles lie on each other in it.
+    """
+    area_mm2 = np.linalg.norm(double_areas(corners_mm), axis=1)
+    area = np.abs(_double_areas_in_map(places))
+    px_by_mm = np.sqrt(area / np.maximum(area_mm2, 1e-300))
+    side = 1.0 / max(texel_mm * _median_by(px_by_mm, area_mm2), 1e-300)
+    side_px = 4 * max(math.ceil(min(side, 1e9) / 4.0), 1)
+    if side_px > most_side_px and not may_be_coarser:
+        raise InputError(_too_large(texel_mm, side_px, most_side_px))
+    side_px = min(side_px, most_side_px)
+    corners_px = places * side_px
+    triangle_of_texel = np.full((side_px, side_px), -1, np.int32)
+    is_expelled = np.zeros(len(corners_px), np.bool_)
+    _rasterise(corners_px, triangle_of_texel, is_expelled)
+    if area_mm2[is_expelled].sum() > _MOST_SHARED * area_mm2.sum():
+        share = area_mm2[is_expelled].sum() / area_mm2.sum()
+        raise InputError(
+            f"{100.0 * share:.3g} % of the surface lies on other parts of it in the given texture (mirrored or "
+            "stacked charts); unwrap the mesh so that each place has a texel of its own"
+        )
+    is_inside = triangle_of_texel >= 0
+    own_texel_mm = 1.0 / (side_px * _median_by(px_by_mm, area_mm2))
+    chart = _charts_by(places, triangles)
+    return Atlas(side_px, own_texel_mm, chart, corners_px, _pad(triangle_of_texel), is_inside)
+
+
+def _double_areas_in_map(places: Floats) -> Floats:
+    """[n] of places [n, 3, 2]; below 0 where the triangle is seen from its outer side, as down is positive."""
+    ab, ac = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+    return np.asarray(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+
+
+def _median_by(values: Floats, weights: Floats) -> float:
+    order = np.argsort(values)
+    running = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(running, 0.5 * running[-1])])
+
+
+def _charts_by(places: Floats, triangles: NDArray[np.integer]) -> Integers:
+    """[n] charts: parts that hang together on the surface and in the texture, and have the same side up."""
+    keys = np.concatenate([triangles.reshape(-1, 1), np.rint(places.reshape(-1, 2) / _SAME_PLACE)], axis=1)
+    _, number = np.unique(keys.astype(np.int64), axis=0, return_inverse=True)
+    is_mirrored = _double_areas_in_map(places) > 0.0
+    return parts_of(neighbours_of(number.reshape(-1, 3)), is_mirrored.astype(np.int32))
 
 
 def _pack_charts(

@@ -66,8 +66,7 @@ def cut_charts(corners_mm: Floats, neighbours: Integers) -> Integers:
     for _ in range(_ROUNDINGS):
         chart, axes = _grow(normals, means, neighbours, _middles(corners_mm, chart), most)
     _merge(normals, neighbours, chart, axes)
-    parts: Integers = _numbered_parts(neighbours, chart)
-    return parts
+    return parts_of(neighbours, chart)
 
 
 def _middles(corners_mm: Floats, chart: Integers) -> NDArray[np.int64]:
@@ -88,8 +87,12 @@ def chart_axes(corners_mm: Floats, chart: Integers) -> Floats:
 
 def split_off(neighbours: Integers, chart: Integers, is_expelled: NDArray[np.bool_]) -> Integers:
     """The charts [n] anew, where expelled triangles [n] are charts of their own, as far as they hang together."""
-    apart = np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32)
-    parts: Integers = _numbered_parts(neighbours, apart)
+    return parts_of(neighbours, np.where(is_expelled, chart + chart.max() + 1, chart).astype(np.int32))
+
+
+def parts_of(neighbours: Integers, kind: Integers) -> Integers:
+    """[n] charts from 0: triangles of one kind [n] that hang together."""
+    parts: Integers = _numbered_parts(neighbours, kind)
     return parts
 
 

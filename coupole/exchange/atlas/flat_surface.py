@@ -2,7 +2,8 @@
 materials.
 
 The frame in which a normal map is written belongs to the mesh: at each vertex the mean normal N of the triangles
-around it, the tangent T along the map's columns, and N x T, which points up in the map. Within a triangle N and T
+around it, the tangent T along the map's columns, and N x T, which points up in the map (of a chart that a given
+texture has mirrored, T x N does). Within a triangle N and T
 are interpolated and made unit. Programs that make tangents themselves, from a triangle's places in the map, find
 the same T on flat parts.
 """
@@ -16,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coupole.errors import InputError
-from coupole.exchange.atlas.atlas_layout import Atlas, lay_out, nearest_known
+from coupole.exchange.atlas.atlas_layout import Atlas, lay_out, lay_out_by, nearest_known
 from coupole.exchange.atlas.charts import double_areas, unit
 from coupole.exchange.atlas.open_sky import open_sky
+from coupole.exchange.atlas.own_places import OwnPlaces, read_own_places
 from coupole.exchange.material_values import UNCERTAIN, red_green_blue
 from coupole.exchange.of_results.measured_surface import MeasuredSurface
 from coupole.geometry import apply
@@ -47,6 +49,8 @@ class FlatMesh:
     """[v, 3] unit; the same for all vertices of one place."""
     tangents: Floats
     """[v, 3] unit, along the columns of the maps."""
+    handedness: Floats
+    """[v] 1, or -1 in charts that are mirrored: N x T times it points up in the map."""
     map_places: Floats
     """[v, 2] 0 to 1, rightwards and downwards from the maps' top left corner."""
     triangles: NDArray[np.int64]
@@ -99,20 +103,31 @@ def flatten(surface: MeasuredSurface) -> FlatSurface:
     Raises InputError if the maps would be wider than the options say, or than `MOST_SIDE_PX`, or if nothing has a
     material.
     """
+    own_places = read_own_places(surface.options.uv_mesh) if surface.options.uv_mesh else None
     views = open_views(surface.result) if surface.fit == TEXELS else []
     rows = _rows_to_show(surface, views)
-    corners_mm = surface.vertices_mm[surface.triangles[rows]]
+    surface.options.say("charts", 0, 1)
+    rows, atlas = _lay_out(surface, rows, views, own_places)
+    surface.options.say("charts", 1, 1)
+    return _fill(surface, rows, atlas, _Known(surface, views, rows, surface.vertices_mm[surface.triangles[rows]]))
+
+
+def _lay_out(
+    surface: MeasuredSurface, rows: NDArray[np.int64], views: list[TexelView], own_places: OwnPlaces | None
+) -> tuple[NDArray[np.int64], Atlas]:
+    """Places of triangles `rows`, or of those that a mesh with texture coordinates of its own has, too."""
     options = surface.options
-    options.say("charts", 0, 1)
-    atlas = lay_out(
-        corners_mm,
-        surface.triangles[rows],
-        options.texel_mm or _finest_mm(views, corners_mm),
-        options.map_px or MOST_SIDE_PX,
-        may_be_coarser=options.texel_mm is None,
+    corners_mm = surface.vertices_mm[surface.triangles[rows]]
+    texel_mm = options.texel_mm or _finest_mm(views, corners_mm)
+    most_px, may_be_coarser = options.map_px or MOST_SIDE_PX, options.texel_mm is None
+    if own_places is None:
+        triangles = surface.triangles[rows]
+        return rows, lay_out(corners_mm, triangles, texel_mm, most_px, may_be_coarser=may_be_coarser)
+    rows_there, places = own_places.on(corners_mm)
+    triangles = surface.triangles[rows[rows_there]]
+    return rows[rows_there], lay_out_by(
+        places, corners_mm[rows_there], triangles, texel_mm, most_px, may_be_coarser=may_be_coarser
     )
-    options.say("charts", 1, 1)
-    return _fill(surface, rows, atlas, _Known(surface, views, rows, corners_mm))
 
 
 def _rows_to_show(surface: MeasuredSurface, views: list[TexelView]) -> NDArray[np.int64]:
@@ -263,9 +278,9 @@ def _mesh(
     tangents = _tangents(surface.vertices_mm[triangles], atlas.corners_px, corners, normals)
     is_shown = np.zeros(len(rows), np.bool_)
     is_shown[atlas.triangle_of_texel.reshape(-1)[known_texels]] = True
-    places_mm = surface.vertices_mm[vertices]
+    places_mm, handedness = surface.vertices_mm[vertices], np.repeat(atlas.handedness, 3)[first]
     sky = open_sky(surface.vertices_mm[surface.triangles], places_mm, normals)
-    flat = FlatMesh(places_mm, normals, tangents, map_places, corners[is_shown], rows[is_shown], sky)
+    flat = FlatMesh(places_mm, normals, tangents, handedness, map_places, corners[is_shown], rows[is_shown], sky)
     return _Mesh(flat, corners)
 
 
@@ -304,7 +319,8 @@ def _in_frames(mesh: _Mesh, atlas: Atlas, texels: NDArray[np.int64], normals: Si
         corners = mesh.corners[atlas.triangle_of_texel.reshape(-1)[texels[part]]]
         outward = unit(np.einsum("kc,kcx->kx", weights, mesh.flat.normals[corners]))
         along = unit(np.einsum("kc,kcx->kx", weights, mesh.flat.tangents[corners]))
-        frames = np.stack([along, np.cross(outward, along), outward], axis=2)
+        up = np.cross(outward, along) * mesh.flat.handedness[corners[:, :1]]
+        frames = np.stack([along, up, outward], axis=2)
         components = np.linalg.solve(frames, normals[part].astype(np.float64)[..., None])[..., 0]
         components[:, 2] = np.maximum(components[:, 2], 0.0)
         local[part] = unit(components)

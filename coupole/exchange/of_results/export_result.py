@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 
 from coupole.errors import InputError
-from coupole.exchange.formats import MAP_SIZE, Source, Writer, format_named, refuse_others_options
+from coupole.exchange.formats import MAPS, Source, Writer, format_named, refuse_others_options
 from coupole.exchange.of_results.measured_surface import ExportChoice, read_surface
 from coupole.exchange.target_folder import writing_into
 
@@ -29,7 +29,7 @@ def export_result(
     """
     export_format = format_named(to, Source.RESULT, Writer.RESULT)
     refuse_others_options(export_format, ["triangle"] if options and options.triangles else [])
-    surface = read_surface(result, fit, options, takes_texels=MAP_SIZE[0] in export_format.options)
+    surface = read_surface(result, fit, options, takes_texels=MAPS[0] in export_format.options)
     if not overwrite and folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: has files already. Choose another --out, or give --overwrite")
     with writing_into(folder):

@@ -5,7 +5,8 @@ Colour is pi kd, roughness the square root of GGX's alpha, ks stands as the refl
 towards grazing by Schlick's formula and takes from the diffuse one what it reflects; what it takes at normal
 incidence is made up for in the colour.
 
-A material of triangles has one texel for each. Of texels there are maps with a normal and ambient occlusion too.
+A material of triangles has one texel for each. Of texels, or by a mesh's own texture coordinates, there are maps
+with a normal and ambient occlusion too.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from coupole.exchange.atlas.map_codes import colour_map, normal_map, packed_map,
 from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, Floats, MeasuredSurface, under_a_layer
 from coupole.exchange.of_results.texel_layout import middles, texture
 from coupole.exchange.srgb import srgb
-from coupole.reflectance.fits import TEXELS
 from coupole.storage.durable import write_synced
 
 _F0 = 0.04
@@ -51,7 +51,7 @@ class _Contents:
 
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.glb`: metres, y up. Triangles without a material are left out."""
-    contents = _of_maps(flatten(surface)) if surface.fit == TEXELS else _of_triangles(surface)
+    contents = _of_maps(flatten(surface)) if surface.has_maps else _of_triangles(surface)
     arrays = [values.astype("<f4") for values in contents.attributes.values()]
     if contents.triangles is not None:
         arrays.append(contents.triangles.reshape(-1, 1).astype("<u4"))
@@ -87,7 +87,7 @@ def _of_maps(flat: FlatSurface) -> _Contents:
     attributes = {
         "POSITION": (mesh.places_mm @ Y_UP_FROM_SUPPORT.T) * 1e-3,
         "NORMAL": mesh.normals @ Y_UP_FROM_SUPPORT.T,
-        "TANGENT": np.column_stack([mesh.tangents @ Y_UP_FROM_SUPPORT.T, np.ones(len(mesh.tangents))]),
+        "TANGENT": np.column_stack([mesh.tangents @ Y_UP_FROM_SUPPORT.T, mesh.handedness]),
         "TEXCOORD_0": mesh.map_places,
     }
     maps = (colour_map(flat), packed_map(flat), specular_map(flat, _F0 * most_ks), normal_map(flat, 8))

@@ -23,7 +23,6 @@ from coupole.exchange.atlas.flat_surface import flatten
 from coupole.exchange.of_results.measured_surface import Y_UP_FROM_SUPPORT, MeasuredSurface, under_a_layer
 from coupole.exchange.of_results.obj import mesh_text
 from coupole.exchange.of_results.texel_layout import middles, texture
-from coupole.reflectance.fits import TEXELS
 from coupole.storage.durable import write_synced
 
 DOCUMENT, MESH = "surface.mtlx", "surface.obj"
@@ -34,7 +33,7 @@ _SURFACE, _NORMAL = "measured_surface", "normal_of_surface"
 def write(surface: MeasuredSurface, folder: Path) -> list[Path]:
     """`surface.mtlx`, its textures (OpenEXR, float32, linear) and `surface.obj` (metres, y up). Triangles without
     a material are left out."""
-    if surface.fit == TEXELS:
+    if surface.has_maps:
         flat = flatten(surface)
         mesh = mesh_text(flat.mesh, surface.remark, None)
         columns = _columns(under_a_layer(flat.kd, flat.ks), flat.ks, flat.alpha) | {
@@ -75,21 +74,20 @@ def _document(surface: MeasuredSurface) -> bytes:
         "specular_weight": "float",
         "specular_roughness": "float",
     }
-    has_maps = surface.fit == TEXELS
-    suffix, filtering = ("of_texels", "linear") if has_maps else ("of_triangles", "closest")
-    for name, kind in (inputs | ({"normal": "vector3"} if has_maps else {})).items():
+    suffix, filtering = ("of_texels", "linear") if surface.has_maps else ("of_triangles", "closest")
+    for name, kind in (inputs | ({"normal": "vector3"} if surface.has_maps else {})).items():
         image = ET.SubElement(root, "image", name=f"{name}_{suffix}", type=kind)
         ET.SubElement(image, "input", name="file", type="filename", value=f"{name}.exr")
         ET.SubElement(image, "input", name="filtertype", type="string", value=filtering)
         for axis in ("uaddressmode", "vaddressmode"):
             ET.SubElement(image, "input", name=axis, type="string", value="clamp")
-    if has_maps:
+    if surface.has_maps:
         frame = ET.SubElement(root, "normalmap", name=_NORMAL, type="vector3")
         ET.SubElement(frame, "input", name="in", type="vector3", nodename=f"normal_{suffix}")
     shader = ET.SubElement(root, "open_pbr_surface", name=_SURFACE, type="surfaceshader")
     for name, kind in inputs.items():
         ET.SubElement(shader, "input", name=name, type=kind, nodename=f"{name}_{suffix}")
-    if has_maps:
+    if surface.has_maps:
         ET.SubElement(shader, "input", name="geometry_normal", type="vector3", nodename=_NORMAL)
     ET.SubElement(shader, "input", name="specular_ior", type="float", value=str(_IOR))
     material = ET.SubElement(root, "surfacematerial", name=f"{_SURFACE}_material", type="material")

@@ -42,6 +42,8 @@ class ExportChoice:
     """Side of a map's texels; None: as the views have it."""
     map_px: int | None = None
     """Greatest width of maps; None: as large as need be."""
+    uv_mesh: Path | None = None
+    """The same mesh with texture coordinates, in which the maps are laid out; None: on charts of our own."""
     say: Said = _say_nothing
 
 
@@ -76,6 +78,11 @@ class MeasuredSurface:
     def has_material(self) -> NDArray[np.bool_]:
         """[n] triangles that have a material."""
         return np.isfinite(self.alpha) & np.isfinite(self.kd).all(axis=1)
+
+    @property
+    def has_maps(self) -> bool:
+        """Formats that can give each triangle one texel give maps instead."""
+        return self.fit == TEXELS or self.options.uv_mesh is not None
 
     @property
     def remark(self) -> str:

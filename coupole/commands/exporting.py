@@ -153,6 +153,7 @@ def _export_result(request: Asked, console: Console) -> Found:
             request.whole_number("map-px"),
             request.path("uv"),
             say,
+            lambda line: console.print(line, markup=False),
         )
         paths = export_result(
             request.source,

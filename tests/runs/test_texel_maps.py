@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -161,6 +162,25 @@ def test_normals_stand_in_the_frames_of_a_mirrored_texture(detailed: Made, model
         off_deg = np.degrees(np.arccos(np.clip(np.einsum("kx,kx->k", made, flat.normals), -1.0, 1.0)))
         tilt_deg = np.degrees(np.arccos(np.clip(flat.normals_in_frames[:, 2], -1.0, 1.0)))
         assert np.median(off_deg) < 0.25 * np.median(tilt_deg)
+
+
+def test_what_a_model_lacks_is_left_out_and_told(detailed: Made, model: Path, tmp_path: Path) -> None:
+    mesh = trimesh.load(model, process=False)
+    mesh.update_faces(np.arange(len(mesh.faces)) < 0.8 * len(mesh.faces))
+    (tmp_path / "cut.ply").write_bytes(mesh.export(file_type="ply"))
+    out = tmp_path / "obj"
+    ended = cells.here(
+        "export", detailed[1], "--to", "obj", "--out", out, "--uv", tmp_path / "cut.ply", "--fit", "ggx"
+    )
+    assert ended.code == 0, ended.err
+    told = re.search(
+        r"([\d,]+) of ([\d,]+) measured triangles are not in cut.ply: left out", " ".join(ended.out.split())
+    )
+    assert told is not None
+    lost, total = (int(words.replace(",", "")) for words in told.groups())
+    faces = [line for line in (out / "surface.obj").read_text().splitlines() if line.startswith("f ")]
+    assert 0.17 < lost / total < 0.23
+    assert len(faces) <= total - lost
 
 
 @needs_checkers

@@ -124,6 +124,8 @@ def _lay_out(
         triangles = surface.triangles[rows]
         return rows, lay_out(corners_mm, triangles, texel_mm, most_px, may_be_coarser=may_be_coarser)
     rows_there, places = own_places.on(corners_mm)
+    if lost := len(rows) - len(rows_there):
+        options.tell(f"{lost:,} of {len(rows):,} measured triangles are not in {own_places.path.name}: left out")
     triangles = surface.triangles[rows[rows_there]]
     return rows[rows_there], lay_out_by(
         places, corners_mm[rows_there], triangles, texel_mm, most_px, may_be_coarser=may_be_coarser

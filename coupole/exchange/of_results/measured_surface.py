@@ -30,6 +30,10 @@ def _say_nothing(_step: str, _count: int, _total: int) -> None:
     """Progress that nobody watches."""
 
 
+def _tell_nobody(_line: str) -> None:
+    """A line that nobody reads."""
+
+
 @dataclass(frozen=True)
 class ExportChoice:
     """Options of an export, beside its format."""
@@ -45,6 +49,8 @@ class ExportChoice:
     uv_mesh: Path | None = None
     """The same mesh with texture coordinates, in which the maps are laid out; None: on charts of our own."""
     say: Said = _say_nothing
+    tell: Callable[[str], None] = _tell_nobody
+    """Takes a line for whoever asked for the export."""
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,7 @@ def test_what_a_model_lacks_is_left_out_and_told(detailed: Made, model: Path, tm
     )
     assert ended.code == 0, ended.err
     told = re.search(
-        r"([\d,]+) of ([\d,]+) measured triangles are not in cut.ply: left out", " ".join(ended.out.split())
+        r"([\d,]+) of ([\d,]+) measured triangles are not in cut.ply: left out", " ".join(ended.err.split())
     )
     assert told is not None
     lost, total = (int(words.replace(",", "")) for words in told.groups())

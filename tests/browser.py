@@ -36,9 +36,9 @@ needs_chromium = pytest.mark.skipif(
 class Browser:
     """One window."""
 
-    def __init__(self) -> None:
+    def __init__(self, *more: str) -> None:
         options = webdriver.ChromeOptions()
-        for option in QUIET:
+        for option in (*QUIET, *more):
             options.add_argument(option)
         options.binary_location = CHROMIUM or ""
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})

@@ -65,6 +65,32 @@ def gltf_messages(path: Path) -> list[str]:
     return [f"{one['code']} {one['message']}" for one in found["messages"] if one["severity"] < 2]
 
 
+_OF_ANNOTATIONS = """
+const { items, ...page } = JSON.parse(require("fs").readFileSync(0, "utf8"));
+const isValid = require("validate-web-annotation");
+const each = items.map(({ created, ...item }) => ({ "@context": page["@context"], ...item }));
+console.log(JSON.stringify(each.filter((item) => !isValid(item)).map(({ id }) => id)));
+"""
+
+
+def annotation_faults(page: dict[str, Any]) -> list[str]:
+    """Ids of the annotations of a W3C AnnotationPage that validate-web-annotation refuses, each with the page's
+    context; without `created`, for which it wants a day where the data model has a time."""
+    node = shutil.which("node") or HOME / "bin/node"
+    environment = os.environ | {"NODE_PATH": str(HOME / "node/node_modules")}
+    told = subprocess.run(
+        [str(node), "-e", _OF_ANNOTATIONS],
+        input=json.dumps(page),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        env=environment,
+        check=True,
+    )
+    faults: list[str] = json.loads(told.stdout)
+    return faults
+
+
 def crate_issues(crate: Path, aside: Path, severity: str = "required") -> list[str]:
     """What the RO-Crate community's roc-validator misses of RO-Crate 1.1, of a severity and above. Without a
     network: the context is the one that ro-crate-py brings, of 1.3, which has all terms of 1.1."""

@@ -45,7 +45,14 @@ class Page:
         self.browser.open(f"{path.as_uri()}{address}")
         cells.wait_until(lambda: self.run("Boolean(window.coupole?.readPixel)"), "the page's interface")
         self.run("coupole.setSamples(1)")  # it rests after each change
+        self.show_settings()
         self.beginning = self.run("coupole.state")
+
+    def show_settings(self, *sections: str) -> None:
+        """Open the panel, and sections of it."""
+        self.driver.execute_script("document.querySelector('#settings[aria-expanded=false]')?.click()")
+        for name in sections:
+            self.driver.execute_script(f"document.getElementById('{name}').open = true")
 
     def run(self, script: str) -> Any:
         return self.browser.run(script)
@@ -110,7 +117,7 @@ def difference(picture: np.ndarray, other: np.ndarray, white: float) -> np.ndarr
 
 @contextmanager
 def opened_page() -> Iterator[Page]:
-    browser = Browser()
+    browser = Browser("--force-prefers-reduced-motion")  # else the light moves
     browser.driver.set_window_size(*SMALL)
     browser.driver.set_network_conditions(offline=True, latency=0, throughput=0)
     yield Page(browser)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -18,6 +19,7 @@ from coupole.errors import CoupoleError, InputError
 
 if TYPE_CHECKING:
     from coupole.exchange.look.look_blocks import Look
+    from coupole.exchange.look.look_of_runs import OtherState
 
 SourceArgument = Annotated[
     Path,
@@ -68,6 +70,19 @@ MapOption = Annotated[
         show_default=False,
     ),
 ]
+BesideOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--beside",
+        metavar="RESULT",
+        help="For a result of runs: another result of the same object (another state of it), to compare with by a "
+        "slider. It is brought onto the first by what did not change.",
+        show_default=False,
+    ),
+]
+AlignedOption = Annotated[
+    bool, typer.Option("--aligned", help="With --beside: both are in one frame already; do not align them.")
+]
 
 
 @dataclass(frozen=True)
@@ -80,6 +95,8 @@ class ShowOptions:
     residual_planes: PlanesOption = None
     fit: FitOption = None
     map_px: MapOption = None
+    beside: BesideOption = None
+    is_aligned: AlignedOption = False
 
 
 @flatten_options
@@ -137,7 +154,10 @@ def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], Non
         "--residual-planes": options.residual_planes is not None,
         "--fit": options.fit,
         "--map-px": options.map_px,
+        "--beside": options.beside,
     }
+    if options.beside is None:
+        _refuse({"--aligned": options.is_aligned}, "there is no --beside")
     if source.is_file():
         _refuse(views | of_runs | environment, f"{source} is a scene")
         return _look_of_scene(source)
@@ -150,11 +170,40 @@ def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], Non
             return with_environment(look_of_pictures(source), options.environment, OF_PICTURES)
         if (source / run_result.OBJECT).exists():
             _refuse(views, f"{source} is a result")
-            choice = PageChoice(options.fit, options.residual_planes, options.samples, options.map_px or MOST_PX)
+            other = _other_state(source, options.beside, is_aligned=options.is_aligned) if options.beside else None
+            map_px = options.map_px or MOST_PX
+            choice = PageChoice(options.fit, options.residual_planes, options.samples, map_px, beside=other)
             return with_environment(look_of_result(source, say, choice), options.environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")
+
+
+def _other_state(first: Path, other: Path, *, is_aligned: bool) -> OtherState:
+    """Bring another result onto the first. Raises InputError if it is none, or of something else; ExtraMissing."""
+    import numpy as np
+
+    from coupole.exchange.look.look_of_runs import OtherState
+    from coupole.heritage.comparison.result_state import read_result_state
+    from coupole.heritage.comparison.unchanged_alignment import align
+    from coupole.reflectance import run_result
+
+    if other.resolve() == first.resolve():
+        raise InputError(f"--beside {other}: is the result itself; name another state of the object")
+    if not (other / run_result.OBJECT).exists():
+        raise InputError(f"--beside {other}: expected a result of runs (`coupole reflectance RUN --out FOLDER`)")
+    if is_aligned:
+        return OtherState(other, np.eye(4), "Both were said to be in one frame; nothing was aligned.")
+    try:
+        alignment = align(read_result_state(first), read_result_state(other))
+    except InputError as error:
+        raise InputError(f"--beside {other}: {error}") from error
+    u_mm = math.sqrt(float(np.trace(alignment.covariance[:3, :3])))
+    told = (
+        f"Brought together by what did not change, standard uncertainty {u_mm:.2g} mm; surfaces that did not "
+        f"change lie {alignment.noise_mm:.2g} mm apart (rms)."
+    )
+    return OtherState(other, alignment.before_from_after, told)
 
 
 def _look_of_scene(path: Path) -> Look:

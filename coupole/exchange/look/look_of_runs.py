@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,18 @@ class PageChoice:
     """Greatest width of maps."""
     coarse_over: int = MOST_TRIANGLES
     """Triangles of a mesh above which a coarse one is shown first."""
+    beside: OtherState | None = None
+
+
+@dataclass(frozen=True)
+class OtherState:
+    """A result of the same object at another time."""
+
+    folder: Path
+    first_from_other: Floats
+    """[4, 4] between the support frames of both results, mm."""
+    told: str
+    """How the two were brought together, in a sentence."""
 
 
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
@@ -62,14 +74,17 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
     planes = 0 if texels else PLANES if choice.planes is None else choice.planes
     left_of = residual_fit(result) if planes and choice.fit is None else None
     fit = TEXELS if texels else choice.fit or left_of or best_fit(result, MATERIALS)
+    other = _other_state(choice, fit, say) if choice.beside else None
     support_from_base = inverse(result.base_from_support)
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
-    places, triangles, origin_mm, step_mm = weld_corners(corners_mm)
+    both_mm = np.concatenate([corners_mm, other.corners_mm]) if other else corners_mm
+    places, triangles, origin_mm, step_mm = weld_corners(corners_mm, both_mm)
     count = len(triangles)
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
     of_triangles = texels.of_triangles if texels else _materials(result, fit, support_from_base)
     count_measured = int(np.count_nonzero(of_triangles["gloss"][:, 0]))
     maps = {"map_places": texels.map_places} if texels else {}
+    box_steps = np.rint((np.stack([both_mm.min(axis=0), both_mm.max(axis=0)]) - origin_mm) / step_mm)
     blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles | maps).items())
     views = [frames for view in result.views if (frames := frames_of_view(result, view, support_from_base))]
     about: dict[str, Any] = {
@@ -78,6 +93,8 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "simulated": bool(source_about.get("simulated")),
         "software": source_about.get("software", {}),
         "views": [view for view, _ in views],
+        "scan_noise_um": source_about.get("scan_noise_um"),
+        "mesh_sha256": source_about.get("mesh"),
         "led_exponent": 2 if source_about.get("emission") == "paper" else 1,
         "triangles": count,
         "measured": count_measured,
@@ -90,7 +107,7 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
             "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
             "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
         },
-        "box": [places.min(axis=0).tolist(), places.max(axis=0).tolist()],
+        "box": box_steps.astype(int).tolist(),
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
@@ -99,6 +116,9 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         about["texels"], later = texels.about, texels.blocks
         about["told"]["Texels"] = texels.remark
     later += [block for _, pictures in views for block in pictures]
+    if other:
+        about["beside"], blocks_of_other = other.look(both_mm)
+        later += blocks_of_other
     errors = (_ERRORS_OF_TEXELS if texels else _ERRORS) | {
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
@@ -110,15 +130,19 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
     return Look(about, blocks, tuple(later), coarse, errors)
 
 
-def _texels_of(result: RunResult, choice: PageChoice, say: Said) -> LookTexels | None:
-    """Texels, unless triangles are to be shown."""
+def _texels_of(
+    result: RunResult, choice: PageChoice, say: Said, turn: Floats | None = None, prefix: str = ""
+) -> LookTexels | None:
+    """Texels, unless triangles are to be shown. A rotation [3, 3] turns their normals."""
     if choice.fit not in (None, TEXELS) or (choice.fit is None and (choice.planes or not has_texels(result))):
         return None
     if choice.planes:
         raise InputError("--residual-planes: a residual is what triangles leave; texels have none")
     options = ExportChoice(map_px=choice.map_px, say=say)
     flat = flatten(read_surface(result.folder, TEXELS, options, takes_texels=True))
-    return look_texels(flat, len(result.corners_mm))
+    if turn is not None:
+        flat = replace(flat, normals=(flat.normals @ turn.T).astype(np.float32))
+    return look_texels(flat, len(result.corners_mm), prefix)
 
 
 _ERRORS_OF_TEXELS = {
@@ -186,11 +210,58 @@ def _coarse_blocks(
     return tuple(block_of(f"first-{name}", values) for name, values in arrays.items())
 
 
-def weld_corners(corners_mm: Floats) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
+@dataclass(frozen=True)
+class _Other:
+    """The other state in the frame of the first."""
+
+    name: str
+    told: str
+    fit: str
+    corners_mm: Floats
+    """[3 n, 3]"""
+    of_triangles: dict[str, NDArray[Any]]
+    texels: LookTexels | None
+
+    def look(self, both_mm: Floats) -> tuple[dict[str, Any], list[Block]]:
+        """Return what the page knows of it, and its blocks; `both_mm` are the corners of both states."""
+        places, triangles, _, _ = weld_corners(self.corners_mm, both_mm)
+        arrays: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles, **self.of_triangles}
+        if self.texels:
+            arrays["map_places"] = self.texels.map_places
+        about: dict[str, Any] = {"name": self.name, "told": self.told, "fit": self.fit, "blocks": list(arrays)}
+        about["texels"] = self.texels.about if self.texels else None
+        blocks = [block_of(f"{_BESIDE}{name}", values) for name, values in arrays.items()]
+        return about, blocks + (self.texels.blocks if self.texels else [])
+
+
+_BESIDE = "beside-"
+
+
+def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
+    """Read the other state, by the fit of the first if it has that. Raises InputError as `look_of_result` does."""
+    assert choice.beside is not None
+    folder, first_from_other = choice.beside.folder, choice.beside.first_from_other
+    read_about(folder)
+    result = RunResult(folder)
+    other_choice = replace(choice, planes=None, fit=choice.fit if fit_of_first == TEXELS else fit_of_first)
+    texels = _texels_of(result, other_choice, say, first_from_other[:3, :3], _BESIDE)
+    has_same = fit_of_first in MATERIALS and result.materials_path(fit_of_first).exists()
+    fit = TEXELS if texels else choice.fit or (fit_of_first if has_same else best_fit(result, MATERIALS))
+    first_from_base = first_from_other @ inverse(result.base_from_support)
+    corners_mm = apply(first_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
+    of_triangles = texels.of_triangles if texels else _materials(result, fit, first_from_base)
+    return _Other(folder.resolve().name, choice.beside.told, fit, corners_mm, of_triangles, texels)
+
+
+def weld_corners(
+    corners_mm: Floats, within_mm: Floats | None = None
+) -> tuple[NDArray[np.uint16], NDArray[np.uint32], Floats, float]:
     """Weld corners [3 n, 3] of triangles. Returns places [m, 3] in steps from an origin, each once, in the order
-    of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm."""
-    origin_mm = corners_mm.min(axis=0)
-    step_mm = max(float(np.ptp(corners_mm, axis=0).max()), 1e-6) / PLACES
+    of their first use; triangles [n, 3] as numbers of places; [3] origin and step, mm, which are those of all
+    places `within_mm` [m, 3] (of the corners, without them)."""
+    within_mm = corners_mm if within_mm is None else within_mm
+    origin_mm = within_mm.min(axis=0)
+    step_mm = max(float(np.ptp(within_mm, axis=0).max()), 1e-6) / PLACES
     steps = np.rint((corners_mm - origin_mm) / step_mm).astype(np.uint64)
     keys = steps[:, 0] << np.uint64(32) | steps[:, 1] << np.uint64(16) | steps[:, 2]
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)

@@ -39,12 +39,12 @@ class LookTexels:
     """Tiles, in the order in which they are wanted."""
 
 
-def look_texels(flat: FlatSurface, count: int) -> LookTexels:
-    """Make them from maps, for a mesh of `count` triangles."""
+def look_texels(flat: FlatSurface, count: int, prefix: str = "") -> LookTexels:
+    """Make them from maps, for a mesh of `count` triangles; `prefix` begins the names of their blocks."""
     peaks = [max(float(np.quantile(values, 0.9999)), 1e-6) for values in (flat.kd, flat.ks)]
     about: dict[str, Any] = {"side_px": flat.side_px, "tile_px": TILE_PX, "peaks": peaks, "tiles": []}
     blocks = []
-    for column, row, tile in _tiles(flat, peaks):
+    for column, row, tile in _tiles(flat, peaks, prefix):
         blocks += tile
         place = {"column": column, "row": row, "blocks": [block.name for block in tile]}
         about["tiles"].append({**place, "size_px": list(tile[1].shape[1::-1])})
@@ -80,7 +80,7 @@ def _means(flat: FlatSurface, count: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def _tiles(flat: FlatSurface, peaks: list[float]) -> Iterator[tuple[int, int, list[Block]]]:
+def _tiles(flat: FlatSurface, peaks: list[float], prefix: str) -> Iterator[tuple[int, int, list[Block]]]:
     """Column and row of each tile in which there is something, and its blocks: shape, kd and ks."""
     shape = _shape_codes(flat)
     colours = [
@@ -92,7 +92,7 @@ def _tiles(flat: FlatSurface, peaks: list[float]) -> Iterator[tuple[int, int, li
             texels = flat.texel_of_place[top : top + TILE_PX, first_column : first_column + TILE_PX]
             if not (texels >= 0).any():
                 continue
-            name = f"texels-{top // TILE_PX}-{first_column // TILE_PX}"
+            name = f"{prefix}texels-{top // TILE_PX}-{first_column // TILE_PX}"
             is_known = (texels >= 0)[..., None]
             planes = np.where(is_known, shape[texels], 0).transpose(2, 0, 1)
             blocks = [block_of(f"{name}-shape", np.ascontiguousarray(planes))]

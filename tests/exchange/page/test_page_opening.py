@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from browser import needs_chromium
 from relight_cases import GLOSSY, waves, write_result
+from selenium.webdriver.common.action_chains import ActionChains
 from shown_page import SMALL, Page
 
 from coupole.exchange.look.look_blocks import block_of
@@ -124,3 +125,69 @@ def test_the_coarse_picture_stays_where_the_rest_is_missing(page: Page, folder: 
         return shown.getImageData(0, 0, 60, 60).data.filter((value, k) => k % 4 === 1 && value > 60).length;
     })()"""
     assert page.run(bright) > 300
+
+
+MOTION = "Emulation.setEmulatedMedia"
+
+
+def test_the_light_moves_at_first_and_stops_where_it_is_at_the_first_touch(page: Page, folder: Path) -> None:
+    page.driver.execute_cdp_cmd(
+        MOTION, {"features": [{"name": "prefers-reduced-motion", "value": "no-preference"}]}
+    )
+    try:
+        page.opened = None
+        page.browser.open((folder / "look.html").as_uri())
+        way = "coupole.state?.lights[0].direction"
+        first = cells.wait_until(lambda: page.run(way), "the page's interface")
+        cells.wait_until(lambda: np.abs(np.subtract(page.run(way), first)).max() > 0.02, "the light to move")
+        assert page.browser.at("#moving").get_attribute("aria-pressed") == "true"
+        assert not page.browser.at("#panel").is_displayed()
+        ActionChains(page.driver).move_to_element(page.browser.at("#picture")).click().perform()
+        assert page.browser.at("#moving").get_attribute("aria-pressed") == "false"
+        rests = page.run(way)
+        time.sleep(0.5)
+        assert page.run(way) == rests
+        page.browser.at("#moving").click()
+        cells.wait_until(lambda: np.abs(np.subtract(page.run(way), rests)).max() > 0.02, "the light to move again")
+        page.run("coupole.setSamples(1)")
+    finally:
+        page.driver.execute_cdp_cmd(MOTION, {"features": []})
+
+
+def test_no_light_moves_for_who_wants_less_motion_or_has_an_address(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html", "#")
+    assert page.browser.at("#moving").get_attribute("aria-pressed") == "false"
+    address = page.run("location.hash") or "#"
+    page.driver.execute_cdp_cmd(
+        MOTION, {"features": [{"name": "prefers-reduced-motion", "value": "no-preference"}]}
+    )
+    try:
+        page.browser.at("#link").click()
+        address = page.run("location.hash")
+        page.open(folder / "look.html", address)
+        before = page.run("coupole.state.lights[0].direction")
+        time.sleep(0.5)
+        assert page.run("coupole.state.lights[0].direction") == before
+    finally:
+        page.driver.execute_cdp_cmd(MOTION, {"features": []})
+
+
+def test_the_object_fills_the_window_between_words_and_tools(page: Page, folder: Path) -> None:
+    page.open(folder / "look.html", "#")
+    page.wide()
+    page.browser.at("#reset").click()
+    seen = page.driver.execute_script("""
+        const { width, height, rgba } = coupole.readPicture(), found = [width, height, 0, 0];
+        for (let k = 0; k < rgba.length; k += 4) {
+          if (rgba[k + 3] < 0.5) continue;
+          const x = k / 4 % width, y = Math.floor(k / 4 / width);
+          found[0] = Math.min(found[0], x); found[1] = Math.min(found[1], y);
+          found[2] = Math.max(found[2], x); found[3] = Math.max(found[3], y);
+        }
+        const stage = document.getElementById("stage").getBoundingClientRect();
+        const end = (name, side) => document.getElementById(name).getBoundingClientRect()[side] - stage.top;
+        return { found, width, top: end("words", "bottom"), bottom: end("tools", "top") };""")
+    left, top, right, bottom = seen["found"]
+    assert top >= seen["top"] - 1
+    assert bottom <= seen["bottom"] + 1
+    assert max((right - left) / seen["width"], (bottom - top) / (seen["bottom"] - seen["top"])) > 0.9

@@ -17,15 +17,18 @@ class App {
     this.lost = new Set();
     this.theme = new Theme(() => this.changed("screen"));
     this.samples = new Samples(about);
+    this.detail = new Detail();
     this.tool = "turn";
     this.ruler = [];
     this.pinned = null;
     this.most = SAMPLES;
     this.fitCanvas();
-    this.state = stateOf(location.hash.slice(1)) ?? startState();
+    const found = stateOf(location.hash.slice(1));
+    this.state = found ?? startState();
     if (about.kind === "run") this.state.view ||= about.views[0].name;
-    this.state.camera ??= this.startCamera();
+    this.state.camera ??= this.wholeCamera = this.startCamera();
     this.controls = new Controls(this, (what) => this.changed(what));
+    this.moving = new MovingLight(this);
     new Pointer(this, this.canvas, byId("sphere"));
     this.listen();
     this.tellAbout();
@@ -35,6 +38,11 @@ class App {
     }
     this.isNew = !this.state.white;
     this.changed("light");
+    if (!found) this.moving.begin();
+  }
+
+  get chosenLight() {
+    return this.state.lights[this.state.chosen];
   }
 
   /** All of the mesh has come. */
@@ -45,8 +53,24 @@ class App {
 
   startCamera() {
     if (this.about.start) return structuredClone(this.about.start.camera);
-    const above = this.about.picture_px ? 90 : 50;
-    return startCamera(this.renderer.corners, this.canvas.width, this.canvas.height, above);
+    const above = this.about.picture_px ? 90 : 50, { width, height } = this.canvas;
+    const whole = startCamera(this.renderer.corners, width, height, above);
+    return framed(whole, this.renderer.outline, width, height, this.freeArea());
+  }
+
+  /** The part of the canvas that neither words nor tools lie over, px: left, top, right, bottom. */
+  freeArea() {
+    const { width, height } = this.canvas, scale = height / Math.max(this.canvas.clientHeight, 1);
+    const stage = byId("stage").getBoundingClientRect();
+    const top = (byId("words").getBoundingClientRect().bottom - stage.top) * scale;
+    const bottom = (byId("tools").getBoundingClientRect().top - stage.top) * scale;
+    return bottom - top > height / 2 ? [0, top, width, bottom] : [0, 0, width, height];
+  }
+
+  /** Show or hide the settings. */
+  showPanel(isShown) {
+    byId("panel").hidden = !isShown;
+    byId("settings").setAttribute("aria-expanded", String(isShown));
   }
 
   listen() {
@@ -55,10 +79,13 @@ class App {
     for (const name of ["focus", "blur"]) this.canvas.addEventListener(name, () => this.showMarks());
     this.canvas.addEventListener("webglcontextlost", () => this.say("The graphics failed: load the page again."));
     byId("tools").addEventListener("click", (event) => this.choose(event.target.dataset.tool));
+    byId("settings").addEventListener("click", () => this.showPanel(byId("panel").hidden));
     byId("reset").addEventListener("click", () => this.showAll());
     byId("snapshot").addEventListener("click", () => this.snapshot());
     byId("link").addEventListener("click", () => this.copyLink());
     byId("notes").addEventListener("click", (event) => this.pressedNote(event.target.dataset));
+    byId("save-notes").addEventListener("click", () => this.saveNotes());
+    byId("load-notes").addEventListener("change", () => this.loadNotes(byId("load-notes")));
     byId("note-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.keepNote(byId("note-text").value.trim());
@@ -74,6 +101,7 @@ class App {
       return;
     }
     this.state.view = view ? name : "";
+    if (view) this.state.beside = "";
     this.state.camera = view ? cameraOf(view, this.renderer.corners, width, height) : this.startCamera();
     this.changed("light");
   }
@@ -87,6 +115,7 @@ class App {
     const wanted = this.missing();
     if (!wanted || this.isBringing) return;
     this.isBringing = true;
+    if (wanted.told) this.say(wanted.told);
     try {
       await wanted.bring();
     } catch (error) {
@@ -105,6 +134,8 @@ class App {
       const { frame } = found, { block: name } = frame;
       wanted.push({ name, bring: async () => renderer.keepFrame(frame, await laterBlock(this.about, name)) });
     }
+    const other = renderer.missingBeside(this.state);
+    if (other) wanted.push({ name: other.name, told: "Reading the other state…", bring: () => this.bringBeside() });
     if (view) wanted.push({ name: view.blocks[0], bring: () => renderer.residual.bring(view) });
     const tile = renderer.missingTexels;
     if (tile) wanted.push({ name: tile.blocks[0], bring: () => this.bringTexels(tile) });
@@ -112,9 +143,14 @@ class App {
   }
 
   async bringTexels(tile) {
-    const { texels } = this.renderer;
+    const texels = this.renderer.bodies.map((body) => body.texels).find(({ wanted }) => wanted === tile);
     await texels.bring(tile);
     this.say(texels.told());
+  }
+
+  async bringBeside() {
+    await this.renderer.bringBeside();
+    this.say("");
   }
 
   /** More of the picture has come, or has failed to. */
@@ -139,11 +175,14 @@ class App {
 
   /** Something of the state is new: all, or only how the mean is shown ("screen"). */
   changed(what) {
-    if (what !== "screen") this.renderer.restart();
+    if (what !== "screen") {
+      this.renderer.restart();
+      this.detail.moved();
+    }
     this.controls.show();
     this.bring();
     byId("banner").textContent = this.banner();
-    drawSphere(byId("sphere"), this.state.camera, this.state.lights, this.state.chosen, this.renderer.dome?.(this.state));
+    this.showSphere();
     this.showMarks();
     this.wanted = true;
     this.schedule();
@@ -153,6 +192,7 @@ class App {
 
   goTo(state) {
     if (!state) return;
+    this.moving.stop();
     this.state = { ...state, camera: state.camera ?? this.startCamera(), white: state.white || this.state.white };
     this.changed("light");
   }
@@ -160,11 +200,46 @@ class App {
   schedule() {
     this.frame ??= requestAnimationFrame(() => {
       this.frame = null;
-      if (this.renderer.samples < this.most) this.draw();
+      this.goOn();
+      if (this.renderer.samples < this.most) this.drawInTime();
       else if (this.wanted) this.renderer.show(this.state, this.theme.ground);
       this.wanted = false;
-      if (this.renderer.samples < this.most) this.schedule();
+      if (this.moving.isMoving) setTimeout(() => this.schedule(), this.detail.took_ms);  // others want the machine too
+      else if (this.renderer.samples < this.most) this.schedule();
     });
+  }
+
+  /** Go on with what moves by itself; what rests has all of its detail. */
+  goOn() {
+    if (this.moving.isMoving) {
+      this.moving.step();
+      this.detail.moved();
+      this.renderer.restart();
+      if (!byId("panel").hidden) this.showSphere();
+    } else if (!this.detail.isInMotion && this.detail.restore() && this.fitCanvas()) {
+      this.renderer.restart();
+    }
+  }
+
+  /** Draw; while something moves, in as much detail as comes fast enough. */
+  drawInTime() {
+    const begun = performance.now();
+    this.draw();
+    if (!this.detail.isInMotion) return;
+    this.renderer.read(0, 0, 1, 1);  // waits for it
+    if (this.detail.isTooFine(performance.now() - begun) && this.fitCanvas()) this.renderer.restart();
+    if (this.moving.isMoving && this.detail.isHopeless) this.moving.stop();
+  }
+
+  /** All of the detail, at once. */
+  rest() {
+    if (!this.detail.restore() || !this.fitCanvas()) return;
+    this.renderer.restart();
+    this.draw();
+  }
+
+  showSphere() {
+    drawSphere(byId("sphere"), this.state.camera, this.state.lights, this.state.chosen, this.renderer.dome?.(this.state));
   }
 
   draw() {
@@ -183,6 +258,7 @@ class App {
 
   /** Draw until the mean has so many samples. */
   settle(samples) {
+    this.rest();
     while (this.renderer.samples < samples) this.draw();
     this.renderer.read(0, 0, 1, 1);  // waits for it
   }
@@ -191,7 +267,7 @@ class App {
   fitCanvas() {
     const { clientWidth: width, clientHeight: height } = byId("stage");
     const wished = Math.min(window.devicePixelRatio || 1, 2);
-    this.scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
+    this.scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1))) * this.detail.share;
     const size = [width, height].map((side) => Math.max(1, Math.round(side * this.scale)));
     if (size[0] === this.canvas.width && size[1] === this.canvas.height) return false;
     [this.canvas.width, this.canvas.height] = size;
@@ -200,6 +276,7 @@ class App {
 
   resize() {
     if (!this.fitCanvas()) return;
+    if (this.state.camera === this.wholeCamera) this.state.camera = this.wholeCamera = this.startCamera();
     this.renderer.restart();
     this.draw();
     this.changed("screen");
@@ -250,7 +327,7 @@ class App {
 
   showAll() {
     this.leaveFrame();
-    this.state.camera = this.startCamera();
+    this.state.camera = this.wholeCamera = this.startCamera();
     this.changed("light");
   }
 
@@ -285,6 +362,7 @@ class App {
 
   /** What is seen at a place of the page. */
   seenAt(x, y) {
+    this.rest();
     const found = this.renderer.seenAt(Math.floor(x * this.scale), Math.floor(y * this.scale));
     if (!found) this.say("There is nothing of the object at this place.");
     return found;
@@ -301,11 +379,11 @@ class App {
       this.tellPoint(this.renderer.toldAt(found));
       return;
     }
-    const material = this.renderer.materialOf(found.triangle);
+    const material = this.renderer.materialOf(found.triangle, found.body);
     const view = unit(minus(axesOf(this.state.camera).place, found.place));
     const angle = material ? degrees(Math.acos(clamp(dot(view, material.normal), -1, 1))) : 0;
     this.tellPoint(toldOf(found.triangle, found.place, material, Math.min(angle, PLOT.reach)));
-    if (material && this.about.samples) this.tellSamples(found, material);
+    if (material && this.about.samples && !found.body) this.tellSamples(found, material);
   }
 
   /** Samples of a triangle, when they have come. */
@@ -332,6 +410,7 @@ class App {
 
   tellPoint(markup) {
     byId("point").innerHTML = markup;
+    this.showPanel(true);
     byId("point-section").open = true;
     byId("point-section").scrollIntoView({ block: "nearest" });
     this.say("");
@@ -340,16 +419,25 @@ class App {
   measure(x, y) {
     const found = this.seenAt(x, y);
     if (!found) return;
-    this.ruler = [...this.ruler.slice(this.ruler.length === 2 ? 2 : 0), found.place];
-    const [one, other] = this.ruler;
-    this.say(other ? `Straight distance ${lengthText(length(minus(other, one)))}` : "Now the other end.");
+    const { height, width } = this.canvas, normal = this.renderer.faceOf(found);
+    const cosine = dot(normal, unit(minus(axesOf(this.state.camera).place, found.place)));
+    const parts = partsOfEnd(this.about, this.state.camera, Math.min(width, height), found.place, cosine);
+    this.ruler = [...this.ruler.slice(this.ruler.length === 2 ? 2 : 0), { place: found.place, parts }];
+    if (this.ruler.length === 2) this.keepLength(measuredLength(this.about, this.ruler));
+    else this.say("Now the other end.");
     this.showMarks();
+  }
+
+  keepLength(measured) {
+    this.say(`Straight distance ${measuredText(measured)}`);
+    byId("lengths").append(Object.assign(document.createElement("li"), { textContent: lengthTold(measured) }));
   }
 
   pin(x, y) {
     const found = this.seenAt(x, y);
     if (!found) return;
     this.pinned = found.place;
+    this.showPanel(true);
     byId("notes-section").open = true;
     byId("note-text").focus();
     this.say("Write the note, then press Enter.");
@@ -362,11 +450,49 @@ class App {
       return;
     }
     const { camera, lights } = structuredClone(this.state);
-    this.state.notes.push({ text, place: this.pinned, camera, lights });
+    const by = byId("note-by").value.trim();
+    this.state.notes.push({ text, place: this.pinned, camera, lights, by, id: newId(), created: new Date().toISOString() });
     this.pinned = null;
     byId("note-text").value = "";
     this.say("");
     this.changed("screen");
+  }
+
+  saveNotes() {
+    if (!this.state.notes.length) {
+      this.say("There are no notes yet.");
+      return;
+    }
+    for (const note of this.state.notes) {
+      note.id ??= newId();
+      note.created ??= new Date().toISOString();
+    }
+    const text = annotationsText(this.about, this.state.notes);
+    saveAs(`${this.about.title}.annotations.jsonld`, new Blob([text], { type: "application/ld+json" }));
+  }
+
+  /** Add the notes of a file that somebody chose, in place of those of the same id. */
+  async loadNotes(input) {
+    const [file] = input.files;
+    if (!file) return;
+    try {
+      const text = await file.text(), { camera, lights } = structuredClone(this.state);
+      const found = notesOf(this.about, text, { camera, lights }, (place) => this.distanceTo(place), OFF_SURFACE * this.renderer.radius);
+      const ids = new Set(found.map(({ id }) => id));
+      this.state.notes = [...this.state.notes.filter(({ id }) => !ids.has(id)), ...found];
+      this.changed("screen");
+      this.say(`${found.length} ${found.length === 1 ? "note" : "notes"} of ${file.name}`);
+    } catch (error) {
+      this.say(`${file.name}: ${error.message}`);
+    }
+    input.value = "";
+  }
+
+  /** How far a place is from the surface; of pictures, from their rectangle, px. */
+  distanceTo(place) {
+    if (!this.about.picture_px) return distanceToMesh(this.renderer.bodies[0].arrays, this.about, place);
+    const inside = this.about.picture_px.map((side, k) => clamp(place[k], 0, side));
+    return length(minus(place, [...inside, 0]));
   }
 
   pressedNote({ show, remove }) {
@@ -443,12 +569,7 @@ class App {
     const white = isLit(this.state.mode) ? ` · white ${shown.toPrecision(4)} ${unit}` : "";
     const words = `${this.about.title} · ${MODES[this.state.mode]}${white} · ${this.banner()}`;
     context.fillText(words, 8 * this.scale, height + line * 0.68, width - 16 * this.scale);
-    made.toBlob((blob) => {
-      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob) });
-      link.download = `${this.about.title}.png`;
-      link.click();
-      URL.revokeObjectURL(link.href);
-    });
+    made.toBlob((blob) => saveAs(`${this.about.title}.png`, blob));
   }
 
   async copyLink() {

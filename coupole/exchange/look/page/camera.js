@@ -17,6 +17,24 @@ function startCamera(corners, width, height, above) {
   return { ...camera, distance: Math.max(...needed) };
 }
 
+const FRAME_ROUNDS = 8, FRAME_FILL = 0.96;
+
+/** The same camera, nearer and aside, so that places of the object fill an area of the picture: [left, top, right,
+ * bottom], px. */
+function framed(camera, places, width, height, [left, top, right, bottom]) {
+  let found = camera;
+  for (let round = 0; round < FRAME_ROUNDS; round++) {
+    const seen = places.map((place) => projected(found, width, height, place));
+    if (seen.includes(null)) return camera;
+    const [x, y] = [0, 1].map((k) => seen.map((at) => at[k]));
+    const [low, high] = [Math.min, Math.max].map((end) => [end(...x), end(...y)]);
+    const factor = Math.max((high[0] - low[0]) / (right - left), (high[1] - low[1]) / (bottom - top)) / FRAME_FILL;
+    found = moved(found, (left + right - low[0] - high[0]) / 2, (top + bottom - low[1] - high[1]) / 2, Math.min(width, height));
+    if (factor > 0) found = { ...found, distance: found.distance * factor };
+  }
+  return found;
+}
+
 /** Right, up and back of a camera, and where it is. */
 function axesOf(camera) {
   const a = radians(camera.azimuth), h = radians(camera.height);

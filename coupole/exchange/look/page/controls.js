@@ -18,6 +18,8 @@ class Controls {
     byId("quantity").append(...choices(UNCERTAIN));
     this.listenToPicture();
     this.listenToLight();
+    this.beside = new Beside(app);
+    new Printer(app);
   }
 
   get state() {
@@ -114,7 +116,8 @@ class Controls {
       this.changed("screen");
     });
     byId("preset-row").hidden = this.app.about.kind === "scene" || this.isRun;
-    byId("preset").append(...Object.entries(PRESETS).map(([name, { told }]) => new Option(told, name)));
+    const hasLeds = this.app.about.views.some(({ frames }) => frames?.length);
+    byId("preset").append(...Object.entries(PRESETS).filter(([name]) => name !== "dome" || hasLeds).map(([name, { told }]) => new Option(told, name)));
     this.on("preset", "change", (input) => this.lightAs(PRESETS[input.value]));
     for (const name of ["azimuth", "height"]) {
       this.on(name, "input", () => {
@@ -129,7 +132,10 @@ class Controls {
   lightAs(preset) {
     byId("preset").value = "";
     if (!preset) return;
-    Object.assign(this.state, { lights: [presetLight(preset, this.state.camera)], chosen: 0, sky: preset.sky });
+    const light = presetLight(preset, this.state.camera);
+    if (preset === PRESETS.dome) light.direction = this.app.renderer.nearestLed(this.light.direction);
+    Object.assign(this.state, { lights: [light], chosen: 0, sky: preset.sky });
+    if (this.app.about.environment) this.state.environment = 0;
     this.changed("light");
   }
 
@@ -181,6 +187,7 @@ class Controls {
     byId("adapted").value = state.adapted ? "yes" : "no";
     byId("colour").value = light.colour;
     if (this.isRun) byId("shot").innerHTML = this.app.renderer.shotTold(state);
+    this.beside.show();
     this.showLights();
   }
 

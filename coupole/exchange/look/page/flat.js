@@ -6,6 +6,14 @@ const FIELDS_OF_TILES = { normals: ["uint16", 2], kd: ["float16", 3], ks: ["floa
 const PATIENCE_MS = 300;
 
 class FlatRenderer extends Renderer {
+  get outline() {
+    return this.corners;
+  }
+
+  faceOf() {
+    return [0, 0, 1];
+  }
+
   viewShown() {
     return this.about;
   }
@@ -46,7 +54,7 @@ class FlatRenderer extends Renderer {
 
   prepareTiles() {
     const gl = this.gl, none = { uint8: new Uint8Array(4), uint16: new Uint16Array(3), uint32: new Uint32Array(3) };
-    this.textures = {
+    this.textures = this.bodies[0].textures = {
       places: numbersTexture(gl, none.uint16, "uint16", 3),
       triangles: numbersTexture(gl, none.uint32, "uint32", 3),
       uncertainty: numbersTexture(gl, none.uint8, "uint8", 4),

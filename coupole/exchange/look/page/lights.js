@@ -74,12 +74,13 @@ const PRESETS = {
   ].map((from, number) => [`raking ${number}`, {
     told: `Raking from ${from}`, side: 45 * number, height: RAKING_DEG, strength: 4, softness: 0.5, kelvin: NEUTRAL_KELVIN, sky: 0,
   }])),
+  dome: { told: "The dome's LED nearest to the light", height: 0, strength: 1, softness: 0, kelvin: NEUTRAL_KELVIN, sky: 0 },
   day: { told: "Day, under a bright sky", side: 120, height: 45, strength: 0.5, softness: 15, kelvin: NEUTRAL_KELVIN, sky: 0.8 },
   candle: { told: "Candle, from the lower left", side: 215, height: 20, strength: 2, softness: 3, kelvin: 2000, sky: 0 },
 };
 
 /** The one light of a preset, for a camera. */
-function presetLight({ side, height, strength, softness, kelvin }, camera) {
+function presetLight({ side = 0, height, strength, softness, kelvin }, camera) {
   const direction = wayOf(camera.azimuth + 90 + side, height);
   return { ...startLight(), direction, strength, softness, kelvin };
 }

@@ -8,7 +8,8 @@ function interfaceOf(app) {
       if (![x, y, z].every(Number.isFinite) || length([x, y, z]) < 1e-9) {
         throw new RangeError("setLight: expected x, y, z, not all 0");
       }
-      app.state.lights[app.state.chosen].direction = unit([x, y, z]);
+      app.moving.stop();
+      app.chosenLight.direction = unit([x, y, z]);
       app.changed("light");
     },
     readPixel(px, py) {
@@ -26,6 +27,7 @@ function interfaceOf(app) {
     },
     whole: () => app.whole(),
     setSamples(most) {
+      app.moving.stop();
       app.most = Math.max(1, Math.floor(most));
       app.changed("light");
       app.settle(app.most);

@@ -29,24 +29,18 @@ function marksOf(camera, width, height, notes, ruler) {
     return here && `<g transform="translate(${here[0]} ${here[1]})"><circle r="10"/><text y="4">${
       number + 1}</text></g>`;
   });
-  const ends = ruler.map(at);
+  const ends = ruler.map(({ place }) => at(place));
   const dots = ends.map((here) => here && `<circle class="end" cx="${here[0]}" cy="${here[1]}" r="4"/>`);
   if (ends.length === 2 && ends[0] && ends[1]) {
     const [[x, y], [u, v]] = ends;
     dots.push(`<line x1="${x}" y1="${y}" x2="${u}" y2="${v}"/><text class="length" x="${(x + u) / 2}"
-      y="${(y + v) / 2 - 8}">${lengthText(length(minus(ruler[1], ruler[0])))}</text>`);
+      y="${(y + v) / 2 - 8}">${measuredText(measuredLength(ABOUT, ruler))}</text>`);
   }
   return [...pins, ...dots].filter(Boolean).join("");
 }
 
 /** A cross in the middle of the picture, where keys point to, as markup. */
 const aimOf = (width, height) => `<path class="aim" d="M${width / 2 - 9} ${height / 2}h18m-9 -9v18"/>`;
-
-/** Where the measured frame ends and the fitted one begins, as markup. */
-function splitOf(state, width, height) {
-  const x = state.split * width;
-  return state.view && ABOUT.kind === "mesh" && isLit(state.mode) ? `<line class="split" x1="${x}" x2="${x}" y1="0" y2="${height}"/>` : "";
-}
 
 function legendOf(mode, quantity) {
   const { from, to, logarithmic, unit: told } = rangeOf(mode, quantity);
@@ -78,6 +72,8 @@ function bannerOf(about, state, compared, left) {
     told.push(...coloursTold(about, state));
   }
   if (isStereo(state)) told.push("for two eyes, the left one's to the left");
+  if (state.beside === "state") told.push(`left: ${about.beside.name}, ${about.beside.fit}`);
+  if (state.beside === "light") told.push("left: another light");
   if (state.mode === "unsharp") told.push("relief exaggerated");
   if (compared?.texture && isLit(state.mode)) told.push(`left: measured frame under LED ${compared.frame.led}`);
   return told.join(" · ");

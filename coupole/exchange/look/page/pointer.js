@@ -30,13 +30,19 @@ class Pointer {
   down(event) {
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.focus({ focusVisible: false });
-    if (!this.fingers.size) this.travelled = 0;
+    if (!this.fingers.size) {
+      this.travelled = 0;
+      this.divides = this.app.controls.beside.isOnHandle(event.offsetX, event.offsetY);
+    }
     this.fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
   }
 
   move(event) {
     const before = this.fingers.get(event.pointerId);
-    if (!before) return;
+    if (!before) {
+      this.canvas.classList.toggle("divides", this.app.controls.beside.isOnHandle(event.offsetX, event.offsetY));
+      return;
+    }
     const now = [event.offsetX, event.offsetY], x = now[0] - before[0], y = now[1] - before[1];
     this.travelled += Math.abs(x) + Math.abs(y);
     if (this.fingers.size === 1) {
@@ -52,7 +58,8 @@ class Pointer {
 
   drag(event, x, y) {
     const { app } = this;
-    if (event.buttons & 2 || event.altKey) app.move(x, y);
+    if (this.divides) app.controls.beside.divide(app.state.split + x / this.canvas.clientWidth);
+    else if (event.buttons & 2 || event.altKey) app.move(x, y);
     else if (app.tool === "light" || event.shiftKey) app.dragLight(x, y);
     else app.turn(x, y);
   }

@@ -25,7 +25,9 @@ const IDENTITY = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 
 const EYES_DEG = 3.4;  // between two eyes, 65 mm apart, that look at a thing 1.1 m away
 
-const isStereo = (state) => Boolean(state.stereo && !state.view && ["mesh", "scene"].includes(ABOUT.kind));
+const OUTLINE_PLACES = 3000;
+
+const isStereo = (state) => Boolean(state.stereo && !state.view && !state.beside && ["mesh", "scene"].includes(ABOUT.kind));
 
 class Renderer {
   constructor(canvas, about, arrays) {
@@ -38,10 +40,10 @@ class Renderer {
     this.depths = null;
     this.arrived = () => {};  // what is called when more has come
     this.measure();
+    this.bodies = [{ about, texels: new Texels(this.gl, about) }];
+    this.shadowMaps = {};
     this.prepare(arrays);
     this.residual = new Residual(this.gl, about, this.middle);
-    this.texels = new Texels(this.gl, about);
-    this.drawnShadows = [];
     this.frames = {};
   }
 
@@ -51,6 +53,12 @@ class Renderer {
     if (!view) return null;
     const frame = nearestFrame(view, this.middle, state.lights[state.chosen].direction);
     return { view, frame, texture: this.frames[frame.block] };
+  }
+
+  /** The direction of the LED, of those whose frames the page has, that is nearest to one. */
+  nearestLed(way) {
+    const ways = this.about.views.flatMap(({ frames }) => frames.map(({ at_mm: place }) => unit(minus(place, this.middle))));
+    return ways.reduce((best, one) => dot(one, way) > dot(best, way) ? one : best);
   }
 
   /** What is shown as white, and its unit: a frame that is compared with has its own. */
@@ -63,9 +71,29 @@ class Renderer {
     return bannerOf(this.about, state, this.frameOf(state), this.residual.told(state));
   }
 
-  /** The material of what `seenAt` has found. */
-  materialOf(number) {
-    return materialOf(this.arrays, number);
+  /** The material of what `seenAt` has found, of the object or of its other state. */
+  materialOf(number, body = 0) {
+    return materialOf(this.bodies[body].arrays, number);
+  }
+
+  /** Places of the object, some thousand of them, between which it lies. */
+  get outline() {
+    const { arrays: { places }, about: { origin_mm: origin, step_mm: step } } = this, found = [];
+    const every = 3 * Math.max(1, Math.ceil(places.length / 3 / OUTLINE_PLACES));
+    for (let k = 0; k < places.length; k += every) found.push(add(origin, times([...places.subarray(k, k + 3)], step)));
+    return found;
+  }
+
+  /** The object's other state, if it is to be shown and is not at hand yet; else null. */
+  missingBeside(state) {
+    return state.beside === "state" && !this.bodies[1] ? this.about.beside : null;
+  }
+
+  async bringBeside() {
+    const { beside } = this.about, arrays = {};
+    for (const name of beside.blocks) arrays[name] = await laterBlock(this.about, `beside-${name}`);
+    this.bodies[1] = { about: { ...this.about, ...beside }, texels: new Texels(this.gl, { ...this.about, ...beside }) };
+    this.fill(this.bodies[1], arrays);
   }
 
   /** Whether there is anything to be seen. */
@@ -91,7 +119,8 @@ class Renderer {
 
   /** The tile of texels that is wanted next; null for none, and while a coarse mesh is shown. */
   get missingTexels() {
-    return this.triangles === this.about.triangles ? this.texels.wanted : null;
+    if (this.triangles !== this.about.triangles) return null;
+    return this.bodies.map(({ texels }) => texels.wanted).find(Boolean) ?? null;
   }
 
   keepFrame(frame, bytes) {
@@ -136,20 +165,31 @@ class Renderer {
   }
 
   /** Type and count of the numbers of each texture. */
-  get fields() {
-    return this.about.texels ? TEXTURES_OF_TEXELS : TEXTURES;
+  fieldsOf(about) {
+    return about.texels ? TEXTURES_OF_TEXELS : TEXTURES;
   }
 
   /** Show these numbers of the object from now on. */
   take(arrays) {
-    this.arrays = arrays;
-    this.triangles = arrays.triangles.length / 3;
-    for (const [name, [dtype, count]] of Object.entries(this.fields)) {
-      this.gl.deleteTexture(this.textures[name] ?? null);
-      this.textures[name] = numbersTexture(this.gl, arrays[name], dtype, count);
-    }
-    this.drawnShadows = [];
+    this.fill(this.bodies[0], arrays);
+    this.hold(0);
     this.restart();
+  }
+
+  /** Give a state of the object its numbers. */
+  fill(body, arrays) {
+    Object.assign(body, { arrays, triangles: arrays.triangles.length / 3, textures: body.textures ?? {} });
+    for (const [name, [dtype, count]] of Object.entries(this.fieldsOf(body.about))) {
+      this.gl.deleteTexture(body.textures[name] ?? null);
+      body.textures[name] = numbersTexture(this.gl, arrays[name], dtype, count);
+    }
+    Object.values(this.shadowMaps).forEach((maps) => { maps.drawn = []; });
+  }
+
+  /** Draw the object, 0, or its other state, 1, until another is held. */
+  hold(number) {
+    const { arrays, triangles, textures, texels } = this.bodies[number];
+    Object.assign(this, { held: number, arrays, triangles, textures, texels });
   }
 
   use(name, textures) {
@@ -187,26 +227,38 @@ class Renderer {
   /** Draw one more sample into the mean. */
   sample(state) {
     this.fit();
-    const beams = this.beamsOf(state);
-    this.shownResidual = this.residual.wantedFor(state);
-    this.drawShadows(beams);
-    this.gl.enable(this.gl.SCISSOR_TEST);
-    for (const part of this.parts(state)) {
-      this.gl.scissor(part.x, 0, part.width, this.height);
+    this.shownParts = this.parts(state);
+    for (const part of this.shownParts) {
+      this.hold(part.body);
+      this.shownResidual = part.body ? null : this.residual.wantedFor(part.state);
+      const beams = this.beamsOf(part.state);
+      this.drawShadows(beams, part.maps);
+      this.gl.enable(this.gl.SCISSOR_TEST);
+      this.gl.scissor(part.from, 0, part.to - part.from, this.height);
       this.drawSurface(part.state, part);
       this.drawLight(part.state, beams);
+      this.gl.disable(this.gl.SCISSOR_TEST);
     }
-    this.gl.disable(this.gl.SCISSOR_TEST);
+    this.hold(0);
     [this.targets.mean, this.targets.other] = [this.targets.other, this.targets.mean];
     this.samples += 1;
   }
 
-  /** Parts of the picture, pixels from the left: all of it, or one for each eye, the left eye's to the left. */
+  /** Parts of the picture from one pixel to another, from the left, each with its viewport, its state, the object or
+   * its other state, and its shadow maps: all of it, both sides of a comparison, or one for each eye, the left
+   * eye's to the left. */
   parts(state) {
-    if (!isStereo(state)) return [{ x: 0, width: this.width, state }];
+    const whole = { x: 0, width: this.width, from: 0, to: this.width, state, body: 0, maps: 0 };
+    if (isBeside(state, this.bodies[1])) {
+      const split = Math.round(state.split * this.width);
+      const left = { ...whole, to: split, state: leftOf(state), body: state.beside === "state" ? 1 : 0, maps: 1 };
+      return [left, { ...whole, from: split }].filter(({ from, to }) => to > from);
+    }
+    if (!isStereo(state)) return [whole];
     const width = Math.floor(this.width / 2);
     return [-1, 1].map((side, number) => ({
-      x: number * width, width, state: { ...state, camera: turned(state.camera, side * EYES_DEG / 2, 0) },
+      ...whole, x: number * width, width, from: number * width, to: (number + 1) * width,
+      state: { ...state, camera: turned(state.camera, side * EYES_DEG / 2, 0) },
     }));
   }
 
@@ -245,25 +297,27 @@ class Renderer {
     return product(orthographic(reach, reach, reach, 3 * reach), from);
   }
 
-  drawShadows(beams) {
-    const gl = this.gl;
+  drawShadows(beams, number) {
+    const gl = this.gl, maps = this.shadowMaps[number] ??= { depths: null, drawn: [] };
     const wished = 2 ** Math.ceil(Math.log2(2 * Math.max(this.width, this.height)));
     const size = clamp(wished, ...SHADOW_PX);
-    if (!this.depths || this.depths.layers < beams.length || this.depths.size !== size) {
-      this.depths?.free();
-      this.depths = depthLayers(gl, size, beams.length);
-      this.drawnShadows = [];
+    if (!maps.depths || maps.depths.layers < beams.length || maps.depths.size !== size) {
+      maps.depths?.free();
+      maps.depths = depthLayers(gl, size, beams.length);
+      maps.drawn = [];
     }
+    this.depths = maps.depths;
     const { places, triangles } = this.textures;
     const at = this.use("shadow", { places, triangles });
     gl.viewport(0, 0, size, size);
     beams.forEach((beam, layer) => {
-      if (this.drawnShadows[layer] === String(beam.shadow)) return;
+      const drawn = `${this.held} ${beam.shadow}`;
+      if (maps.drawn[layer] === drawn) return;
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.depths.frames[layer]);
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.uniformMatrix4fv(at("clip_from_object"), false, beam.shadow);
       gl.drawArrays(gl.TRIANGLES, 0, 3 * this.triangles);
-      this.drawnShadows[layer] = String(beam.shadow);
+      maps.drawn[layer] = drawn;
     });
   }
 
@@ -313,7 +367,7 @@ class Renderer {
 
   setTexels(at) {
     this.gl.uniform1i(at("has_texels"), this.texels.textures ? 1 : 0);
-    if (this.texels.textures) this.gl.uniform2fv(at("texel_peaks"), this.about.texels.peaks);
+    if (this.texels.textures) this.gl.uniform2fv(at("texel_peaks"), this.texels.about.texels.peaks);
   }
 
   setResidual(at) {
@@ -386,12 +440,24 @@ class Renderer {
     return new Float32Array(this.readBits(this.targets.mean, x, y, width, height).buffer);
   }
 
-  /** What a pixel sees: its place, mm, and the number of a triangle; null for none. */
+  /** What a pixel sees: its place, mm, the number of a triangle, and whether it is the object, 0, or its other
+   * state, 1; null for none. */
   seenAt(x, y) {
     if (x < 0 || y < 0 || x >= this.width || y >= this.height) return null;
     const found = this.readBits(this.targets.seen, x, y, 1, 1);
     if (!found[3]) return null;
-    return { place: [...new Float32Array(found.buffer, 0, 3)], triangle: found[3] - 1 };
+    const { body } = this.shownParts.find(({ from, to }) => x >= from && x < to) ?? { body: 0 };
+    return { place: [...new Float32Array(found.buffer, 0, 3)], triangle: found[3] - 1, body };
+  }
+
+  /** The unit normal of what `seenAt` has found, of its flat triangle. */
+  faceOf({ triangle, body }) {
+    const { arrays: { places, triangles }, about: { step_mm: step } } = this.bodies[body];
+    const [a, b, c] = [0, 1, 2].map((k) => {
+      const number = triangles[3 * triangle + k];
+      return times([...places.subarray(3 * number, 3 * number + 3)], step);
+    });
+    return unit(cross(minus(b, a), minus(c, a)));
   }
 
   readBits(target, x, y, width, height) {

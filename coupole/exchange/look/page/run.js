@@ -19,7 +19,7 @@ class RunRenderer extends FlatRenderer {
 
   prepareTiles() {
     const gl = this.gl;
-    this.textures = { planes: layersTexture(gl, PLANE_LAYERS, TILE_ROWS * SLOTS), factors: factorsTexture(gl) };
+    this.textures = this.bodies[0].textures = { planes: layersTexture(gl, PLANE_LAYERS, TILE_ROWS * SLOTS), factors: factorsTexture(gl) };
   }
 
   surfaceTextures() {

@@ -15,7 +15,7 @@ class SceneRenderer extends Renderer {
     return "scene.frag";
   }
 
-  get fields() {
+  fieldsOf() {
     return SCENE_FIELDS;
   }
 

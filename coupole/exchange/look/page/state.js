@@ -21,7 +21,7 @@ const startLight = () => ({
 
 const startState = () => ({
   mode: Object.keys(MODES)[0], quantity: "kd", white: 0, relief: 1, sky: 0, environment: ABOUT.environment ? 1 : 0, chosen: 0, lights: [startLight()],
-  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false, withResidual: true, ...structuredClone(ABOUT.start ?? {}),
+  camera: null, notes: [], view: "", split: 0.5, adapted: false, stereo: false, withResidual: true, beside: "", besideLight: null, ...structuredClone(ABOUT.start ?? {}),
 });
 
 const rounded = (key, value) => typeof value === "number" ? Number(value.toPrecision(5)) : value;
@@ -48,9 +48,18 @@ function isCamera(camera) {
 }
 
 function isNote(note) {
-  return typeof note?.text === "string" && isVector(note.place) && isCamera(note.camera)
+  return typeof note?.text === "string"
+    && ["id", "created", "by"].every((name) => ["string", "undefined"].includes(typeof note[name]))
+    && isVector(note.place) && isCamera(note.camera)
     && Array.isArray(note.lights) && note.lights.length > 0 && note.lights.length <= MOST_LIGHTS
     && note.lights.every(isLight);
+}
+
+/** Whether a state compares with something that this page has. */
+function isComparison({ beside = "", besideLight = null }) {
+  if (beside !== "light") return beside === "" || beside === "state" && Boolean(ABOUT.beside);
+  return Array.isArray(besideLight?.lights) && isNumber(besideLight.lights.length, 1, MOST_LIGHTS)
+    && besideLight.lights.every(isLight) && isNumber(besideLight.sky, 0, 100) && isNumber(besideLight.environment, 0, 100);
 }
 
 /** The state of an address; null if it holds none, or one that does not fit this page. */
@@ -73,6 +82,7 @@ function stateOf(address) {
     && (found.stereo === undefined || typeof found.stereo === "boolean")
     && (found.withResidual === undefined || typeof found.withResidual === "boolean")
     && (found.adapted === undefined || typeof found.adapted === "boolean")
+    && isComparison(found)
     && (!found.view || viewOf(ABOUT, found.view)) && (found.split === undefined || isNumber(found.split, 0, 1));
   return fits ? { ...startState(), ...found } : null;
 }

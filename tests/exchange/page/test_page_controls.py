@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axe_selenium_python import Axe
 from browser import needs_chromium
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
@@ -22,13 +23,13 @@ pytestmark = needs_chromium
 def test_dragging_the_light_moves_it_and_changes_the_picture(page: Page, folder: Path) -> None:
     page.open(folder / "look.html")
     page.wide()
-    before, way = page.run("coupole.readPixel(260, 200)"), page.run("coupole.state.lights[0].direction")
+    before, way = page.run("coupole.readPixel(230, 110)"), page.run("coupole.state.lights[0].direction")
     page.browser.at("[data-tool=light]").click()
     canvas = page.browser.at("#picture")
     ActionChains(page.driver).drag_and_drop_by_offset(canvas, 60, 0).perform()
     after = page.run("coupole.state.lights[0].direction")
     assert after[0] > way[0] + 0.2
-    assert page.run("coupole.readPixel(260, 200)") != before
+    assert page.run("coupole.readPixel(230, 110)") != before
 
 
 def test_keys_alone_turn_light_measure_and_note(page: Page, folder: Path) -> None:
@@ -220,3 +221,20 @@ def test_pixels_outside_of_the_picture_and_lights_without_direction_are_refused(
     for call in ("readPixel(-1, 5)", "readPixel(5, 1e6)", "readPixel(0.5, 5)", "setLight(0, 0, 0)", "setLight(1)"):
         refused = f"try {{ coupole.{call}; }} catch (error) {{ return error.message; }}"
         assert "expected" in page.driver.execute_script(refused), call
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (360, 780)])
+def test_axe_finds_nothing_with_all_of_the_settings_open(
+    page: Page, folder: Path, width: int, height: int
+) -> None:
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 700}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    try:
+        page.open(folder / "look.html", "#")
+        page.driver.execute_script("document.querySelectorAll('details').forEach(one => one.open = true)")
+        axe = Axe(page.driver)
+        axe.inject()
+        assert [f"{found['id']}: {found['nodes'][0]['html']}" for found in axe.run()["violations"]] == []
+        assert page.run("document.documentElement.scrollWidth") <= width
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -153,7 +153,7 @@ def test_a_picture_for_print_has_its_resolution_its_size_and_a_true_scale_bar(
         assert picture.width == round(80 / 25.4 * 150)
         assert picture.info["Description"].startswith("Our sheet\n")
         pixels = np.asarray(picture.convert("L")).astype(float)
-        scale = float(re.findall(r"Scale ([\d.]+) : 1", picture.info["Description"])[0])
+        scale = 1.0 / float(re.findall(r"Scale 1 : ([\d.]+)", picture.info["Description"])[0])
     row = pixels[int(page.run("coupole.readPicture().height / coupole.readPicture().width") * len(pixels[0]) / 2)]
     across = np.flatnonzero(row < 250)
     side_on_paper_mm = (across[-1] - across[0] + 1) / 150 * 25.4

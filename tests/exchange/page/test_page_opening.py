@@ -177,9 +177,13 @@ def test_the_object_fills_the_window_between_words_and_tools(page: Page, folder:
     page.wide()
     page.browser.at("#reset").click()
     seen = page.driver.execute_script("""
-        const { width, height, rgba } = coupole.readPicture(), found = [width, height, 0, 0];
-        for (let k = 0; k < rgba.length; k += 4) {
-          if (rgba[k + 3] < 0.5) continue;
+        coupole.readPixel(0, 0);
+        const picture = document.getElementById("picture"), { width, height } = picture;
+        const copy = Object.assign(document.createElement("canvas"), { width, height }).getContext("2d");
+        copy.drawImage(picture, 0, 0);
+        const { data } = copy.getImageData(0, 0, width, height), found = [width, height, 0, 0];
+        for (let k = 0; k < data.length; k += 4) {
+          if (data[k] === data[0] && data[k + 1] === data[1]) continue;  // the ground
           const x = k / 4 % width, y = Math.floor(k / 4 / width);
           found[0] = Math.min(found[0], x); found[1] = Math.min(found[1], y);
           found[2] = Math.max(found[2], x); found[3] = Math.max(found[3], y);

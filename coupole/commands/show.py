@@ -170,16 +170,18 @@ def _look(source: Path, options: ShowOptions, say: Callable[[str, int, int], Non
             return with_environment(look_of_pictures(source), options.environment, OF_PICTURES)
         if (source / run_result.OBJECT).exists():
             _refuse(views, f"{source} is a result")
-            other = _other_state(source, options.beside, is_aligned=options.is_aligned) if options.beside else None
+            beside = (
+                _other_state(source, options.beside, is_aligned=options.is_aligned) if options.beside else None
+            )
             map_px = options.map_px or MOST_PX
-            choice = PageChoice(options.fit, options.residual_planes, options.samples, map_px, beside=other)
+            choice = PageChoice(options.fit, options.residual_planes, options.samples, map_px, beside=beside)
             return with_environment(look_of_result(source, say, choice), options.environment, OF_RUNS)
     except (OSError, KeyError) as error:
         raise InputError(f"{source}: is damaged ({error}); make the result again into another folder") from error
     raise InputError(f"{source}: holds no run or result (`coupole reflectance RUN --out FOLDER` makes one)")
 
 
-def _other_state(first: Path, other: Path, *, is_aligned: bool) -> OtherState:
+def _other_state(first: Path, other_folder: Path, *, is_aligned: bool) -> OtherState:
     """Bring another result onto the first. Raises InputError if it is none, or of something else; ExtraMissing."""
     import numpy as np
 
@@ -188,22 +190,24 @@ def _other_state(first: Path, other: Path, *, is_aligned: bool) -> OtherState:
     from coupole.heritage.comparison.unchanged_alignment import align
     from coupole.reflectance import run_result
 
-    if other.resolve() == first.resolve():
-        raise InputError(f"--beside {other}: is the result itself; name another state of the object")
-    if not (other / run_result.OBJECT).exists():
-        raise InputError(f"--beside {other}: expected a result of runs (`coupole reflectance RUN --out FOLDER`)")
+    if other_folder.resolve() == first.resolve():
+        raise InputError(f"--beside {other_folder}: is the result itself; name another state of the object")
+    if not (other_folder / run_result.OBJECT).exists():
+        raise InputError(
+            f"--beside {other_folder}: expected a result of runs (`coupole reflectance RUN --out FOLDER`)"
+        )
     if is_aligned:
-        return OtherState(other, np.eye(4), "Both were said to be in one frame; nothing was aligned.")
+        return OtherState(other_folder, np.eye(4), "Both were said to be in one frame; nothing was aligned.")
     try:
-        alignment = align(read_result_state(first), read_result_state(other))
+        alignment = align(read_result_state(first), read_result_state(other_folder))
     except InputError as error:
-        raise InputError(f"--beside {other}: {error}") from error
+        raise InputError(f"--beside {other_folder}: {error}") from error
     u_mm = math.sqrt(float(np.trace(alignment.covariance[:3, :3])))
-    told = (
+    remark = (
         f"Brought together by what did not change, standard uncertainty {u_mm:.2g} mm; surfaces that did not "
         f"change lie {alignment.noise_mm:.2g} mm apart (rms)."
     )
-    return OtherState(other, alignment.before_from_after, told)
+    return OtherState(other_folder, alignment.before_from_after, remark)
 
 
 def _look_of_scene(path: Path) -> Look:

@@ -58,8 +58,8 @@ class OtherState:
     folder: Path
     first_from_other: Floats
     """[4, 4] between the support frames of both results, mm."""
-    told: str
-    """How the two were brought together, in a sentence."""
+    remark: str
+    """Sentence on how the two were brought together."""
 
 
 def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice | None = None) -> Look:
@@ -74,17 +74,16 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
     planes = 0 if texels else PLANES if choice.planes is None else choice.planes
     left_of = residual_fit(result) if planes and choice.fit is None else None
     fit = TEXELS if texels else choice.fit or left_of or best_fit(result, MATERIALS)
-    other = _other_state(choice, fit, say) if choice.beside else None
+    other_state = _other_state(choice, fit, say) if choice.beside else None
     support_from_base = inverse(result.base_from_support)
     corners_mm = apply(support_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
-    both_mm = np.concatenate([corners_mm, other.corners_mm]) if other else corners_mm
+    both_mm = np.concatenate([corners_mm, other_state.corners_mm]) if other_state else corners_mm
     places, triangles, origin_mm, step_mm = weld_corners(corners_mm, both_mm)
     count = len(triangles)
     shapes: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles}
     of_triangles = texels.of_triangles if texels else _materials(result, fit, support_from_base)
     count_measured = int(np.count_nonzero(of_triangles["gloss"][:, 0]))
     maps = {"map_places": texels.map_places} if texels else {}
-    box_steps = np.rint((np.stack([both_mm.min(axis=0), both_mm.max(axis=0)]) - origin_mm) / step_mm)
     blocks = tuple(block_of(name, values) for name, values in (shapes | of_triangles | maps).items())
     views = [frames for view in result.views if (frames := frames_of_view(result, view, support_from_base))]
     about: dict[str, Any] = {
@@ -100,14 +99,8 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         "measured": count_measured,
         "irradiance": math.pi,
         "unit": "1/sr",
-        "told": {
-            "Object": "simulated" if source_about.get("simulated") else "measured",
-            "Triangles": f"{count:,}, {count_measured:,} with a material",
-            "Views": ", ".join(view.view for view in result.views),
-            "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that "
-            "is shown as white; a white diffuser that faces a light of strength 1 has 1.",
-        },
-        "box": box_steps.astype(int).tolist(),
+        "told": _facts(result, f"{count:,}, {count_measured:,} with a material", source_about.get("simulated")),
+        "box": _box_steps(both_mm, origin_mm, step_mm),
         "origin_mm": origin_mm.tolist(),
         "step_mm": step_mm,
     }
@@ -116,9 +109,8 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         about["texels"], later = texels.about, texels.blocks
         about["told"]["Texels"] = texels.remark
     later += [block for _, pictures in views for block in pictures]
-    if other:
-        about["beside"], blocks_of_other = other.look(both_mm)
-        later += blocks_of_other
+    if other_state:
+        later += other_state.blocks(both_mm, about)
     errors = (_ERRORS_OF_TEXELS if texels else _ERRORS) | {
         "places": f"{0.5e3 * step_mm:.2g} um in each coordinate"
     }
@@ -128,6 +120,24 @@ def look_of_result(folder: Path, say: Said = lambda *_: None, choice: PageChoice
         about["samples"], later = samples[0], later + samples[1]
     coarse = _coarse_blocks(places, triangles, of_triangles, choice.coarse_over, has_maps=bool(maps))
     return Look(about, blocks, tuple(later), coarse, errors)
+
+
+def _facts(result: RunResult, triangles_text: str, is_simulated: object) -> dict[str, str]:
+    """Return facts for the reader of the page."""
+    return {
+        "Object": "simulated" if is_simulated else "measured",
+        "Triangles": triangles_text,
+        "Views": ", ".join(view.view for view in result.views),
+        "Light": "straight from lamps, with shadows; none from surface to surface. White is the radiance that is "
+        "shown as white; a white diffuser that faces a light of strength 1 has 1.",
+    }
+
+
+def _box_steps(corners_mm: Floats, origin_mm: Floats, step_mm: float) -> list[list[int]]:
+    """Return the box of all corners, in steps from the origin."""
+    ends_mm = np.stack([corners_mm.min(axis=0), corners_mm.max(axis=0)])
+    box: list[list[int]] = np.rint((ends_mm - origin_mm) / step_mm).astype(int).tolist()
+    return box
 
 
 def _texels_of(
@@ -215,23 +225,24 @@ class _Other:
     """The other state in the frame of the first."""
 
     name: str
-    told: str
+    remark: str
     fit: str
     corners_mm: Floats
     """[3 n, 3]"""
     of_triangles: dict[str, NDArray[Any]]
     texels: LookTexels | None
 
-    def look(self, both_mm: Floats) -> tuple[dict[str, Any], list[Block]]:
-        """Return what the page knows of it, and its blocks; `both_mm` are the corners of both states."""
+    def blocks(self, both_mm: Floats, about_page: dict[str, Any]) -> list[Block]:
+        """Return its blocks, and put what the page knows of it into `about_page`; `both_mm` are the corners of
+        both states."""
         places, triangles, _, _ = weld_corners(self.corners_mm, both_mm)
         arrays: dict[str, NDArray[Any]] = {"places": places, "triangles": triangles, **self.of_triangles}
         if self.texels:
             arrays["map_places"] = self.texels.map_places
-        about: dict[str, Any] = {"name": self.name, "told": self.told, "fit": self.fit, "blocks": list(arrays)}
-        about["texels"] = self.texels.about if self.texels else None
+        about: dict[str, Any] = {"name": self.name, "told": self.remark, "fit": self.fit, "blocks": list(arrays)}
+        about_page["beside"] = about | {"texels": self.texels.about if self.texels else None}
         blocks = [block_of(f"{_BESIDE}{name}", values) for name, values in arrays.items()]
-        return about, blocks + (self.texels.blocks if self.texels else [])
+        return blocks + (self.texels.blocks if self.texels else [])
 
 
 _BESIDE = "beside-"
@@ -250,7 +261,7 @@ def _other_state(choice: PageChoice, fit_of_first: str, say: Said) -> _Other:
     first_from_base = first_from_other @ inverse(result.base_from_support)
     corners_mm = apply(first_from_base, result.corners_mm.reshape(-1, 3).astype(np.float64))
     of_triangles = texels.of_triangles if texels else _materials(result, fit, first_from_base)
-    return _Other(folder.resolve().name, choice.beside.told, fit, corners_mm, of_triangles, texels)
+    return _Other(folder.resolve().name, choice.beside.remark, fit, corners_mm, of_triangles, texels)
 
 
 def weld_corners(

@@ -73,8 +73,11 @@ class BurstRunner:
         max_frames_per_s: float,
         tell: Callable[[Burst, int], None],
         wait_while_paused: Callable[[], None],
+        see_mark: Callable[[int, Burst, int], None] = lambda slot, burst, step: None,
     ) -> None:
         self._cell, self._recorder, self._arm, self._dose = cell, recorder, arm, dose
+        self._see_mark = see_mark
+        """Looks at a mark that is not kept, in this slot, of this step of the burst."""
         self._outcome, self._gain_db, self._max_frames_per_s = outcome, gain_db, max_frames_per_s
         self._tell = tell
         self._by_host = HostBurst(cell, recorder, arm, tell, wait_while_paused, dose, self._note)
@@ -253,7 +256,9 @@ class BurstRunner:
                 continue
             record = StepRecord(*log[frame_match.step_of_frame[frame]].tolist())
             label = running.burst.labels[record.step]
-            if label and not record.invalid_exposure:
+            if label is None:
+                self._see_mark(grabber.slot(frame), running.burst, record.step)
+            elif not record.invalid_exposure:
                 shot = ShotId(running.burst.view, label)
                 self._recorder.prove(grabber.slot(frame), shot, step_fields(record, record.t_trigger_ns))
                 running.proven.add(frame)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +101,8 @@ class Wishes:
             raise InputError(f"--material: expected {', '.join(SUPPOSED)} or {UNKNOWN}; found {self.material!r}")
         if self.unit not in MM_PER_UNIT:
             raise InputError(f"--unit: expected {', '.join(MM_PER_UNIT)}; found {self.unit!r}")
+        if self.dose is not None and not math.isfinite(self.dose):
+            raise InputError(f"--dose: expected a number of lux h; found {self.dose}; leave it out for no bound")
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(f"--name: expected letters, digits, dots, hyphens and underscores; found {name!r}")
         for path in (Path(f"{name}.yaml"), Path(f"{name}.html")):

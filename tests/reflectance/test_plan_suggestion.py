@@ -148,3 +148,9 @@ def test_the_view_that_shows_the_rest_comes_second() -> None:
     assert choice.value == pytest.approx(0.5 * 5 * 0.5 * (math.log(1901.0) + math.log(51.0)))
     assert choose_views(views, 0, [prior], np.ones(2), 4).views == (0, 2, 1)  # the fourth tells nothing
     np.testing.assert_array_equal(prior.bread, np.tile(np.eye(5), (2, 1, 1)))  # what was known before stays
+
+
+def test_light_without_a_bound_in_numbers_is_refused(tmp_path: Path) -> None:
+    ended = suggest(tmp_path, "--rig", "sim", "--dose", "inf")
+    assert ended.code == 2, ended.err
+    assert "--dose: expected a number of lux h" in ended.err

@@ -181,3 +181,29 @@ def test_a_picture_that_cannot_be_kept_costs_no_frame(cell: CellFolder) -> None:
     assert ended.code == 0, ended.err
     (found,) = _found(cell)
     assert (found["kind"], found["picture"]) == ("ambient light", "")
+
+
+# -- frames of other attempts and other views -----------------------------------------------------------------
+
+
+def test_a_lamp_that_is_on_only_while_a_lost_shot_is_taken_again_is_found(cell: CellFolder) -> None:
+    """Dark marks of what is taken again are kept nowhere, but they tell of the room."""
+    cell.write(lights=EVERY)
+    burst = read_job(cell.plan).schedule.bursts[0][0]
+    lost, edges = burst.inner[len(burst.inner) // 2], len(burst.labels)
+    cell.faults({"kind": "drop_trigger", "edge": lost}, {"kind": "room_lamp", "lux": 10, "at_edge": edges})
+    ended = cell.acquire()
+    assert ended.code == 0, ended.err
+    assert ended.document["reshot"] == 1
+    (found,) = _found(cell)
+    assert found["kind"] == "ambient light"
+    assert f"top/{burst.labels[lost]}" in found["shots"]
+    assert set(found["shots"]) <= {f"top/{label}" for label in cells.labels(cell.run_folder)}
+
+
+def test_a_frame_lost_in_one_view_is_not_judged_by_the_same_light_in_the_view_before(cell: CellFolder) -> None:
+    cell.write(views=[cells.TOP, cells.LOW], order="as_written")
+    ended = _watched(cell, True, *({"kind": "drop_trigger", "edge": edge} for edge in range(100, 110)))
+    assert ended.code == 0, ended.err
+    assert ended.document["reshot"] > 0
+    assert _found(cell) == []

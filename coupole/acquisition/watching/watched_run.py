@@ -24,7 +24,7 @@ from coupole.geometry import Transform, apply
 from coupole.plan.bursts import Burst
 from coupole.plan.choices import FrameSample
 from coupole.plan.schedule import ViewPose
-from coupole.plan.shot_id import Led, ShotId, ShotLabel
+from coupole.plan.shot_id import Dark, Led, ShotId, ShotLabel
 from coupole.plan.watch import NOTHING
 from coupole.preflight.job import Job
 from coupole.storage.frame_file_creation import Collections
@@ -32,6 +32,9 @@ from coupole.storage.journal_events import Event, FindingNoted
 
 _MOST_PICTURES = 200
 """Pictures of one session, at most: what is found in each burst of a long run looks alike."""
+
+_FIRST_UNKEPT = 1_000_000
+"""Number of the first mark that is not kept, beyond those of all that are."""
 
 
 def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> BurstJudge:
@@ -48,6 +51,15 @@ def judge_of(job: Job, grid: LookGrid, view: ViewPose, first: FirstFrames) -> Bu
     mm_per_bin = grid.bin_px * rig.sensor.pixel_pitch_um * 1e-3 / magnification
     noise = CameraNoise.of(rig.watch, grid, job.plan.gain_db)
     return BurstJudge(rig.watch, noise, mm_per_bin, table, first)
+
+
+def _unkept_mark(burst: Burst, step: int) -> ShotLabel:
+    """A label for a mark that has none, for the burst's judgement alone: no file has it."""
+    return ShotLabel(Dark(_FIRST_UNKEPT + step), burst.exposure_index, burst.repeat)
+
+
+def _is_unkept(label: ShotLabel) -> bool:
+    return isinstance(label.light, Dark) and label.light.number >= _FIRST_UNKEPT
 
 
 class WatchedRecorder:
@@ -94,6 +106,8 @@ class WatchedRecorder:
     ) -> None:
         self._recorder.begin_view(view, frames, frame_format, arm, base_from_camera, collections)
         self._first.begin_view()
+        self._seen.clear()
+        self._timeline = []
         self._grid = LookGrid(frame_format, is_sparse=self._watch.frames == "darks")
         self._judge = None
 
@@ -117,6 +131,12 @@ class WatchedRecorder:
             self._held[shot] = slot, fields
         else:
             self._recorder.prove(slot, shot, fields)
+
+    def see_mark(self, slot: int, burst: Burst, step: int) -> None:
+        """Look at a dark mark that is not kept, because what is taken again has its marks already: it tells of the
+        room. With a panel marks are not dark."""
+        if slot in self._looks and not burst.panel:
+            self._seen[_unkept_mark(burst, step)] = self._looks[slot]
 
     def free(self, slot: int) -> None:
         self._looks.pop(slot, None)
@@ -165,7 +185,7 @@ class WatchedRecorder:
             return []
         self._judge = self._judge or judge_of(self._job, self._grid, self._views[burst.view], self._first)
         findings = self._judge.judge(frames, burst.timing.exposure_us)
-        findings = [self._with_unseen_shots(burst, finding) for finding in findings]
+        findings = [self._with_shots(burst, finding) for finding in findings]
         new_labels = {label for label in burst.labels if label}
         return [finding for finding in findings if self._is_news(finding) and new_labels & set(finding.labels)]
 
@@ -183,16 +203,19 @@ class WatchedRecorder:
 
     def _frames_of(self, burst: Burst) -> list[SeenFrame]:
         """Frames of the burst, and of the attempts before, in the order of time."""
-        labels = [label for label in burst.labels if label]
-        if not set(labels) <= set(self._timeline):
+        labels = [label or _unkept_mark(burst, step) for step, label in enumerate(burst.labels)]
+        if not {label for label in burst.labels if label} <= set(self._timeline):
             self._timeline = []
             self._seen = {label: look for label, look in self._seen.items() if label in set(labels)}
         again = set(labels)
         self._timeline = [label for label in self._timeline if label not in again] + labels
         return [SeenFrame(label, self._seen[label]) for label in self._timeline if label in self._seen]
 
-    def _with_unseen_shots(self, burst: Burst, finding: Found) -> Found:
-        """The same with the shots of the burst, if only its dark frames were looked at."""
+    def _with_shots(self, burst: Burst, finding: Found) -> Found:
+        """The same without marks that are not kept, and with the shots of the burst, if only its dark frames were
+        looked at."""
+        kept = (label for label in finding.labels if not _is_unkept(label))
+        finding = replace(finding, labels=tuple(kept))
         if self._watch.frames == "all":
             return finding
         shots = (label for label in burst.labels if label and label.is_shot)

@@ -37,7 +37,7 @@ PROMISES: dict[str, Callable[[State], bool]] = {
     "Lamps are dark when the session has not spoken to the box for the watchdog's time": (
         lambda now: not now.lamps or now.unspoken <= WATCHDOG
     ),
-    "After a freeze that needs a confirmation, and after Ctrl-Z, nothing moves or is lit before a person confirms": (
+    "After a freeze that needs a confirmation, or Ctrl-Z, nothing moves or is lit before a person confirms": (
         lambda now: not (now.owed and now.since >= AT_ONCE and (now.lamps or now.arm == MOVES))
     ),
     "A confirmation ends no pause while the cell is still being made safe, or before the session has paused": (

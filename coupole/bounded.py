@@ -88,7 +88,7 @@ class Call:
             self.of,
             expected=f"an end of the call `{self.operation}`",
             happened=f"it has not returned for {lasts_s:.0f} s, and was left behind",
-            remedy="Switch the device off and on, then resume the run; if it comes back, report it with the "
+            remedy="Switch the device off and on, then resume the run; if this happens again, report it with the "
             "versions of the device's library and firmware.",
         )
 

@@ -266,6 +266,6 @@ class ArmSupervisor:
 def _may_go_on(lapse_s: float) -> str:
     """Return the message about a lapse after which no person is asked."""
     return (
-        f"robot: nobody looked at its motion for {lapse_s:.2f} s (the program stood still, or waited for "
-        "something), so it braked on its path. It may move on by itself at any moment: keep clear of it."
+        f"robot: its motion was not checked for {lapse_s:.2f} s (the program stood still, or waited for "
+        "something), so it braked on its path. It may move again by itself at any moment: keep clear of it."
     )

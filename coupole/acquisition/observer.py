@@ -129,7 +129,7 @@ class Control:
         word = "stopped by the operator" if self.signal_number == signal.SIGINT else "stopped"
         name = self.stopped_by or signal.Signals(self.signal_number).name
         if self.held_because and not self.can_stand:
-            why = f"{self.held_because}; this cannot stand and go on, so it was ended"
+            why = f"{self.held_because}; this command cannot pause, so it was ended"
             return Interrupted(why, self.signal_number)
         return Interrupted(f"{word} ({name}); everything proven so far is kept", self.signal_number)
 

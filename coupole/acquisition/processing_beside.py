@@ -95,7 +95,7 @@ class ProcessingBeside:
     def refusals(self) -> list[str]:
         """List why no result could be made; to be asked before anything moves."""
         if not self._has_answered.wait(_TOLD_AFTER_S):
-            self._console.print("reflectance: plan, mesh and records are looked at ...", markup=False)
+            self._console.print("reflectance: checking plan, mesh and records ...", markup=False)
         if not self._has_answered.wait(_READY_WITHIN_S):
             return [f"--reflectance: its process gave no answer within {_READY_WITHIN_S:g} s"]
         if self._reasons is None:
@@ -226,7 +226,7 @@ class ProcessingBeside:
 
     def _tell_of_failure(self) -> None:
         alarm(
-            f"reflectance failed: {self._reason}. The acquisition goes on without it; "
+            f"reflectance failed: {self._reason}. The acquisition continues without it; "
             f"the samples of {self._views_text} are kept"
         )
 
@@ -240,7 +240,7 @@ class ProcessingBeside:
             return "its process ended"
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "its process ended without a word"
+        return lines[-1] if lines else "its process ended without a message"
 
     def _end(self) -> bool:
         """End the process; False if it had ended."""

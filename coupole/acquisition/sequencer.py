@@ -335,7 +335,7 @@ class Sequencer:
                 if control.unsure:
                     raise DeviceError(
                         "cell",
-                        expected="lights off and the arm at rest while the session stands",
+                        expected="lights off and the arm at rest while the session is paused",
                         happened="; ".join(control.unsure),
                         remedy="Look at the cell, then resume the run.",
                     )

@@ -148,7 +148,8 @@ def _silence(pid: int, patience_s: float) -> str:
     if is_stopped(pid):
         return (
             f"process {pid} is stopped (Ctrl-Z, SIGSTOP). An arm that moved has braked, and the box's watchdog "
-            f"switches lamps off; `kill -CONT {pid}` lets the process run again, and a run then asks a person"
+            f"switches lamps off; `kill -CONT {pid}` lets the process run again; a run then asks a person "
+            f"before it continues"
         )
     return f"nothing within {patience_s:.2g} s from process {pid}"
 

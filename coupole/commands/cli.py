@@ -258,7 +258,7 @@ def _code_of_defect(error: Exception) -> int:
 
 def _not_taken(why: str) -> int:
     """Tell that standard output does not have the whole document; the exit code."""
-    error = StorageError(f"standard output: {why}; what was printed there is not complete")
+    error = StorageError(f"standard output: {why}; the text printed there is not complete")
     _say(error)
     return error.exit_code
 

@@ -102,7 +102,7 @@ def export(
         raise
     console.print(f"{summary.files} files, {bytes_text(summary.bytes)}, in {folder}")
     for view, miss_dn in summary.misses_dn.items():
-        console.print(f"{view}: its own pictures are missed by {miss_dn:.1f} of 255, rms")
+        console.print(f"{view}: the error against its own pictures is {miss_dn:.1f} of 255, rms")
     if as_json:
         document = {"out": str(folder.resolve()), "files": summary.files, "bytes": summary.bytes}
         print(json.dumps({**document, **({"misses_dn": summary.misses_dn} if summary.misses_dn else {})}))

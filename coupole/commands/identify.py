@@ -54,7 +54,7 @@ ClassesOption = Annotated[
 ]
 UnitOption = Annotated[
     Literal["auto", "percent", "fraction"],
-    typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not tell it."),
+    typer.Option("--unit", help="Unit of the spectra's reflectance, if their files do not state it."),
 ]
 PageOption = Annotated[
     Path | None, typer.Option("--report", help="Folder for a page with the curves and the evidence in each band.")

@@ -41,7 +41,7 @@ _DEVICES: Mapping[Step, tuple[str, ...]] = {
 """The devices that a step is about."""
 _MOST_TOLD = 8
 _FILE = "commissioning.yaml"
-_HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, say `coupole commission`."
+_HEAD = "# The commissioning of a cell. It carries its own checksum: do not edit it, use `coupole commission`."
 
 
 class Answer(Model):
@@ -185,7 +185,7 @@ def why_outdated(cell: Cell, result: StepResult, identities: Mapping[str, Identi
     lacking = []
     if result.covers is None:
         if places := _places(key for key in now if key not in before):
-            lacking = [f"it was done by an earlier version, which did not cover {places}"]
+            lacking = [f"an earlier version did it, which did not cover {places}"]
         before, now = ({key: fingerprints[key] for key in before if key in now} for fingerprints in (before, now))
     changes = _changes(before, now)
     if identities is not None:

@@ -24,7 +24,7 @@ from coupole.plan.light_selection import leds_of_plan
 if TYPE_CHECKING:
     from coupole.preflight.job import Job
 
-HOW_TO_KNOW = "`white_response` in the rig makes it known (docs/how-to/expose-and-focus.md)"
+HOW_TO_KNOW = "set `white_response` in the rig (docs/how-to/expose-and-focus.md)"
 UNDER_EXPOSED = 0.05
 """Share of full scale that white must reach."""
 

@@ -322,7 +322,7 @@ def _subtract_view(
         shutil.copyfile(view.path, part)
         shares, sample_count = [], 0
         with h5py.File(part, "r+") as file:
-            description = "share of f that was inter-reflection, and was taken off"
+            description = "share of f that was inter-reflection, and was subtracted"
             share_dataset = file.create_dataset(
                 INTER_REFLECTION, file["f"].shape, np.float16, chunks=file["f"].chunks, fillvalue=np.nan
             )

@@ -161,7 +161,7 @@ class RunResult:
         if settings["subtracted"] and any(view.inter_reflection is None for view in self.views):
             raise InputError(
                 f"{self.folder}: inter-reflection is still in its samples; `coupole reflectance extract`, as it "
-                "was begun, takes it off"
+                "was begun, subtracts it"
             )
         paths = [self.materials_path(name) for name in MATERIALS]
         paths += [self.slices_path(name, view) for name in SLICES for view in self.views]
@@ -299,7 +299,7 @@ class RunResult:
         path = self.slices_path(name, view)
         with h5py.File(path, "r") as file:
             if file["coefficients"].shape[-1] != SLICES[name].coefficients:
-                raise InputError(f"{path}: an earlier version made it; make the result anew")
+                raise InputError(f"{path}: an earlier version made it; make the result again")
             return np.asarray(file["coefficients"][rows], np.float32)
 
 
@@ -350,7 +350,7 @@ def read_about(folder: Path) -> dict[str, Any]:
         raise InputError([problem]) from error
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise InputError([Problem(str(path), 0, 0, "schema", f"expected {SCHEMA}")])
-    remedy = f"`coupole reflectance check {folder}` writes it anew"
+    remedy = f"`coupole reflectance check {folder}` writes it again"
     wrong = [name for name, kind in _TOLD.items() if not isinstance(about.get(name), kind)]
     if "software" not in wrong and "coupole" not in about["software"]:
         wrong.append("software: coupole")

@@ -60,7 +60,7 @@ def _of_runs(result: Path, view: str | None, fit: str | None, camera: FreeCamera
     from coupole.reflectance import relit_uncertainty, run_intervals, run_relighting, run_result
 
     if camera is not None and view is not None:
-        raise InputError("--view: a camera anywhere (--from) is no view of the run; give one of the two")
+        raise InputError("--view: a free camera (--from) is not a view of the run; give one of the two")
     is_simulated = bool(run_result.read_about(result)["simulated"])
     folder = run_result.RunResult(result)
     if camera is None:

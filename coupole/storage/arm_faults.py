@@ -94,10 +94,10 @@ class ArmFaults:
         if standing := self.standing():
             raise DeviceFault(
                 "robot",
-                expected="the word of a person who has been to the cell",
-                happened=f"since {standing[-1].t} the arm is in a fault: {standing[-1].message.rstrip('.')}",
-                remedy=f"Find the cause, see that the cell is clear, then say `coupole confirm {rig} --name NAME` "
-                "(`--yes` does not).",
+                expected="a confirmation by a person who has been to the cell",
+                happened=f"since {standing[-1].t} the arm has a fault: {standing[-1].message.rstrip('.')}",
+                remedy=f"Find the cause, check that the cell is clear, then give `coupole confirm {rig} --name "
+                f"NAME` (`--yes` is not enough).",
             )
 
     def note(self, message: str, run: str = "") -> None:

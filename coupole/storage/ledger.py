@@ -102,9 +102,9 @@ class Ledger:
     def _refuse_lacking(self, history: History) -> None:
         if history.lacks_lines:
             raise StorageError(
-                f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was moved "
-                "away or replaced while light was given, and nobody knows what the object may still receive. Put "
-                "the whole ledger back; if it is lost, say "
+                f"{self.path}: has light of a plan that is not in it, so earlier lines are missing: it was "
+                f"moved or replaced while light was given, and nobody knows what the object may still receive. "
+                f"Put the whole ledger back; if it is lost, give "
                 f"`coupole dose {self.object_id} --add LUX_H --note WHY` with what it had, or with 0"
             )
 

@@ -122,7 +122,7 @@ class Status:
     def left_in_words(self) -> str:
         """Say in words what is left to take; where bursts are chosen in the run, nobody knows how much more."""
         frames = "1 frame" if self.frames_left == 1 else f"{self.frames_left} frames"
-        return f"{frames} and what is yet to be chosen" if self.open_views else frames
+        return f"{frames} and frames that are not chosen yet" if self.open_views else frames
 
     def figures(self) -> dict[str, Any]:
         """Content of `--json`."""

@@ -182,7 +182,7 @@ def _measured_views(run: Run, events: Sequence[Event], views: Sequence[SampledVi
         "What was measured",
         tables=[Table("Views, in the plan's order", head, rows)],
         notes=[
-            "Proven: box and camera show of which light and exposure the frame is. Hidden: LEDs that light "
-            "nothing which the view sees, because arm, camera or object stand between."
+            "Proven: box and camera show which light and exposure the frame belongs to. Hidden: LEDs that light "
+            "nothing that the view sees, because arm, camera or object hide it."
         ],
     )

@@ -217,7 +217,7 @@ def test_a_watchdog_that_is_off_is_found_and_the_light_goes_out_all_the_same(
     box: Any = wrong.opened.ledbox
     box._scpi.ask(":SYST:WATC 0", 0)
     light_timing.watchdog(wrong)
-    assert "last light after the host fell silent" in missed(wrong)
+    assert "last light after the host's last command" in missed(wrong)
     assert "watchdogs that the box does not report" in missed(wrong)
     assert _world(wrong_cell).ask("state")["shining"] == []
 

@@ -72,7 +72,7 @@ def test_a_cell_without_a_switch_passes_and_its_record_says_so(tmp_path: Path) -
     bench = bench_with(Box(None), Onlooker())
     presence_step.presence(bench)
     assert missed(bench) == []
-    assert "nothing tells whether anybody is at the cell" in bench.findings.remarks[0]
+    assert "nothing shows whether anybody is at the cell" in bench.findings.remarks[0]
 
 
 def test_a_cell_whose_rig_has_a_switch_needs_one() -> None:

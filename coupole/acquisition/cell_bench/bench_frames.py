@@ -52,7 +52,7 @@ class BenchFrames:
         it was asked. Raises InputError, DoseBudgetReached, DeviceError."""
         self._refuse_what_there_is_not(request)
         if request.stops not in (None, stops):
-            raise InputError("frame: the bench was stopped since; look at its state, and ask anew")
+            raise InputError("frame: the bench was stopped meanwhile; look at its state, then ask again")
         with self._devices.in_use:
             before_lux_h = self._shots.given_lux_h
             shot = self._expose_lights(request, stops)

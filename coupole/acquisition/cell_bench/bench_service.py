@@ -102,7 +102,7 @@ class BenchService:
             if self._ending or self.closing.is_set() or (begins and self._control.stop.is_set()):
                 raise InputError("the bench is closing")
             if begins and is_gone():
-                raise InputError("whoever asked has gone: not begun")
+                raise InputError("the caller has disconnected: not begun")
             return {"version": VERSION, **self._obey(request, stops)}
         except CoupoleError as error:
             if isinstance(error, DeviceError):
@@ -273,7 +273,7 @@ def serve_bench(
                     "cell",
                     expected="a metering that ends as it should",
                     happened=service.works.last.figures()["why"] if service.works.last else "it failed",
-                    remedy="The cell was made safe; begin the bench anew.",
+                    remedy="The cell was made safe; begin the bench again.",
                 )
             if service.idle_s > leave_after_s:
                 console.print(f"nobody has asked for {leave_after_s:g} s: closed")

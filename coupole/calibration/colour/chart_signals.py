@@ -106,7 +106,7 @@ def pixels_inside(polygon: Floats, shape: tuple[int, ...]) -> tuple[NDArray[np.i
 def read_patches(picture: ChartPicture, names: Sequence[str]) -> Reading:
     """Means of all patches. Raises InputError: patches outside the picture, or too small in it."""
     if picture.pattern == MONO:
-        raise InputError(f"{picture.name}: the camera has one channel; it has no colours")
+        raise InputError(f"{picture.name}: the camera has one channel, so it has no colours")
     count = len(names)
     mean, u, sd = (np.empty((count, 3)) for _ in range(3))
     full = np.zeros(count, np.bool_)
@@ -166,7 +166,7 @@ def combined_signals(
         good &= ~odd
         strength, patch = _split(mean, good)
     else:
-        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be told")
+        remarks.append("fewer than three lights: shadows and gloss on the chart cannot be detected")
     return _averaged_signals(mean / strength[:, None], u / strength[:, None], sd, good, tuple(remarks))
 
 

@@ -112,7 +112,7 @@ def _least_squares(terms: Floats, xyz: Floats) -> Floats:
     design = (terms[:, :-1] - terms[:, -1:]) * weight[:, None]
     if np.linalg.cond(design) > _LARGEST_CONDITION:
         raise InputError(
-            "colour: the channels are too much alike on this chart to tell its colours apart; expected a colour "
+            "colour: the channels are too similar on this chart to distinguish its colours; expected a colour "
             "camera and patches of many hues"
         )
     target = (xyz - terms[:, -1:] * D50_WHITE) * weight[:, None]

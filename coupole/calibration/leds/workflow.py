@@ -252,10 +252,12 @@ def _h5(
             "[leds] of the centre's variance that comes from poses, lens and hand-eye, as its neighbours' does"
         )
         write_dataset("shared_part", geometry.shared_part[where], "", shared_text)
-        write_dataset("offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] off its place on the board")
-        write_dataset("views", views[where], "", "[leds] that it was found in")
+        write_dataset(
+            "offset_mm", geometry.state.offsets_mm[where], "mm", "[leds, 3] distance from its place on the board"
+        )
+        write_dataset("views", views[where], "", "[leds] number of views in which the LED was found")
         write_dataset("residual_rms", np.sqrt(square / np.maximum(views, 1))[where], "px", "[leds]")
-        write_dataset("found", matching.place_of >= 0, "", "[leds] False: placed by its board alone")
+        write_dataset("found", matching.place_of >= 0, "", "[leds] False: only its board determines its place")
     return buffer.getvalue()
 
 

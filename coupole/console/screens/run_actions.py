@@ -49,7 +49,7 @@ class RunActions:
                 action_button = button(words, do, name=words.split()[0].lower(), icon=icon)
                 action_button.set_enabled(visit.may_act)
         if not visit.may_act:
-            ui.label("Operators at this machine may do these.").classes("hint")
+            ui.label("Only operators at this machine may do this.").classes("hint")
         self._links = ui.row().classes("links")
         self._there: list[bool] = []
         self._look()
@@ -110,8 +110,8 @@ class RunActions:
         if await sure(
             f"Reflectance of {self._name}?",
             f"Normals and materials are fitted to its {self._frames} frames, with the calibrations in force for "
-            f"it: minutes to hours of this machine's processors. The result lands in {out}. When it is stopped, "
-            "it goes on where it was when it is begun again.",
+            f"it: minutes to hours of this machine's processors. The result lands in {out}. If you stop it and "
+            f"begin it again, it continues.",
             "Begin",
         ):
             out.parent.mkdir(parents=True, exist_ok=True)

@@ -65,7 +65,9 @@ class Email(Model):
     @model_validator(mode="after")
     def _no_open_password(self) -> Email:
         if self.password and self.security == "none" and self.server not in _HERE:
-            raise ValueError("expected `security: starttls` or `tls`: the password would be sent in the clear")
+            raise ValueError(
+                "expected `security: starttls` or `tls`: the password would be sent without encryption"
+            )
         return self
 
 

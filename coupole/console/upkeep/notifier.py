@@ -160,5 +160,5 @@ def send_test(settings: Settings, cell: str) -> dict[str, str]:
         except (OSError, ValueError) as error:
             error_of_way[way] = f"{error or type(error).__name__} (after {time.monotonic() - begun_s:.0f} s)"
     if not error_of_way:
-        raise InputError("the settings name no way: expected `email`, `webhooks` or `desktop: true`")
+        raise InputError("the settings name no channel: expected `email`, `webhooks` or `desktop: true`")
     return error_of_way

@@ -115,8 +115,8 @@ def left_open(exposure_s: Array) -> str:
     if factor < _WIDE:
         return ""
     return (
-        f"no two photographs are nearer than {factor:.1f} times in exposure: waves of the response are known by "
-        "its smoothness alone, and u is wider for them; steps of 2, or raw files, know it better"
+        f"no two photographs are nearer than {factor:.1f} times in exposure: only its smoothness excludes waves "
+        f"of the response, and u is larger for them; steps of 2, or raw files, determine it better"
     )
 
 

@@ -138,8 +138,9 @@ def _smallest(
         trials = [(larger, _relative_errors(larger, check_pairs)) for larger in _larger(table)]
         if not trials:
             raise InputError(
-                f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB misses "
-                f"its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; ask for no less"
+                f"--adaptive {most_error:g}: {material.name}: a table of {table.size_bytes / 1e6:.0f} MB "
+                f"differs from its fit by {errors[1::2].max():.1e} or more in 5 % of the directions; choose a "
+                f"larger value"
             )
         worst = errors[1::2].max()
         gains = [

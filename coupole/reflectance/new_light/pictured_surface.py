@@ -135,7 +135,9 @@ def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Sur
 
     in_strips(height, trace)
     if not (triangle_of_pixel >= 0).any():
-        raise InputError("--from: no pixel of this camera sees a measured part of the object; look at it")
+        raise InputError(
+            "--from: no pixel of this camera sees a measured part of the object; turn the camera to the object"
+        )
     return Surface(triangle_of_pixel, places_mm, camera_mm, triangles, corners_mm.mean(axis=1), normals)
 
 

@@ -109,7 +109,7 @@ def test_the_disk_must_take_all_that_waits(desk: Desk, monkeypatch: pytest.Monke
     )
     for _ in range(2):
         desk.enter(plan="free.yaml")
-    with pytest.raises(InputError, match=r"storage .* all that runs and waits needs 0.00 GB"):
+    with pytest.raises(InputError, match=r"storage .* the plans that run and wait need 0.00 GB"):
         desk.enter(plan="free.yaml")
     assert len(desk.names) == 2
 

@@ -94,8 +94,9 @@ class ArmSupervisor:
         self._checked_state()
 
     def go(self, visit: Visit, meanwhile: Callable[[], None] = lambda: None, speed: float = 1.0) -> SettledPose:
-        """Follow the leg of a visit; returns the measured pose. What `meanwhile`, called every 10 ms, raises is
-        raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's speeds.
+        """Follow the leg of a visit; returns the measured pose. `meanwhile` is called every 10 ms. If it raises,
+        the error is raised at once, while the arm still moves: the caller stops it. `speed`: share of the arm's
+        speeds.
 
         A motion that was braked because this thread did not look at it, or that is held, goes on from where it
         stands on its checked line: by itself after a short lapse, by a person's word after all else."""

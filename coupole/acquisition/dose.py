@@ -1,9 +1,9 @@
 """The light that a session gives the object: entered in its ledger before it is given, corrected afterwards.
 
-Whoever gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`): the object's
-budget is asked, after all that its ledger has at that moment, and what is planned is on the disk before the first
-lamp is lit. Lights that the host switches are asked for once more each. A session that ends without a word (kill
--9, power cut) leaves the plan of one burst, which is at least what was given.
+Every caller that gives light asks here first, burst by burst (`DoseMeter`) or flash by flash (`FlashMeter`). The
+object's budget is checked after all entries of its ledger at that moment, and the planned light is on the disk
+before the first lamp is lit. Lights that the host switches are asked for once more each. A session that ends
+without a word (kill -9, power cut) leaves the plan of one burst, which is at least what was given.
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ class Control:
     """The operator's stop and pause: set from signal handlers and other threads.
 
     A *pause* waits for the end of the burst. A *hold* does not: something stopped the program, or the arm, that
-    nobody had asked for, or that cannot wait. Whoever holds a session has lights switched off and the arm stopped
-    (`halting`), and only a person lets it go on.
+    nobody had asked for, or that cannot wait. A pause switches lights off and stops the arm (`halting`), and only
+    a person ends it.
     """
 
     session: Control | None = None

@@ -35,8 +35,9 @@ class UserSocket:
     """Serves a socket at a path while a context lasts. Raises OSError if it cannot."""
 
     def __init__(self, path: Path, answer: Callable[[bytes, Gone], Mapping[str, Any]]) -> None:
-        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. What lies at the
-        path was left by a process that was killed: the caller knows that none is alive."""
+        """`answer` makes an answer of a request's line, and begins nothing for who has `Gone`. A file at the path
+        was left by a process that was killed: the caller knows that no such process is alive.
+        """
         self.path, self._answer = path, answer
 
     def __enter__(self) -> UserSocket:

@@ -134,7 +134,7 @@ class Input(Model):
 
 
 class Validity(Model):
-    """Conditions under which a record holds. What is None was not known and is not checked."""
+    """Conditions under which a record holds. A value of None was not known and is not checked."""
 
     expires: AwareDatetime
     camera: str | None = None

@@ -220,7 +220,7 @@ def fit(
 
 @reflectance_app.command()
 def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOption = False) -> None:
-    """The third step alone: what the fits miss under the LEDs that were left out, and the report."""
+    """Run only the third step: the errors of the fits under the LEDs that were left out, and the report."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.result_pages import run_reflectance_page
@@ -234,7 +234,7 @@ def check(result: ResultArgument, memory: MemoryOption = "2GB", as_json: JsonOpt
 
 @reflectance_app.command()
 def ablate(result: ResultArgument, as_json: JsonOption = False) -> None:
-    """What the fits would miss with fewer LEDs, without grazing light, with fewer coefficients: one page."""
+    """Compute the errors of the fits with fewer LEDs, without grazing light, with fewer coefficients: one page."""
 
     def step(say: Said) -> dict[str, Any]:
         from coupole.reflectance.result_pages import ablation_page

@@ -1,8 +1,8 @@
 """Chooses LEDs in the run, by what those before them have shown of the view (`lights: {kind: adaptive}`).
 
-The first burst is spread over the dome. After each burst `next_lights` says by how much pictures for the LEDs not
-yet lit would miss, and which LEDs tell most beside those lit. Pixels are divided by the illuminance that the LED
-table gives at the view's target. Neither mesh nor records are needed: what is judged are the frames themselves.
+The first burst is spread over the dome. After each burst `next_lights` gives the expected error of pictures for
+the LEDs not yet lit, and the LEDs that would add most information. Pixels are divided by the illuminance that the
+LED table gives at the view's target. Neither mesh nor records are needed: only the frames are used.
 """
 
 from __future__ import annotations

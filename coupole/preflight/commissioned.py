@@ -117,8 +117,8 @@ def empty_record(cell: Cell) -> CommissioningRecord:
 def read_commissioning(cell: Cell) -> CommissioningRecord | None:
     """The record of the cell, by the controller of its arm and in the rig's state folder; None if there is none.
 
-    Of each step the newest result that fits the rig is taken, else the newest. Raises InputError for a record that
-    was edited or cannot be read.
+    For each step the newest result that fits the rig is taken, otherwise the newest result. Raises InputError for
+    a record that was edited or cannot be read.
     """
     paths = [place / _FILE for place in places_of_arm(cell)]
     records = {path: _read_record(path) for path in paths if path.exists()}

@@ -20,7 +20,7 @@ class Files:
     rig: Path | None = None
     """None: the plan's."""
     resume: Path | None = None
-    """The run of which only what is left is checked."""
+    """The run whose remaining part is checked."""
     output: Path | None = None
     """Parent folder of the run; None: the rig's."""
 

@@ -57,8 +57,9 @@ class Workshop(Protocol):
         ...
 
     def refuse_blind(self, folder: Path, witness: str) -> None:
-        """Raises InputError if a worker does not see a folder as it is here, by the content of one of its files,
-        or has another version of Coupole."""
+        """Raises InputError if a worker sees another content of one file of a folder than this machine, or has
+        another version of Coupole.
+        """
         ...
 
 

@@ -1,6 +1,6 @@
 """Many small regularised least-squares problems, one after the other in compiled code, by SciPy's BLAS and LAPACK.
 
-Their own threads are to be turned off by the caller (`one_thread`): whole problems are what is done side by side.
+The caller must turn off their own threads (`one_thread`), because whole problems are solved in parallel.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def factorise(product, penalty, factor):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def solve(factor, right):  # type: ignore[no-untyped-def]
-    """Solve in place for `right` [m, n], by what `factorise` left."""
+    """Solve in place for `right` [m, n], with the factors from `factorise`."""
     upper = np.array([85], np.uint8)
     sizes = np.array([len(factor), len(right), 0], np.intc)
     _dpotrs(

@@ -36,7 +36,9 @@ SAMPLES = "samples"
 AS_MEASURED = "as_measured.h5"
 """File of the reflectance before inter-reflection was taken off, from the folder."""
 U_OF_INTER_REFLECTION = 0.2
-"""Relative standard uncertainty of what is taken off. Of a simulated relief of white stone it was 0.15 to 0.19."""
+"""Relative standard uncertainty of what is taken off. For a simulated relief of white stone it was 0.15 to
+0.19.
+"""
 MOST_ROWS = 1 << 16
 LOWER = np.tril_indices(UNKNOWNS)
 VARIANCES = [row * (row + 3) // 2 for row in range(UNKNOWNS)]

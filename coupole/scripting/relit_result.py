@@ -39,7 +39,8 @@ def open_result(
     result: Path, view: str | None, fit: str | None, camera: FreeCamera | None, samples: int, *, uncertain: bool
 ) -> Relit:
     """The result in a folder, of runs or of pictures. `samples` are rays to an area or an environment. Raises
-    InputError: no result, or one that has no such view, fit, camera or uncertainty."""
+    InputError: no result, or a result without this view, fit, camera or uncertainty.
+    """
     from coupole.reflectance import fits, relit_uncertainty, run_relighting, run_result
 
     if (result / run_result.OBJECT).exists():

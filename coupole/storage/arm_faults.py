@@ -3,7 +3,7 @@
 A fault belongs to the arm, not to the run in which it happened, nor to the rig: until a named person confirms that
 the cause is found and the cell is clear, no session of any run may move that arm. So it is noted by the address
 and the serial number of the arm's controller and in the rig's state folder (`coupole.plan.controller_places`), and
-stands as long as it stands in one of them. A confirmation names the faults that it is about: it counts for these
+holds as long as it is in one of them. A confirmation names the faults that it is about: it counts for these
 wherever else they are noted.
 """
 

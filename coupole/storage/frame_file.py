@@ -101,7 +101,7 @@ class Layout:
 
 @contextmanager
 def open_view(path: Path) -> Iterator[h5py.File]:
-    """A view's file, to be read. What h5py or the caller then finds wrong in it raises StorageError."""
+    """A view's file, to be read. If h5py or the caller then finds a fault in it, StorageError is raised."""
     try:
         with h5py.File(path, "r") as file:
             yield file

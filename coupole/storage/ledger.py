@@ -1,6 +1,6 @@
 """The dose ledger of each object: all light that it has received, `<ledger folder>/<object id>.jsonl`.
 
-Whoever gives light enters what is planned before it is given (`Ledger.plan`), and afterwards what was given
+A caller that gives light enters the planned light before (`Ledger.plan`), and the light that was given afterwards
 (`Ledger.correct`); both are on disk when the call returns. So a process that is killed, or a power cut, can only
 leave too high a figure: that of the last plan. Writers hold a lock on the object's file.
 

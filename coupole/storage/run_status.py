@@ -133,7 +133,9 @@ class Status:
 
 
 def status(run: Run, *, in_use: bool | None = None) -> Status:
-    """Progress of a run, also of one that is running. Whoever holds its lock says whether it is `in_use`."""
+    """Progress of a run, also of one that is running. The caller that knows about its lock states whether it is
+    `in_use`.
+    """
     status = Status(proof=run.proof)
     shots = list(run.expected_shots())
     status.shots = sum(shot.is_shot for shot in shots)

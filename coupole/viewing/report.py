@@ -31,8 +31,9 @@ from coupole.viewing.run_sample import SampledView, sampled_views
 
 
 def write(run: Run, path: Path | None = None, *, in_use: bool | None = None) -> Path:
-    """Write the run's report into its folder, or to another file; also of an incomplete run. Whoever holds the
-    run's lock says whether it is `in_use`. Raises StorageError."""
+    """Write the run's report into its folder, or to another file; also of an incomplete run. The caller that knows
+    about the run's lock states whether it is `in_use`. Raises StorageError.
+    """
     path = path or run.report_path
     write_page(path, _page(run, status(run, in_use=in_use)))
     return path

@@ -2,8 +2,8 @@
 between them.
 
 A binder's glossy face reflects part of the light before it enters, and most of the diffuse light that wants to
-leave. Of a paint that reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5.
-The two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
+leave. If a paint reflects 0.50 in air, gloss excluded, the layer inside reflects 0.74 under an index of 1.5. The
+two must not be mixed: the types have no arithmetic, and `Face` is the only way from one to the other.
 """
 
 from __future__ import annotations
@@ -103,4 +103,4 @@ def face(index: ArrayLike, geometry: Geometry = "gloss excluded") -> Face:
 
 
 BARE = Face(np.ones(()), np.zeros(()), np.zeros(()))
-"""No face: dry powder, matt distemper. What is seen is what holds inside."""
+"""No face: dry powder, matt distemper. The reflectance seen and the reflectance inside are the same."""

@@ -1,6 +1,6 @@
 """Signals of a chart's patches: means over the pixels of each in a picture, then one value from many lights.
 
-Of a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
+On a matt chart each light k gives the patch p the signal s = g_k E_kp b_p: E is the light's irradiance there,
 known or from a white sheet in the chart's place, g the light's own strength. Medians over patches and lights give
 g and b; a patch that departs from them under a light is in shadow there, or glossy, and is left out.
 """

@@ -60,7 +60,7 @@ class Account:
 
 
 FIRST_ENGINEER = Account("first engineer", Role.ENGINEER)
-"""Whoever signs in with the token, until an engineer has an account."""
+"""The person who signs in with the token, until an engineer has an account."""
 
 
 class Accounts:

@@ -3,7 +3,7 @@
 A console stands still if it is stopped (Ctrl-Z, SIGSTOP), or if its machine sleeps. When it runs again it finds
 requests whose senders have long given up. So nothing begins for a caller whose connection is gone. Where that
 cannot be seen (a page that is still open), nothing begins of what may have come while the console stood still.
-What ends or pauses something always counts.
+Requests that end or pause something are always obeyed.
 """
 
 from __future__ import annotations

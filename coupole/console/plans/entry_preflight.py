@@ -1,4 +1,4 @@
-"""Preflight of what is entered in the queue, by a process of its own, with words for those who wait for it."""
+"""Preflight of entries of the queue, in a separate process, with text for the people who wait for it."""
 
 from __future__ import annotations
 

@@ -61,8 +61,8 @@ def too_much_light(
 ) -> dict[str, str]:
     """Refusals of the entries that wait whose object's budget is exceeded when all before them are done, by id.
 
-    `received_lux_h` tells what an object has received by its ledger, `budget_lux_h` what it may receive by that; a
-    plan's own budget can only be stricter.
+    `received_lux_h` is the light that an object has received by its ledger, `budget_lux_h` the light that it may
+    receive; a plan's own budget can only be stricter.
     """
     light: dict[str, float] = {}
     refusals: dict[str, str] = {}

@@ -66,7 +66,7 @@ class Entry(BaseModel):
     result: str = ""
     """Folder of that result, if not the run's with `-reflectance` behind."""
     needs: Needs | None = None
-    """None for a hold, and for what began at once."""
+    """None for a hold, and for an entry that began at once."""
     by: str
     """Name of whoever entered it."""
     entered: str

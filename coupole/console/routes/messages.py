@@ -186,8 +186,9 @@ class StateNow(BaseModel):
     queue: list[EntryNow]
     """All entries that run or wait, after the 20 that ended last, in their order."""
     checking: str
-    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. What else
-    is entered waits for it."""
+    """Preflight that is being made: of what, for whom, since when and how far it is; empty if none is. Other
+    entries wait for it.
+    """
     in_control: str
     """Name of the person who may act; empty: any operator."""
     asked_by: str

@@ -1,4 +1,4 @@
-"""Sees what happens at a cell and tells people of it, in threads of its own: nothing else waits for them."""
+"""Notices events at a cell and notifies people, in separate threads: nothing else waits for them."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """A camera's response from photographs of one scene with several exposure times.
 
 Debevec and Malik, "Recovering high dynamic range radiance maps from photographs" (SIGGRAPH 1997), Eq. 3: the
-logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. What is
-different: the pixels' ln E are eliminated, so that thousands of pixels cost no more than a few. Noise is that of
-values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
+logarithm of exposure g(z) of each value z, such that g(z) = ln E + ln t for all pixels and photographs. The
+difference is that the pixels' ln E are eliminated, so thousands of pixels cost no more than a few. Noise is that
+of values: g is looked up at the value that a pixel's mean predicts, and the noisy value only adds g' times its
 difference (where g is looked up at noisy values, least squares prefers stairs and waves, which steps of 4 do not
 contradict). And g is a Gaussian process: its slope over ln z wanders, by an amount that the photographs themselves
 make most likely. Where they cannot tell, as with waves of the period of all steps, this is what the uncertainty

@@ -107,8 +107,9 @@ def surface_of_view(result: RunResult, view: ViewSamples) -> Surface:
 
 
 def surface_from(result: RunResult, mesh: PacketMesh, camera: FreeCamera) -> Surface:
-    """Return the surface of the triangles that any view has seen, from a camera anywhere. Those of `mesh` that no
-    view has seen hide what is behind them, as others do. Raises InputError if the camera sees none."""
+    """Return the surface of the triangles that any view has seen, from a camera anywhere. Triangles of `mesh` that
+    no view has seen also hide the surface behind them. Raises InputError if the camera sees none.
+    """
     triangles = result.triangles
     corners_mm = result.corners_mm[triangles].astype(np.float64)
     normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])

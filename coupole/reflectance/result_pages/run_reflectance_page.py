@@ -1,4 +1,6 @@
-"""`report.html` of the reflectance of runs: maps of each view, what was left out, what the materials miss."""
+"""`report.html` of the reflectance of runs: maps of each view, samples that were left out, errors of the
+materials.
+"""
 
 from __future__ import annotations
 

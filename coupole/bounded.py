@@ -1,4 +1,4 @@
-"""Every wait ends: a call that never returns is given up, told, and left behind.
+"""Every wait ends: a call that never returns is reported and given up.
 
 A library may hang in a call, a network disk may be dead: no thread that waits in there can be ended, by a signal
 as little as by another thread. So whoever may hang is a thread that nobody needs (`run_bounded`), and each call of

@@ -60,7 +60,8 @@ class ArmSupervisor:
         tell_lapse: Callable[[str], None] = lambda message: None,
     ) -> None:
         """`stand` waits until a person lets a session that is held go on; without it what held a motion is raised.
-        `tell_lapse` is told of a motion that was braked because nobody had looked at it."""
+        `tell_lapse` is called for a motion that was braked because it was not checked.
+        """
         self._stand, self._tell_lapse = stand, tell_lapse
         self._rig, self._robot, self._clock, self._control = rig, cell.robot, cell.clock, control
         self._halt = cell.halt
@@ -135,7 +136,8 @@ class ArmSupervisor:
 
     def _stand_after(self, error: Exception) -> None:
         """The motion was braked, or is to be: come to rest, then wait for a person unless the lapse was short.
-        Raises what has another cause."""
+        Other errors are raised.
+        """
         lapse_s = error.silent_s if isinstance(error, ArmUnattended) else 0.0
         if self._control.stop.is_set() or not (self.was_held(error) or lapse_s):
             raise error

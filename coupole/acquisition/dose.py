@@ -85,7 +85,7 @@ class LightOnObject:
 
     @property
     def lux_h_at_most(self) -> float:
-        """The same with all that is planned and of which nobody has said what was given."""
+        """The same, with all planned light whose true amount was never entered."""
         return self.lux_h if self._planned is None else float((self._given_lux_h + self._planned.at_most).max())
 
     @property
@@ -95,7 +95,7 @@ class LightOnObject:
 
     @property
     def total_lux_h(self) -> float:
-        """Dose of the object's life, by its ledger as it is now, without what is being given."""
+        """Dose of the object's life, by its ledger as it is now, without the light that is being given."""
         planned_lux_h = self._history.planned_lux_h(self._planned.plan_id) if self._planned else 0.0
         return self._history.total_lux_h - planned_lux_h + self._unentered_lux_h
 

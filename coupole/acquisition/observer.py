@@ -75,7 +75,7 @@ class Control:
     """Set while lights are switched off and the arm is stopped for a hold: nobody can let the session go on."""
     held_because: str = ""
     unsure: Sequence[str] = ()
-    """Sentences on what a hold could not confirm to be safe: then the session ends."""
+    """Sentences on devices that a pause could not confirm to be safe: then the session ends."""
     pulse_s: float = math.inf
     """Time when this process last proved that it runs, monotonic s. A thread that does nothing else sets it
     (`coupole.acquisition.signals`); infinite where there is none."""

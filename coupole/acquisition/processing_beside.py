@@ -77,7 +77,7 @@ class ProcessingBeside:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process, if it has not ended: what it did is kept."""
+        """End the process, if it has not ended; its results are kept."""
         if self._end() and self._run is not None:
             self._why = "ended with the run, which is not complete"
             self._console.print(
@@ -167,7 +167,7 @@ class ProcessingBeside:
         self._why = why
 
     def _cpu_s(self) -> float:
-        """Time that the process has computed; 0 where that cannot be told."""
+        """Time that the process has computed; 0 if it is not known."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
             return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
@@ -232,7 +232,7 @@ class ProcessingBeside:
 
     @property
     def _last_words(self) -> str:
-        """Reason why the process ended, as far as it can be told."""
+        """Reason why the process ended, as far as it is known."""
         code = self._process.returncode
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}" + (" (memory was short?)" if code == -9 else "")

@@ -40,7 +40,7 @@ def note_failure(error: BaseException, cell: OpenedCell, run: Run, recorder: Run
 
 
 def note_what_hangs(error: BaseException, cell: OpenedCell, run: Run, recorder: RunRecorder) -> None:
-    """A stop has ended the session; if something was left behind meanwhile, that is told too."""
+    """A stop has ended the session; if a call was given up meanwhile, this is reported too."""
     if left_behind():
         alarm(str(error))
         note_failure(error, cell, run, recorder)

@@ -111,7 +111,8 @@ def exchange(
     say: Callable[[str], object] = lambda _: None,
 ) -> dict[str, Any]:
     """The answer to a request; `say` is told, within 2 s, why there is none yet. Raises OSError, and ValueError
-    for what is no answer."""
+    for data that are not an answer.
+    """
     begun_s = time.monotonic()
     with socket.socket(socket.AF_UNIX) as connection:
         connection.settimeout(patience_s)

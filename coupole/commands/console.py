@@ -170,7 +170,7 @@ def queue(
 
 
 def _queue_requests(plans: list[Path], resumed_runs: list[Path], hold: str) -> list[dict[str, str]]:
-    """List what is to be entered, in order."""
+    """List the entries to be made, in order."""
     requests = [{"plan": str(path.resolve())} for path in plans] + [
         {"resume": str(path.resolve())} for path in resumed_runs
     ]

@@ -34,7 +34,7 @@ class Asked:
     """Options that were given, by name."""
 
     def refuse(self, names: tuple[str, ...], why: str) -> None:
-        """Raise InputError if one of these options was given; `why` is what they are for."""
+        """Raise InputError if one of these options was given; `why` is their purpose."""
         if option_names := [f"--{name}" for name in names if name in self.options]:
             raise InputError(f"{', '.join(option_names)}: {'is' if len(option_names) == 1 else 'are'} {why}")
 

@@ -184,7 +184,7 @@ def _write_report(out: Path, result: _Result) -> None:
 
 
 def _with_plan(given_records: tuple[InForce, ...], plan: Path | None) -> tuple[InForce, ...]:
-    """The records given, and for kinds that are not given those in force for a plan."""
+    """The given records; for kinds that are not given, the records in force for a plan."""
     from coupole.calibration.budget.records import of_use
     from coupole.preflight.job import read_job
 

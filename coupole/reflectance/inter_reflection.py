@@ -1,5 +1,4 @@
-"""Light that comes from one part of the object to another, estimated from its mesh and samples, and taken off
-them.
+"""Light from one part of the object to another, estimated from its mesh and samples, and subtracted from them.
 
 A sample of reflectance counts all light of its triangle as the LED's own. In a fold a part of it came by way of
 other triangles. The object is cut into patches; their radiosity under each LED follows from the light that

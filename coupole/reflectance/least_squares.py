@@ -21,7 +21,9 @@ _INT, _DOUBLE, _CHAR = map(types.CPointer, (types.intc, types.float64, types.uin
 
 
 def _routine(module: str, name: str, *kinds: Any) -> Any:
-    """A Fortran routine that compiled code may call. It is known by name, so that what calls it can be cached."""
+    """A Fortran routine that compiled code may call. It is known by name, so functions that call it can be
+    cached.
+    """
     symbol = f"coupole_{name}"
     llvmlite.binding.add_symbol(symbol, get_cython_function_address(f"scipy.linalg.cython_{module}", name))
     return types.ExternalFunction(symbol, types.void(*kinds))

@@ -64,7 +64,7 @@ class ArmPaths:
         return ShownPath(number, name, start_deg, visit, self.motion)
 
     def figures(self, path: ShownPath) -> dict[str, Any]:
-        """Return what a console shows of a path, as JSON's values only."""
+        """Return a path as a console shows it, with values of JSON only."""
         corners = [path.start_deg, *path.visit.leg.waypoints]
         along = shown_postures(corners)
         return {

@@ -55,7 +55,7 @@ class BenchArm:
         self._paths.motion.bodies.is_clear(home_deg, home_deg + 0.1)  # compiled before anybody waits for it
 
     def state(self) -> dict[str, Any]:
-        """Posture, motion and what the controller tells of its safety."""
+        """Posture, motion and the controller's report of its safety."""
         arm = self._opened.robot.measured()
         joints_deg = np.array(arm.joints_deg)
         return {

@@ -70,7 +70,7 @@ class BenchService:
         self.works = Works()
         self.closing = threading.Event()
         self.trouble: list[str] = []
-        """Sentences on what was not sure when the bench was closed."""
+        """Sentences on devices that were not surely safe when the bench was closed."""
         self._devices = BenchDevices(cell, opened_cell)
         self._arm = BenchArm(cell, opened_cell, job, self.works, control)
         self._frames = BenchFrames(cell, opened_cell, job, self._devices, self.works)
@@ -177,8 +177,9 @@ class BenchService:
         return work.figures()
 
     def _stop(self) -> list[str]:
-        """Stop everything; return what is not sure then. Pictures that are under way have ended, with their light,
-        when this returns."""
+        """Stop everything; return the devices that are not surely safe then. Pictures that are under way have
+        ended, with their light, when this returns.
+        """
         self.works.stop()
         trouble = unsure(self._opened.halt(), _STOPPED_WITHIN_S)
         if self.works.last is not None:
@@ -209,7 +210,7 @@ class BenchService:
         }
 
     def end(self) -> None:
-        """Stop what is under way, make the cell safe, enter the light that was given."""
+        """Stop the present work, make the cell safe, enter the light that was given."""
         self._ending = True
         self.closing.set()
         self._stop()

@@ -61,8 +61,8 @@ def cycle(bench: Bench) -> None:
 
 
 def axes(bench: Bench) -> None:
-    """Turn each axis by a few degrees: the measured change, and what the person sees, must be what the rig's arm
-    says.
+    """Turn each axis by a few degrees: the measured change, and the motion that the person sees, must agree with
+    the rig's arm.
 
     The angles that a controller reports are its own, so only the person can tell an axis that turns the wrong way.
     """

@@ -41,7 +41,7 @@ class Pictures:
 
 
 def lamps(bench: Bench) -> None:
-    """Light each LED of the table once and compare what the camera sees with the table."""
+    """Light each LED of the table once and compare the picture with the table."""
     findings, table = bench.findings, bench.cell.leds
     findings.remedy = (
         "Check that LED's wire, driver and board, and its line in the LED table; after swapping wires or lines "

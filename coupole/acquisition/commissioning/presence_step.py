@@ -10,8 +10,9 @@ _WITHIN_S, _POLL_S = 30.0, 0.05
 
 
 def presence(bench: Bench) -> None:
-    """Ask the person to hold and to release it. A cell without one passes, and its record says so, unless its rig
-    has one."""
+    """Ask the person to hold and to release it. A cell without an enabling switch passes, and its record says so,
+    unless its rig has one.
+    """
     findings, box = bench.findings, bench.opened.ledbox
     findings.remedy = (
         "Check the enabling switch and its cable to the LED box. Until it works, do not move the arm from any "

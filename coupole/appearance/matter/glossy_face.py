@@ -63,8 +63,9 @@ class Face:
         return MeasuredReflectance(np.asarray(self.passing * r / (1.0 - self.inner * r) + self.gloss))
 
     def inside(self, measured_reflectance: MeasuredReflectance) -> InternalReflectance:
-        """Return the reflectance of the layer under this face. Raises InputError where no layer can be the reason
-        of what is seen."""
+        """Return the reflectance of the layer under this face. Raises InputError if no layer can have the
+        reflectance that was seen.
+        """
         r = np.asarray(measured_reflectance.values, dtype=float) - self.gloss
         internal = np.asarray(r / (self.passing + self.inner * r))
         internal = np.where((internal > 1.0) & (internal < 1.0 + _ROUNDING), 1.0, internal)

@@ -66,7 +66,7 @@ class Signals:
     mean: Floats
     """[patches, 3] of uniform light."""
     u: Floats
-    """[patches, 3] standard uncertainty, by noise and by what lights disagree."""
+    """[patches, 3] standard uncertainty, from noise and from the disagreement of the lights."""
     pixel_sd: Floats
     """[patches, 3] relative standard deviation of single pixels, in the median of the lights."""
     remarks: tuple[str, ...]

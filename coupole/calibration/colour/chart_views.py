@@ -174,7 +174,7 @@ def key_of(frame: LightFrame) -> tuple[str, str]:
 
 
 def mean_picture(pictures: Sequence[ChartPicture]) -> ChartPicture:
-    """The mean of pictures of one view; what is saturated in one is so in the mean."""
+    """The mean of pictures of one view; pixels that are saturated in one picture are saturated in the mean."""
     first = pictures[0]
     signal = np.mean([picture.signal for picture in pictures], axis=0)
     full = np.any([picture.full for picture in pictures], axis=0)

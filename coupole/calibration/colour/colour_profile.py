@@ -172,7 +172,9 @@ def leave_out(patch_signals: Balanced, form: Form, tell: Callable[[], None] = la
 
 
 def better(matrix: LeftOut, roots: LeftOut) -> Form:
-    """The form that misses patches left out less; the matrix, unless the other is clearly better."""
+    """The form with the smaller error for left-out patches; the matrix, unless the other form is clearly
+    better.
+    """
     return "root-polynomial" if roots.mean < _WORTH * matrix.mean and roots.worst < matrix.worst else "matrix"
 
 

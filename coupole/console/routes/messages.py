@@ -182,7 +182,7 @@ class StateNow(BaseModel):
     devices: dict[str, Any]
     """Identities of the devices that a run, or the bench, has open."""
     lent_to: str
-    """Name of who has borrowed the cell, and for what; empty if it is not lent. Nothing begins meanwhile."""
+    """Name of the borrower of the cell, and the purpose; empty if it is not lent. Nothing begins meanwhile."""
     queue: list[EntryNow]
     """All entries that run or wait, after the 20 that ended last, in their order."""
     checking: str

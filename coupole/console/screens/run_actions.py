@@ -22,7 +22,7 @@ _LOOK_EVERY_S = 0.3
 
 
 async def resume(visit: Visit, name: str) -> None:
-    """Enter a run in the queue, to take what is left of it."""
+    """Enter a run in the queue, to take its remaining frames."""
     await enter(visit, NewEntry(resume=name), name)
 
 
@@ -56,7 +56,7 @@ class RunActions:
         ui.timer(2.0, self._look)
 
     def _look(self) -> None:
-        """Links to what there is by now."""
+        """Links to the files that exist now."""
         run, page = self._run.folder, look_page(self._cell, self._run)
         there = [self._run.report_path.is_file(), (run / "README.txt").is_file(), stands_alone(page)]
         if there == self._there:

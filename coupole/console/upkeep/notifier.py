@@ -24,7 +24,7 @@ _RELIEF = 1.1
 
 
 class Occurrences:
-    """Search for what has happened at a cell since it was last asked."""
+    """Search for new events at a cell since the last call."""
 
     def __init__(self, cell: Cell, plans: PlanQueue, disk_low_gb: float) -> None:
         self._cell, self._queue, self._low_bytes = cell, plans, disk_low_gb * 1e9
@@ -83,8 +83,9 @@ class Occurrences:
 
 
 class Notifier:
-    """Sends what has happened, while a context lasts. `trouble` says what the last message met; each delivery has
-    a line in `notifications.jsonl`."""
+    """Sends events, while a context lasts. `trouble` says what the last message met; each delivery has a line in
+    `notifications.jsonl`.
+    """
 
     def __init__(self, settings: Settings | None, occurrences: Occurrences, folder: Path) -> None:
         self._settings, self._occurrences = settings, occurrences
@@ -100,7 +101,7 @@ class Notifier:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the threads; what is still to be sent is given up."""
+        """End the threads; unsent messages are given up."""
         self._ending.set()
         with contextlib.suppress(queue.Full):
             self._messages.put_nowait(None)

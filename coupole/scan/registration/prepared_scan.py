@@ -172,7 +172,7 @@ def spacing(points_mm: NDArray[np.float32]) -> float:
 
 
 def vertex_normals(mesh: Mesh) -> Floats | None:
-    """[n, 3] by the triangles, of length 1 or 0; None of a cloud without triangles."""
+    """[n, 3] normals from the triangles, of length 1 or 0; None for a cloud without triangles."""
     vertices, triangles = mesh.vertices, mesh.triangles
     if not len(triangles):
         return None

@@ -26,6 +26,8 @@ from markdown_it.token import Token
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = ("coupole", "drivers", "sim")
 FEWEST_WORDS = 5
+QUOTES = "plain-english.md"
+"""Page that quotes sentences which need a second reading; nothing is drawn from it."""
 _END = re.compile(r"(?<=[.!?])[)\"'*_`]*\s+(?=[\"'(*_`{\[]*[A-Z0-9`{-])")
 _ABBREVIATION = re.compile(r"(\b(e\.g|i\.e|vs|cf|Fig|No|approx|Dr|et al)|\b[A-Z])\.$")
 _MARKUP = re.compile(r"</|/>|[{};]\n|\bfunction\b")
@@ -120,7 +122,8 @@ def draw(every: list[Sentence], seed: int, number: int) -> list[Sentence]:
 def _files(kind: str) -> Iterator[tuple[Path, Callable[[str], Iterator[tuple[int, str]]]]]:
     if kind == "docs":
         for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
-            yield path, paragraphs_of_page
+            if path.name != QUOTES:
+                yield path, paragraphs_of_page
         for path in sorted((ROOT / "docs" / "notebooks").glob("*.py")):
             yield path, paragraphs_of_notebook
         return

@@ -155,7 +155,7 @@ def test_a_stop_that_takes_longer_than_promised_is_found(wrong: Bench) -> None:
 def test_swapped_leds_are_named_and_no_others(wrong: Bench) -> None:
     lamp_step.lamps(wrong)
     assert missed(wrong) == [
-        *(f"LED {led}: from its place in the table" for led in SWAPPED),
+        *(f"LED {led}: angle from its place in the table" for led in SWAPPED),
         "largest deviation from the LED table",
     ]
 

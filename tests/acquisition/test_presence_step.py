@@ -76,7 +76,7 @@ def test_a_cell_without_a_switch_passes_and_its_record_says_so(tmp_path: Path) -
 
 
 def test_a_cell_whose_rig_has_a_switch_needs_one() -> None:
-    with pytest.raises(StepFailedError, match="tells of no input"):
+    with pytest.raises(StepFailedError, match="reports no input"):
         presence_step.presence(bench_with(Box(None), Onlooker(), must_exist=True))
 
 

@@ -156,7 +156,7 @@ def write_refined(
         for number, picture in enumerate(pictures):
             data = file.create_dataset(f"pictures/{number}", data=_preview(picture), track_times=False)
             data.attrs["blocks"] = picture.shape
-            data.attrs["told"] = "what the view was compared by, scaled down; its height and width were `blocks`"
+            data.attrs["told"] = "the picture by which the view was compared, scaled; its size was `blocks`"
 
 
 def _pointings(

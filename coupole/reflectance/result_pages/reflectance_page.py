@@ -41,8 +41,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         )
     yield (
         f"{about['pixels']} pixels under {about['lights'] - len(about['left_out'])} lights; residual of the "
-        f"materials "
-        f"{100 * about['residual']:.1f} % (median, of square roots)"
+        f"materials {100 * about['residual']:.1f} % (median, of square roots)"
     )
     if about["not_fitted"]:
         yield f"{about['not_fitted']} pixels saw too few lights and have no normal"
@@ -55,7 +54,7 @@ def remarks(about: dict[str, Any]) -> Iterator[str]:
         names = ", ".join(f"{name} ({gain:.2f})" for name, gain in about["suspect_pictures"].items())
         yield f"pictures brighter or darker than all others predict: {names}"
     if about["held_out_psnr_db"] is not None:
-        yield f"left-out lights are made with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, inside the mask)"
+        yield f"left-out lights are predicted with {about['held_out_psnr_db']:.2f} dB (PSNR, linear, in the mask)"
 
 
 def _page(result: PictureResult) -> Page:
@@ -100,7 +99,7 @@ def _quality(about: dict[str, Any]) -> str:
             f"Pictures of lights that were left out are predicted with {about['held_out_psnr_db']:.1f} dB "
             f"(PSNR, inside the mask)."
         )
-    return f"The materials leave {100 * about['residual']:.1f} % of the pictures (median, of square roots)."
+    return f"The median residual of the materials is {100 * about['residual']:.1f} % (of square roots)."
 
 
 def _next_step(name: str, about: dict[str, Any]) -> Inline:
@@ -134,7 +133,7 @@ def _materials(result: PictureResult, fields: dict[str, NDArray[Any]]) -> Sectio
         reason = f"they add less than {lobes_told.LEAST_HIGHLIGHT:.0%} to the diffuse part"
         notes = [lobes_told.no_lobe_in_words(share, reason)]
     residual = 100 * _on_the_picture(result, fields["residual"])
-    figures.append(value_map("what the materials leave", residual, "% of the diffuse part", 10.0))
+    figures.append(value_map("residual of the materials", residual, "% of the diffuse part", 10.0))
     return Section("materials", "Materials", figures=figures, notes=notes)
 
 

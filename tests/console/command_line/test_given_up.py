@@ -103,7 +103,7 @@ def test_a_page_that_has_gone_begins_nothing_and_neither_does_what_lay_for_long(
     with waits:
         answer = _all_of(waits)
     assert " 409 " in answer.splitlines()[0]
-    assert "stood still" in answer
+    assert "was frozen for" in answer
     assert stays_empty(engineer)
 
 
